@@ -14,6 +14,7 @@ from tests.support.station import VIAL
 from tests.support.station_process import node_process
 
 
+@pytest.mark.slow
 def test_a_program_asks_for_pours_and_reads_them_as_a_table_with_units(tmp_path: Path) -> None:
     pytest.importorskip("pandas")
     with node_process(tmp_path, "station") as url, decant.Station(url, state=tmp_path / "state") as station:

@@ -84,6 +84,7 @@ outputs: {directory: runs}
 """
 
 
+@pytest.mark.slow
 def test_a_campaign_pours_its_series_and_fills_the_source_again(campaign: Path) -> None:
     path = small_campaign.write_campaign(campaign.parent, SERIES)
     result = decant("dose", str(path), "--dry-run")

@@ -153,6 +153,7 @@ def test_arm_of_hardware_moves_by_what_was_typed_and_ctrl_c_stops_it(tmp_path: P
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 def test_arm_of_hardware_goes_home_after_its_laboratory_and_home_were_typed(tmp_path: Path) -> None:
     home = [radians(q) for q in hardware_laboratory.HOME]
     start = [*home[:4], home[4] + radians(3.0), home[5] - radians(12.0)]

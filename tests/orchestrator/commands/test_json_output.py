@@ -64,8 +64,8 @@ def said(command: str) -> str:
         pytest.param("calibrate", "--in-process", marks=pytest.mark.slow),
         pytest.param("plan", "--in-process --iterations 2 --seeds 2", marks=pytest.mark.slow),
         ("simulate", f"{ACTION} --seeds 2"),
-        ("simulate", "--from pours.csv --seeds 2"),
-        ("pour", f"{ACTION} --in-process"),
+        pytest.param("simulate", "--from pours.csv --seeds 2", marks=pytest.mark.slow),
+        pytest.param("pour", f"{ACTION} --in-process", marks=pytest.mark.slow),
     ],
 )
 def test_work_on_a_campaign_prints_what_is_documented(campaign: Path, command: str, options: str) -> None:

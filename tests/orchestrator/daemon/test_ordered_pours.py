@@ -96,6 +96,7 @@ def test_a_source_that_cannot_serve_an_order_refuses_it_before_anything_moves(tm
     run(work())
 
 
+@pytest.mark.slow
 def test_a_dry_run_states_amount_spread_duration_and_limits_and_leaves_nothing_behind(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:

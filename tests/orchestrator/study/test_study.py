@@ -132,6 +132,7 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
     arms, levels = {"C4": {"repetitions": 1, "simulations": 4, "initial_samples": 4}}, read("quick")["mismatch"][:1]
     deployment = {"D3": {**read("quick")["deployment"]["D3"], "pours": 1, "repetitions": 1}}
