@@ -19,6 +19,7 @@ from typing import Any
 
 import uvicorn
 
+from actors.runtime.child_process import child_environment
 from orchestrator.daemon import ordering, rig_worker
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
@@ -122,7 +123,12 @@ async def serve(folder: Path, stage: str) -> None:
 @contextlib.contextmanager
 def node_process(folder: Path, served: str = "node") -> Iterator[str]:
     """Run the daemon with a filled beaker; yields the URL of its 'node' for MADSci, or of the 'station'."""
-    process = subprocess.Popen([sys.executable, "-m", __name__, str(folder), served], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-m", __name__, str(folder), served],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=child_environment(),
+    )
     try:
         assert process.stdout is not None
         yield process.stdout.readline().strip()

@@ -13,6 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
+from actors.runtime.child_process import child_environment
 from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.daemon_settings import MadsciSettings
 from orchestrator.daemon.madsci_node import create_node, new_ulid
@@ -158,7 +159,12 @@ def test_the_unmodified_client_of_madsci_pours(tmp_path: Path) -> None:
     with node_process(tmp_path) as url:
         arguments = {"source": "beaker", "receiver": "vial-1"}
         done = subprocess.run(
-            [python, "-c", CLIENT, url, json.dumps(arguments)], capture_output=True, text=True, timeout=600, check=False
+            [python, "-c", CLIENT, url, json.dumps(arguments)],
+            capture_output=True,
+            text=True,
+            timeout=600,
+            check=False,
+            env=child_environment(),
         )
     assert done.returncode == 0, done.stderr[-3000:]
     told = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("TOLD "))[5:])

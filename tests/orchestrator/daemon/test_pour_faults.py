@@ -15,6 +15,7 @@ from urllib.parse import urlparse
 
 import pytest
 
+from actors.runtime.child_process import child_environment
 from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from tests.support.station import order, setting_up
@@ -25,7 +26,10 @@ from tests.support.waiting import PATIENCE
 @contextlib.contextmanager
 def station(folder: Path, stage: str = "none") -> Iterator[tuple[Client, subprocess.Popen[str]]]:
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.support.station_process", str(folder), stage], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-m", "tests.support.station_process", str(folder), stage],
+        stdout=subprocess.PIPE,
+        text=True,
+        env=child_environment(),
     )
     try:
         assert process.stdout is not None
