@@ -124,6 +124,7 @@ def test_home_from_home_is_no_step() -> None:
 def test_arm_of_hardware_moves_by_what_was_typed_and_ctrl_c_stops_it(tmp_path: Path) -> None:
     start = [radians(q) for q in hardware_laboratory.HOME]
     with VirtualController.start(free_address(), "ur10", joints=start) as controller:
+        hardware_laboratory.install(controller)
         laboratory = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", controller.address)
         write_record(laboratory, SafetyRecord(controller.fault("state")["checksum"], "2016300123", "", "", "", ""))
         with Terminal("robot", "jog", str(laboratory), "--enable-motion", cwd=str(tmp_path)) as terminal:
@@ -158,6 +159,7 @@ def test_arm_of_hardware_goes_home_after_its_laboratory_and_home_were_typed(tmp_
     home = [radians(q) for q in hardware_laboratory.HOME]
     start = [*home[:4], home[4] + radians(3.0), home[5] - radians(12.0)]
     with VirtualController.start(free_address(), "ur10", joints=start) as controller:
+        hardware_laboratory.install(controller)
         laboratory = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", controller.address)
         write_record(laboratory, SafetyRecord(controller.fault("state")["checksum"], "2016300123", "", "", "", ""))
         refused = invoke(f"robot home {laboratory}")

@@ -40,6 +40,7 @@ def controller() -> Iterator[VirtualController]:
     with VirtualController.start(
         free_address(), "ur10", joints=[radians(q) for q in hardware_laboratory.HOME]
     ) as started:
+        hardware_laboratory.install(started)
         yield started
 
 

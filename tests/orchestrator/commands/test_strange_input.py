@@ -18,9 +18,17 @@ ACTION = "--set angular_velocity=100 --set x_offset=100"
 
 # file to write: the file that it is made of, what is replaced, by what
 SPOILT: dict[str, tuple[str, str, str]] = {
-    "campaigns/tolerance.yaml": (QUICKSTART, "friction: [0, 0.6]", "receiver_x: {measured: 0 mm, tolerance: 3000 km}"),
-    "campaigns/measured.yaml": (QUICKSTART, "friction: [0, 0.6]", "receiver_x: {measured: .nan mm, tolerance: 3 mm}"),
-    "campaigns/many.yaml": (QUICKSTART, "simulations: 24", "simulations: 1000000000000"),
+    "campaigns/tolerance.yaml": (
+        QUICKSTART,
+        "receiver_x: [-25 mm, 25 mm]",
+        "receiver_x: {measured: 0 mm, tolerance: 3000 km}",
+    ),
+    "campaigns/measured.yaml": (
+        QUICKSTART,
+        "receiver_x: [-25 mm, 25 mm]",
+        "receiver_x: {measured: .nan mm, tolerance: 3 mm}",
+    ),
+    "campaigns/many.yaml": (QUICKSTART, "simulations: 30", "simulations: 1000000000000"),
     "campaigns/long.yaml": (QUICKSTART, "name: quickstart", f"name: {'x' * 300}"),
     "campaigns/name.yaml": (QUICKSTART, "name: quickstart", "name: 注ぐ"),
     "campaigns/two.yaml": (QUICKSTART, "name: quickstart", "name: a\n---\nname: quickstart"),
