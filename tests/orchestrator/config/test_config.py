@@ -380,7 +380,7 @@ def test_strategies_have_their_own_budgets(keys: str, expected: DeploymentSettin
 def test_section_overrides_the_motion_of_the_campaign(tmp_path: Path) -> None:
     text = (CONFIGS / "campaigns" / "quickstart.yaml").read_text(encoding="utf-8").replace("../", f"{CONFIGS}/")
     path = tmp_path / "campaign.yaml"
-    path.write_text(text.replace("motion: {max_angle: 120 deg,", "motion: {hold_time: 2 s, max_angle: 120 deg,"))
+    path.write_text(text.replace("120 deg, height: 110 mm}", "120 deg, height: 110 mm, hold_time: 2 s}"))
     plan = load_campaign(path)
     assert plan.calibration is not None
     assert plan.deployment is not None

@@ -173,7 +173,7 @@ def test_a_campaign_that_the_arm_can_t_make_is_refused_before_anything_starts():
     assert len(problems) == 2
     said = problems[0].message
     assert said.startswith("calibration: the arm can make none of 21 actions that were tried; for example")
-    assert re.search(r"for example angular_velocity \S+ deg/s  max_angle \S+ deg: the arm can't", said)  # as searched
+    assert re.search(r"for example angular_velocity \S+ deg/s  x_offset \S+ mm: the arm can't", said)  # as searched
     assert "57.3 deg are allowed: lower max_angle, or raise arm.limits.tilt" in said
     assert problems[0].where == "calibration.actions"
     assert "deployment into 'narrow'" in problems[1].message

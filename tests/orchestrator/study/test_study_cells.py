@@ -116,7 +116,7 @@ def risky(folder: Path, **arm: Any) -> Path:
     return written(folder, {**data, "campaign": str(folder / "campaign.yaml")})
 
 
-def test_risk_of_the_campaign_is_that_of_d1_and_leaves_the_others_what_they_are(tmp_path: Path) -> None:
+def test_risk_of_the_campaign_is_that_of_d1_and_what_simulates_draws_from_the_posterior(tmp_path: Path) -> None:
     study = load_study(risky(tmp_path))
     planned = study.deployment("D1-2").plan.settings
     assert isinstance(planned, D1Settings)
@@ -131,7 +131,7 @@ def test_risk_of_the_campaign_is_that_of_d1_and_leaves_the_others_what_they_are(
             made[cell.arm] = stages[0].build({}, 1)
             assert plan.deployment is not None
             drawn = [one.cohesion for one in plan.deployment.thetas]
-            assert drawn == ([0.0, 0.01, 0.02] if cell.arm == "D1-2" else [])
+            assert drawn == ([] if cell.arm == "D2" else [0.0, 0.01, 0.02])  # D2 simulates nothing
     assert {arm: type(one) for arm, one in made.items()} == {"D1-2": RobustPlanning, "D2": RealOnly, "D3": Hybrid}
     with pytest.raises(ConfigError, match="at least 2 are needed"):
         load_study(risky(tmp_path / "few", simulations_per_iteration=1))
@@ -150,7 +150,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "nothing left to search": (
         lambda d: {
             **without(d, "search"),
-            "parameters": {"particles": 500, "cohesion": "0 N/m", "friction": 0.1, "wall_distance": 0.5},
+            "parameters": {"particles": 500, "cohesion": "0 N/m", "friction": 0.1, "wall_distance": 0.5, "receiver_x": "0 mm"},
         },
         "parameters: fixes all that the campaign searches",
     ),
