@@ -150,7 +150,13 @@ WRONG: dict[str, tuple[Any, str]] = {
     "nothing left to search": (
         lambda d: {
             **without(d, "search"),
-            "parameters": {"particles": 500, "cohesion": "0 N/m", "friction": 0.1, "wall_distance": 0.5, "receiver_x": "0 mm"},
+            "parameters": {
+                "particles": 500,
+                "cohesion": "0 N/m",
+                "friction": 0.1,
+                "wall_distance": 0.5,
+                "receiver_x": "0 mm",
+            },
         },
         "parameters: fixes all that the campaign searches",
     ),
