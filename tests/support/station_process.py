@@ -116,6 +116,7 @@ async def serve(folder: Path, stage: str) -> None:
         for vessel, shape in (("beaker", BEAKER), ("vial-1", VIAL)):
             materials.add_vessel(vessel, "", shape, "", "test")
         materials.weigh("beaker", 0.1, 1e-4, "water", "test")
+    listening.listen()  # a client may connect as soon as it knows the address
     print(f"http://127.0.0.1:{listening.getsockname()[1]}", flush=True)
     await server.serve([listening])
 

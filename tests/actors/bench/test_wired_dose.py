@@ -123,6 +123,7 @@ def test_a_dose_over_other_balances(open_stage: OpenStage, dialect: str) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_campaign_of_six_beakers_over_the_wires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
     plan = load_campaign(shipped("campaigns/dispense.yaml"), laboratory=LABORATORIES / "virtual-dosing.yaml")
