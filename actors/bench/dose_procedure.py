@@ -365,6 +365,7 @@ class DoseProcedure:
             **after_dose(self._series),
             "wanted": self._dose.amount,
             "received": result.amount,
+            "spilled": None,  # nothing outside the receiver is weighed
             "end": str(result.end),
             "top_ups": result.top_ups,
             "duration": self._duration,

@@ -12,6 +12,7 @@ Amounts are poured by the strategy of `decant dose`, actions by that of `decant 
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import math
@@ -36,7 +37,7 @@ from orchestrator.runs.stages import StageDefinition
 from orchestrator.shipped import shipped
 from orchestrator.strategies.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.dispense import DOSE, Dispense, KnownSource
+from orchestrator.strategies.dispense import DOSE, Dispense, KnownSource, spilled_mass
 from orchestrator.strategies.single_action import OnePour, RepeatedSimulation
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.motion import plan_motion
@@ -324,8 +325,6 @@ class PlannedOrder:
             InvalidActionError: the pour can't be made.
         """
         if self.target is not None:
-            import asyncio
-
             return await asyncio.to_thread(self._forecast)
         return {**await self._simulated(simulators()), "duration_s": self.duration()}
 
@@ -346,8 +345,6 @@ class PlannedOrder:
         }
 
     async def _simulated(self, pool: SimulatorPool) -> dict[str, Any]:
-        import asyncio
-
         assert self.plan.deployment is not None
         costing = Costing.of(self.plan.deployment, self.scene, self.plan.parameters)
         strategy = RepeatedSimulation(costing, self.action, SEEDS, self.order.seed)
@@ -421,11 +418,11 @@ def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float
     """
     about: dict[str, Any] = measured.notes.get(DOSE, {})
     received = 1e3 * float(about.get("received", measured.delivered))
-    half = INTERVAL * 1e3 * math.sqrt(2.0) * deviation
+    half, spilled = INTERVAL * 1e3 * math.sqrt(2.0) * deviation, spilled_mass(measured)
     found: dict[str, Any] = {
         "received_g": received,
         "received_interval_g": [received - half, received + half],
-        "spilled_g": 1e3 * measured.spilled,
+        "spilled_g": None if spilled is None else 1e3 * spilled,
         "left_in_source_g": 1e3 * measured.retained,
         "end": str(about.get("end", "")),
         "duration_s": about.get("duration"),

@@ -140,7 +140,8 @@ class PourSummary(ResultPart):
     @property
     def line(self) -> str:
         """'pour 3 into narrow: 1.20 % (12.0 g spilled, 3.4 g left in the pourer)', once it is weighed."""
-        weights = f"{self.spilled_g or 0.0:.1f} g spilled, {self.retained_g or 0.0:.1f} g left in the pourer"
+        spilled = "spilled mass not weighed" if self.spilled_g is None else f"{self.spilled_g:.1f} g spilled"
+        weights = f"{spilled}, {self.retained_g or 0.0:.1f} g left in the pourer"
         return f"pour {self.number} into {self.receiver}: {self.measured} ({weights})"
 
 

@@ -49,6 +49,7 @@ from orchestrator.strategies.calibration.calibration_base import CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import Scores
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.strategies.dispense import spilled_mass
 from orchestrator.strategies.single_action import Confirmed, PredictedPour
 from sim_engine.model_validity import NotCovered
 from sim_engine.outcome import normalised_spillage
@@ -266,8 +267,11 @@ def pour_summary(
         section: CalibrationPlan | DeploymentPlan | None = plan.calibration if calibrating else plan.deployment
         names = ("angular_velocity", "x_offset") if section is None else section.actions.names
         loss = None if measured is None else loss_of_pour(plan, request, measured)
+    spilled = None if measured is None else spilled_mass(measured)
     state = "unknown" if pour.state == "under way" and not live else pour.state
     came = "" if measured is None else "too little was poured" if loss is None else unit.text(loss)
+    if measured is not None and spilled is None:
+        came = f"{1e3 * measured.delivered:.2f} g received"
     action = style.display_values({name: values[name] for name in names})
     if request.dose is not None:
         action = f"{1e3 * request.dose.amount:g} g wanted"
@@ -286,10 +290,10 @@ def pour_summary(
         best=best,
         remark=_remark(state, pour),
         loaded_g=None if measured is None else 1e3 * measured.loaded,
-        spilled_g=None if measured is None else 1e3 * measured.spilled,
+        spilled_g=None if spilled is None else 1e3 * spilled,
         retained_g=None if measured is None else 1e3 * measured.retained,
-        spillage=None if measured is None else measured.fractions.spilled,
-        spilled_of_poured=None if measured is None else normalised_spillage(measured.fractions),
+        spillage=None if measured is None or spilled is None else measured.fractions.spilled,
+        spilled_of_poured=None if measured is None or spilled is None else normalised_spillage(measured.fractions),
         time=pour.time,
         seconds=pour.seconds,
     )

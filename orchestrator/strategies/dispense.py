@@ -19,6 +19,7 @@ from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.strategies.strategy import Progress
 from orchestrator.strategies.trials import SeedStream
+from sim_engine.outcome import PourMeasurement
 
 DOSE = "dose"
 """Purpose of these pours."""
@@ -247,7 +248,8 @@ class Dispense:
         match outcome:
             case Poured(measured):
                 about = measured.notes.get(DOSE, {})
-                received, spilled = 1e3 * float(about.get("received", measured.delivered)), 1e3 * measured.spilled
+                received, outside = 1e3 * float(about.get("received", measured.delivered)), spilled_mass(measured)
+                spilled = None if outside is None else 1e3 * outside
                 end = str(about.get("end", ""))
             case Failed(kind, reason):
                 end = f"{kind}: {reason}"
@@ -277,6 +279,13 @@ class Dispense:
     def result(self) -> Dispensed:
         """The doses so far."""
         return Dispensed(scene=self._plan.scenes[0].name, doses=tuple(self._doses))
+
+
+def spilled_mass(measured: PourMeasurement) -> float | None:
+    """Mass outside the receiver [kg]; None after a dose on a bench that does not weigh it."""
+    about: dict[str, Any] = measured.notes.get(DOSE, {})
+    found: float | None = about.get("spilled", measured.spilled)
+    return found
 
 
 def left_after(dose: DoseTarget, outcome: Outcome) -> KnownSource | None:

@@ -176,6 +176,41 @@ class Stepper:
             f.x[i] = x
 
     @ti.func
+    def iterate(self, s, warm: ti.template(), thick: ti.template()):
+        """Chebyshev-accelerated Jacobi iteration on the density, from the present multipliers.
+
+        Args:
+            s: scene.
+            warm: whether these are multipliers whose displacements the first iteration includes; otherwise they are 0.
+            thick: whether the viscosity is in SI.
+        """
+        f = self.state
+        n = 0
+        compressed = ti.cast(1.0, ti.f32)
+        # Three-term recurrence of the Chebyshev iteration on [SMOOTHEST, ROUGHEST] (Golub & Varga 1961).
+        centre = ti.cast(0.5 * (ROUGHEST + SMOOTHEST), ti.f32)
+        half = ti.cast(0.5 * (ROUGHEST - SMOOTHEST), ti.f32)
+        sigma = half / centre
+        rate = 1.0 / centre
+        momentum = ti.cast(0.0, ti.f32)
+        while n < ITERATIONS or (compressed > TOLERANCE and n < MOST_ITERATIONS):
+            if ti.static(warm) and n == 0:
+                measure_first(f, s)
+                compressed = multiply_first(f, s, rate, thick)
+            else:
+                if n > 0:
+                    following = 1.0 / (2.0 * centre / half - sigma)
+                    momentum = sigma * following
+                    rate = 2.0 * following / half
+                    sigma = following
+                measure(f, s)
+                compressed = multiply(f, s, rate, momentum, thick)
+            displace(f, s)
+            self.apply(s)
+            n += 1
+        f.iterations[s] = f.iterations[s] + n
+
+    @ti.func
     def solve_density(self, s, ratio, thick: ti.template()):
         """Chebyshev-accelerated Jacobi iteration, which starts from a fraction of the last step's multipliers.
 
@@ -191,29 +226,7 @@ class Stepper:
         f = self.state
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
             f.pressure[i] = f.pressure[i] * WARM * ratio
-        n = 0
-        compressed = ti.cast(1.0, ti.f32)
-        # Three-term recurrence of the Chebyshev iteration on [SMOOTHEST, ROUGHEST] (Golub & Varga 1961).
-        centre = ti.cast(0.5 * (ROUGHEST + SMOOTHEST), ti.f32)
-        half = ti.cast(0.5 * (ROUGHEST - SMOOTHEST), ti.f32)
-        sigma = half / centre
-        rate = 1.0 / centre
-        momentum = ti.cast(0.0, ti.f32)
-        while n < ITERATIONS or (compressed > TOLERANCE and n < MOST_ITERATIONS):
-            if n == 0:
-                measure_first(f, s)
-                compressed = multiply_first(f, s, rate, thick)
-            else:
-                following = 1.0 / (2.0 * centre / half - sigma)
-                momentum = sigma * following
-                rate = 2.0 * following / half
-                sigma = following
-                measure(f, s)
-                compressed = multiply(f, s, rate, momentum, thick)
-            displace(f, s)
-            self.apply(s)
-            n += 1
-        f.iterations[s] = f.iterations[s] + n
+        self.iterate(s, True, thick)
 
     @ti.func
     def decompress(self, s):
@@ -227,25 +240,7 @@ class Stepper:
             f.pressure[i] = 0.0
             f.allowed[i] = 0.0
             f.dv[i] = f.x[i]
-        n = 0
-        compressed = ti.cast(1.0, ti.f32)
-        centre = ti.cast(0.5 * (ROUGHEST + SMOOTHEST), ti.f32)
-        half = ti.cast(0.5 * (ROUGHEST - SMOOTHEST), ti.f32)
-        sigma = half / centre
-        rate = 1.0 / centre
-        momentum = ti.cast(0.0, ti.f32)
-        while n < ITERATIONS or (compressed > TOLERANCE and n < MOST_ITERATIONS):
-            if n > 0:
-                following = 1.0 / (2.0 * centre / half - sigma)
-                momentum = sigma * following
-                rate = 2.0 * following / half
-                sigma = following
-            measure(f, s)
-            compressed = multiply(f, s, rate, momentum, True)
-            displace(f, s)
-            self.apply(s)
-            n += 1
-        f.iterations[s] = f.iterations[s] + n
+        self.iterate(s, False, True)
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
             f.pressure[i] = f.pressure_copy[i]
             f.dv[i] = f.x[i] - f.dv[i]

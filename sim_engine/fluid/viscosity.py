@@ -97,11 +97,11 @@ BESIDE = 0.386
 ABOVE = 0.16
 """… and the part of a layer above, times its height in spacings."""
 THINNEST = 0.15
+"""Least thickness of films, in spacings."""
 LEAST_INERTIA = 0.02
 """Added to the inertia of a neighbourhood, as a fraction of its trace: a single pair has none about its own line."""
 ROUNDS = 2
 """Solutions with improved rotation. With one, vortices decay by 16 % too slowly at dt ν k² = 0.13."""
-"""Least thickness of films, in spacings."""
 
 
 @ti.func

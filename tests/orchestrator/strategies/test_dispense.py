@@ -66,6 +66,14 @@ def test_doses_are_asked_one_after_the_other_in_order() -> None:
     assert [dose.received_g for dose in strategy.result().doses] == pytest.approx([50.3, 24.9])
 
 
+def test_a_spilled_mass_that_nobody_weighed_is_unknown_and_not_zero() -> None:
+    strategy = Dispense(plan(50, 25), seed=5)
+    for spilled in ({"spilled": None}, {}):  # with an arm; on a simulated bench
+        pour = asked(strategy)
+        strategy.tell(pour, poured(pour, 1e3 * (pour.dose.amount if pour.dose else 0.0), **spilled))
+    assert [dose.spilled_g for dose in strategy.result().doses] == [None, 0.0]
+
+
 def test_a_dose_knows_what_the_earlier_ones_have_shown_and_left() -> None:
     strategy = Dispense(plan(50, 25), seed=5)
     first = asked(strategy)
