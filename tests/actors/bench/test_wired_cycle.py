@@ -122,6 +122,7 @@ def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(poured):
     assert max(p.balance for p in poured.seen if p.balance is not None) > 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pour_that_is_refused_asks_nobody_and_moves_nothing(open_stage):
     async def play():
@@ -154,6 +155,7 @@ def test_no_consent_no_movement(open_stage):
     assert loaded == pytest.approx(0.2, abs=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
     patience = OperatorSettings(answers="virtual", time=2.0, reminder=4.0, deadline=12.0)
@@ -170,6 +172,7 @@ def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
     assert moved < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pourer_filled_wrongly_is_filled_anew_before_anything_is_poured(open_stage):
     async def play():

@@ -107,6 +107,7 @@ def test_vessels_plugins_and_checks_print_what_is_documented(tmp_path: Path) -> 
     validated("plugins", said("plugins --json"))
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_checks_and_paths_of_the_virtual_arm_print_what_is_documented(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -132,6 +132,7 @@ def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_recor
     assert joints[-1] == pytest.approx([radians(q) for q in hardware_laboratory.HOME], abs=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, controller: VirtualController) -> None:
     campaign = hardware_laboratory.write_rig(tmp_path, controller.address)

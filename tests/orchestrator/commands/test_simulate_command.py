@@ -75,6 +75,7 @@ def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path
     assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
 
 
+@pytest.mark.slow
 def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
     theta = {"cohesion": 0.05}
     draws = [{"theta": {"cohesion": 0.02 * i}, "weight": 1.0} for i in range(4)]
@@ -121,6 +122,7 @@ def test_simulate_shows_the_pour_as_picture_and_recording(
     assert "pour.rrd" in simulated.stderr
 
 
+@pytest.mark.slow
 def test_simulate_takes_units_parameters_and_another_receiver(
     simulated: subprocess.CompletedProcess[str], inputs: Path
 ) -> None:

@@ -56,6 +56,7 @@ def test_unfinished_run_gets_the_figures_it_can(results: dict[str, Any], tmp_pat
     assert set(only_pours) == {"spillage against pours", "loss map narrow"}
 
 
+@pytest.mark.slow
 def test_a_figure_that_fails_does_not_take_the_others_with_it(
     results: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -203,6 +203,7 @@ def run_risk(directory: Path, *, resume: bool = False) -> Any:
     return asyncio.run(toy_campaign.run_toy(directory, laboratory, plan=plan, stages=None, resume=resume))
 
 
+@pytest.mark.slow
 def test_killed_on_the_way_it_makes_the_requests_it_would_have_made(tmp_path: Path) -> None:
     result = run_risk(tmp_path / "undisturbed").results["deployment:cup"]
     assert result.window.checks
