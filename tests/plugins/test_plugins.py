@@ -106,6 +106,7 @@ def write_files(folder: Path) -> None:
     (folder / "cone.yaml").write_text(CONE)
 
 
+@pytest.mark.slow
 def test_what_is_installed_is_listed_with_its_package(decant: Decant) -> None:
     listed = json.loads(decant("plugins", "--json").stdout)
     packages = {(p["group"], p["name"]): p["package"] for p in listed["plugins"]}
@@ -148,6 +149,7 @@ def test_a_broken_package_is_named_and_disturbs_nobody(site: Path, broken: Path,
     assert decant("validate", "cone.yaml", cwd=folder).returncode == 0
 
 
+@pytest.mark.slow
 def test_a_laboratory_that_needs_a_broken_package_is_refused_with_its_name(
     site: Path, broken: Path, folder: Path
 ) -> None:

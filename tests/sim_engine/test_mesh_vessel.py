@@ -55,6 +55,7 @@ def mug() -> Vessel:
     return build_vessel(VesselSpec(name="mug", shape=MeshShape(path=MUG, unit="mm")), use_cache=False)
 
 
+@pytest.mark.slow
 def test_mug_with_a_handle_is_centred_on_its_opening_and_measured_like_its_profile(mug: Vessel) -> None:
     # the inner profile of make_meshes.py, from the floor to the crest of the rim
     inner = [

@@ -20,6 +20,7 @@ from tests.support.wired_bench import ACTION, SCENE, Stage, opened_stage, reach,
 DEFAULT = (Placement.TRAY, Placement.RECEIVER, Placement.MANUAL)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     "placement",
@@ -198,6 +199,7 @@ def test_a_mistyped_weight_is_asked_for_again(open_stage):
     assert measured.spilled == pytest.approx(stage.contents.on_tray, abs=3e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pour_given_up_before_consent_was_not_made(open_stage):
     seen = []

@@ -238,6 +238,7 @@ def joints_violation(angle: float) -> str | None:
     return SafetyConfiguration.of(MODELS["ur10"]).joints_violation(q)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "package"),
     [

@@ -168,7 +168,9 @@ async def is_interrupted_twice(plan: CampaignPlan, laboratory: object, directory
     raise asyncio.CancelledError
 
 
-@pytest.mark.parametrize(("ends", "code"), [(breaks_off, 3), (is_interrupted_twice, 130)])
+@pytest.mark.parametrize(
+    ("ends", "code"), [pytest.param(breaks_off, 3, marks=pytest.mark.slow), (is_interrupted_twice, 130)]
+)
 def test_pour_whose_outcome_is_unknown_doesn_t_promise_to_be_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: Callable[..., object], code: int
 ) -> None:

@@ -64,6 +64,7 @@ def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
     assert "not simulated" not in simulated.stderr
 
 
+@pytest.mark.slow
 def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path) -> None:
     done = typed("simulate small.yaml --set angular_velocity=20 --set max_angle=75 --set x_offset=70 --seeds 2", inputs)
     assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)

@@ -38,6 +38,7 @@ from tests.support import example_run
 from tests.support.example_results import changed, is_picture, shown, strays
 
 
+@pytest.mark.slow
 def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], tmp_path: Path) -> None:
     drawn = draw_figures(tmp_path / "figures", example_run.campaign(), results)
     assert set(drawn) == {

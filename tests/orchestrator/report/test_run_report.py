@@ -274,6 +274,7 @@ def test_the_verb_refuses_what_it_can_not_report_on(made: Made, argument: str, s
     assert said in done.output
 
 
+@pytest.mark.slow
 def test_the_library_writes_it_too(made: Made, tmp_path: Path) -> None:
     import decant as library
 

@@ -331,6 +331,7 @@ def asked_for(directory: Path) -> list[Any]:
     return [request for request in requests if request["type"] != "Ask"]
 
 
+@pytest.mark.slow
 def test_a_campaign_that_asks_pauses_and_goes_on_as_answered(tmp_path: Path) -> None:
     directory = tmp_path / "asked"
     with pytest.raises(OperatorNeededError, match=r"How to go on.*--answer 'go on'") as caught:
