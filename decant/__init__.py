@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     )
     from decant.simulation import Simulation, simulate
     from decant.station import Station, StationPour
+    from orchestrator.catalogue.vessel_account import VesselAccount, VesselContent
     from orchestrator.config.action_assignments import AssignmentError
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from orchestrator.results.publishing import Published
@@ -59,6 +60,8 @@ __all__ = [
     "SimulationParameters",
     "Station",
     "StationPour",
+    "VesselAccount",
+    "VesselContent",
     "VesselSpec",
     "build_campaign",
     "calibrate",
@@ -88,6 +91,7 @@ _HOMES = {
     "decant.simulation": ("Simulation", "simulate"),
     "decant.station": ("Station", "StationPour"),
     "actors.interfaces": ("LaboratoryError",),
+    "orchestrator.catalogue.vessel_account": ("VesselAccount", "VesselContent"),
     "orchestrator.config.action_assignments": ("AssignmentError",),
     "orchestrator.config.yaml.yaml_errors": ("ConfigError",),
     "orchestrator.run_errors": ("RunError",),

@@ -3,7 +3,7 @@
 `Store` is the only writer of one SQLite file and flushes every change to disk. `QueueItem` is a submitted campaign with
 its desired state (`DesiredState`); `StoredQuestion` is a question to the operator. The journal of a run remains the
 authoritative record of its events; this file holds the operators' intentions. The tables of ordered pours and of
-materials are read and written by `pour_orders` and `materials`.
+materials are read and written by `pour_orders` and `materials`; the contents of vessels are a file of their own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from orchestrator.catalogue.run_registry import make_state_directory
 from orchestrator.journal.journal_file import locked_alone
 from orchestrator.run_errors import RunError
 
-FORMAT = 3
+FORMAT = 4
 
 _SCHEMA = """
 create table campaign (
@@ -83,18 +83,8 @@ create table node_action (
     id text primary key, name text not null, args text not null check (json_valid(args)), created real not null,
     started real, campaign text, error text, json_result text
 ) strict;
-create table account (
-    id integer primary key, t real not null, vessel text not null, kind text not null, change real, deviation real,
-    liquid text, pour text, by text not null, note text not null
-) strict;
-create unique index account_once on account (pour, vessel) where pour is not null;
-create index account_by_vessel on account (vessel);
-create trigger account_is_never_changed before update on account begin
-    select raise(abort, 'account entries are append-only'); end;
-create trigger account_is_never_deleted before delete on account begin
-    select raise(abort, 'account entries are append-only'); end;
 """
-"""Batches, reservations, ordered pours and materials; added in format 3. Masses in kg, capacities in m³."""
+"""Batches, reservations, ordered pours and materials; added in format 4. Masses in kg, capacities in m³."""
 
 _FROM_2 = """
 alter table campaign add column batch text not null default '';

@@ -104,7 +104,8 @@ class Running:
         """
         if self.item.task == POUR and self.item.run is None:
             await self._renew_order()
-        found = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig)
+        vessels = Materials(self._shared.store).on_rig(self._rig.name)
+        found = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig, vessels)
         request, warned = await asyncio.to_thread(_prepared, found)
         assert request.folder is not None
         for text in warned:
