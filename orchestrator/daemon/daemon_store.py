@@ -243,6 +243,13 @@ class Store:
 
     def _open(self) -> None:
         self._db = sqlite3.connect(self.path, isolation_level=None, timeout=10.0)
+        try:
+            self._prepare()
+        except BaseException:
+            self._db.close()  # an interrupted upgrade would keep the file locked
+            raise
+
+    def _prepare(self) -> None:
         self._db.row_factory = sqlite3.Row
         self._db.execute("pragma journal_mode = wal")
         self._db.execute("pragma synchronous = full")
@@ -292,6 +299,26 @@ class Store:
             "case when state = 'queued' then -priority else 0 end, case when state = 'queued' then rank else 0 end, "
             "created desc limit ?",
             [*wanted, limit],
+        )
+        return [_item(row) for row in rows]
+
+    def ids(self) -> set[str]:
+        """Return the ids of all campaigns."""
+        return {row["id"] for row in self.rows("select id from campaign")}
+
+    def active(self) -> list[QueueItem]:
+        """Return the campaigns that are in no state of rest."""
+        return [
+            _item(row) for row in self._db.execute(f"select * from campaign where state not in ({_quoted(AT_REST)})")
+        ]
+
+    def wanted(self, rig: str) -> list[QueueItem]:
+        """Return the campaigns of a rig that rest, have not ended and should run: the queue in its order first."""
+        rows = self._db.execute(
+            f"select * from campaign where state in ({_quoted(AT_REST)}) and state not in ({_quoted(ENDED)}) and "
+            "rig = ? and desired_state = ? order by case when state = 'queued' then 0 else 1 end, "
+            "priority desc, rank",
+            [rig, str(DesiredState.RUN)],
         )
         return [_item(row) for row in rows]
 

@@ -487,6 +487,14 @@ class OrderBook:
         rows = self._store.rows("select * from pour_order where campaign = ?", campaign)
         return _decoded(rows[0]) if rows else None
 
+    def begun(self) -> tuple[str, ...]:
+        """Return the campaigns of orders that have begun and have no result."""
+        rows = self._store.rows(
+            "select campaign from pour_order join campaign on campaign.id = campaign where result is null and "
+            "run is not null"
+        )
+        return tuple(row["campaign"] for row in rows)
+
     def list(self, limit: int, source: str = "") -> list[dict[str, Any]]:
         """Return orders, newest first."""
         where, arguments = ("where source = ?", [source]) if source else ("", [])

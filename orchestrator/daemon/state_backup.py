@@ -145,9 +145,11 @@ def restore(source: Path, state: Path) -> dict[str, float]:
     store = Store(state / STORE)
     try:
         store.set_flag(PAUSED, {"by": "restore", "time": time.time()})
-        for item in store.items(limit=1_000_000):
-            if item.state not in (*ENDED, "queued"):
-                store.change(item.id, desired_state=str(DesiredState.PAUSE))
+        rest = (*ENDED, "queued")
+        store.write(
+            f"update campaign set desired_state = ? where state not in ({', '.join('?' * len(rest))})",
+            *(str(DesiredState.PAUSE), *rest),
+        )
         store.note(
             "restore", "restore backup", detail=time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(about["time"]))
         )
