@@ -257,11 +257,11 @@ class VesselAccount:
                 (held, moved.taken, -1.0, held.liquid, "from"),
                 (there, moved.received, 1.0, mixed, "into"),
             ):
-                about = {"liquid": liquid, "pour": pour, "by": by, "note": note, "knowledge": before.knowledge}
                 kind, mass, deviation = _after(before, change, sign)
                 entry = VesselContent(
-                    before.vessel, time.time(), kind, mass, deviation, weighed=before.weighed, **about
-                )
+                    before.vessel, time.time(), kind, mass, deviation, liquid, pour, by, note, before.weighed,
+                    before.knowledge,
+                )  # fmt: skip
                 _write(connection, f"{pour} {role}", entry)
 
     # ---- entries of runs
@@ -367,7 +367,7 @@ _COLUMNS = "vessel, t, kind, mass, deviation, liquid, pour, by, note, weighed, k
 
 def _read(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> list[VesselContent]:
     rows = connection.execute(f"select {_COLUMNS} from entry {condition}", values).fetchall()
-    return [VesselContent(*row[:-1], None if row[-1] is None else json.loads(row[-1])) for row in rows]
+    return [VesselContent(*(*row[:-1], None if row[-1] is None else json.loads(row[-1]))) for row in rows]
 
 
 def _last(connection: sqlite3.Connection, vessel: str) -> VesselContent | None:

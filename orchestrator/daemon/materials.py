@@ -189,12 +189,11 @@ class Materials:
             MaterialError: a vessel is unknown, or both are the same one.
             OSError: the account can't be written.
         """
-        names = [name if "/" in name else self.vessel(name).id for name in (source, receiver)]
-        if names[0] == names[1]:
-            raise MaterialError(f"{names[0]}: is source and receiver at once")
-        self.account.transfer(
-            f"by hand {pour}", *names, Transfer((mass, deviation), (mass, deviation)), by=by, note=note
-        )
+        source, receiver = (name if "/" in name else self.vessel(name).id for name in (source, receiver))
+        if source == receiver:
+            raise MaterialError(f"{source}: is source and receiver at once")
+        moved = Transfer((mass, deviation), (mass, deviation))
+        self.account.transfer(f"by hand {pour}", source, receiver, moved, by=by, note=note)
 
     def content(self, vessel: str) -> VesselContent:
         """Return the content of a registered vessel. Raises MaterialError if it is unknown."""
