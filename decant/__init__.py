@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         build_campaign,
         calibrate,
         check,
+        doctor,
         load_campaign,
         load_vessel,
         plan,
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     )
     from decant.simulation import Simulation, simulate
     from decant.station import Station, StationPour
+    from orchestrator.bench_check import BenchReport
+    from orchestrator.catalogue.vessel_account import VesselAccount, VesselContent
     from orchestrator.config.action_assignments import AssignmentError
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from orchestrator.results.publishing import Published
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AssignmentError",
+    "BenchReport",
     "CampaignPlan",
     "CheckReport",
     "ConfigError",
@@ -59,10 +63,13 @@ __all__ = [
     "SimulationParameters",
     "Station",
     "StationPour",
+    "VesselAccount",
+    "VesselContent",
     "VesselSpec",
     "build_campaign",
     "calibrate",
     "check",
+    "doctor",
     "events",
     "find_pours",
     "find_runs",
@@ -82,12 +89,14 @@ _HOMES = {
     "decant.catalogue_tables": ("find_pours", "find_runs"),
     "decant.running": (
         *("build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"),
-        *("calibrate", "check", "plan", "run", "start", "RunningCampaign"),
+        *("calibrate", "check", "doctor", "plan", "run", "start", "RunningCampaign"),
     ),
     "decant.run_results": ("Run", "open_run", "publish"),
     "decant.simulation": ("Simulation", "simulate"),
     "decant.station": ("Station", "StationPour"),
     "actors.interfaces": ("LaboratoryError",),
+    "orchestrator.bench_check": ("BenchReport",),
+    "orchestrator.catalogue.vessel_account": ("VesselAccount", "VesselContent"),
     "orchestrator.config.action_assignments": ("AssignmentError",),
     "orchestrator.config.yaml.yaml_errors": ("ConfigError",),
     "orchestrator.run_errors": ("RunError",),

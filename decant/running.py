@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from decant.run_results import Run
-from orchestrator.config.file_loading import campaign_from, load_campaign, load_vessel
+from orchestrator.bench_check import BenchReport, check_bench
+from orchestrator.config.file_loading import campaign_from, load_campaign, load_laboratory, load_vessel
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.live_view.live_server import recorder_of
@@ -42,6 +43,7 @@ from orchestrator.run_service import (
     task_request,
 )
 from orchestrator.runs.events import Subscriber as Watch
+from orchestrator.runs.motion_approval import read_record
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import POSTERIOR_DRAWS, posterior_draws
 from orchestrator.shipped import shipped, starting_set
@@ -129,6 +131,30 @@ def check(campaign: CampaignPlan, task: Task = "run") -> CheckReport:
         ValueError: the campaign has no section for the task.
     """
     return RunService().check(task_request(campaign, task))
+
+
+def doctor(laboratory: Path | str) -> BenchReport:
+    """Check everything that a pour needs, as `decant robot check` does: controller, safety settings, balance, packages.
+
+    Nothing moves and no setting is changed. For a virtual laboratory, its devices are started for the check.
+
+    Args:
+        laboratory: file of a laboratory with an arm.
+
+    Returns:
+        The checks with their remedies; `ready` is whether none fails, `document()` the JSON of the command.
+
+    Raises:
+        ConfigError: the file is invalid.
+        InvalidArgumentError: the laboratory has no arm.
+        RunError: the record of accepted safety settings is invalid.
+        LaboratoryError: a package is missing, or a virtual device does not start.
+    """
+    path = Path(laboratory).expanduser()
+    spec = load_laboratory(path)
+    if spec.arm is None:
+        raise InvalidArgumentError(f"{path}: laboratory {spec.name} has no 'arm': there is no device to check")
+    return check_bench(spec, path, None if spec.mode != "hardware" else read_record(path))
 
 
 class RunningCampaign:

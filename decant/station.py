@@ -236,6 +236,31 @@ class Station:
         body = {"mass": mass, "liquid": liquid, "deviation": deviation}
         self._client.post(f"/materials/vessels/{vessel}/weighed", body)
 
+    def poured_by_hand(
+        self,
+        id: str,  # noqa: A002
+        *,
+        source: str,
+        receiver: str,
+        mass: str,
+        deviation: str = "0.1 g",
+        note: str = "",
+    ) -> None:
+        """Enter a pour that a person has made and weighed; the same id is entered once.
+
+        Args:
+            id: of the pour, chosen by the caller.
+            source, receiver: ids or bar codes of vessels, or LABORATORY/VESSEL for the source of a campaign.
+            mass: weighed in the receiver, such as '30.2 g'.
+            deviation: its standard deviation.
+            note: text of the account's entries.
+
+        Raises:
+            DecantError: a vessel is unknown, or the daemon can't be reached.
+        """
+        body = {"id": id, "source": source, "receiver": receiver, "mass": mass, "deviation": deviation, "note": note}
+        self._posted("/materials/pours", body)
+
     def add_liquid(self, id: str, properties: Mapping[str, Any] | None = None, code: str = "") -> None:  # noqa: A002
         """Register a liquid; `properties` are the keys of a campaign's liquid without its mass. Raises DecantError."""
         self._client.post("/materials/liquids", {"id": id, "code": code, "properties": dict(properties or {})})

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.catalogue.source_account import SourceAccount
+from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
 from orchestrator.journal.run_record import CampaignResult, read_result
@@ -281,8 +281,8 @@ class RunHandle:
         self._subscribers: list[Subscriber] = [*resources.subscribers, self._note]
         if recorder is not None:
             self._subscribers.append(recorder)
-        if request.campaign.dispense is not None:
-            self._subscribers.append(SourceAccount.open().follow(request.campaign.dispense))
+        if (series := request.campaign.dispense) is not None and series.laboratory:
+            self._subscribers.append(VesselAccount.open().follow(series))
         self._pausing = self._aborting = self._abandoning = False
         self._winding_down = asyncio.Event()
         self._result: CampaignResult | None = None

@@ -26,6 +26,9 @@ from sim_engine.liquids import Liquid
 INTERVAL = 0.02
 """Time between two readings of the arm [s]."""
 
+SILENCE = 30.0
+"""Time without an answer of the arm's emulator after which nothing flows any more [s]: the emulator has ended."""
+
 
 @dataclass(frozen=True)
 class FlowOrder:
@@ -138,12 +141,13 @@ class FlowingLiquid:
         )
 
     def _run(self) -> None:
+        answered = time.monotonic()
         while not self._ending.wait(INTERVAL):
-            begin = time.monotonic()
             try:
                 self._follow()
-            except LaboratoryError:
-                if time.monotonic() - begin > 30.0:
+                answered = time.monotonic()
+            except LaboratoryError:  # a single lost answer is made up for by the next one
+                if time.monotonic() - answered > SILENCE:
                     return
             if self._clock - self._begun > 20.0 * LONGEST_DOSE:
                 return

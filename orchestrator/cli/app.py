@@ -16,6 +16,7 @@ from orchestrator.cli import (
     campaign_commands,
     dose_command,
     file_commands,
+    materials_commands,
     physics_command,
     pour_command,
     queue_commands,
@@ -253,8 +254,23 @@ _add(station_commands.batch, "decant queue batch plate.json", to=_queue)
 _add(station_commands.batch_status, "decant queue batch-status plate-1", name="batch-status", to=_queue)
 _add(station_commands.hold, "decant queue hold narrow-1b2c3d", "decant queue hold narrow-1b2c3d --release", to=_queue)
 _add(station_commands.reserve, "decant queue reserve left --hours 2", to=_queue)
-_add(station_commands.materials, "decant queue materials", to=_queue)
-_add(station_commands.weigh, "decant queue weigh beaker-1 '412.3 g' --liquid water", to=_queue)
+
+_materials = _group("materials", "See what is left in vessels, and enter weighings and pours made by hand.")
+_add(
+    materials_commands.list_vessels, "decant materials list", "decant materials list --json", name="list", to=_materials
+)
+_add(
+    materials_commands.weigh,
+    "decant materials weigh virtual/beaker '412.3 g' --liquid water   # the source of a campaign",
+    "decant materials weigh beaker-1 '412.3 g' --note 'after lunch'     # a vessel of the daemon",
+    to=_materials,
+)
+_add(materials_commands.history, "decant materials history virtual/beaker", to=_materials)
+_add(
+    materials_commands.poured,
+    "decant materials poured monday-1 --from beaker-1 --into vial-7 --weighed '30.2 g'",
+    to=_materials,
+)
 
 _add(queue_commands.estop, "decant estop", "decant estop --rig left", "decant estop --clear")
 

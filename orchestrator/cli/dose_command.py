@@ -154,12 +154,12 @@ def _scenes(plan: CampaignPlan) -> list[Scene]:
 
 
 def _known(plan: DispensePlan) -> dict[str, KnownSource]:
-    from orchestrator.catalogue.source_account import SourceAccount
+    from orchestrator.catalogue.vessel_account import VesselAccount
 
     if not plan.as_left:
         return {}
     try:
-        return SourceAccount.open().known(plan)
+        return VesselAccount.open().known(plan)
     except OSError as error:
         raise RefusalError(f"the content of the sources is not known: {error}", FAILED) from None
 

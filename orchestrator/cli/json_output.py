@@ -15,7 +15,7 @@ from actors.arm.arm_interface import PathReport
 from actors.interfaces import DeviceCheck
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, StatusOut
-from orchestrator.daemon.station_schemas import BatchOut, MaterialsOut, PourOut
+from orchestrator.daemon.station_schemas import AccountOut, BatchOut, ContentOut, PourOut
 from orchestrator.results.run_summary import ReceiverSummary, RunSummary, UntitledSchema
 from orchestrator.strategies.dispense import Dose
 from orchestrator.strategies.single_action import WeighedPour
@@ -486,6 +486,28 @@ class DosePredictionOutput(_Output):
     doses: list[PredictedDoseOutput]
 
 
+class VesselContentOutput(ContentOut):
+    """One vessel of `decant materials list`."""
+
+    id: str
+    """Id at the station, or LABORATORY/VESSEL for the source of a campaign."""
+
+    position: str
+    """Where it stands; '' if it is unknown."""
+
+
+class VesselContentsOutput(_Output):
+    """Vessels with their contents."""
+
+    vessels: list[VesselContentOutput]
+
+
+class VesselHistoryOutput(_Output):
+    """Entries of a vessel's account, oldest first."""
+
+    entries: list[AccountOut]
+
+
 OUTPUTS: dict[str, Any] = {
     "run": RunOutput,
     "calibrate": CalibrateOutput,
@@ -515,7 +537,8 @@ OUTPUTS: dict[str, Any] = {
     "queue pour": PourOut,
     "queue batch": BatchOut,
     "queue batch-status": BatchOut,
-    "queue materials": MaterialsOut,
+    "materials list": VesselContentsOutput,
+    "materials history": VesselHistoryOutput,
 }
 """Models of the output, by command."""
 

@@ -387,13 +387,25 @@ def answer(
     state: State = None,
 ) -> None:
     """Answer a question, or list the open questions if none is given."""
+    from orchestrator.states import State
+
     with connected_client(url, state) as client:
         if question is None:
             questions = client.get("/questions")
             for one in questions:
                 _print_question(one)
             if not questions:
-                print_message("no question is open")
+                asking = [
+                    one["id"]
+                    for one in client.get("/campaigns", limit=50)
+                    if one["state"] == State.WAITING_FOR_OPERATOR
+                ]
+                print_message(
+                    f"the question of {asking[0]} is being prepared: the arm and the balance are read. Try again in a "
+                    "moment"
+                    if asking
+                    else "no question is open"
+                )
             return
         if not text:
             raise RefusalError(

@@ -13,7 +13,7 @@ import dataclasses
 import getpass
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -61,11 +61,10 @@ def check(
     Nothing moves and no setting is changed. For a virtual laboratory, controller and balance are started for the check.
     Exit code 1 if a check fails.
     """
-    from actors.balance.balance_settings import balance_diagnostics
-    from actors.interfaces import DeviceCheck, LaboratoryError
-    from actors.laboratory import check_bench_packages, reached
+    from actors.interfaces import LaboratoryError
+    from actors.laboratory import check_bench_packages
+    from orchestrator.bench_check import check_bench
     from orchestrator.commissioning_archive import ArchiveError, write_robot_check
-    from orchestrator.installed_plugins import broken
     from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
     spec = read_laboratory(laboratory)
@@ -88,27 +87,24 @@ def check(
         record = None
     with Refused(LaboratoryError):
         check_bench_packages(spec)
-    with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
-        assert ready.arm is not None
-        look = ready.arm.diagnostics()
-        if accept_safety and not virtual:
-            record = _accept(laboratory, look)
+
+    def read(look: ArmDiagnostics) -> SafetyRecord | None:
+        found = _accept(laboratory, look) if accept_safety and not virtual else record
         if record_to is not None:
             with Refused(OSError, ArchiveError, at=f"--record {record_to}: "):
-                write_robot_check(record_to, laboratory, look, record, virtual=virtual)
-        checks = look.checks(record, accept=f"decant robot check {laboratory} --accept-safety", virtual=virtual)
-        checks += balance_diagnostics(ready.balance, tare=tare)
-    checks += _packages(spec)
-    checks += [DeviceCheck("plug-in", "warn", str(one), f"repair or remove {one.package}") for one in broken()]
-    failed = [check for check in checks if check.state == "fail"]
+                write_robot_check(record_to, laboratory, look, found, virtual=virtual)
+        return found
+
+    with Refused(LaboratoryError, code=FAILED):
+        report = check_bench(spec, laboratory, record, tare=tare, read=read)
     if as_json:
-        table = [dataclasses.asdict(check) for check in checks]
-        print_json({"laboratory": spec.name, "mode": spec.mode, "ready": not failed, "checks": table})
+        print_json(report.document())
     else:
-        print_table(checks)
-    if failed:
-        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail; nothing should move before they are fixed")
-    print_message("ready" if all(check.state == "ok" for check in checks) else "ready, with warnings")
+        print_table(report.checks)
+    if report.failed:
+        count = f"{len(report.failed)} of {len(report.checks)}"
+        raise RefusalError(f"{count} checks fail; nothing should move before they are fixed")
+    print_message("ready" if all(check.state == "ok" for check in report.checks) else "ready, with warnings")
 
 
 def archive(
@@ -147,18 +143,6 @@ def archive(
     print_message(f"{archive}: {len(checks)} recordings, read as on the day")
 
 
-def _packages(spec: LaboratorySettings) -> list[DeviceCheck]:
-    """Check the packages that a run needs, with the run's own check."""
-    from actors.interfaces import DeviceCheck, LaboratoryError
-    from actors.laboratory import check_laboratory
-
-    try:
-        check_laboratory(spec.with_values(ray=None), need_bench=True)
-    except LaboratoryError as error:
-        return [DeviceCheck("packages", "fail", str(error), "install them into the environment that Decant runs in")]
-    return []
-
-
 def without_arm(path: Path, spec: LaboratorySettings, asked: str) -> RefusalError:
     """Return the refusal for a laboratory without an arm, with a suggestion.
 
@@ -186,7 +170,7 @@ def read_laboratory(path: Path) -> LaboratorySettings:
         return load_laboratory(path)
 
 
-def print_table(checks: list[DeviceCheck]) -> None:
+def print_table(checks: Sequence[DeviceCheck]) -> None:
     """Print the checks on stdout, each followed by its advice."""
     from rich.console import Console
     from rich.table import Table

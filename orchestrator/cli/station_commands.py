@@ -1,4 +1,4 @@
-"""Commands for pours, batches and materials of the daemon, and for backups of its state."""
+"""Commands for pours and batches of the daemon, and for backups of its state."""
 
 from __future__ import annotations
 
@@ -125,39 +125,6 @@ def reserve(
     with connected_client(url, state) as client:
         found = client.post("/reservations", {"rig": rig, "begins": now, "ends": now + 3600.0 * hours, "note": note})
     print(f"reservation {found['id']}: {rig} until {time.strftime('%H:%M', time.localtime(found['ends']))}")
-
-
-def materials(url: Url = None, state: State = None, as_json: Json = False) -> None:
-    """List vessels with their contents."""
-    with connected_client(url, state) as client:
-        found = client.get("/materials")
-    if as_json:
-        print_json(found)
-        return
-    if not found["vessels"]:
-        print_message("no vessel is registered; see docs/laboratory/station.md")
-    for one in found["vessels"]:
-        content = one["content"]
-        mass = (
-            "unknown: weigh it"
-            if content["mass_g"] is None
-            else f"{content['mass_g']:.1f} ± {content['deviation_g']:.1f} g"
-        )
-        print(f"{one['id']:20s} {content['liquid'] or '-':12s} {mass:24s} {one['position']}".rstrip())
-
-
-def weigh(
-    vessel: Annotated[str, typer.Argument(help="Id or bar code of the vessel.", show_default=False)],
-    mass: Annotated[str, typer.Argument(help="Its content, for example '123.4 g'.", show_default=False)],
-    liquid: Annotated[str, typer.Option(help="Liquid, after a filling.", show_default=False)] = "",
-    deviation: Annotated[str, typer.Option(help="Standard deviation of the mass.")] = "0.1 g",
-    url: Url = None,
-    state: State = None,
-) -> None:
-    """Correct the content of a vessel by a weighing, or enter a filling."""
-    with connected_client(url, state) as client:
-        client.post(f"/materials/vessels/{vessel}/weighed", {"mass": mass, "liquid": liquid, "deviation": deviation})
-    print(f"{vessel}: {mass}")
 
 
 def backup(

@@ -289,7 +289,7 @@ class DoseSettings(Settings):
     amount: Annotated[DoseAmount, Example("50 g")]
     """Wanted in the receiver."""
 
-    position: Text = ""
+    position: Text | None = None
     """Name of the receiver's place; the operator puts this receiver on the balance."""
 
     tolerance: DoseAmount | None = None

@@ -276,7 +276,7 @@ def resolve_dispense(
         if receivers.setdefault(vessel.name, vessel) != vessel:
             report.add(place.at("doses", i), f"two different receivers are both called '{vessel.name}'")
         limit = section.tolerance if dose.tolerance is None else dose.tolerance
-        doses.append(PlannedDose(dose.amount, limit, vessel.name, dose.position))
+        doses.append(PlannedDose(dose.amount, limit, vessel.name, dose.position or ""))
     names = [one.name for one in pourers if one is not None]
     if len(set(names)) < len(names):
         report.add(place.at("sources"), "two sources have the same name; give each vessel its own")

@@ -3,7 +3,7 @@
 `Store` is the only writer of one SQLite file and flushes every change to disk. `QueueItem` is a submitted campaign with
 its desired state (`DesiredState`); `StoredQuestion` is a question to the operator. The journal of a run remains the
 authoritative record of its events; this file holds the operators' intentions. The tables of ordered pours and of
-materials are read and written by `pour_orders` and `materials`.
+materials are read and written by `pour_orders` and `materials`; the contents of vessels are a file of their own.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from orchestrator.catalogue.run_registry import make_state_directory
 from orchestrator.journal.journal_file import locked_alone
 from orchestrator.run_errors import RunError
 
-FORMAT = 3
+FORMAT = 4
 
 _SCHEMA = """
 create table campaign (
@@ -83,18 +83,8 @@ create table node_action (
     id text primary key, name text not null, args text not null check (json_valid(args)), created real not null,
     started real, campaign text, error text, json_result text
 ) strict;
-create table account (
-    id integer primary key, t real not null, vessel text not null, kind text not null, change real, deviation real,
-    liquid text, pour text, by text not null, note text not null
-) strict;
-create unique index account_once on account (pour, vessel) where pour is not null;
-create index account_by_vessel on account (vessel);
-create trigger account_is_never_changed before update on account begin
-    select raise(abort, 'account entries are append-only'); end;
-create trigger account_is_never_deleted before delete on account begin
-    select raise(abort, 'account entries are append-only'); end;
 """
-"""Batches, reservations, ordered pours and materials; added in format 3. Masses in kg, capacities in m³."""
+"""Batches, reservations, ordered pours and materials; added in format 4. Masses in kg, capacities in m³."""
 
 _FROM_2 = """
 alter table campaign add column batch text not null default '';
@@ -253,6 +243,13 @@ class Store:
 
     def _open(self) -> None:
         self._db = sqlite3.connect(self.path, isolation_level=None, timeout=10.0)
+        try:
+            self._prepare()
+        except BaseException:
+            self._db.close()  # an interrupted upgrade would keep the file locked
+            raise
+
+    def _prepare(self) -> None:
         self._db.row_factory = sqlite3.Row
         self._db.execute("pragma journal_mode = wal")
         self._db.execute("pragma synchronous = full")
@@ -302,6 +299,26 @@ class Store:
             "case when state = 'queued' then -priority else 0 end, case when state = 'queued' then rank else 0 end, "
             "created desc limit ?",
             [*wanted, limit],
+        )
+        return [_item(row) for row in rows]
+
+    def ids(self) -> set[str]:
+        """Return the ids of all campaigns."""
+        return {row["id"] for row in self.rows("select id from campaign")}
+
+    def active(self) -> list[QueueItem]:
+        """Return the campaigns that are in no state of rest."""
+        return [
+            _item(row) for row in self._db.execute(f"select * from campaign where state not in ({_quoted(AT_REST)})")
+        ]
+
+    def wanted(self, rig: str) -> list[QueueItem]:
+        """Return the campaigns of a rig that rest, have not ended and should run: the queue in its order first."""
+        rows = self._db.execute(
+            f"select * from campaign where state in ({_quoted(AT_REST)}) and state not in ({_quoted(ENDED)}) and "
+            "rig = ? and desired_state = ? order by case when state = 'queued' then 0 else 1 end, "
+            "priority desc, rank",
+            [rig, str(DesiredState.RUN)],
         )
         return [_item(row) for row in rows]
 

@@ -1,38 +1,33 @@
-"""Materials of a station: liquids, vessels, positions, and the account of the contents.
+"""Materials of a station: liquids, vessels and positions, and what their contents can serve.
 
-`Materials` reads and writes its tables in the daemon's `Store`. The account is append-only: an entry sets the content
-of a vessel (a weighing) or changes it (a pour). `Materials.content` adds the entries up, with their uncertainty.
-`Materials.refusal` is the reason why vessels can't serve a pour; it is checked before anything moves.
-
-Limitations: liquids that were poured together become a mixture, which is no source any more. Evaporation is not
-estimated. Campaigns other than ordered pours are not in the account: an operator refills their pourer.
+`Materials` registers them in the daemon's `Store`; the contents are in the account of this machine's vessels
+(`orchestrator.catalogue.vessel_account`). `Materials.refusal` is the reason why vessels can't serve a pour; it is
+checked before anything moves. A vessel `LABORATORY/VESSEL`, the source of a campaign, needs no registration.
 """
 
 from __future__ import annotations
 
 import csv
 import json
-import math
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
+from orchestrator.catalogue.vessel_account import FILE_NAME, MIXTURE, Transfer, VesselAccount, VesselContent
 from orchestrator.config.file_loading import liquid_from, vessel_from
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document
 from orchestrator.daemon.daemon_store import ENDED, Store
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.dispense import ENOUGH
+from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 from sim_engine.settings.quantity import QuantityError, parse_quantity
 from sim_engine.vessel.shapes import VesselError
 from sim_engine.vessel.vessel import build_vessel
-
-MIXTURE = "mixture"
-"""Liquid of a vessel that several liquids were poured into."""
 
 SURE = ENOUGH
 """Number of standard deviations by which a content may be smaller than its estimate, and larger."""
@@ -42,27 +37,6 @@ class MaterialError(RunError):
     """A material can't be registered, found, or used; the message gives the reason and a remedy."""
 
     exit_code = 2
-
-
-@dataclass(frozen=True)
-class VesselContent:
-    """Content of a vessel, from the account.
-
-    Attributes:
-        mass: [kg]; None if a pour with unknown outcome has changed it.
-        deviation: standard deviation of the mass [kg].
-        liquid: id of the liquid, 'mixture', or '' if it is empty.
-        since: time of the last change, seconds since 1970.
-        pour: caller's id of the pour that changed it last; '' after a weighing.
-        weighed: time of the last weighing.
-    """
-
-    mass: float | None
-    deviation: float
-    liquid: str
-    since: float
-    pour: str
-    weighed: float
 
 
 @dataclass(frozen=True)
@@ -84,23 +58,18 @@ class RegisteredVessel:
     position: str
 
 
-@dataclass(frozen=True)
-class Transfer:
-    """Masses that a pour has moved [kg], each with its standard deviation; None: unknown."""
-
-    taken: tuple[float, float] | None
-    received: tuple[float, float] | None
-
-
 class Materials:
     """Materials of one daemon.
 
     Args:
         store: its store.
+
+    Attributes:
+        account: the contents of vessels.
     """
 
     def __init__(self, store: Store) -> None:
-        self._store = store
+        self._store, self.account = store, VesselAccount(store.path.parent / FILE_NAME)
 
     # ---- registration
 
@@ -142,23 +111,21 @@ class Materials:
         except (VesselError, ValueError) as error:
             raise MaterialError(f"shape: {error}") from None
         self._require_free(position, key)
-        with self._store.together():
-            if self._add("vessel", key, code, shape=text, capacity=float(capacity), position=position or None):
-                self._enter(key, "weighed", 0.0, 0.0, "", None, by, "registered as empty")
+        self._add("vessel", key, code, shape=text, capacity=float(capacity), position=position or None)
+        self.account.weigh(key, 0.0, 0.0, by=by, note="registered as empty", key=f"registered {key}")
 
-    def _add(self, table: str, key: str, code: str, **values: Any) -> bool:
+    def _add(self, table: str, key: str, code: str, **values: Any) -> None:
         """Insert a row; an identical row may be registered again."""
         found = self._store.rows(f"select * from {table} where id = ?", key)
         if found:
             if any(found[0][name] != value for name, value in {"code": code or None, **values}.items()):
                 raise MaterialError(f"{table} '{key}' is registered already, with other properties")
-            return False
+            return
         if code and any(self._store.rows(f"select id from {t} where code = ?", code) for t in _TABLES):
             raise MaterialError(f"code {code} is in use already")
         values = {"id": key, "code": code or None, **values, "created": time.time()}
         names, marks = ", ".join(values), ", ".join("?" * len(values))
         self._store.write(f"insert into {table} ({names}) values ({marks})", *values.values())
-        return True
 
     def _require_free(self, position: str, vessel: str) -> None:
         if not position:
@@ -175,13 +142,13 @@ class Materials:
         self._require_free(position, found.id)
         self._store.write("update vessel set position = ? where id = ?", position or None, found.id)
 
-    # ---- the account
+    # ---- contents
 
     def weigh(self, vessel: str, mass: float, deviation: float, liquid: str, by: str, note: str = "") -> None:
         """Correct the content of a vessel by a weighing: an operator's correction, or a filling.
 
         Args:
-            vessel: id or code.
+            vessel: id or code, or `LABORATORY/VESSEL`.
             mass: content [kg].
             deviation: its standard deviation [kg].
             liquid: id or code; '' keeps the present one.
@@ -190,87 +157,77 @@ class Materials:
 
         Raises:
             MaterialError: vessel or liquid is unknown, the liquid is missing, or the vessel can't hold that much.
+            OSError: the account can't be written.
         """
-        found, before = self.vessel(vessel), self.content(vessel)
-        liquid = str(self._row("liquid", liquid)["id"]) if liquid else before.liquid
-        if mass > 0.0 and not liquid:
-            raise MaterialError(f"{found.id}: is empty so far; name the liquid that it was filled with")
-        if mass > 0.0 and liquid != MIXTURE:
-            volume = mass / self.liquid(liquid).density
+        if "/" not in vessel:
+            found = self.vessel(vessel)
+            vessel, liquid = found.id, self.liquid_id(liquid) if liquid else self.content(found.id).liquid
+            volume = 0.0 if not liquid or liquid == MIXTURE else mass / self.liquid(liquid).density
             if volume > found.capacity:
                 raise MaterialError(
                     f"{found.id}: holds {1e6 * found.capacity:.0f} ml, and {1e6 * volume:.0f} ml are stated"
                 )
-        self._enter(found.id, "weighed", mass, deviation, liquid if mass > 0.0 else "", None, by, note)
+        try:
+            self.account.weigh(vessel, mass, deviation, liquid=liquid, by=by, note=note)
+        except InvalidArgumentError as error:
+            raise MaterialError(str(error)) from None
 
-    def enter_pour(self, pour: str, source: str, receiver: str, moved: Transfer, by: str) -> None:
-        """Enter a pour in the account of both vessels, once: a second call changes nothing.
+    def poured_by_hand(
+        self, pour: str, source: str, receiver: str, mass: float, deviation: float, by: str, note: str = ""
+    ) -> None:
+        """Enter a pour that a person has made and weighed, once: a second call with the same id changes nothing.
 
         Args:
-            pour: caller's id.
-            source, receiver: ids of the vessels.
-            moved: masses.
-            by: who ordered it.
-        """
-        if self._store.rows("select 1 from account where pour = ? limit 1", pour):
-            return
-        liquid, there = self.content(source).liquid, self.content(receiver).liquid
-        mixed = liquid if there in ("", liquid) else MIXTURE
-        with self._store.together():
-            for vessel, change, sign, kind in (
-                (source, moved.taken, -1.0, liquid),
-                (receiver, moved.received, 1.0, mixed),
-            ):
-                if change is None:
-                    self._enter(vessel, "unknown", None, None, kind, pour, by, "the outcome of this pour is unknown")
-                else:
-                    self._enter(vessel, "poured", sign * change[0], change[1], kind, pour, by, "")
+            pour: its id, chosen by the person.
+            source, receiver: ids or codes, or `LABORATORY/VESSEL`.
+            mass: weighed [kg].
+            deviation: its standard deviation [kg].
+            by: who poured it.
+            note: text of the account's entries.
 
-    def _enter(
-        self, vessel: str, kind: str, change: float | None, deviation: float | None, liquid: str, pour: str | None,
-        by: str, note: str,
-    ) -> None:  # fmt: skip
-        self._store.write(
-            "insert into account (t, vessel, kind, change, deviation, liquid, pour, by, note) "
-            "values (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            *(time.time(), vessel, kind, change, deviation, liquid, pour, by, note),
-        )
+        Raises:
+            MaterialError: a vessel is unknown, or both are the same one.
+            OSError: the account can't be written.
+        """
+        source, receiver = (name if "/" in name else self.vessel(name).id for name in (source, receiver))
+        if source == receiver:
+            raise MaterialError(f"{source}: is source and receiver at once")
+        moved = Transfer((mass, deviation), (mass, deviation))
+        self.account.transfer(f"by hand {pour}", source, receiver, moved, by=by, note=note)
 
     def content(self, vessel: str) -> VesselContent:
-        """Return the content of a vessel. Raises MaterialError if the vessel is unknown."""
-        mass: float | None = 0.0
-        variance, liquid, since, pour, weighed = 0.0, "", 0.0, "", 0.0
-        for entry in self.account(self.vessel(vessel).id):
-            since, liquid, pour = entry["t"], entry["liquid"] or "", entry["pour"] or ""
-            if entry["kind"] == "weighed":
-                mass, variance, weighed = entry["change"], entry["deviation"] ** 2, entry["t"]
-            elif entry["kind"] == "unknown":
-                mass = None
-            elif mass is not None:
-                mass, variance = mass + entry["change"], variance + entry["deviation"] ** 2
-        return VesselContent(
-            mass if mass is None else max(mass, 0.0), math.sqrt(variance), liquid, since, pour, weighed
-        )
+        """Return the content of a registered vessel. Raises MaterialError if it is unknown."""
+        key = self.vessel(vessel).id
+        return self.account.content(key) or VesselContent(key, 0.0, "weighed", 0.0, 0.0)
 
-    def account(self, vessel: str | None = None) -> list[dict[str, Any]]:
-        """Return the entries of one vessel or of all, oldest first. Masses in kg."""
-        where, arguments = ("", []) if vessel is None else ("where vessel = ?", [vessel])
-        return self._store.rows(f"select * from account {where} order by id", *arguments)
+    def on_rig(self, rig: str) -> dict[str, str]:
+        """Return the ids of the vessels that may stand at a rig, by id and by code.
+
+        A campaign's source with one of these names is that vessel.
+        """
+        rows = self._store.rows(
+            "select vessel.id, coalesce(vessel.code, '') as code from vessel left join position on "
+            "position.id = vessel.position where coalesce(position.rig, ?) = ?",
+            *(rig, rig),
+        )
+        return {name: row["id"] for row in rows for name in (row["code"], row["id"]) if name}
 
     def table(self) -> str:
         """Return the account as CSV, for the export of runs: masses in g, and the run of each pour; '' if empty."""
-        rows = self._store.rows(
-            "select t, vessel, kind, 1e3 * change as change_g, 1e3 * deviation as deviation_g, liquid, pour, run, "
-            "account.by, note from account left join pour_order on pour_order.id = pour "
-            "left join campaign on campaign.id = campaign order by account.id"
-        )
-        if not rows:
+        runs = {
+            row["id"]: row["run"]
+            for row in self._store.rows(
+                "select pour_order.id, run from pour_order join campaign on campaign.id = campaign"
+            )
+        }
+        entries = self.account.history(count=-1)
+        if not entries:
             return ""
         text = StringIO()
-        columns = ("t", "vessel", "kind", "change_g", "deviation_g", "liquid", "pour", "run", "by", "note")
+        columns = ("t", "vessel", "kind", "mass_g", "deviation_g", "liquid", "pour", "run", "by", "note")
         writer = csv.DictWriter(text, columns)
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({**one.json_entry(), "run": runs.get(one.pour, "")} for one in reversed(entries))
         return text.getvalue()
 
     # ---- look-up
@@ -309,23 +266,24 @@ class Materials:
 
     def everything(self) -> dict[str, list[dict[str, Any]]]:
         """Return all materials, with the contents of the vessels; ready for JSON, masses in g and volumes in ml."""
+        contents = {one.vessel: one for one in self.account.all()}
         vessels = []
         for row in self._store.rows("select * from vessel order by id"):
-            held = asdict(self.content(row["id"]))
-            mass, deviation = held.pop("mass"), held.pop("deviation")
-            held = {"mass_g": None if mass is None else 1e3 * mass, "deviation_g": 1e3 * deviation, **held}
+            held = contents.pop(row["id"], None) or VesselContent(row["id"], 0.0, "weighed", 0.0, 0.0)
             vessels.append(
                 {
                     "id": row["id"], "code": row["code"] or "", "position": row["position"] or "",
-                    "capacity_ml": 1e6 * row["capacity"], "content": held, "promised_g": 1e3 * self.promised(row["id"]),
+                    "capacity_ml": 1e6 * row["capacity"], "content": held.json_content(),
+                    "promised_g": 1e3 * self.promised(row["id"]),
                 }
             )  # fmt: skip
+        sources = [{"id": name, "content": held.json_content()} for name, held in contents.items()]
         liquids = [
             {"id": row["id"], "code": row["code"] or "", "properties": json.loads(row["properties"])}
             for row in self._store.rows("select * from liquid order by id")
         ]
         positions = self._store.rows("select id, coalesce(code, '') as code, rig, note from position order by id")
-        return {"liquids": liquids, "vessels": vessels, "positions": positions}
+        return {"liquids": liquids, "vessels": vessels, "sources": sources, "positions": positions}
 
     # ---- requests
 

@@ -25,10 +25,11 @@ from actors.dosing.dose_series import check_dose, predict_dose
 from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
 from actors.laboratory_settings import LaboratorySettings
+from orchestrator.catalogue.vessel_account import Transfer
 from orchestrator.config.action_assignments import AssignmentError, assigned_action, set_action
 from orchestrator.config.campaign_checks import check_vessels, touch
 from orchestrator.daemon.daemon_store import QueueItem, Store
-from orchestrator.daemon.materials import Materials, Transfer, mass_of
+from orchestrator.daemon.materials import Materials, mass_of
 from orchestrator.journal.run_record import RecordedPour, read_record
 from orchestrator.requests import Failed, Simulated, Slots
 from orchestrator.run_errors import RunError
@@ -257,7 +258,8 @@ class PlannedOrder:
         if order.amount is not None:
             scene = replace(scene, fixed=action.values())
             dose = PlannedDose(order.amount, order.tolerance, scene.receiver.name)
-            series = DispensePlan((scene,), (dose,), 0.0, False, plan.laboratory.name)
+            # `OrderBook.settle` enters the outcome in the account of both vessels, once
+            series = DispensePlan((scene,), (dose,), 0.0, False, laboratory="")
             plan = replace(plan, deployment=None, dispense=series)
         return cls(plan, order, scene, action)
 
@@ -485,6 +487,14 @@ class OrderBook:
         rows = self._store.rows("select * from pour_order where campaign = ?", campaign)
         return _decoded(rows[0]) if rows else None
 
+    def begun(self) -> tuple[str, ...]:
+        """Return the campaigns of orders that have begun and have no result."""
+        rows = self._store.rows(
+            "select campaign from pour_order join campaign on campaign.id = campaign where result is null and "
+            "run is not null"
+        )
+        return tuple(row["campaign"] for row in rows)
+
     def list(self, limit: int, source: str = "") -> list[dict[str, Any]]:
         """Return orders, newest first."""
         where, arguments = ("where source = ?", [source]) if source else ("", [])
@@ -530,7 +540,7 @@ class OrderBook:
             return
         result["seconds"] = pour.seconds
         if moved is not None:
-            self._materials.enter_pour(row["id"], row["source"], row["receiver"], moved, item.by)
+            self._materials.account.transfer(row["id"], row["source"], row["receiver"], moved, by=item.by)
         self._store.write("update pour_order set result = ? where campaign = ?", json.dumps(result), item.id)
 
 

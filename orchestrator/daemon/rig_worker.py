@@ -19,7 +19,7 @@ from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
-from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, DesiredState, QueueItem, Store
+from orchestrator.daemon.daemon_store import ENDED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.materials import Materials
 from orchestrator.daemon.pour_orders import POUR, OrderBook, OrderError, PourOrder, renew_load, settled_pour
@@ -104,7 +104,8 @@ class Running:
         """
         if self.item.task == POUR and self.item.run is None:
             await self._renew_order()
-        found = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig)
+        vessels = Materials(self._shared.store).on_rig(self._rig.name)
+        found = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig, vessels)
         request, warned = await asyncio.to_thread(_prepared, found)
         assert request.folder is not None
         for text in warned:
@@ -420,12 +421,8 @@ class RigWorker:
         if self.latched or self._daemon.stopping or self._shared.warm.lost:
             return None
         store = self._shared.store
-        mine = [
-            one for one in store.items([*AT_REST]) if one.rig == self.rig.name and one.desired_state == DesiredState.RUN
-        ]
-        begun = sorted(
-            (one for one in mine if one.run is not None and one.state not in ENDED), key=lambda one: one.begun or 0.0
-        )
+        mine = store.wanted(self.rig.name)
+        begun = sorted((one for one in mine if one.run is not None), key=lambda one: one.begun or 0.0)
         now, other = time.time(), store.reserved_by(self.rig.name, time.time())
         queued = [
             one

@@ -14,6 +14,7 @@ import zipfile
 from pathlib import Path, PurePosixPath
 
 from orchestrator.catalogue.run_registry import make_state_directory
+from orchestrator.catalogue.vessel_account import FILE_NAME as ACCOUNT
 from orchestrator.daemon.daemon_store import ENDED, DesiredState, Store, StoreError
 from orchestrator.daemon.supervisor import PAUSED
 from orchestrator.journal.journal import JOURNAL_NAME
@@ -65,6 +66,9 @@ def back_up(state: Path, target: Path) -> dict[str, int]:
         ):
             # The store is first: a run that is further than the store continues from its journal.
             archive.writestr(STORE, whole_copy(state / STORE))
+            # The account is second: a pour whose result is in the store is in the account.
+            if (state / ACCOUNT).is_file():
+                archive.writestr(ACCOUNT, whole_copy(state / ACCOUNT))
             if (state / "tokens").is_file():
                 archive.write(state / "tokens", "tokens")
             for folder in campaigns:
@@ -141,9 +145,11 @@ def restore(source: Path, state: Path) -> dict[str, float]:
     store = Store(state / STORE)
     try:
         store.set_flag(PAUSED, {"by": "restore", "time": time.time()})
-        for item in store.items(limit=1_000_000):
-            if item.state not in (*ENDED, "queued"):
-                store.change(item.id, desired_state=str(DesiredState.PAUSE))
+        rest = (*ENDED, "queued")
+        store.write(
+            f"update campaign set desired_state = ? where state not in ({', '.join('?' * len(rest))})",
+            *(str(DesiredState.PAUSE), *rest),
+        )
         store.note(
             "restore", "restore backup", detail=time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(about["time"]))
         )

@@ -20,6 +20,7 @@ from orchestrator.daemon.station_schemas import (
     AccountOut,
     BatchIn,
     BatchOut,
+    HandPourIn,
     LiquidIn,
     MaterialsOut,
     PlaceIn,
@@ -62,6 +63,8 @@ def _answering() -> Iterator[None]:
         raise HTTPException(422, str(error)) from None
     except KeyError as error:
         raise HTTPException(404, f"there is no '{str(error.args[0])[:80]}'") from None
+    except OSError as error:
+        raise HTTPException(503, f"the account of the vessels can't be used: {error}") from None
     except RunError as error:
         raise HTTPException(422 if error.exit_code == 2 else 409, str(error)) from None
 
@@ -220,20 +223,15 @@ async def materials(orders: Orders, person: Viewer) -> Any:
 
 @router.get("/materials/account", operation_id="account", response_model=list[AccountOut])
 async def account(
-    orders: Orders, person: Viewer, vessel: Annotated[str, Query(max_length=80)] = ""
+    orders: Orders,
+    person: Viewer,
+    vessel: Annotated[str, Query(max_length=200)] = "",
+    limit: Annotated[int, Query(ge=1, le=100_000)] = 1000,
 ) -> list[dict[str, Any]]:
-    """Return the account of one vessel or of all, oldest entry first."""
+    """Return the last entries of the account of one vessel or of all, oldest first."""
     with _answering():
-        rows = orders.materials.account(orders.materials.vessel(vessel).id if vessel else None)
-    return [
-        {
-            **{name: row[name] or "" for name in ("liquid", "pour", "by", "note")},
-            **{name: row[name] for name in ("t", "vessel", "kind")},
-            "change_g": None if row["change"] is None else 1e3 * row["change"],
-            "deviation_g": None if row["deviation"] is None else 1e3 * row["deviation"],
-        }
-        for row in rows
-    ]
+        name = vessel if not vessel or "/" in vessel else orders.materials.vessel(vessel).id
+        return [one.json_entry() for one in reversed(orders.materials.account.history(name, limit))]
 
 
 @router.post("/materials/liquids", status_code=201, operation_id="add_liquid", response_model=MaterialsOut)
@@ -262,13 +260,24 @@ async def add_vessel(daemon: Daemon, orders: Orders, person: Operator, body: Ves
     return _changed(daemon, orders, person.name, "register vessel", body.id)
 
 
-@router.post("/materials/vessels/{key}/weighed", operation_id="weigh_vessel", response_model=MaterialsOut)
+@router.post("/materials/vessels/{key:path}/weighed", operation_id="weigh_vessel", response_model=MaterialsOut)
 async def weigh_vessel(daemon: Daemon, orders: Orders, person: Operator, key: str, body: WeighingIn) -> Any:
     """Correct the content of a vessel by a weighing, or enter a filling."""
     with _answering():
         mass, deviation = mass_of(body.mass, "mass"), mass_of(body.deviation, "deviation")
         orders.materials.weigh(key, mass, deviation, body.liquid, person.name, body.note)
     return _changed(daemon, orders, person.name, "weigh vessel", f"{key}: {body.mass}")
+
+
+@router.post("/materials/pours", operation_id="enter_pour_by_hand", response_model=MaterialsOut)
+async def enter_pour_by_hand(daemon: Daemon, orders: Orders, person: Operator, body: HandPourIn) -> Any:
+    """Enter a pour that a person has made and weighed. A repeated call with the same `id` changes nothing."""
+    with _answering():
+        mass, deviation = mass_of(body.mass, "mass"), mass_of(body.deviation, "deviation")
+        orders.materials.poured_by_hand(body.id, body.source, body.receiver, mass, deviation, person.name, body.note)
+    return _changed(
+        daemon, orders, person.name, "enter pour", f"{body.id}: {body.mass} from {body.source} into {body.receiver}"
+    )
 
 
 @router.post("/materials/vessels/{key}/place", operation_id="place_vessel", response_model=MaterialsOut)

@@ -333,6 +333,25 @@ class WeighingIn(_In):
     note: str = Field(default="", max_length=200)
 
 
+class HandPourIn(_In):
+    """A pour that a person has made and weighed."""
+
+    id: CallerId
+    source: str = Field(max_length=200)
+    """Id or code, or LABORATORY/VESSEL for the source of a campaign."""
+
+    receiver: str = Field(max_length=200)
+    """As `source`."""
+
+    mass: Quantity
+    """Weighed in the receiver."""
+
+    deviation: Quantity = "0.1 g"
+    """Standard deviation of the mass."""
+
+    note: str = Field(default="", max_length=200)
+
+
 class ContentOut(_Out):
     """Content of a vessel."""
 
@@ -343,9 +362,10 @@ class ContentOut(_Out):
     liquid: str
     since: float
     pour: str
-    """Caller's id of the pour that changed it last; '' after a weighing."""
+    """The pour that changed it last: its caller's id, or run and number; '' after a weighing."""
 
-    weighed: float
+    weighed: float | None
+    """Time of the last weighing."""
 
 
 class VesselOut(_Out):
@@ -358,6 +378,15 @@ class VesselOut(_Out):
     content: ContentOut
     promised_g: float
     """Amounts that queued pours will take."""
+
+
+class SourceOut(_Out):
+    """A vessel that is not registered: the source of a campaign."""
+
+    id: str
+    """LABORATORY/VESSEL."""
+
+    content: ContentOut
 
 
 class LiquidOut(_Out):
@@ -382,6 +411,9 @@ class MaterialsOut(_Out):
 
     liquids: list[LiquidOut]
     vessels: list[VesselOut]
+    sources: list[SourceOut]
+    """Sources of campaigns, which need no registration."""
+
     positions: list[PositionOut]
 
 
@@ -390,11 +422,11 @@ class AccountOut(_Out):
 
     t: float
     vessel: str
-    kind: Literal["weighed", "poured", "unknown"]
-    change_g: float | None
-    """Content after a weighing; change by a pour."""
+    kind: Literal["filled", "weighed", "begun", "poured", "unknown"]
+    mass_g: float | None
+    """Content after it; null if it is unknown."""
 
-    deviation_g: float | None
+    deviation_g: float
     liquid: str
     pour: str
     by: str

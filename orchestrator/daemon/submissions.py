@@ -152,8 +152,16 @@ def load_confined(campaign: Path, roots: Sequence[Path], laboratory: Path | None
         return load_campaign(campaign, laboratory)
 
 
-def run_request(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunRequest:
+def run_request(
+    settings: DaemonSettings, item: QueueItem, rig: Rig, vessels: Mapping[str, str] | None = None
+) -> RunRequest:
     """Make the run of a submitted campaign from its snapshot. Reads files; don't call it in an event loop.
+
+    Args:
+        settings: of the daemon.
+        item: the campaign.
+        rig: that it leases.
+        vessels: ids of the station's vessels at the rig, by the names that a series may give its sources.
 
     Raises:
         ConfigError, RunTaskError: it can't be used.
@@ -163,6 +171,9 @@ def run_request(settings: DaemonSettings, item: QueueItem, rig: Rig) -> RunReque
     theta = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: it asks the operator, whatever the campaign says.
     plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
+    if plan.dispense is not None and vessels:
+        named = {name: vessels[name] for name in plan.dispense.sources if name in vessels}
+        plan = replace(plan, dispense=replace(plan.dispense, vessels=named))
     if item.task == POUR:
         request = order_request(plan, PourOrder.read(folder))
     else:

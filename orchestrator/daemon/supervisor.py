@@ -21,10 +21,10 @@ from actors.interfaces import LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.catalogue.run_registry import make_state_directory
 from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
-from orchestrator.daemon.daemon_store import AT_REST, ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store
+from orchestrator.daemon.daemon_store import ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.notifications import Counts
-from orchestrator.daemon.pour_orders import POUR
+from orchestrator.daemon.pour_orders import POUR, OrderBook
 from orchestrator.daemon.remote_operator import Asking
 from orchestrator.daemon.rig_worker import RigWorker, Running, SharedServices, settle
 from orchestrator.daemon.run_readout import Pours
@@ -81,16 +81,14 @@ class Supervisor:
 
     async def start(self) -> None:
         """Recover the stored state and start all tasks."""
-        await asyncio.to_thread(self._remove_unacknowledged, {item.id for item in self.store.items(limit=1_000_000)})
-        for item in self.store.items():
-            if item.state not in AT_REST:
-                found = f"found {item.state} after the daemon had ended without a word"
-                # without a run nothing has begun: it is in the queue again
-                self.store.change(item.id, state="paused" if item.run is not None else "queued", reason=found)
-                self.feed.publish("CampaignFound", {"state": item.state, "text": found}, item.id)
-        for item in self.store.items(limit=1_000_000):
-            if item.task == POUR and item.state not in (*ENDED, "queued"):
-                await self.settle(item)
+        await asyncio.to_thread(self._remove_unacknowledged, self.store.ids())
+        for item in self.store.active():
+            found = f"found {item.state} after the daemon had ended without a word"
+            # without a run nothing has begun: it is in the queue again
+            self.store.change(item.id, state="paused" if item.run is not None else "queued", reason=found)
+            self.feed.publish("CampaignFound", {"state": item.state, "text": found}, item.id)
+        for key in OrderBook(self.store).begun():
+            await self.settle(self.item(key))
         self._tasks = [asyncio.create_task(self.feed.flushing(), name="feed")]
         self._tasks += [
             asyncio.create_task(worker.work(), name=f"rig {worker.rig.name}") for worker in self.workers.values()
@@ -173,7 +171,7 @@ class Supervisor:
         """Return a random key that no campaign's id ends with."""
         while True:
             key = secrets.token_hex(3)
-            if not any(item.id.endswith(key) for item in self.store.items()):
+            if not self.store.rows("select 1 from campaign where id like ?", f"%{key}"):
                 return key
 
     def submit(self, item: QueueItem) -> QueueItem:

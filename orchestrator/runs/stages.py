@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from orchestrator.catalogue.source_account import SourceAccount
+from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.journal.codec import Results, result_of
 from orchestrator.requests import Order
 from orchestrator.run_errors import RunError
@@ -139,7 +139,7 @@ def dispense_stages(plan: DispensePlan) -> list[StageDefinition]:
         if not plan.as_left:
             return ReadSources({})
         try:
-            return ReadSources(SourceAccount.open().known(plan))
+            return ReadSources(VesselAccount.open().known(plan))
         except OSError as error:
             raise RunError(f"the content of the sources is not known: {error}; write 'start: filled'") from error
 

@@ -16,6 +16,7 @@ This module does not read files and runs no strategy.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from pkgutil import resolve_name
@@ -475,7 +476,8 @@ class DispensePlan:
         doses: in the order of pouring.
         refill_below: a source that would hold less after a dose is not used before it is filled again [kg].
         as_left: whether the series begins with what earlier runs left in the sources; otherwise they are filled.
-        laboratory: name under which the content of the sources is tracked.
+        laboratory: part of the names under which the content of the sources is tracked; '': the run does not track it.
+        vessels: sources that are vessels of the station, with their ids.
     """
 
     scenes: tuple[Scene, ...]
@@ -483,6 +485,7 @@ class DispensePlan:
     refill_below: float
     as_left: bool
     laboratory: str
+    vessels: Annotated[Mapping[str, str], NOT_IN_FINGERPRINT] = field(default_factory=dict)
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -494,9 +497,12 @@ class DispensePlan:
         return next(one for one in self.scenes if (one.pourer.name, one.receiver.name) == (source, receiver))
 
     def tracked(self, source: str) -> str:
-        """Name under which a source's content is tracked: laboratory, vessel and liquid."""
-        scene = next(one for one in self.scenes if one.pourer.name == source)
-        return f"{self.laboratory}/{source}/{scene.liquid.name}"
+        """Name of a source in the account of the vessels: its id at the station, or laboratory and vessel."""
+        return self.vessels.get(source) or f"{self.laboratory}/{source}"
+
+    def liquid(self, source: str) -> str:
+        """Name of a source's liquid."""
+        return next(one.liquid.name for one in self.scenes if one.pourer.name == source)
 
 
 class OutputSettings(Settings):

@@ -20,6 +20,7 @@ from typing import Any
 import uvicorn
 
 from actors.runtime.child_process import child_environment
+from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.daemon import ordering, rig_worker
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
@@ -57,7 +58,7 @@ def die_at(stage: str) -> None:
         case "poured":
             rig_worker.settle = die
         case "in the account":
-            Materials.enter_pour = after(Materials.enter_pour)  # type: ignore[method-assign]
+            VesselAccount.transfer = after(VesselAccount.transfer)  # type: ignore[method-assign]
         case "weighed":
             OrderBook.settle = after(OrderBook.settle)  # type: ignore[method-assign]
 

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
+import decant
 from actors.arm.arm_interface import ArmRefusedError, NotAcceptedError
 from actors.arm.ur import controller_readout as look
 from actors.arm.ur.controller_readout import read_exchange
@@ -106,6 +107,21 @@ def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
     after = controller.fault("state")
     assert after["joints"] == before["joints"]
     assert balance.state()["heard"].count("T") == 0 if "heard" in balance.state() else True
+
+
+def test_a_program_gets_the_report_that_the_command_prints(laboratory: Path) -> None:
+    report = decant.doctor(laboratory)
+    printed = json.loads(doctor(laboratory, "--json").stdout.splitlines()[-1])
+    found = report.document()
+    assert [(one["name"], one["advice"]) for one in found["checks"] if one["name"] != "connection"] == [
+        (one["name"], one["advice"]) for one in printed["checks"] if one["name"] != "connection"
+    ]  # a busy machine changes the connection's line
+    assert {**found, "checks": []} == {**printed, "checks": []}
+    assert not report.ready  # nobody has accepted its safety settings
+    assert "accepted by nobody" in str(report)
+    assert "accepted by nobody" in report._repr_html_()
+    with pytest.raises(decant.InvalidArgumentError, match="has no 'arm'"):
+        decant.doctor("configs/laboratories/planning.yaml")
 
 
 @pytest.mark.realtime

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from actors.interfaces import DoseSource
-from orchestrator.catalogue.source_account import SourceAccount
+from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.journal.codec import decode_request, decode_result, encode_request, encode_result
 from orchestrator.requests import Failed, Pour, Poured, Slots
 from orchestrator.runs.events import CampaignOpened, RequestFinished, RequestStarted
@@ -138,24 +138,25 @@ def test_a_pour_without_an_amount_is_written_as_before() -> None:
 
 
 def test_the_account_follows_a_run_once_and_another_process_reads_it(tmp_path: Path) -> None:
-    series, path = plan(50, 25), tmp_path / "sources.sqlite"
+    series, path = plan(50, 25), tmp_path / "vessels.sqlite"
     strategy = Dispense(series, seed=5)
     opened = CampaignOpened(name="c", run_directory=tmp_path, stages=("doses",), mode="virtual", simulators=1)
-    follow = SourceAccount(path).follow(series)
+    follow = VesselAccount(path).follow(series)
     follow(opened)
     first = asked(strategy)
     follow(RequestStarted(stage="doses", id=1, request=first))
     name = series.tracked("beaker")
-    begun = SourceAccount(path).content(name)
+    begun = VesselAccount(path).content(name)
     assert begun is not None
     assert begun.kind == "begun"
+    assert begun.mass is not None
     assert begun.mass + 2 * begun.deviation > 0.3 > 0.25 > begun.mass - 2 * begun.deviation  # all or nothing of it
     outcome = poured(first, 50.0)
     finished = RequestFinished(stage="doses", id=1, request=first, outcome=outcome)
     for _ in range(2):  # a resumed run tells of it again
         follow(finished)
-    assert [entry.kind for entry in SourceAccount(path).history(name)] == ["dosed", "begun", "filled"]
-    known = SourceAccount(path).known(series)["beaker"]
+    assert [entry.kind for entry in VesselAccount(path).history(name)] == ["poured", "begun", "filled"]
+    known = VesselAccount(path).known(series)["beaker"]
     assert known.mass == pytest.approx(0.25)
     again = source_of(asked(Dispense(series, seed=6, known={"beaker": known})))
     assert (again.fill, again.mass) == (False, pytest.approx(0.25))
@@ -165,14 +166,16 @@ def test_the_account_follows_a_run_once_and_another_process_reads_it(tmp_path: P
 
 def test_a_weighing_replaces_the_estimate_and_an_unknown_dose_ends_it(tmp_path: Path) -> None:
     series = plan(50)
-    account, name = SourceAccount(tmp_path / "sources.sqlite"), series.tracked("beaker")
-    account.fill(name, 0.3, 1e-3)
+    account, name = VesselAccount(tmp_path / "vessels.sqlite"), series.tracked("beaker")
+    account.fill(name, 0.3, 1e-3, liquid="water")
     account.weigh(name, 0.27, 1e-4)
     found = account.content(name)
     assert found is not None
     assert (found.mass, found.deviation) == (0.27, 1e-4)
     pour = asked(Dispense(series, seed=5, known=account.known(series)))
-    account.finish(name, pour, Failed("pour_unknown", "nobody saw it"), key="run 1")
-    assert account.content(name) is None
+    account.finish(name, pour, Failed("pour_unknown", "nobody saw it"), "water", key="run 1")
+    unknown = account.content(name)
+    assert unknown is not None
+    assert unknown.mass is None
     assert account.known(series) == {}
     assert [entry.kind for entry in account.all()] == ["unknown"]

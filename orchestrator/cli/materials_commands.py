@@ -1,0 +1,196 @@
+"""The commands `decant materials …`: the contents of vessels, and entries of people.
+
+A daemon that runs on the state directory, or the one of `--url`, makes the entries, so that its checks and its audit
+apply. Without a daemon the commands read and write the account of this machine (`VesselAccount`), which holds the
+sources of campaigns; a daemon reads the same account later.
+"""
+
+from __future__ import annotations
+
+import getpass
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from orchestrator.cli.command_options import Json
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message
+from orchestrator.cli.queue_commands import State, Url, connected_client
+
+if TYPE_CHECKING:
+    from orchestrator.catalogue.vessel_account import VesselAccount
+    from orchestrator.daemon.daemon_client import Client
+
+VesselName = Annotated[
+    str,
+    typer.Argument(
+        metavar="VESSEL",
+        help="Id or bar code of a vessel of the daemon, or LABORATORY/VESSEL for the source of a campaign.",
+        show_default=False,
+    ),
+]
+Deviation = Annotated[str, typer.Option(help="Standard deviation of the mass.")]
+Note = Annotated[str, typer.Option(help="Text of the entry.", show_default=False)]
+
+
+@contextmanager
+def _opened(url: str | None, state: Path | None) -> Iterator[Client | VesselAccount]:
+    """The daemon if there is one, else the account of this machine."""
+    from orchestrator.catalogue.run_registry import state_directory
+    from orchestrator.catalogue.vessel_account import VesselAccount
+
+    with Refused(OSError):
+        folder = state or state_directory()
+        named = url is not None or bool(os.environ.get("DECANT_URL"))
+        if named or _daemon_answers(folder):
+            with connected_client(url, state) as client:
+                yield client
+        else:
+            yield VesselAccount.open(folder)
+
+
+def _daemon_answers(folder: Path) -> bool:
+    if not (folder / "url").is_file():
+        return False
+    from orchestrator.daemon.daemon_client import Client, DaemonError
+
+    try:
+        with Client(None, folder) as client:
+            client.get("/materials")
+    except DaemonError as error:
+        return not error.unreachable
+    return True
+
+
+def _mass(text: str, option: str) -> float:
+    from sim_engine.settings.quantity import QuantityError, parse_quantity
+
+    with Refused(QuantityError, at=f"{option}: "):
+        found = parse_quantity(text, "kg", "412.3 g")
+    if found < 0.0:
+        raise RefusalError(f"{option}: {text} should be 0 g or more", BAD_INPUT)
+    return found
+
+
+def _of_campaign(vessel: str) -> str:
+    """The name of a vessel that needs no daemon."""
+    laboratory, slash, name = vessel.partition("/")
+    if not (laboratory and slash and name):
+        raise RefusalError(
+            f"{vessel}: without a daemon, only sources of campaigns can be changed: write LABORATORY/VESSEL, for "
+            "example virtual/beaker. A vessel of the station needs 'decant server start'",
+            BAD_INPUT,
+        )
+    return vessel
+
+
+def list_vessels(url: Url = None, state: State = None, as_json: Json = False) -> None:
+    """List vessels with what is left in each one, and its standard deviation.
+
+    Vessels of the daemon have an id; the sources of `dispense` campaigns and of `decant dose` are LABORATORY/VESSEL.
+    """
+    from orchestrator.catalogue.vessel_account import VesselAccount
+
+    rows: list[dict[str, Any]]
+    with _opened(url, state) as where:
+        if not isinstance(where, VesselAccount):
+            found = where.get("/materials")
+            rows = [{"id": one["id"], "position": one["position"], **one["content"]} for one in found["vessels"]]
+            rows += [{"id": one["id"], "position": "", **one["content"]} for one in found["sources"]]
+        else:
+            rows = [{"id": one.vessel, "position": "", **one.json_content()} for one in where.all()]
+    if as_json:
+        print_json({"vessels": rows})
+        return
+    if not rows:
+        print_message("no vessel has content; 'decant materials weigh' enters one, see docs/laboratory/station.md")
+    for one in rows:
+        text = f"{one['id']:24s} {one['liquid'] or '-':12s} {_content(one):24s} {one['position']}"
+        print(text.rstrip())
+
+
+def _content(one: dict[str, Any]) -> str:
+    if one["mass_g"] is None:
+        return "unknown: weigh it"
+    return f"{one['mass_g']:.1f} ± {one['deviation_g']:.1f} g"
+
+
+def history(
+    vessel: VesselName,
+    limit: Annotated[int, typer.Option(min=1, help="Number of entries.")] = 20,
+    url: Url = None,
+    state: State = None,
+    as_json: Json = False,
+) -> None:
+    """Show the last entries of a vessel's account, newest last: fillings, weighings and pours."""
+    from orchestrator.catalogue.vessel_account import VesselAccount
+
+    with _opened(url, state) as where:
+        if not isinstance(where, VesselAccount):
+            rows = where.get("/materials/account", vessel=vessel, limit=limit)
+        else:
+            rows = [one.json_entry() for one in reversed(where.history(vessel, limit))]
+    if as_json:
+        print_json({"entries": rows})
+        return
+    if not rows:
+        print_message(f"{vessel}: has no entry; 'decant materials list' lists the vessels")
+    for one in rows:
+        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(one["t"]))
+        about = "  ".join(part for part in (one["pour"], one["by"], one["note"]) if part)
+        print(f"{when}  {one['kind']:8s} {_content(one):24s} {about}".rstrip())
+
+
+def weigh(
+    vessel: VesselName,
+    mass: Annotated[str, typer.Argument(help="Its content, for example '123.4 g'.", show_default=False)],
+    liquid: Annotated[str, typer.Option(help="Liquid, for an empty vessel.", show_default=False)] = "",
+    deviation: Deviation = "0.1 g",
+    note: Note = "",
+    url: Url = None,
+    state: State = None,
+) -> None:
+    """Enter what a vessel holds, as weighed: it replaces the estimate."""
+    from orchestrator.catalogue.vessel_account import VesselAccount
+    from sim_engine.errors import InvalidArgumentError
+
+    kilograms, spread = _mass(mass, "MASS"), _mass(deviation, "--deviation")
+    with _opened(url, state) as where:
+        if not isinstance(where, VesselAccount):
+            body = {"mass": mass, "liquid": liquid, "deviation": deviation, "note": note}
+            where.post(f"/materials/vessels/{vessel}/weighed", body)
+        else:
+            name = _of_campaign(vessel)
+            with Refused(InvalidArgumentError):
+                where.weigh(name, kilograms, spread, liquid=liquid, by=getpass.getuser(), note=note)
+    print(f"{vessel}: {mass}")
+
+
+def poured(
+    key: Annotated[
+        str, typer.Argument(metavar="ID", help="Your id of the pour: with it, a repeated command enters it once.")
+    ],
+    source: Annotated[str, typer.Option("--from", help="Vessel that was poured from.")],
+    receiver: Annotated[str, typer.Option("--into", help="Vessel that was poured into.")],
+    mass: Annotated[str, typer.Option("--weighed", help="Mass in the receiver, for example '30.2 g'.")],
+    deviation: Deviation = "0.1 g",
+    note: Note = "",
+    url: Url = None,
+    state: State = None,
+) -> None:
+    """Enter a pour that you made by hand and weighed: the source holds less, the receiver more."""
+    from orchestrator.catalogue.vessel_account import Transfer, VesselAccount
+
+    moved = _mass(mass, "--weighed"), _mass(deviation, "--deviation")
+    with _opened(url, state) as where:
+        if not isinstance(where, VesselAccount):
+            body = {"id": key, "source": source, "receiver": receiver, "mass": mass, "deviation": deviation}
+            where.post("/materials/pours", {**body, "note": note})
+        else:
+            names = _of_campaign(source), _of_campaign(receiver)
+            where.transfer(f"by hand {key}", *names, Transfer(moved, moved), by=getpass.getuser(), note=note)
+    print(f"{key}: {mass} from {source} into {receiver}")

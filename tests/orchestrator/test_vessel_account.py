@@ -1,0 +1,155 @@
+"""The account of vessels: one content for doses, orders, pours by hand and weighings, in every process and restart."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from actors.interfaces import ProgressCallback
+from orchestrator.catalogue.vessel_account import FILE_NAME, MIXTURE, Transfer, VesselAccount
+from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
+from sim_engine.errors import InvalidArgumentError
+from sim_engine.liquids import Liquid
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
+from sim_engine.vessel.shapes import cylinder
+from tests.support.cli_inputs import invoke
+from tests.support.station import BEAKER, content, rigs_in
+from tests.support.toy_campaign import ToyOptimizer, ToySimulators
+from tests.support.toy_daemon import HeldBench, HeldLaboratory, campaign_in, run, serving
+
+SERIES = """\
+name: series
+seed: 3
+laboratory: {name: numbers, simulators: 2, bench: {liquid: {particles: 400}, time_scale: 0}}
+liquid: {name: water, mass: 100 g}
+pourer: beaker.yaml
+receiver: tumbler.yaml
+motion: {pivot: lip, x_offset: 80 mm, height: 100 mm}
+dispense: {start: as_left, doses: [{amount: 30 g}]}
+outputs: {recording: false, figures: false}
+"""
+
+
+def series(name: str = "beaker") -> DispensePlan:
+    pourer = cylinder(name, inner_radius=0.04, inner_height=0.1)
+    receiver = cylinder("tumbler", inner_radius=0.03, inner_height=0.09)
+    scene = Scene("dispense", pourer, receiver, Liquid(mass=0.3))
+    return DispensePlan((scene,), (PlannedDose(0.05, 1e-3, "tumbler"),), 0.0, True, "bench")
+
+
+def masses(account: VesselAccount) -> dict[str, float | None]:
+    return {one.vessel: one.mass for one in account.all()}
+
+
+def test_a_pour_is_entered_once_in_both_vessels_and_adds_to_their_uncertainty(tmp_path: Path) -> None:
+    account = VesselAccount(tmp_path / FILE_NAME)
+    account.weigh("beaker-1", 0.2, 3e-4, liquid="water", by="ada")
+    for _ in range(2):
+        moved = Transfer((0.031, 4e-4), (0.030, 4e-4))
+        VesselAccount(tmp_path / FILE_NAME).transfer("order-1", "beaker-1", "vial-7", moved)
+    assert masses(account) == {"beaker-1": pytest.approx(0.169), "vial-7": pytest.approx(0.030)}
+    source, receiver = account.content("beaker-1"), account.content("vial-7")
+    assert source is not None
+    assert receiver is not None
+    assert (source.deviation, source.pour, receiver.liquid) == (pytest.approx(5e-4), "order-1", "water")
+
+
+def test_another_liquid_makes_a_mixture_and_an_unknown_pour_is_healed_by_a_weighing(tmp_path: Path) -> None:
+    account = VesselAccount(tmp_path / FILE_NAME)
+    account.weigh("a", 0.2, 0.0, liquid="water")
+    account.weigh("b", 0.1, 0.0, liquid="ethanol")
+    account.transfer("1", "a", "b", Transfer((0.02, 0.0), (0.02, 0.0)))
+    account.transfer("2", "a", "b", Transfer(None, None))
+    account.transfer("3", "a", "b", Transfer((0.01, 0.0), (0.01, 0.0)))  # an unknown content remains unknown
+    assert masses(account) == {"a": None, "b": None}
+    account.weigh("b", 0.14, 1e-4)
+    found = account.content("b")
+    assert found is not None
+    assert (found.mass, found.liquid) == (0.14, MIXTURE)
+    with pytest.raises(InvalidArgumentError, match=r"deviation: -1\.0 kg should be"):
+        account.weigh("b", 0.14, -1.0)
+    with pytest.raises(InvalidArgumentError, match="name the liquid"):
+        account.weigh("c", 0.14, 1e-4)
+
+
+def test_a_series_takes_the_content_of_its_liquid_only_and_that_of_the_station_if_it_is_there(tmp_path: Path) -> None:
+    account = VesselAccount(tmp_path / FILE_NAME)
+    account.weigh("bench/beaker", 0.2, 1e-4, liquid="ethanol")
+    assert account.known(series()) == {}
+    account.weigh("bench/beaker", 0.2, 1e-4, liquid="water")
+    account.weigh("4001", 0.1, 1e-4, liquid="water")
+    assert account.known(series())["beaker"].mass == 0.2
+    assert account.known(replace(series(), vessels={"beaker": "4001"}))["beaker"].mass == 0.1
+
+
+class DosingBench(HeldBench):
+    """Pours 30.2 g of a dose and estimates what is left."""
+
+    async def pour(
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
+    ) -> PourMeasurement:
+        left = dose.source.mass - 0.0305
+        return PourMeasurement(dose.source.mass, 3e-4, left, {"dose": {"received": 0.0302, "left": [left, 4e-4]}})
+
+
+def test_a_campaign_of_the_daemon_pours_out_of_a_vessel_of_the_station(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
+    campaign_in(tmp_path).write_text(SERIES, encoding="utf-8")
+
+    def make() -> HeldLaboratory:
+        return HeldLaboratory(ToySimulators(), DosingBench(), ToyOptimizer())
+
+    async def work() -> None:
+        async with serving(tmp_path, make, rigs=rigs_in(tmp_path)) as served:
+            await served.post("/materials/liquids", {"id": "water"})
+            await served.post("/materials/vessels", {"id": "beaker", "shape": BEAKER})
+            weighed = {"mass": "90 g", "liquid": "water", "deviation": "0.1 g"}
+            await served.post("/materials/vessels/beaker/weighed", weighed)
+            await served.until(await served.submit(rig="left"), "finished")
+            found = await content(served, "beaker")
+            assert found["mass_g"] == pytest.approx(59.5)
+            assert found["pour"].startswith("series-")
+            for _ in range(2):  # a person pours; a repeated entry counts once
+                body = {"id": "m-1", "source": "beaker", "receiver": "jar/cup", "mass": "9.5 g", "note": "by eye"}
+                await served.post("/materials/pours", body)
+            found = await served.get("/materials")
+            assert found["vessels"][0]["content"]["mass_g"] == pytest.approx(50.0)
+            assert [(one["id"], one["content"]["mass_g"]) for one in found["sources"]] == [
+                ("jar/cup", pytest.approx(9.5))
+            ]
+            kinds = [one["kind"] for one in await served.get("/materials/account", vessel="beaker")]
+            assert kinds == ["weighed", "weighed", "begun", "poured", "poured"]
+            await served.post("/materials/vessels/jar/cup/weighed", {"mass": "9 g"})
+            assert (await served.get("/materials"))["sources"][0]["content"]["mass_g"] == pytest.approx(9.0)
+
+    run(work())
+
+
+def test_a_person_weighs_a_source_on_the_command_line_and_sees_what_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path))
+    monkeypatch.delenv("DECANT_URL", raising=False)
+    assert "name the liquid" in invoke("materials weigh bench/beaker '200 g'").stderr
+    assert invoke("materials weigh bench/beaker '200 g' --liquid water --note Monday").exit_code == 0
+    assert invoke("materials poured m-1 --from bench/beaker --into bench/jar --weighed '30.5 g'").exit_code == 0
+    listed = json.loads(invoke("materials list --json").stdout)["vessels"]
+    assert {one["id"]: one["mass_g"] for one in listed} == {
+        "bench/beaker": pytest.approx(169.5),
+        "bench/jar": pytest.approx(30.5),
+    }
+    assert "169.5 ± 0.1 g" in invoke("materials list").stdout
+    lines = invoke("materials history bench/beaker").stdout.splitlines()
+    assert [line.split()[2] for line in lines] == ["weighed", "poured"]
+    assert "Monday" in lines[0]
+    assert VesselAccount.open().known(series())["beaker"].mass == pytest.approx(0.1695)
+    refused = invoke("materials weigh beaker '200 g'")  # a vessel of the station: its daemon checks the entry
+    assert refused.exit_code == 2
+    assert "write LABORATORY/VESSEL" in refused.stderr
