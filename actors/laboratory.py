@@ -70,11 +70,10 @@ def check_bench_packages(spec: LaboratorySettings) -> None:
     Raises:
         LaboratoryError: some are not; the text names them and their extra.
     """
-    if (spec.pump is None and spec.arm is None) or (
-        spec.arm is not None and (spec.arm.emulator == "" and spec.arm.missing() is None and spec.balance is None)
-    ):
+    arm = spec.arm
+    if not spec.dispenses or (arm is not None and not arm.emulator and arm.missing() is None and spec.balance is None):
         return
-    needed = ["psutil"] if spec.mode == "virtual" and spec.arm is not None and spec.arm.emulator else []
+    needed = ["psutil"] if spec.mode == "virtual" and arm is not None and arm.emulator else []
     if spec.balance is not None and not spec.balance.typed and isinstance(spec.balance, SerialBalanceSettings):
         needed.append("serial")
     missing = [module for module in needed if not installed(module)]

@@ -104,7 +104,7 @@ def require_flag(laboratory: LaboratorySettings, *, enabled: bool, again: str) -
     """
     if laboratory.mode == "hardware" and not enabled:
         raise RefusalError(
-            f"laboratory {laboratory.name} is hardware: its {'arm' if laboratory.arm is not None else 'pump'} would move. Try it without moving first "
+            f"laboratory {laboratory.name} is hardware: {laboratory.dispenser} would move. Try it without moving first "
             f"('decant robot check', 'decant pour --dry-run'); then enable motion for this one run: {again}",
             BAD_INPUT,
         )

@@ -482,9 +482,7 @@ def check_campaign(
     if plan.laboratory.pump is not None:
         for key, stage in (("calibration", plan.calibration), ("deployment", plan.deployment)):
             if stage is not None:
-                checker.add(
-                    ((key,),), f"'{key}' needs an arm; the pump of laboratory '{plan.laboratory.name}' doses only"
-                )
+                checker.add(((key,),), f"needs an arm; laboratory '{plan.laboratory.name}' doses with a pump")
     if plan.dispense is not None:
         balance = plan.laboratory.balance
         if plan.laboratory.dispenses and (balance is None or balance.placement not in ("receiver", "everything")):
