@@ -299,7 +299,8 @@ class SimulatedPump:
     def __init__(self, settings: SimulatedPumpSettings) -> None:
         self._settings = settings
         self._pace = Pace(settings.time_scale)
-        self._moved = 0.0
+        self._moved = self._told = 0.0
+        self._rate = self._seconds = 0.0
         self.prepare((0,))
 
     def prepare(self, seed: tuple[int, ...]) -> None:
@@ -308,8 +309,14 @@ class SimulatedPump:
 
     def moved(self) -> float:
         """The true volume that has left the pump since the last call [m³]."""
-        moved, self._moved = self._moved, 0.0
+        total = self._moved + self._flowing
+        moved, self._told = total - self._told, total
         return moved
+
+    @property
+    def _flowing(self) -> float:
+        """Volume of the present request so far [m³]."""
+        return self._rate * min(self._pace.now, self._seconds) if self._rate > 0.0 else 0.0
 
     def connect(self) -> str:
         """See `Pump.connect`."""
@@ -322,12 +329,14 @@ class SimulatedPump:
     def run(self, seconds: float) -> None:
         """See `Pump.run`."""
         settings = self._settings
+        factor = settings.factor * (1.0 + settings.scatter * float(self._rng.standard_normal()))
         self._pace.restart()
         self._pace.resume()
+        self._seconds, self._rate = seconds, factor * settings.flow
         done = self._pace.wait_until(seconds)
-        share = 1.0 if done else min(self._pace.now / seconds, 1.0)
-        factor = settings.factor * (1.0 + settings.scatter * float(self._rng.standard_normal()))
-        self._moved += factor * settings.flow * seconds * share
+        flowed = self._rate * seconds if done else self._flowing
+        self._rate = 0.0
+        self._moved += flowed
         if not done:
             raise PumpStoppedError("the pump was stopped")
 

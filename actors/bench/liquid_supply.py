@@ -196,6 +196,7 @@ class SpillWatch:
     ) -> None:
         self._device, self._spec, self._questions, self._tell = device, spec, questions, tell
         self._connected = False
+        self._seen: list[SpillEvent] = []
         self.wet: dict[str, SpillEvent] = {}
         """Wet places by name, as far as they are known."""
 
@@ -216,27 +217,33 @@ class SpillWatch:
             NotPouredError: the table is not dry, or the sensor cannot be read; nothing was poured.
         """
         try:
-            await self._look()
+            await self.look()
             await self._wiped(safe)
         except LaboratoryError as error:
             raise NotPouredError(f"{error}. Nothing was poured") from error
-        seen: list[SpillEvent] = []
-        async with self._following(seen, alarm):
+        self._seen = []
+        async with self._following(alarm):
             measured = await pour()
         if self._spec.simulates:
             await self._device.call("spill", measured.spilled, deadline=ANSWER_DEADLINE)
         with contextlib.suppress(LaboratoryError):  # the pour counts; the next one does not begin before it is dry
-            seen += await self._look()
+            await self.look()
             await self._wiped(safe)
-        if not seen:
+        if not self._seen:
             return measured
-        return replace(measured, notes={**measured.notes, "spills": [asdict(event) for event in seen]})
+        return replace(measured, notes={**measured.notes, "spills": [asdict(event) for event in self._seen]})
 
-    async def _look(self) -> list[SpillEvent]:
+    async def look(self) -> list[SpillEvent]:
+        """Read the sensor now; also connects it. Returns the new events.
+
+        Raises:
+            LaboratoryError: it cannot be read.
+        """
         if not self._connected or await self._device.revive():
             await self._device.call("connect", deadline=ANSWER_DEADLINE)
             self._connected = True
         events: list[SpillEvent] = await self._device.call("events", deadline=ANSWER_DEADLINE, urgent=True)
+        self._seen += events
         for event in events:
             if event.wet:
                 self.wet[event.place] = event
@@ -264,25 +271,22 @@ class SpillWatch:
             )
             if self._spec.simulates:
                 await self._device.call("wipe", deadline=ANSWER_DEADLINE)
-            await self._look()
+            await self.look()
             problem = f"the spill sensor still reports liquid: {', '.join(self.wet)}" if self.wet else ""
 
     @contextlib.asynccontextmanager
-    async def _following(
-        self, seen: list[SpillEvent], alarm: Callable[[], Awaitable[None]] | None
-    ) -> AsyncIterator[None]:
+    async def _following(self, alarm: Callable[[], Awaitable[None]] | None) -> AsyncIterator[None]:
         over = asyncio.Event()
 
         async def follow() -> None:
             failed = False
             while not over.is_set():
                 try:
-                    events, failed = await self._look(), False
+                    events, failed = await self.look(), False
                 except LaboratoryError as error:
                     if not failed:
                         self._tell(Notice("warning", f"spill sensor: {error}"))
                     events, failed = [], True
-                seen.extend(events)
                 if alarm is not None and any(event.wet for event in events):
                     await alarm()
                 with contextlib.suppress(TimeoutError):

@@ -347,7 +347,10 @@ class PumpBench:
                 raise
         else:
             await self._arrived(moved)
-        return [] if self._watch is None else list(self._watch.wet)
+        if self._watch is None:
+            return []
+        await self._watch.look()
+        return list(self._watch.wet)
 
     async def _arrived(self, moved: float = 0.0) -> None:
         """Put what a simulated pump has moved [m³] into the receiver, and on the balance."""

@@ -1,4 +1,4 @@
-"""For the tests of your own plug-ins: contracts of arms, balances, pumps and spill sensors, and the harness of strategies::
+"""For the tests of your own plug-ins: contracts of devices, and the harness of strategies::
 
     from decant.plugins.testing import ArmBench, ArmContract            # needs pytest
     from decant.plugins.testing import BalanceBench, BalanceContract    # needs pytest
