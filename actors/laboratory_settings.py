@@ -185,16 +185,18 @@ class LaboratorySettings(Settings):
     cell: RobotCell | None = None
     """Objects around the arm."""
 
-    pump: Annotated[PumpSettings, OneOf(lambda: PUMPS.all)] | None = None
+    pump: Annotated[Annotated[PumpSettings, OneOf(lambda: PUMPS.all)] | None, NOT_IN_FINGERPRINT] = None
     """A pump or tap instead of the arm, for wanted amounts; `kind` is one of the installed kinds."""
 
     balance: Annotated[BalanceSettings, OneOf(kinds)] | None = None
     """The balance next to the arm, or under the receiver of the pump."""
 
-    source: SourceSettings | None = None
+    source: Annotated[SourceSettings | None, NOT_IN_FINGERPRINT] = None
     """Devices at the source vessel."""
 
-    spill_sensor: Annotated[SpillSensorSettings, OneOf(lambda: SPILL_SENSORS.all)] | None = None
+    spill_sensor: Annotated[
+        Annotated[SpillSensorSettings, OneOf(lambda: SPILL_SENSORS.all)] | None, NOT_IN_FINGERPRINT
+    ] = None
     """A sensor that watches the table for spills; the campaign waits until the operator has wiped it."""
 
     operator: Annotated[OperatorSettings, NOT_IN_FINGERPRINT] = OperatorSettings()
