@@ -1,6 +1,6 @@
-"""Devices of a bench besides arm and balance: pumps, spill sensors, and what stands at the source vessel.
+"""Devices of a bench besides arm and balance: pumps, spill sensors, and the devices at the source vessel.
 
-- `Pump` is a driver that moves liquid: a pump, or a tap with a valve. It pours wanted amounts in place of an arm, or
+- `Pump` is a driver that moves liquid: a pump, or a tap with a valve. It pours wanted amounts instead of an arm, or
   fills the source vessel of an arm or another pump again. `PumpSettings` are its settings, `PUMPS` the installed kinds.
 - `SpillSensor` is a driver that reports a wet table as `SpillEvent`s; `SpillSensorSettings`, `SPILL_SENSORS`.
 - `SourceSettings` is a laboratory's section `source`: a balance under the source vessel, and its refill device.
@@ -87,7 +87,7 @@ class PumpSettings(Settings):
     metering: Annotated[Literal["volume", "time"], SET_BY_PROGRAM] = "volume"
     """Whether the driver has `dispense` ('volume') or `run` ('time')."""
 
-    flow: Flow = 5e-6
+    flow: Flow = 4e-6
     """Nominal flow; the balance under the receiver shows the true one."""
 
     smallest: Volume = 0.2e-6
@@ -279,7 +279,7 @@ class SimulatedPumpSettings(PumpSettings):
     """Standard deviation of a volume, relative to it."""
 
     missed: Annotated[float, Quantity("kg", "1 g", 0.0, 1.0)] = 0.0
-    """Mass of each dose that falls beside the receiver."""
+    """Mass of each dose that misses the receiver."""
 
     time_scale: Annotated[float, Quantity("1", "10", 0.0, 1e6)] = 1.0
     """Bench seconds per second of the clock; 0 means no waiting."""

@@ -1,8 +1,8 @@
-"""What a bench does with the devices at its source vessel, and with its spill sensor.
+"""The source vessel and the spill sensor of a bench.
 
 - `LiquidSupply` fills the source vessel with the refill device, and weighs the vessel if a balance stands under it.
-- `SpillWatch` runs a pour under the eyes of the spill sensor. While the table is wet, the operator is asked to wipe it,
-  and nothing is poured.
+- `SpillWatch` runs a pour under the eyes of the spill sensor. While the table is wet, the operator has to wipe it, and
+  nothing is poured.
 
 The drivers are in `actors.liquid_devices`.
 """
@@ -137,7 +137,7 @@ class LiquidSupply:
     async def filled(self, source: DoseSource, density: float, seed: int) -> DoseSource | None:
         """Fill a source with the refill device. Returns the filled source; None if the operator has to fill it.
 
-        The operator fills it if there is no refill device, or if nobody knows how much is in the vessel.
+        The operator fills it if there is no refill device, or if the content of the vessel is unknown.
 
         Args:
             source: to be filled, to its `mass`.

@@ -167,7 +167,7 @@ class SpillSensorContract:
         assert bench.driver.events() == []
 
     def test_each_change_is_one_event_with_its_place(self, bench: SpillRig) -> None:
-        """The operator is asked to wipe that place; the answer is checked."""
+        """The question to the operator names that place, and the answer is checked."""
         bench.driver.connect()
         assert bench.change(True) == (bench.place, True)
         assert bench.driver.events() == []

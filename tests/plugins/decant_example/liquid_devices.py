@@ -37,7 +37,7 @@ class TapSettings(PumpSettings):
 
 
 class Valve:
-    """The tap itself: 5 mL/s flow while it is open.
+    """The tap itself: 4 mL/s flow while it is open.
 
     Attributes:
         plugged: its cable is connected.
@@ -61,7 +61,7 @@ class Valve:
     @property
     def flowed(self) -> float:
         """Volume that has left it [m³]."""
-        return self._flowed + (0.0 if self._opened is None else 5e-6 * (time.monotonic() - self._opened))
+        return self._flowed + (0.0 if self._opened is None else 4e-6 * (time.monotonic() - self._opened))
 
 
 class Tap:
@@ -69,7 +69,7 @@ class Tap:
 
     Args:
         settings: nominal flow.
-        valve: what it opens; its own by default.
+        valve: the tap itself; its own by default.
     """
 
     def __init__(self, settings: TapSettings, valve: Valve | None = None) -> None:
@@ -151,7 +151,7 @@ class Strip:
 
     Args:
         settings: its place.
-        wires: what it reads; its own by default.
+        wires: the strip itself; its own by default.
     """
 
     def __init__(self, settings: StripSettings, wires: Wires | None = None) -> None:
