@@ -165,9 +165,10 @@ class DoseSource:
         name: under which its content is tracked.
         mass: expected content before the dose [kg].
         deviation: standard deviation of the content [kg].
-        fill: the operator fills it to this content before the dose.
+        fill: it is filled to this content before the dose, by the operator or a refill device.
         constants: number from which a simulated bench draws what stays the same over a series.
         knowledge: of earlier doses; None if there are none.
+        before: content before this filling [kg]; None if it is not known, or nothing is filled.
     """
 
     name: str
@@ -176,6 +177,7 @@ class DoseSource:
     fill: bool
     constants: int
     knowledge: DoseKnowledge | None = None
+    before: float | None = field(default=None, metadata={"written": "if set"})
 
 
 @dataclass(frozen=True)

@@ -70,9 +70,10 @@ def check_bench_packages(spec: LaboratorySettings) -> None:
     Raises:
         LaboratoryError: some are not; the text names them and their extra.
     """
-    if spec.arm is None or (spec.arm.emulator == "" and spec.arm.missing() is None and spec.balance is None):
+    arm = spec.arm
+    if not spec.dispenses or (arm is not None and not arm.emulator and arm.missing() is None and spec.balance is None):
         return
-    needed = ["psutil"] if spec.mode == "virtual" and spec.arm.emulator else []
+    needed = ["psutil"] if spec.mode == "virtual" and arm is not None and arm.emulator else []
     if spec.balance is not None and not spec.balance.typed and isinstance(spec.balance, SerialBalanceSettings):
         needed.append("serial")
     missing = [module for module in needed if not installed(module)]
@@ -226,7 +227,7 @@ class _OpenLaboratory:
         """
         if self._opened is None:
             return False
-        await self._opened.bench.arm.stop()
+        await self._opened.bench.stop()
         return True
 
     @property

@@ -21,6 +21,14 @@ from actors.balance.dialect_registry import kinds
 from actors.balance.scale_model import Drift
 from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import OperatorSettings
+from actors.liquid_devices import (
+    PUMPS,
+    SPILL_SENSORS,
+    PumpSettings,
+    SourceSettings,
+    SpillSensorSettings,
+    check_devices,
+)
 from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.settings.model import (
@@ -177,11 +185,22 @@ class LaboratorySettings(Settings):
     cell: RobotCell | None = None
     """Objects around the arm."""
 
+    pump: Annotated[Annotated[PumpSettings, OneOf(lambda: PUMPS.all)] | None, NOT_IN_FINGERPRINT] = None
+    """A pump or tap instead of the arm, for wanted amounts; `kind` is one of the installed kinds."""
+
     balance: Annotated[BalanceSettings, OneOf(kinds)] | None = None
-    """The balance next to the arm."""
+    """The balance next to the arm, or under the receiver of the pump."""
+
+    source: Annotated[SourceSettings | None, NOT_IN_FINGERPRINT] = None
+    """Devices at the source vessel."""
+
+    spill_sensor: Annotated[
+        Annotated[SpillSensorSettings, OneOf(lambda: SPILL_SENSORS.all)] | None, NOT_IN_FINGERPRINT
+    ] = None
+    """A sensor that watches the table for spills; the campaign waits until the operator has wiped it."""
 
     operator: Annotated[OperatorSettings, NOT_IN_FINGERPRINT] = OperatorSettings()
-    """The operator next to the arm."""
+    """The operator next to the arm or the pump."""
 
     bench: BenchSettings | None = None
     """Ground truth of a virtual bench. Without bench and arm, the laboratory only simulates and plans."""
@@ -195,12 +214,22 @@ class LaboratorySettings(Settings):
     @property
     def pours(self) -> bool:
         """Whether there is a bench."""
-        return self.arm is not None or self.bench is not None
+        return self.dispenses or self.bench is not None
+
+    @property
+    def dispenses(self) -> bool:
+        """Whether there is a device that pours, virtual or real: an arm or a pump."""
+        return self.arm is not None or self.pump is not None
+
+    @property
+    def dispenser(self) -> str:
+        """Name of the arm or the pump in messages; '' without one."""
+        return self.arm.title if self.arm is not None else f"pump {self.pump.kind}" if self.pump is not None else ""
 
     @property
     def needs_person(self) -> bool:
         """Whether the laboratory needs a person who answers questions."""
-        return self.arm is not None and self.operator.answers == "person"
+        return self.dispenses and self.operator.answers == "person"
 
     @property
     def simulator_count(self) -> int:
@@ -212,8 +241,9 @@ class LaboratorySettings(Settings):
 
         The arm knows its cell, arm and balance the time scale of the bench, and the operator who answers.
         """
-        scale = 1.0 if self.bench is None else self.bench.time_scale
-        answers = "virtual" if self.arm is None or self.mode == "virtual" else "person"
+        timed = self.bench or self.pump
+        scale = 1.0 if timed is None else timed.time_scale
+        answers = "virtual" if not self.dispenses or self.mode == "virtual" else "person"
         return self.with_values(
             arm=None if self.arm is None else self.arm.in_laboratory(self.cell, scale),
             balance=None if self.balance is None else self.balance.with_values(time_scale=scale),
@@ -241,7 +271,10 @@ class LaboratorySettings(Settings):
         """See `Settings.check_values`."""
         if self.mode == "hardware":
             self._check_hardware(problems)
-        if self.arm is None:
+        check_devices(problems, self.mode, self.pump, self.source, self.spill_sensor)
+        if self.pump is not None:
+            self._check_with_pump(problems)
+        elif self.arm is None:
             self._check_without_arm(problems)
         else:
             self._check_with_arm(problems)
@@ -260,12 +293,31 @@ class LaboratorySettings(Settings):
                 "the clock's. Remove the section, or write 'mode: virtual'",
                 "bench",
             )
-        if self.arm is None:
-            text = "a laboratory of hardware needs its arm; add an 'arm' and a 'cell' section"
+        if not self.dispenses:
+            text = "a laboratory of hardware needs its arm; add an 'arm' and a 'cell' section, or a 'pump'"
             problems.add(text, key=True, of="arm")
 
+    def _check_with_pump(self, problems: Problems) -> None:
+        for key, why in (
+            ("arm", "a laboratory pours with an arm or with a pump"),
+            ("cell", "belongs to an arm, and a pump pours here"),
+            ("bench", "hides the liquid of a virtual arm, and a pump pours here"),
+        ):
+            if key in self.model_fields_set and problems.valid(key):
+                problems.add(f"{why}; remove it", key, key=True)
+        balance, inner = self.balance, problems.within("balance")
+        if balance is None:
+            text = "a pump needs a balance under the receiver; add 'balance: {placement: receiver, …}'"
+            problems.add(text, of="balance")
+        elif balance.placement not in ("receiver", "everything"):
+            inner.add("with a pump the balance stands under the receiver; write 'receiver'", "placement")
+        elif self.mode == "virtual" and not balance.receives_load:
+            problems.add("is not emulated next to a pump; write 'kind: simulated'", "balance")
+        else:
+            balance.check_laboratory(inner, mode=self.mode)
+
     def _check_without_arm(self, problems: Problems) -> None:
-        for key in ("cell", "balance", "operator"):
+        for key in ("cell", "balance", "operator", "source", "spill_sensor"):
             if key in self.model_fields_set:
                 meant = "; a simulated bench has 'bench: {balance: …, operator_time: …}'" if key != "cell" else ""
                 text = f"belongs to an arm, and there is none; add 'arm', or remove it{meant}"

@@ -27,6 +27,7 @@ from actors.arm.arm_settings import ARMS, UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import OperatorSettings
+from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.physics_command import kept_records
 from orchestrator.config import campaign_file as campaign
@@ -89,6 +90,9 @@ SECTIONS: dict[str, type[Settings]] = {
     "arm": UrArmSettings,
     "limits": ArmLimits,
     "cell": RobotCell,
+    "pump": SimulatedPumpSettings,
+    "source": SourceSettings,
+    "spill-sensor": SimulatedSpillSensorSettings,
     "operator": OperatorSettings,
     "bench": laboratory.BenchSettings,
     "balance": SerialBalanceSettings,
@@ -122,6 +126,8 @@ OF_SECTIONS = {
     "JointAngles": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
     "SerialBalanceSettings": "[balance](#balance)",
     "SimulatedBalanceSettings": "[balance](#balance)",
+    "PumpSettings": "[pump](#pump)",
+    "SpillSensorSettings": "[spill sensor](#spill-sensor)",
     "OperatorSettings": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
     "PoseErrorSettings": "[pose error](#pose-error)",

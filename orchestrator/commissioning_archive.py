@@ -223,7 +223,7 @@ def _read_robot_check(path: Path) -> tuple[str, str, Any]:
     try:
         file = folder / "laboratory.yaml"
         file.write_text(data["laboratory"], encoding="utf-8")
-        arm = load_laboratory(file).arm
+        arm = load_laboratory(file, stored=False).arm
     except ConfigError as error:
         raise ValueError(f"its laboratory: {error}") from error
     finally:

@@ -12,23 +12,34 @@ started.
 from __future__ import annotations
 
 import ipaddress
+import json
 import math
 import re
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, Strict
 
 from actors.arm.arm_geometry import ArmLimits, Centre, JointAngles, Mount, Pose, RobotCell, Speed
-from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel
+from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel, same_robot
 from actors.interfaces import DeviceCheck
 from sim_engine.action import Action
 from sim_engine.scene import Scene
-from sim_engine.settings.model import NOT_IN_FINGERPRINT, SET_BY_PROGRAM, Choice, Example, Problems, Settings, Text
+from sim_engine.settings.model import (
+    NOT_IN_FINGERPRINT,
+    SET_BY_PROGRAM,
+    Choice,
+    Example,
+    FilePath,
+    Problems,
+    Settings,
+    Text,
+)
 from sim_engine.settings.plugin_registry import PluginRegistry
 from sim_engine.settings.quantity import Quantity
 
@@ -146,6 +157,17 @@ class ArmSettings(Settings):
     def in_laboratory(self, cell: RobotCell | None, time_scale: float) -> Self:
         """The same settings in a cell, with the time scale of a virtual bench (1 on hardware)."""
         return self.with_values(time_scale=time_scale)
+
+    def with_stored(self, folder: Path) -> Self:
+        """The settings with the contents of recordings that they name.
+
+        Args:
+            folder: of the laboratory's file, to which paths are relative.
+
+        Raises:
+            ValueError: a recording cannot be read; the text names it.
+        """
+        return self
 
     @abstractmethod
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
@@ -310,8 +332,11 @@ class UrArmSettings(ArmSettings):
     cell: Annotated[RobotCell, SET_BY_PROGRAM]
     """Objects around the arm: the laboratory's section `cell`."""
 
+    calibration_file: Annotated[FilePath | None, NOT_IN_FINGERPRINT] = None
+    """Recording of this robot by 'decant robot check --record', with whose calibrated lengths pours are checked before it is connected; nominal lengths unless given."""  # noqa: E501
+
     calibration: Annotated[Calibration | None, SET_BY_PROGRAM] = None
-    """Calibration of this robot, as its controller reports it; None for nominal lengths, as before it is connected."""
+    """Calibration of this robot: as `calibration_file` records it, and once it is connected, as its controller reports it. None for nominal lengths."""  # noqa: E501
 
     @property
     def robot(self) -> RobotModel:
@@ -371,6 +396,25 @@ class UrArmSettings(ArmSettings):
         pourer, receiver = planning.vessel(scene.pourer), planning.vessel(scene.receiver)
         path: PourPath = plan_path(planning.plan_pour(scene, action), self, pourer, receiver)
         return path
+
+    def with_stored(self, folder: Path) -> Self:
+        """See `ArmSettings.with_stored`: the calibration of `calibration_file`."""
+        if self.calibration_file is None:
+            return self
+        path = folder / self.calibration_file
+        try:
+            recorded = json.loads(path.read_text(encoding="utf-8"))["readout"]
+            found = resolve_name("actors.arm.ur.controller_readout:findings_of")(recorded)
+            state, model = found.state, found.model
+        except OSError as error:
+            raise ValueError(f"calibration_file {path}: {error.strerror}") from None
+        except (ValueError, KeyError, TypeError):
+            text = "is no recording of 'decant robot check --record'"
+            raise ValueError(f"calibration_file {path}: {text}") from None
+        if state is None or not same_robot(model, self.model):
+            kind = f"a {model}" if model else "no robot"
+            raise ValueError(f"calibration_file {path}: records {kind}, and the arm is a {self.model}")
+        return self.with_values(calibration=state.calibration)
 
     def fitted_to(self, facts: ArmFacts) -> Self:
         """See `ArmSettings.fitted_to`: the robot's calibration."""

@@ -18,12 +18,15 @@ from actors.arm.arm_settings import ArmSettings, UrArmSettings
 from actors.arm.simulated_arm import SimulatedArmSettings
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings
+from actors.balance.scale_model import Load
 from actors.balance.weighing_plan import PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.consent import Setup
 from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.ground_truth import GroundTruth
+from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.bench.pour_procedure import PourProcedure
+from actors.bench.pump_bench import PumpBench
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
 from actors.dosing.dosing_settings import DosingSettings
@@ -37,6 +40,7 @@ from actors.interfaces import (
     SimulatorPool,
 )
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
+from actors.liquid_devices import PumpSettings, SourceSettings, SpillSensorSettings
 from actors.runtime.remote_object import Device
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
@@ -57,6 +61,7 @@ class PouringBench:
     def __init__(self, setup: Setup, dosing: DosingSettings) -> None:
         self._setup, self._arm_spec, self._dosing = setup, setup.spec, dosing
         self.arm, self.balance, self.ground_truth = setup.arm, setup.balance, setup.ground_truth
+        self._watch = setup.watch
         self._known: dict[str, dict[str, PourMasses]] = {}
         self._one_at_a_time = asyncio.Lock()
 
@@ -89,15 +94,46 @@ class PouringBench:
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)
-            if dose is not None:
-                return await self._dose(scene, dose, path, seed, progress)
-            pour = PourProcedure(
-                self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
-            )
-            try:
-                return await pour.run()
-            finally:
-                self._known[scene.pourer.name] = pour.lasting
+
+            async def run() -> PourMeasurement:
+                return await self._run(scene, action, path, seed, progress, dose)
+
+            return await (run() if self._watch is None else self._watch.watched(run, self.arm.hands_in))
+
+    async def _run(
+        self,
+        scene: Scene,
+        action: Action,
+        path: PlannedPour,
+        seed: int,
+        progress: ProgressCallback | None,
+        dose: DoseTarget | None,
+    ) -> PourMeasurement:
+        if dose is not None:
+            return await self._dose(scene, dose, path, seed, progress)
+        pour = PourProcedure(
+            self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
+        )
+        try:
+            return await pour.run()
+        finally:
+            self._known[scene.pourer.name] = pour.lasting
+
+    async def stop(self) -> None:
+        """Stop any motion; the arm stays locked."""
+        await self.arm.stop()
+
+    async def close(self) -> None:
+        """Close the arm, and release balance, supply and spill sensor."""
+        with contextlib.suppress(LaboratoryError):
+            await self.arm.close()
+        if self.balance is not None:
+            with contextlib.suppress(LaboratoryError):
+                await self.balance.release()
+        if self._setup.supply is not None:
+            await self._setup.supply.close()
+        if self._watch is not None:
+            await self._watch.close()
 
     async def _dose(
         self, scene: Scene, dose: DoseTarget, path: PlannedPour, seed: int, progress: ProgressCallback | None
@@ -131,18 +167,14 @@ class OpenBench:
         operator: answers the questions.
     """
 
-    bench: PouringBench
+    bench: PouringBench | PumpBench
     devices: list[Device]
     emulators: DeviceEmulators | None = None
     operator: Operator | None = None
 
     async def close(self) -> None:
-        """Close the arm, release the balance, and end the emulators that were started for them."""
-        with contextlib.suppress(LaboratoryError):
-            await self.bench.arm.close()
-        if self.bench.balance is not None:
-            with contextlib.suppress(LaboratoryError):
-                await self.bench.balance.release()
+        """Close the bench, and end the emulators that were started for it."""
+        await self.bench.close()
         if self.emulators is not None:
             with contextlib.suppress(LaboratoryError):
                 await self.emulators.close()
@@ -163,9 +195,32 @@ class _Opening:
         cls, args = spec.driver(accepted)
         return DeviceArm(self("arm", cls, *args), spec)
 
-    def balance(self, spec: BalanceSettings, name: str) -> DeviceBalance:
+    def balance(self, spec: BalanceSettings, name: str, device: str = "balance") -> DeviceBalance:
         cls, args = spec.driver(name)
-        return DeviceBalance(self("balance", cls, *args), spec.time_scale, longest_call=spec.longest_call)
+        return DeviceBalance(self(device, cls, *args), spec.time_scale, longest_call=spec.longest_call)
+
+    def pump(self, spec: PumpSettings, name: str) -> PumpDevice:
+        cls, args = spec.driver()
+        return PumpDevice(self(name, cls, *args), spec)
+
+    def supply(
+        self, spec: SourceSettings | None, contents: BenchContents | None, scale: float, tell: Callable[[Notice], None]
+    ) -> LiquidSupply:
+        balance = refill = None
+        if spec is not None and spec.balance is not None:
+            timed = spec.balance.with_values(time_scale=scale)
+            spec, balance = spec.with_values(balance=timed), self.balance(timed, "source", "source-balance")
+        if spec is not None and spec.refill is not None:
+            refill = self.pump(spec.refill, "refill")
+        return LiquidSupply(spec, balance, refill, contents, tell)
+
+    def watch(
+        self, spec: SpillSensorSettings | None, questions: OperatorQuestions, tell: Callable[[Notice], None]
+    ) -> SpillWatch | None:
+        if spec is None:
+            return None
+        cls, args = spec.driver()
+        return SpillWatch(self("spill-sensor", cls, *args), spec, questions, tell)
 
 
 async def open_bench(
@@ -189,16 +244,18 @@ async def open_bench(
     """
     opening = _Opening(make)
     try:
+        if operator is None and spec.needs_person:
+            raise LaboratoryError(
+                f"laboratory {spec.name} needs a person beside it who answers questions, and nobody is here to be asked"
+            )
+        if spec.pump is not None:
+            return _open_pump(spec, spec.pump, opening, operator, tell)
         if spec.arm is None:
             assert spec.bench is not None
             assert liquid is not None
             return _open_simulated(spec.bench, spec.dosing, opening, liquid)
         if spec.balance is None:
             raise LaboratoryError(f"laboratory {spec.name}: an arm that pours needs a balance; add a 'balance' to it")
-        if operator is None and spec.needs_person:
-            raise LaboratoryError(
-                f"laboratory {spec.name} needs a person beside it who answers questions, and nobody is here to be asked"
-            )
         return await _open_devices(spec, spec.arm, spec.balance, opening, liquid, operator, tell)
     except BaseException:
         for device in reversed(opening.devices):
@@ -217,6 +274,35 @@ def _open_simulated(spec: BenchSettings, dosing: DosingSettings, opening: _Openi
         "virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, ground_truth, _discard_notice
     )
     return OpenBench(PouringBench(setup, dosing), opening.devices, operator=operator)
+
+
+def _open_pump(
+    spec: LaboratorySettings,
+    pump_spec: PumpSettings,
+    opening: _Opening,
+    operator: Operator | None,
+    tell: Callable[[Notice], None],
+) -> OpenBench:
+    if spec.balance is None:
+        raise LaboratoryError(f"laboratory {spec.name}: a pump needs a balance under the receiver; add a 'balance'")
+    pump, balance = opening.pump(pump_spec, "pump"), opening.balance(spec.balance, spec.name)
+    hands, scale = None, pump_spec.time_scale
+    if spec.mode == "virtual":
+
+        async def put(mass: float) -> None:
+            await balance.put(Load((0.0,), (mass,)))
+
+        hands = Hands(BenchContents(spec.balance.position), put)
+        if spec.operator.answers == "virtual":
+            operator = operator or VirtualOperator(hands, spec.operator.time / scale if scale > 0.0 else 0.0)
+        elif operator is not None:
+            operator = PlayedOperator(operator, hands)
+    assert operator is not None
+    questions = OperatorQuestions(operator, spec.operator, tell, scale if scale > 0.0 else 1.0)
+    supply = opening.supply(spec.source, None if hands is None else hands.contents, scale, tell)
+    watch = opening.watch(spec.spill_sensor, questions, tell)
+    bench = PumpBench(spec.mode, pump, balance, spec.balance, questions, supply, watch, spec.dosing, hands, tell)
+    return OpenBench(bench, opening.devices, operator=operator)
 
 
 def _discard_notice(notice: Notice) -> None:
@@ -244,8 +330,10 @@ async def _open_devices(
     if emulators is not None and balance_spec.receives_load:
         emulators.told = balance
     ground_truth = GroundTruth(arm_spec.time_scale)
+    contents: BenchContents | None = None
     if emulators is not None and spec.bench is not None and liquid is not None:
-        hands = Hands(BenchContents(balance_spec.position), None if balance is None else emulators.put)
+        contents = BenchContents(balance_spec.position)
+        hands = Hands(contents, None if balance is None else emulators.put)
         if isinstance(true_arm, UrArmSettings):
             ground_truth = FollowedBench(spec.bench, true_arm, emulators, hands, liquid)
         else:
@@ -256,5 +344,19 @@ async def _open_devices(
             operator = PlayedOperator(operator, hands)
     assert operator is not None
     questions = OperatorQuestions(operator, spec.operator, tell, arm_spec.time_scale)
-    setup = Setup(spec.mode, arm_spec, balance_spec, spec.operator.time, arm, balance, questions, ground_truth, tell)
+    supply = None if spec.source is None else opening.supply(spec.source, contents, arm_spec.time_scale, tell)
+    watch = opening.watch(spec.spill_sensor, questions, tell)
+    setup = Setup(
+        spec.mode,
+        arm_spec,
+        balance_spec,
+        spec.operator.time,
+        arm,
+        balance,
+        questions,
+        ground_truth,
+        tell,
+        supply,
+        watch,
+    )
     return OpenBench(PouringBench(setup, spec.dosing), opening.devices, emulators, operator)

@@ -20,6 +20,7 @@ from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.ground_truth import GroundTruth
+from actors.bench.liquid_supply import LiquidSupply, SpillWatch
 from actors.interfaces import BenchLostError, LaboratoryError, Notice, OperatorQuestion
 from actors.runtime.remote_object import DeviceLostError
 
@@ -131,6 +132,8 @@ class Setup:
     questions: OperatorQuestions
     ground_truth: GroundTruth
     tell: Callable[[Notice], None]
+    supply: LiquidSupply | None = None
+    watch: SpillWatch | None = None
 
 
 class Consent:

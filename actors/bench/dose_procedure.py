@@ -19,6 +19,7 @@ import contextlib
 import math
 import time
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -202,6 +203,7 @@ class DoseProcedure:
         await setup.balance.device.revive()
         await setup.balance.resume()
         await setup.balance.connect()
+        await self._refill()
         await setup.ground_truth.prepare_dose(self._scene, self._dose, self._seed)
         async with self._readings.running():
             await self._prepare()
@@ -213,6 +215,16 @@ class DoseProcedure:
         if result.amount is None:
             raise UnknownPourError(unknown_amount(result))
         return self._measurement(result, truth)
+
+    async def _refill(self) -> None:
+        """Let the refill device fill the source, if there is one and the content is known."""
+        source = source_of(self._scene, self._dose)
+        if self._setup.supply is None or not source.fill:
+            return
+        await self._setup.supply.connect()
+        filled = await self._setup.supply.filled(source, self._scene.liquid.density, self._seed)
+        if filled is not None:
+            self._dose = replace(self._dose, source=filled)
 
     async def _prepare(self) -> None:
         """Fill the source, put the receiver on, and measure the lag of the balance."""

@@ -1,4 +1,4 @@
-"""Names for authors of plug-ins: strategies, objectives, balances, arms and sources of vessels.
+"""Names for authors of plug-ins: strategies, objectives, balances, arms, pumps, spill sensors and sources of vessels.
 
 How to write one: docs/extend/plug-ins.md.
 
@@ -42,6 +42,14 @@ if TYPE_CHECKING:
     from actors.bench.pour_feasibility import plan_pour
     from actors.bench.virtual_bench import ArmEmulator, History
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
+    from actors.liquid_devices import (
+        Pump,
+        PumpSettings,
+        PumpStoppedError,
+        SpillEvent,
+        SpillSensor,
+        SpillSensorSettings,
+    )
     from actors.optimizer.questions import (
         CalibrationQuery,
         Data,
@@ -187,6 +195,9 @@ __all__ = [
     "Problems",
     "ProfileShape",
     "Progress",
+    "Pump",
+    "PumpSettings",
+    "PumpStoppedError",
     "Quantity",
     "Reading",
     "ReadingStatus",
@@ -211,6 +222,9 @@ __all__ = [
     "Slots",
     "Space",
     "SpaceFillingQuery",
+    "SpillEvent",
+    "SpillSensor",
+    "SpillSensorSettings",
     "StageResult",
     "Strategy",
     "Suggest",
@@ -327,6 +341,15 @@ _SOURCES = {
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
     "actors.bench.virtual_bench": ("ArmEmulator", "History"),
     "actors.bench.pour_feasibility": ("plan_pour",),
+    # Pumps and spill sensors
+    "actors.liquid_devices": (
+        "Pump",
+        "PumpSettings",
+        "PumpStoppedError",
+        "SpillEvent",
+        "SpillSensor",
+        "SpillSensorSettings",
+    ),
     # Sources of vessels
     "sim_engine.resources": ("load_arrays", "store_arrays"),
     "sim_engine.vessel.distance_grid": ("SignedDistanceGrid",),

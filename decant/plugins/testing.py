@@ -1,7 +1,8 @@
-"""For the tests of your own plug-ins: contracts of arms and balances, and the harness of strategies::
+"""For the tests of your own plug-ins: contracts of devices, and the harness of strategies::
 
     from decant.plugins.testing import ArmBench, ArmContract            # needs pytest
     from decant.plugins.testing import BalanceBench, BalanceContract    # needs pytest
+    from decant.plugins.testing import PumpContract, PumpRig, SpillRig, SpillSensorContract    # needs pytest
     from decant.plugins.testing import StrategyHarness, check_strategy
 
 How to use them: docs/extend/plug-ins.md. Each name is imported on first use.
@@ -16,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from actors.contract_tests.arm_contract import ArmBench, ArmContract
     from actors.contract_tests.balance_contract import BalanceBench, BalanceContract
+    from actors.contract_tests.liquid_device_contracts import PumpContract, PumpRig, SpillRig, SpillSensorContract
     from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
     from orchestrator.strategy_harness import (
         ACTIONS,
@@ -41,7 +43,11 @@ __all__ = [
     "ArmContract",
     "BalanceBench",
     "BalanceContract",
+    "PumpContract",
+    "PumpRig",
     "SpillModel",
+    "SpillRig",
+    "SpillSensorContract",
     "StrategyHarness",
     "VirtualSerialBalance",
     "check_strategy",
@@ -55,6 +61,10 @@ _CONTRACTS = {
     "ArmContract": "actors.contract_tests.arm_contract",
     "BalanceBench": "actors.contract_tests.balance_contract",
     "BalanceContract": "actors.contract_tests.balance_contract",
+    "PumpContract": "actors.contract_tests.liquid_device_contracts",
+    "PumpRig": "actors.contract_tests.liquid_device_contracts",
+    "SpillRig": "actors.contract_tests.liquid_device_contracts",
+    "SpillSensorContract": "actors.contract_tests.liquid_device_contracts",
 }
 
 _SOURCE_OF = dict.fromkeys(__all__, "orchestrator.strategy_harness") | {

@@ -118,6 +118,8 @@ def _chosen(
     plan = read_campaign(path, laboratory)
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
+    if dry_run and plan.laboratory.pump is not None:
+        raise RefusalError("--dry-run: doses of a pump are not predicted; 'decant validate' checks them", BAD_INPUT)
     series = plan.dispense
     if not amounts:
         if series is None or not dry_run:
@@ -272,11 +274,12 @@ def _pour(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: str) ->
     request = RunRequest(plan, dispense_stages(plan.dispense))
     checksum = ""
     if plan.laboratory.mode == "hardware":
-        assert plan.laboratory.arm is not None
-        with Refused(SafetyRecordError):
-            checksum = required_checksum(plan)
-        found = envelope(plan.laboratory.arm, campaign_pours(plan, request.stages))
-        confirm(plan.laboratory, [f"doses          {len(plan.dispense.doses)}", *envelope_lines(found)])
+        lines = [f"doses          {len(plan.dispense.doses)}"]
+        if plan.laboratory.arm is not None:
+            with Refused(SafetyRecordError):
+                checksum = required_checksum(plan)
+            lines += envelope_lines(envelope(plan.laboratory.arm, campaign_pours(plan, request.stages)))
+        confirm(plan.laboratory, lines)
     resources = RunResources(in_process=in_process, approved_checksum=checksum)
     check_somebody_is_there(plan.laboratory)
     check_laboratory_answers(request, resources)

@@ -364,7 +364,7 @@ def person_at_the_terminal(
     """
     from orchestrator.cli.terminal_operator import TerminalOperator
 
-    if not spec.needs_person or spec.arm is None:
+    if not spec.needs_person:
         return None
     return TerminalOperator(spec.operator, paused=paused)
 

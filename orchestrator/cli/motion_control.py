@@ -80,7 +80,9 @@ def enable_campaign_motion(
             )
         return None
     require_flag(laboratory, enabled=enabled, again=f"decant {task} {plan.source.name} --enable-motion")
-    assert laboratory.arm is not None
+    if laboratory.arm is None:  # a pump has no path and no safety settings
+        confirm(laboratory, [f"pours          up to {pour_count(plan, stages)}"])
+        return ""
     with Refused(SafetyRecordError):
         checksum = required_checksum(plan)
     print_note(f"planning paths from all over the actions of {plan.name} …")
@@ -102,7 +104,7 @@ def require_flag(laboratory: LaboratorySettings, *, enabled: bool, again: str) -
     """
     if laboratory.mode == "hardware" and not enabled:
         raise RefusalError(
-            f"laboratory {laboratory.name} is hardware: an arm would move. Try it without moving first "
+            f"laboratory {laboratory.name} is hardware: {laboratory.dispenser} would move. Try it without moving first "
             f"('decant robot check', 'decant pour --dry-run'); then enable motion for this one run: {again}",
             BAD_INPUT,
         )
@@ -125,14 +127,13 @@ def confirm(laboratory: LaboratorySettings, lines: Sequence[str]) -> None:
     Raises:
         RefusalError: stdin is not a terminal, or another text was typed (exit code 2).
     """
-    assert laboratory.arm is not None
     if not sys.stdin.isatty():
         raise RefusalError(
             f"laboratory {laboratory.name} is hardware: an operator enables its motion, who reads what it will do and "
             "types its name. That needs a terminal, with nothing piped into it",
             BAD_INPUT,
         )
-    announce(laboratory.name, laboratory.arm.title, lines, " for this run")
+    announce(laboratory.name, laboratory.dispenser, lines, " for this run")
     termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # discard keys that were pressed before this text was shown
     print("> ", end="", file=sys.stderr, flush=True)
     typed = sys.stdin.readline()

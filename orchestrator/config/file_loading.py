@@ -114,17 +114,27 @@ def liquid_from(document: Document) -> Liquid:
     return section.load()
 
 
-def load_laboratory(path: Path) -> LaboratorySettings:
+def load_laboratory(path: Path, *, stored: bool = True) -> LaboratorySettings:
     """The laboratory of a file.
+
+    Args:
+        path: of the file.
+        stored: read the recordings that it names, too.
 
     Raises:
         ConfigError: the file is invalid.
     """
     report = Report()
-    found = References(report).file(resolved(path), LaboratorySettings)
+    references = References(report)
+    found = references.file(resolved(path), LaboratorySettings)
     report.raise_if_any()
     assert found is not None, "a laboratory without problems has settings"
-    return found[0].ready()
+    if not stored:
+        return found[0].ready()
+    laboratory = references.laboratory(str(resolved(path)), found[1])
+    report.raise_if_any()
+    assert laboratory is not None, "a laboratory without problems is ready"
+    return laboratory
 
 
 class _LooseQuantity(Quantity):

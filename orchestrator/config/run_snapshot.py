@@ -170,7 +170,7 @@ class _Writer:
         return value
 
     def _text(self, value: str, annotation: Any, metadata: tuple[Any, ...], place: Place) -> Any:
-        if _find(FieldMark, annotation, metadata) == IN_FILE:
+        if IN_FILE in _every(FieldMark, annotation, metadata):
             return str(resolved(place.directory / value))
         model = _behind_a_path(annotation)
         found = None if model is None else self.references.section(value, place, model)
@@ -198,8 +198,13 @@ def _behind_a_path(annotation: Any) -> type[Settings] | None:
 
 def _find(kind: type[T], annotation: Any, metadata: tuple[Any, ...]) -> T | None:
     """The first metadata of one kind in an annotation."""
+    return next(iter(_every(kind, annotation, metadata)), None)
+
+
+def _every(kind: type[T], annotation: Any, metadata: tuple[Any, ...]) -> list[T]:
+    """All metadata of one kind in an annotation."""
     every = [*metadata, *(m for _, own in _parts(annotation) for m in own)]
-    return next((m for m in every if isinstance(m, kind)), None)
+    return [m for m in every if isinstance(m, kind)]
 
 
 def _items(annotation: Any, count: int) -> list[Any]:

@@ -54,9 +54,10 @@ def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
         raise MotionNotEnabledError(f"{item.id} is {item.state}")
     try:
         work = run_request(daemon.settings, item, daemon.settings.rig(item.rig))
-        required_checksum(work.campaign)
         arm = work.campaign.laboratory.arm
-        assert arm is not None
+        if arm is None:
+            raise MotionNotEnabledError("a real pump is enabled from the command line only: decant run --enable-motion")
+        required_checksum(work.campaign)
         found = envelope(arm, campaign_pours(work.campaign, work.stages))
     except (ConfigError, RunError, KeyError) as error:
         raise MotionNotEnabledError(str(error)) from None

@@ -291,7 +291,7 @@ class PlannedOrder:
         try:
             if target is not None:
                 check_dose(self.scene, target)
-                if laboratory.arm is None:
+                if not laboratory.dispenses:
                     check_straight(self.scene)
                 return []
             vessels = build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)

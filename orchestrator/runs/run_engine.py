@@ -98,7 +98,7 @@ async def run_campaign(
 def _default_deadlines(plan: CampaignPlan) -> Deadlines:
     """Deadlines of a plan: with an operator who weighs, a pause waits for a pour as long as a question may take."""
     usual, laboratory = Deadlines(), plan.laboratory
-    if laboratory.arm is None or laboratory.operator.answers == "virtual":
+    if not laboratory.needs_person:
         return usual
     return replace(usual, pour_grace=max(usual.pour_grace, laboratory.operator.deadline))
 

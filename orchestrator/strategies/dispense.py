@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget
@@ -212,7 +213,8 @@ class Dispense:
             deviation=FILL_DEVIATION,
             knowledge=None if before is None else before.knowledge,
         )
-        return self._source(name, filled, fill=True)
+        source = self._source(name, filled, fill=True)
+        return source if before is None else replace(source, before=before.mass)
 
     def assume(self, name: str, content: KnownSource) -> None:
         """Set the content of a source, for a forecast of the doses after it."""

@@ -376,11 +376,13 @@ def tagged(variants: Mapping[str, type[Settings]]) -> Any:
     """One of several kinds of settings, distinguished by their `tag` key: `{strategy: D3, …}`.
 
     Args:
-        variants: by the value of that key; two or more. If it is missing, their `default_tag` is meant.
+        variants: by the value of that key. If it is missing, their `default_tag` is meant.
     """
     if not variants:
         raise RuntimeError("Decant's own entry points are not registered; install it again (pip install -e .)")
     first = next(iter(variants.values()))
+    if len(variants) == 1:
+        return first
     key, default = first.tag, first.default_tag
 
     def word(value: Any) -> str | None:

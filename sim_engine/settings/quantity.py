@@ -71,6 +71,7 @@ KINDS = {
     "1": "a plain number",
     "m/s": "a velocity",
     "m^3": "a volume",
+    "m^3/s": "a volume per time",
     "m^2": "an area",
     "N": "a force",
 }

@@ -206,6 +206,15 @@ def judge(
             tool_check(spec, found.state),
             home_check(spec, found.state),
         ]
+    if found.state is not None and spec.calibration_file is not None and found.state.calibration != spec.calibration:
+        checks.append(
+            DeviceCheck(
+                "stored calibration",
+                "warn",
+                f"{spec.calibration_file} records another calibration than this robot has",
+                "record it again: decant robot check --record; pours are planned with the robot's own in any case",
+            )
+        )
     if found.state is not None and found.exchange is not None:
         checks.append(mount_check(spec, found.state, found.exchange))
     if found.exchange is not None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import socket
 
+from actors.arm.ur.primary_interface import PrimaryError, send_command
 from actors.arm.ur.robot_api import RobotApi, RobotApiError
 
 PORT = 29999
@@ -89,10 +90,18 @@ class Dashboard:
 
 
 def stop_program(address: str, patience: float = PATIENCE) -> None:
-    """Stop the running program, whatever it is.
+    """Stop the running program, whatever it is: over dashboard or Robot API, else over the primary interface.
+
+    The primary interface does not reply: the caller has to watch the program's state over RTDE.
 
     Raises:
-        DashboardError: the dashboard cannot be reached.
+        DashboardError: no interface can be reached.
     """
-    with Dashboard(address, patience) as dashboard:
-        dashboard.demand("stop", "Stopped")
+    try:
+        with Dashboard(address, patience) as dashboard:
+            dashboard.demand("stop", "Stopped")
+    except DashboardError as error:
+        try:
+            send_command(address, "stop program", patience)
+        except PrimaryError as also:
+            raise DashboardError(f"{error}; {also}") from error

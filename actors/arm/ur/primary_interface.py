@@ -161,6 +161,36 @@ def read_parts(address: str, patience: float = 3.0) -> dict[int, bytes]:
     return parts
 
 
+READ_BY_THEN = 0.3
+"""Time for which a connection stays open after its command [s]; the controller sends states meanwhile."""
+
+
+def send_command(address: str, command: str, patience: float = PATIENCE) -> None:
+    """Send a command of the primary interface, such as 'stop program', over a connection of its own.
+
+    There is no reply, and a connection in local control ignores it without a word.
+
+    Args:
+        address: of the controller.
+        command: without the end of line.
+        patience: for the connection [s].
+
+    Raises:
+        PrimaryError: the port cannot be reached.
+
+    Source: the manufacturer's client library, for PolyScope X. Unconfirmed on a robot.
+    """
+    try:
+        with socket.create_connection((address, PORT), timeout=patience) as connection:
+            connection.recv(1)  # the controller has accepted the connection
+            connection.sendall(command.encode() + b"\n")
+            end = time.monotonic() + READ_BY_THEN
+            while time.monotonic() < end and connection.recv(65536):  # a connection that closes at once may be ignored
+                pass
+    except OSError as error:
+        raise PrimaryError(f"{address}:{PORT}: {error}") from error
+
+
 class Primary:
     """One connection, read by a thread until it is closed.
 

@@ -15,6 +15,9 @@ from actors.runtime.child_process import python_module, run_async
 MOST_WAITING = 100
 """Number of waiting programs above which their senders are no longer read."""
 
+STOP_PROGRAM = "stop program"
+"""Command that is no program: it stops the running one. Source: the manufacturer's client library."""
+
 PATIENCE = 60.0
 """Longest wait for a translation in a separate process [s of wall time]."""
 
@@ -66,6 +69,8 @@ class Uploads:
             text, sender = self._waiting.popleft()
             if not sender.privileged:
                 sender.refuse()
+            elif text.strip() == STOP_PROGRAM:
+                self._controller.stop()
             elif len(text) <= LONGEST_HERE:
                 self._controller.upload(text)
             else:

@@ -102,4 +102,13 @@ class References:
     def laboratory(self, value: Any, place: Place) -> LaboratorySettings | None:
         """A laboratory, ready for use; None after a problem."""
         found = self.section(value, place, LaboratorySettings)
-        return None if found is None or self.report.is_broken_within(found[1]) else found[0].ready()
+        if found is None or self.report.is_broken_within(found[1]):
+            return None
+        laboratory, at = found[0].ready(), found[1]
+        if laboratory.arm is None:
+            return laboratory
+        try:
+            return laboratory.with_values(arm=laboratory.arm.with_stored(at.directory))
+        except ValueError as error:
+            self.report.add(at.at("arm"), str(error))
+            return None

@@ -8,6 +8,7 @@ import pytest
 
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
 from actors.arm.ur.commissioning import UrDiagnostics
+from actors.arm.ur.dashboard import DashboardError, stop_program
 from tests.support.ur_pours import HOME, START, pour_path
 
 from .conftest import Call, Makers, Rig
@@ -42,6 +43,21 @@ def test_an_arm_pours_is_stopped_and_recovers_without_a_dashboard(rig: Rig) -> N
     rig.arm.release()
     rig.arm.retreat(rig.path)
     assert rig.joints == pytest.approx(HOME, abs=1e-3)
+
+
+def test_the_primary_interface_stops_the_program_where_the_robot_api_is_out_of_reach(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("actors.arm.ur.robot_api.PORTS", (1, 2))
+    pouring = rig.pouring()
+    rig.await_tilt(0.2)
+    stop_program(rig.controller.address)
+    with pytest.raises(ArmStoppedError):
+        pouring.result()
+    rig.await_rest()
+    rig.controller.close()
+    with pytest.raises(DashboardError, match=r"no Robot API.*:30001"):
+        stop_program(rig.controller.address)
 
 
 @pytest.mark.slow

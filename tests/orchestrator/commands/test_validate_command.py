@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import struct
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from actors.arm.arm_settings import UrArmSettings
+from orchestrator.config.campaign_checks import check_campaign
+from orchestrator.config.file_loading import load_campaign, load_laboratory
 from tests.support.cli_inputs import RECORDED, ROOT, invoke, process
 
 
@@ -55,3 +62,64 @@ def test_checking_a_shipped_file_wakes_nothing_heavy(file: str, inputs: Path) ->
     done = process(f"validate {ROOT / 'configs' / file}", inputs, HEAVY)
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines()[-1] == "loaded:"
+
+
+@pytest.fixture
+def calibrated(tmp_path: Path) -> Callable[[float], Path]:
+    """A laboratory that names a recording of its robot, whose first axis is so much longer [m] than recorded."""
+    with zipfile.ZipFile(ROOT / "tests" / "data" / "commissioning" / "virtual.zip") as kept:
+        record = json.loads(kept.read("robot.json"))
+
+    def write(longer: float) -> Path:
+        parts = record["readout"]["primary"]
+        body = bytearray.fromhex(parts["5"])  # 6 checksums, then theta, a and d of six joints
+        struct.pack_into(">d", body, 24 + 12 * 8, struct.unpack_from(">d", body, 24 + 12 * 8)[0] + longer)
+        (tmp_path / "day-one.json").write_text(
+            json.dumps({**record, "readout": {**record["readout"], "primary": {**parts, "5": body.hex()}}})
+        )
+        text = (ROOT / "configs" / "laboratories" / "ur10-kern.yaml").read_text(encoding="utf-8")
+        changed = text.replace("  model: ur10\n", "  model: ur10\n  calibration_file: day-one.json\n", 1)
+        assert changed != text
+        path = tmp_path / "rig.yaml"
+        path.write_text(changed, encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_pours_are_checked_with_the_stored_calibration_of_the_robot(calibrated: Callable[[float], Path]) -> None:
+    campaign = ROOT / "configs" / "campaigns" / "first-pour.yaml"
+    rig = calibrated(0.0)
+    arm = load_laboratory(rig).arm
+    assert isinstance(arm, UrArmSettings)
+    assert arm.calibration is not None
+    assert arm.robot.parameters == arm.calibration != arm.with_values(calibration=None).robot.parameters
+    assert check_campaign(load_campaign(campaign, rig)) == []
+    problems = [problem.message for problem in check_campaign(load_campaign(campaign, calibrated(1.0)))]
+    assert any("the arm can make none of" in text for text in problems)
+    resolved = load_campaign(campaign, rig).resolved
+    assert resolved["laboratory"]["arm"]["calibration_file"] == str(rig.parent / "day-one.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "No such file or directory"),
+        ("{}", "is no recording of 'decant robot check --record'"),
+        ("ur5e", "records a ur10, and the arm is a ur5e"),
+    ],
+)
+def test_a_stored_calibration_that_does_not_fit_is_named(
+    calibrated: Callable[[float], Path], content: str | None, message: str
+) -> None:
+    rig = calibrated(0.0)
+    stored = rig.parent / "day-one.json"
+    if content is None:
+        stored.unlink()
+    elif content == "{}":
+        stored.write_text(content)
+    else:
+        rig.write_text(rig.read_text().replace("model: ur10\n", f"model: {content}\n"))
+    result = invoke(f"validate {rig}")
+    assert result.exit_code == 2
+    assert message in " ".join(result.stderr.split())

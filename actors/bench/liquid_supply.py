@@ -1,0 +1,305 @@
+"""The source vessel and the spill sensor of a bench.
+
+- `LiquidSupply` fills the source vessel with the refill device, and weighs the vessel if a balance stands under it.
+- `SpillWatch` runs a pour under the eyes of the spill sensor. While the table is wet, the operator has to wipe it, and
+  nothing is poured.
+
+The drivers are in `actors.liquid_devices`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import asdict, replace
+from typing import Any
+
+from actors.balance.balance_device import DeviceBalance
+from actors.balance.scale_model import Load
+from actors.bench.bench_operators import BenchContents, OperatorQuestions
+from actors.interfaces import DoseSource, LaboratoryError, Notice, NotPouredError, OperatorQuestion
+from actors.liquid_devices import PumpSettings, SourceSettings, SpillEvent, SpillSensorSettings
+from actors.runtime.remote_object import Device
+from sim_engine.outcome import PourMeasurement
+
+ANSWER_DEADLINE = 60.0
+"""Wall time within which a device must reply to a short call [s]; its process may still be starting."""
+
+LOOK = 0.1
+"""Wall time between two looks at the spill sensor during a pour [s]."""
+
+UNLIKELY = 5.0
+"""Difference between weighed and computed content that is reported, in standard deviations."""
+
+
+class PumpDevice:
+    """A pump's driver behind a `Device`.
+
+    Args:
+        device: holds the driver.
+        spec: its settings.
+    """
+
+    def __init__(self, device: Device, spec: PumpSettings) -> None:
+        self.device, self.spec = device, spec
+
+    async def connect(self) -> None:
+        """Start the driver again if it was lost, and connect it."""
+        await self.device.revive()
+        await self.device.call("connect", deadline=ANSWER_DEADLINE)
+
+    async def move(self, volume: float, seed: tuple[int, ...]) -> float:
+        """Move a volume [m³]. Returns the true volume of a simulated pump, also of a stopped one; else 0.
+
+        Args:
+            volume: wanted [m³].
+            seed: of a simulated pump's scatter.
+        """
+        method, amount = self.spec.request(volume)
+        scale = self.spec.time_scale or math.inf
+        if self.spec.simulates:
+            await self.device.call("prepare", seed, deadline=ANSWER_DEADLINE)
+        await self.device.call(method, amount, deadline=ANSWER_DEADLINE + 4.0 * volume / self.spec.flow / scale)
+        return await self.moved()
+
+    async def moved(self) -> float:
+        """True volume that has left a simulated pump since the last call [m³]; 0 for a real one."""
+        if not self.spec.simulates:
+            return 0.0
+        return float(await self.device.call("moved", deadline=ANSWER_DEADLINE))
+
+    async def stop(self) -> None:
+        """See `Pump.stop`."""
+        await self.device.call("stop", deadline=ANSWER_DEADLINE, urgent=True)
+
+    async def close(self) -> None:
+        """See `Pump.close`."""
+        with contextlib.suppress(LaboratoryError):
+            await self.device.call("close", deadline=ANSWER_DEADLINE, urgent=True)
+
+
+class LiquidSupply:
+    """The source vessel of a bench.
+
+    Args:
+        spec: section `source` of the laboratory; None if it has none.
+        balance: under the source vessel; None if there is none.
+        refill: fills the vessel; None if the operator does.
+        contents: of a virtual bench; None on hardware.
+        tell: receives notices.
+    """
+
+    def __init__(
+        self,
+        spec: SourceSettings | None,
+        balance: DeviceBalance | None,
+        refill: PumpDevice | None,
+        contents: BenchContents | None,
+        tell: Callable[[Notice], None],
+    ) -> None:
+        self._spec, self.balance, self._refill = spec or SourceSettings(), balance, refill
+        self._contents, self._tell = contents, tell
+
+    async def connect(self) -> None:
+        """Connect the devices."""
+        if self.balance is not None:
+            await self.balance.device.revive()
+            await self.balance.resume()
+            await self.balance.connect()
+        if self._refill is not None:
+            await self._refill.connect()
+
+    async def weighed(self, source: DoseSource) -> DoseSource | None:
+        """The source with its weighed content; None without a balance under it. A surprising weight is reported.
+
+        Raises:
+            LaboratoryError: there is no stable weight.
+        """
+        if self.balance is None or self._spec.balance is None:
+            return None
+        if self._contents is not None:
+            await self.balance.put(Load((0.0,), (self._contents.in_pourer + self._spec.vessel,)))
+        weight = await self.balance.weigh()
+        mass = weight.mass - self._spec.vessel
+        deviation = max(self._spec.balance.deviation, weight.step)
+        if not source.fill and abs(mass - source.mass) > UNLIKELY * math.hypot(source.deviation, deviation):
+            self._tell(
+                Notice(
+                    "warning",
+                    f"source {source.name}: the balance under it shows {1e3 * mass:.1f} g of liquid, and "
+                    f"{1e3 * source.mass:.1f} g were expected; the weight counts",
+                )
+            )
+        return replace(source, mass=max(mass, 0.0), deviation=deviation)
+
+    async def filled(self, source: DoseSource, density: float, seed: int) -> DoseSource | None:
+        """Fill a source with the refill device. Returns the filled source; None if the operator has to fill it.
+
+        The operator fills it if there is no refill device, or if the content of the vessel is unknown.
+
+        Args:
+            source: to be filled, to its `mass`.
+            density: of the liquid [kg/m³].
+            seed: of a simulated pump.
+
+        Raises:
+            LaboratoryError: the device has failed.
+        """
+        if self._refill is None:
+            return None
+        now = await self.weighed(source)
+        held = source.before if now is None else now.mass
+        if held is None:
+            return None
+        missing = source.mass - held
+        if missing > self._refill.spec.smallest * density:
+            moved = await self._refill.move(missing / density, (seed, 61))
+            if self._contents is not None:
+                self._contents.in_pourer += density * moved
+        self._tell(Notice("info", f"source {source.name}: refilled with {1e3 * max(missing, 0.0):.0f} g"))
+        deviation = math.hypot(source.deviation, self._spec.refill_error * max(missing, 0.0))
+        found = await self.weighed(source) or replace(source, deviation=deviation)
+        return replace(found, fill=False, before=None)
+
+    async def interrupt(self) -> None:
+        """Stop the refill device and end a weighing; errors are suppressed."""
+        with contextlib.suppress(LaboratoryError):
+            if self._refill is not None:
+                await self._refill.stop()
+        with contextlib.suppress(LaboratoryError):
+            if self.balance is not None:
+                await self.balance.interrupt()
+
+    async def close(self) -> None:
+        """Release the devices."""
+        if self._refill is not None:
+            await self._refill.close()
+        with contextlib.suppress(LaboratoryError):
+            if self.balance is not None:
+                await self.balance.release()
+
+
+class SpillWatch:
+    """Pours while a spill sensor watches the table.
+
+    Args:
+        device: holds the driver of the sensor.
+        spec: its settings.
+        questions: to the operator.
+        tell: receives notices.
+    """
+
+    def __init__(
+        self, device: Device, spec: SpillSensorSettings, questions: OperatorQuestions, tell: Callable[[Notice], None]
+    ) -> None:
+        self._device, self._spec, self._questions, self._tell = device, spec, questions, tell
+        self._connected = False
+        self._seen: list[SpillEvent] = []
+        self.wet: dict[str, SpillEvent] = {}
+        """Wet places by name, as far as they are known."""
+
+    async def watched(
+        self,
+        pour: Callable[[], Awaitable[PourMeasurement]],
+        safe: Callable[[], Awaitable[Any]],
+        alarm: Callable[[], Awaitable[None]] | None = None,
+    ) -> PourMeasurement:
+        """Make a pour once the table is dry. Its notes get the events as `spills`.
+
+        Args:
+            pour: makes it.
+            safe: makes sure that nothing can move, before the operator reaches into the cell.
+            alarm: called when the table gets wet during the pour; None: the pour goes on.
+
+        Raises:
+            NotPouredError: the table is not dry, or the sensor cannot be read; nothing was poured.
+        """
+        try:
+            await self.look()
+            await self._wiped(safe)
+        except LaboratoryError as error:
+            raise NotPouredError(f"{error}. Nothing was poured") from error
+        self._seen = []
+        async with self._following(alarm):
+            measured = await pour()
+        if self._spec.simulates:
+            await self._device.call("spill", measured.spilled, deadline=ANSWER_DEADLINE)
+        with contextlib.suppress(LaboratoryError):  # the pour counts; the next one does not begin before it is dry
+            await self.look()
+            await self._wiped(safe)
+        if not self._seen:
+            return measured
+        return replace(measured, notes={**measured.notes, "spills": [asdict(event) for event in self._seen]})
+
+    async def look(self) -> list[SpillEvent]:
+        """Read the sensor now; also connects it. Returns the new events.
+
+        Raises:
+            LaboratoryError: it cannot be read.
+        """
+        if not self._connected or await self._device.revive():
+            await self._device.call("connect", deadline=ANSWER_DEADLINE)
+            self._connected = True
+        events: list[SpillEvent] = await self._device.call("events", deadline=ANSWER_DEADLINE, urgent=True)
+        self._seen += events
+        for event in events:
+            if event.wet:
+                self.wet[event.place] = event
+                self._tell(Notice("warning", f"spill sensor: {event.place} is wet"))
+            else:
+                self.wet.pop(event.place, None)
+                self._tell(Notice("note", f"spill sensor: {event.place} is dry"))
+        return events
+
+    async def _wiped(self, safe: Callable[[], Awaitable[Any]]) -> None:
+        """Ask the operator to wipe what is wet, until the sensor reports that it is dry."""
+        problem = ""
+        while self.wet:
+            places = ", ".join(self.wet)
+            await safe()
+            await self._questions.ask(
+                OperatorQuestion(
+                    f"The table is wet: {places}. Find out where the liquid comes from, and wipe it dry. Nothing is "
+                    "poured before that.",
+                    "done",
+                    problem,
+                    about="table_wet",
+                    details={"places": places},
+                )
+            )
+            if self._spec.simulates:
+                await self._device.call("wipe", deadline=ANSWER_DEADLINE)
+            await self.look()
+            problem = f"the spill sensor still reports liquid: {', '.join(self.wet)}" if self.wet else ""
+
+    @contextlib.asynccontextmanager
+    async def _following(self, alarm: Callable[[], Awaitable[None]] | None) -> AsyncIterator[None]:
+        over = asyncio.Event()
+
+        async def follow() -> None:
+            failed = False
+            while not over.is_set():
+                try:
+                    events, failed = await self.look(), False
+                except LaboratoryError as error:
+                    if not failed:
+                        self._tell(Notice("warning", f"spill sensor: {error}"))
+                    events, failed = [], True
+                if alarm is not None and any(event.wet for event in events):
+                    await alarm()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(over.wait(), LOOK)
+
+        task = asyncio.create_task(follow())
+        try:
+            yield
+        finally:
+            over.set()  # not cancelled: events that were read would be lost
+            await asyncio.gather(task, return_exceptions=True)
+
+    async def close(self) -> None:
+        """Release the sensor."""
+        with contextlib.suppress(LaboratoryError):
+            await self._device.call("close", deadline=ANSWER_DEADLINE, urgent=True)
