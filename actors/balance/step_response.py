@@ -84,7 +84,7 @@ def step_response(times: Sequence[float], masses: Sequence[float], *, resolution
     rise = (t > first - 0.3) & (np.cumsum(risen > 0.997) < 4)
     t, risen = t[rise], risen[rise]
     sigma = math.hypot(SCATTER, resolution / abs(step), noise)
-    moments = first - np.arange(0.0, 1.5, 0.03)
+    moments = first - np.arange(0.0, 1.5, MOMENT)
     fits = []
     for (_, response), lag in itertools.product(FILTERS.values(), LAGS):
         for duration in PLACING:
@@ -102,7 +102,8 @@ def step_response(times: Sequence[float], masses: Sequence[float], *, resolution
     probability = evidence / evidence.sum()
     of_lag = probability.sum(axis=0)
     mean = float(of_lag @ LAGS)
-    within = float(of_lag @ (LAGS * math.log(LAGS[1] / LAGS[0])) ** 2) / 12.0
+    # a moment between two of the grid's is made up for by the lag
+    within = (float(of_lag @ (LAGS * math.log(LAGS[1] / LAGS[0])) ** 2) + MOMENT**2) / 12.0
     return StepResponse(
         mean,
         math.sqrt(float(of_lag @ (LAGS - mean) ** 2) + within),
@@ -131,6 +132,9 @@ _BUTTERWORTH = [
 
 LAGS = np.geomspace(0.04, 2.0, 45)
 """Lags that are compared [s]."""
+
+MOMENT = 0.03
+"""Distance of the compared moments of the placing [s]."""
 
 PLACING = (0.02, 0.12, 0.25)
 """Durations of the placing that are compared [s]."""
