@@ -309,6 +309,7 @@ def measure(
     *,
     say: Callable[[str], None],
     dump: Path | None = None,
+    pour: bool = True,
 ) -> dict[str, dict[str, list[Dose]]]:
     """All doses by group and controller; every controller pours a series before the next series begins.
 
@@ -317,6 +318,7 @@ def measure(
         seeds: of a group's series.
         say: receives the progress.
         dump: file of all doses, one JSON line for each series and controller; what it has is not poured again.
+        pour: pour what the file lacks; otherwise the result has what is in the file.
     """
     flow = cup_flows()
     known: dict[tuple[str, str, int], list[Dose]] = {}
@@ -331,14 +333,22 @@ def measure(
         for seed in seeds(group):
             for controller in controllers:
                 doses = known.get((name, controller, seed))
+                if doses is None and not pour:
+                    continue
                 if doses is None:
                     doses = CONTROLLERS[controller](Series(group, seed, flow))
                     if dump is not None:
-                        line = {"group": name, "controller": controller, "seed": seed, "doses": list(map(asdict, doses))}
+                        line = {
+                            "group": name,
+                            "controller": controller,
+                            "seed": seed,
+                            "doses": list(map(asdict, doses)),
+                        }
                         with dump.open("a", encoding="utf-8") as file:
                             file.write(json.dumps(line) + "\n")
                 result[name][controller] += doses
-            say(f"{name}: series {seed}")
+            if pour:
+                say(f"{name}: series {seed}")
         say(f"{name}\n{HEAD}")
         for controller, doses in result[name].items():
             say(row(controller, figures(doses)))
@@ -424,6 +434,7 @@ def main() -> None:
     parser.add_argument("--controllers", nargs="*", choices=list(CONTROLLERS), default=list(CONTROLLERS))
     parser.add_argument("--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}")
     parser.add_argument("--dump", type=Path, help="file of all doses; continue if it exists")
+    parser.add_argument("--as-dumped", action="store_true", help="pour nothing: the figures of the doses in --dump")
     parser.add_argument("--picture", type=Path, help="draw one dose, and nothing else")
     options = parser.parse_args()
     if options.picture:
@@ -435,7 +446,14 @@ def main() -> None:
             return range(FIRST_FINAL_SEED, FIRST_FINAL_SEED + group.final)
         return range(options.first, min(options.first + options.series, 100))
 
-    result = measure(names, options.controllers, seeds, say=lambda text: print(text, flush=True), dump=options.dump)
+    result = measure(
+        names,
+        options.controllers,
+        seeds,
+        say=lambda text: print(text, flush=True),
+        dump=options.dump,
+        pour=not options.as_dumped,
+    )
     for name, by in result.items():
         if "particles" in by:
             for rival, doses in by.items():

@@ -41,7 +41,7 @@ from sim_engine.vessel.vessel import build_vessel
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from dosing import AMOUNTS, CUPS, DATA, GROUPS, PARTICLES, Series, cup_flows  # noqa: E402
+from dosing import AMOUNTS, CUPS, DATA, GROUPS, PARTICLES, Series, cup_flows
 
 FIRST_SEED = 7100
 RESOLUTION = 500
@@ -179,7 +179,12 @@ def main() -> None:
         from machine import describe
 
         data = json.loads(DATA.read_text(encoding="utf-8"))
-        data["particle_simulation"] = {"machine": describe(), "particles": RESOLUTION, "rows": rows}
+        data["particle_simulation"] = {
+            "machine": describe(),
+            "particles": RESOLUTION,
+            "first": options.first,
+            "rows": rows,
+        }
         DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 
