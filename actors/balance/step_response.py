@@ -1,7 +1,7 @@
 """The lag of a display, from its readings while a load is put on: `step_response`.
 
-The rise is compared with the step responses of the filters that balances have (`FILTERS`), for lags from 0.04 to 2 s and
-with unknown moment and duration of the placing. The result is a probability for every filter and lag: commissioning
+The rise is compared with the step responses of the filters that balances have (`FILTERS`), for lags from 0.04 to 2 s
+and with unknown moment and duration of the placing. The result is a probability for every filter and lag: commissioning
 states its mean and deviation, closed-loop dosing draws from it. The module knows no balance.
 
 Limitations: a pure delay before the display moves cannot be seen, because the moment of the placing is unknown.
