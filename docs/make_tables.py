@@ -379,7 +379,7 @@ def dosing(group: str) -> str:
     found = data["groups"][group]
     rows = []
     for name, f in found.items():
-        if name == "paired":
+        if name in ("paired", "machine", "seeds"):
             continue
         more = found["paired"].get(name)
         figures = (
@@ -394,8 +394,43 @@ def dosing(group: str) -> str:
         *("controller", "mean error g", "bias g", "95 % g", "worst g", "over +1 g", "first dose, 95 % g", "spilled g"),
         *("50 g weighed, 95 % s", "200 g, 95 % s", "mean error more than particles g"),
     )
-    how = f"{found['particles']['doses']} doses of each controller, same seeds; {data['machine']['date']}"
+    count, others = found["particles"]["doses"], found["PID"]["doses"]
+    doses = f"{count} doses of each controller"
+    if others < count:
+        doses = f"{count} doses with particles, {others} of each other controller"
+    how = f"{doses}, same seeds from {found['seeds'][0]}; {found['machine']['date']}"
     return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing.py --final --json`; {how}.</sub>\n"
+
+
+def dosing_particles() -> str:
+    """Doses of the virtual bench against a particle simulation of the same tilt."""
+    data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))["particle_simulation"]
+    head = (
+        "wanted",
+        "doses",
+        "bench g",
+        "particles g",
+        "difference g",
+        "smallest … largest g",
+        "as a shift of the onset",
+    )
+    rows = [
+        tuple(
+            text.replace("-", "−")
+            for text in (
+                name,
+                str(row["doses"]),
+                f"{row['bench']:.1f}",
+                f"{row['particles']:.1f}",
+                f"{row['difference']:+.1f} ± {row['deviation']:.1f}",
+                f"{row['smallest']:+.1f} … {row['largest']:+.1f}",
+                f"{row['onset']:+.2f}° ± {row['onset_deviation']:.2f}°",
+            )
+        )
+        for name, row in data["rows"].items()
+    ]
+    how = f"{data['particles']} particles, seeds from {data['first']}; {data['machine']['date']}"
+    return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing_particles.py --json`; {how}.</sub>\n"
 
 
 def command_line() -> str:
@@ -539,6 +574,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
     **{f"result-{name}": partial(measured, name) for name in MEASURED},
     **{name: partial(dosing, group) for name, group in DOSING.items()},
+    "dosing-particles": dosing_particles,
     "command-line": command_line,
     "output": json_output,
     "rest": rest,

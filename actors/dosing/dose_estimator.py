@@ -8,7 +8,8 @@ arm reports; `DoseEstimator.update` corrects them with a time-stamped reading:
     y = four first-order lags of the load in a row, of ρ_s·T, (1 − ρ_s)T/3, (1 − ρ_s)T/3, (1 − ρ_s)T/3
 
 - `DoseBelief` holds the values that one dose passes on to the next one. `DoseBelief.prior` makes the first one.
-- `identify_lag` estimates the lag of the balance from the step when the empty receiver is put on it.
+- `draw_lags` draws lags of the balance from the step when the empty receiver is put on it
+  (`actors.balance.step_response`).
 
 The filter of a balance is rarely documented. Its total lag T decides the error of a dose, its shape ρ_s only the
 transients: 1 is a first-order lag, 1/4 four equal poles; a moving average lies near 1/3.
@@ -19,14 +20,14 @@ are moved instead of weighted, so that a hundred of them do not collapse on a sh
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.balance.step_response import FILTERS, LAGS, step_response
 from actors.dosing.cup_flow import CupFlow
 from actors.interfaces import DoseKnowledge
 
@@ -99,7 +100,7 @@ class DoseBelief:
 
         Args:
             volume: mean and standard deviation of the source's content [m³].
-            lag: lags and their shapes (N,) each, see `identify_lag`.
+            lag: lags and their shapes (N,) each, see `draw_lags`.
             rng: draws the particles.
             onset: mean and standard deviation of the onset bias [rad]; a dry lip holds liquid back.
             flow_factor: median, and standard deviation of its logarithm.
@@ -369,16 +370,16 @@ class DoseEstimator:
         )
 
 
-def identify_lag(
-    readings: Sequence[DoseReading], count: int, rng: np.random.Generator, *, step: float = 1e-4
+def draw_lags(
+    placed: Sequence[DoseReading], count: int, rng: np.random.Generator, *, step: float = 1e-4
 ) -> tuple[Floats, Floats]:
-    """Lags and shapes that explain the rise of a balance when the receiver was put on it.
+    """Draw lags and shapes that explain the rise of a balance when the receiver was put on it.
 
     The moment of the placing is unknown, so a pure delay cannot be seen in the rise: `TRANSPORT_DELAY` is added.
 
     Args:
-        readings: from before the step until it has settled; without a step of at least 20 display steps the prior is
-            returned: 0.33 s, times or divided by 1.65.
+        placed: readings from before the step until it has settled; if they do not follow one step, the prior is drawn:
+            0.33 s, times or divided by 1.65.
         count: number of particles.
         rng: draws them.
         step: of the display [kg].
@@ -387,61 +388,19 @@ def identify_lag(
         Total lags [s] and shapes, (count,) each.
     """
     delay = np.clip(TRANSPORT_DELAY[0] + TRANSPORT_DELAY[1] * _even_normal(count, rng), 0.0, None)
-    masses = np.array([one.mass for one in readings])
-    times = np.array([one.time for one in readings])
-    height = float(masses[-1] - masses[0]) if len(masses) > 3 else 0.0
-    if height < 20.0 * step:
+    try:
+        found = step_response([one.time for one in placed], [one.mass for one in placed], resolution=step)
+    except ValueError:
         lag = np.exp(math.log(0.33) + math.log(1.65) * _even_normal(count, rng))
         return np.clip(lag + delay, *LAG_RANGE), rng.permutation(np.linspace(0.25, 1.0, count))
-    risen = (masses - masses[0]) / height
-    first = float(times[np.argmax(risen > 0.01)])
-    rise = (times > first - 0.3) & (np.cumsum(risen > 0.997) < 4)
-    times, risen = times[rise], risen[rise]
-    sigma = math.hypot(0.006, step / height)
-    moments = first - np.arange(0.0, 1.5, 0.03)
-    fits = []
-    for (_, response), lag in itertools.product(FILTERS.values(), _LAGS):
-        for duration in (0.02, 0.12, 0.25):
-            place = (times[None, :] - moments[:, None]) / lag
-            smooth = np.mean([response(place - part * duration / lag) for part in (0.1, 0.3, 0.5, 0.7, 0.9)], axis=0)
-            fits.append(-0.5 * np.sum(((smooth - risen) / sigma) ** 2, axis=1))
-    grid = np.array(fits).reshape(len(FILTERS), len(_LAGS), -1)
-    evidence = np.exp(grid - grid.max()).sum(axis=2)
-    drawn = rng.choice(evidence.size, size=count, p=evidence.ravel() / evidence.sum())
+    drawn = rng.choice(found.probability.size, size=count, p=found.probability.ravel())
     shapes = np.array([shape for shape, _ in FILTERS.values()])
     jitter = 1.0 + 0.05 * _even_normal(count, rng)
     return (
-        np.clip(_LAGS[drawn % len(_LAGS)] * jitter + delay, *LAG_RANGE),
-        np.clip(shapes[drawn // len(_LAGS)] + 0.03 * _even_normal(count, rng), *SHAPE_RANGE),
+        np.clip(LAGS[drawn % len(LAGS)] * jitter + delay, *LAG_RANGE),
+        np.clip(shapes[drawn // len(LAGS)] + 0.03 * _even_normal(count, rng), *SHAPE_RANGE),
     )
 
-
-def _poles(roots: Sequence[complex]) -> Callable[[Floats], Floats]:
-    """Step response over time / lag of a low-pass filter with these poles, scaled to a lag of 1."""
-    scaled = np.array(roots) * float(np.real(np.sum(-1.0 / np.array(roots))))
-    weights = [1.0 / np.prod([1.0 - root / other for other in scaled if other != root]) for root in scaled]
-
-    def response(time: Floats) -> Floats:
-        t = np.maximum(time, 0.0)
-        rest = np.sum([w * np.exp(root * t) for w, root in zip(weights, scaled, strict=True)], axis=0)
-        return np.where(time > 0.0, 1.0 - np.real(rest), 0.0)
-
-    return response
-
-
-_BUTTERWORTH = [
-    complex(-math.sin(a), math.cos(a)) for a in (math.pi / 8, 3 * math.pi / 8, 5 * math.pi / 8, 7 * math.pi / 8)
-]
-_LAGS = np.geomspace(0.04, 2.0, 45)
-
-FILTERS: dict[str, tuple[float, Callable[[Floats], Floats]]] = {
-    "first order": (1.0, _poles([-1.0])),
-    "second order": (0.5, _poles([-1.0, -1.1])),
-    "four equal poles": (0.25, _poles([-1.0, -1.1, -1.2, -1.3])),
-    "Butterworth, fourth order": (0.25, _poles(_BUTTERWORTH)),
-    "moving average": (0.33, lambda time: np.clip(0.5 * time, 0.0, 1.0)),
-}
-"""Filters of balances: the nearest ρ_s, and the step response over time / lag."""
 
 _QUANTILES: dict[int, Floats] = {}
 

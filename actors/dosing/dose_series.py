@@ -20,7 +20,7 @@ import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DoseResult, fine_flow
-from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, identify_lag
+from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget, InvalidActionError
 from sim_engine.scene import Scene
@@ -116,7 +116,7 @@ class DoseSeries:
     ) -> None:
         self._cup, self._settings, self._rng = cup, settings, rng
         self._step, self._fall_time = step, fall_time
-        lag = identify_lag(placed, particles, rng, step=step)
+        lag = draw_lags(placed, particles, rng, step=step)
         volumes = self._volumes(content)
         self.belief = (
             DoseBelief.prior(volumes, lag, rng) if knowledge is None else DoseBelief.known(knowledge, volumes, lag, rng)

@@ -241,6 +241,11 @@ class VirtualDosingBench:
         fall_height: from the lip to the bottom of the receiver [m].
         dose_seed: of all that differs between doses; None: of the whole series, as `seed`.
         wetness: of the lip at first, 0 … 1.
+
+    Attributes:
+        volume: in the source [m³].
+        grip: tilt of the arm at which the cup is upright [rad].
+        discharge: coefficient at a small head.
     """
 
     def __init__(
@@ -265,7 +270,7 @@ class VirtualDosingBench:
         self.volume = liquid.volume
         # constants of this bench, drawn once
         wets = 0.5 if liquid.is_thick else 1.0
-        self._grip = math.radians(float(rng.normal(0.0, 0.4)))
+        self.grip = math.radians(float(rng.normal(0.0, 0.4)))
         self._dry_hold = 1e-3 * wets * float(rng.uniform(0.8, 2.0))
         self._wet_hold = 1e-3 * wets * float(rng.uniform(0.1, 0.5))
         self.discharge = float(rng.normal(0.60, 0.04))
@@ -278,7 +283,7 @@ class VirtualDosingBench:
     def head(self, tilt: float, slosh: float) -> float:
         """Level above the lip at a tilt [rad] with slosh [m], less what the lip holds back [m]."""
         hold = self._dry_hold + (self._wet_hold - self._dry_hold) * self._wetness
-        return self._level(tilt - self._grip, self.volume) + slosh - hold
+        return self._level(tilt - self.grip, self.volume) + slosh - hold
 
     def ideal_flow(self, tilt: float, head: float) -> float:
         """Flow without losses at a tilt [rad] and a positive head [m] [m³/s]."""

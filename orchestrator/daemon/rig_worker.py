@@ -255,6 +255,7 @@ class Running:
             "simulators_busy": progress.busy,
             "line": progress.counts_line(),
             "pour": progress.pour_line(),
+            "dose": progress.dose_line(),
             "checkpoint": self.checkpoint,
             "checkpoint_words": CHECKPOINT_WORDS.get(self.checkpoint, ""),
             "fraction": pour.progress.fraction if pour is not None and pour.progress is not None else None,

@@ -105,6 +105,9 @@ class ProgressOut(_Out):
     simulators_busy: int
     line: str
     pour: str | None
+    dose: str | None
+    """Estimated amount, target and flow while a wanted amount is poured."""
+
     checkpoint: str
     checkpoint_words: str
     fraction: float | None

@@ -225,10 +225,8 @@ class ProgressDisplay:
         note = [f"{100 * fraction:3.0f} %", f"{max(time.time() - pour.started_at, 0.0):.1f} s"]
         if progress is not None and progress.tilt is not None:
             note.append(f"tilt {math.degrees(progress.tilt):.0f} deg")
-        if progress is not None and progress.dose is not None:
-            dose = progress.dose
-            note.append(f"{1e3 * dose.amount:.1f} ± {2e3 * dose.deviation:.1f} g of {1e3 * dose.target:g} g")
-            note.append(f"{1e3 * dose.flow:.1f} g/s")
+        if (dose := self._progress_state.dose_line()) is not None:
+            note.append(dose)
         elif progress is not None and progress.balance is not None:
             note.append(f"balance {progress.balance * 1e3:.1f} g")
         table = Table.grid(padding=(0, 2))

@@ -268,3 +268,12 @@ class ProgressState:
         if pour.result:
             line += f"  measured {pour.result}"
         return line
+
+    def dose_line(self) -> str | None:
+        """'31.2 ± 0.4 g of 50 g   5.1 g/s' while a wanted amount is poured; None otherwise."""
+        progress = None if self.pour is None else self.pour.progress
+        if progress is None or progress.dose is None:
+            return None
+        dose = progress.dose
+        amounts = f"{1e3 * dose.amount:.1f} ± {2e3 * dose.deviation:.1f} g of {1e3 * dose.target:g} g"
+        return f"{amounts}   {1e3 * dose.flow:.1f} g/s"

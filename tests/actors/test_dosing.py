@@ -9,7 +9,7 @@ import pytest
 
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder
-from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, identify_lag
+from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
@@ -25,7 +25,7 @@ SPOUTED = TrueCup(0.040, 0.100, 0.007, 0.014)
 
 
 def no_lag_known(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    return identify_lag([], count, np.random.default_rng(seed))
+    return draw_lags([], count, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("tilt", [30.0, 55.0, 75.0])
@@ -85,7 +85,7 @@ def test_readings_correct_a_wrong_onset_and_flow() -> None:
 def test_the_step_of_the_receiver_shows_the_lag(kind: str, lag: float) -> None:
     scale = TrueScale(kind, lag, delay=0.06)  # type: ignore[arg-type]
     readings = VirtualDosingBench(SPOUTED, WATER, scale, 2).place_receiver()
-    lags, _ = identify_lag(readings, 100, np.random.default_rng(0))
+    lags, _ = draw_lags(readings, 100, np.random.default_rng(0))
     assert float(np.median(lags)) == pytest.approx(lag + 0.06, rel=0.15)
 
 
@@ -101,7 +101,7 @@ def one_dose(
     liquid = Liquid(mass=mass)
     bench = VirtualDosingBench(SPOUTED, liquid, scale or TrueScale(lag=0.3), seed)
     rng = np.random.default_rng(seed)
-    lag = identify_lag(bench.place_receiver(), 80, rng)
+    lag = draw_lags(bench.place_receiver(), 80, rng)
     volume = (believed or mass) / liquid.density
     controller = DoseController(
         CUP,

@@ -94,3 +94,25 @@ def seen(kept: Path, enough: Callable[[Contents], bool]) -> Contents:
             if enough(contents):
                 return contents
     raise AssertionError(f"not enough came to the viewer within {PATIENCE:g} s")
+
+
+def views(path: Path) -> dict[str, list[str]]:
+    """What the views of the last arrangement in an .rrd show: entities by the view's name, '/**' for all below one."""
+    from rerun.chunk import RrdReader
+
+    reader, found = RrdReader(str(path)), {}
+    store = reader.blueprints()[-1]
+    kept: dict[str, dict[str, list[object]]] = {}
+    for chunk in reader.stream(store=store):
+        table = chunk.to_record_batch()
+        for name, column in zip(table.schema.names, table.columns, strict=True):
+            for row in column.to_pylist():
+                if row:
+                    kept.setdefault(str(chunk.entity_path), {})[name.rpartition(":")[2]] = row
+    for entity, rows in kept.items():
+        if "space_origin" in rows:
+            origin = str(rows["space_origin"][0])
+            queries = kept.get(f"{entity}/ViewContents", {}).get("query", ["$origin/**"])
+            name = str((rows.get("display_name") or [entity])[0])
+            found[name] = [str(q).lstrip("+ ").replace("$origin", origin) for q in queries]
+    return found

@@ -101,6 +101,7 @@ export function rigCard(rig, campaign, acts) {
         el("p", {}, progress.stage ? `${progress.stage} (stage ${progress.stage_index} of ${progress.stage_count})` : "",
           progress.seconds_left ? `, about ${lasting(progress.seconds_left)} left` : ""),
         progress.pour ? el("p", { class: "pour" }, progress.pour) : null,
+        progress.dose ? el("p", { class: "pour" }, progress.dose) : null,
         progress.checkpoint ? el("p", { class: "step" }, progress.checkpoint_words || progress.checkpoint) : null,
         bar("pours", progress.pours, progress.of_pours), bar("simulations", progress.simulations, progress.of_simulations),
         el("p", { class: "quiet" }, progress.line),

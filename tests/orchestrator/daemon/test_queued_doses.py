@@ -1,0 +1,83 @@
+"""A series of wanted amounts as a queued campaign: live state, pours, and report."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing.simulated_dose import simulated_dose
+from actors.interfaces import DoseProgress, PourProgress, ProgressCallback
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
+from tests.support.small_campaign import write_campaign
+from tests.support.toy_campaign import ToyOptimizer, ToySimulators
+from tests.support.toy_daemon import HeldBench, HeldLaboratory, run, serving
+
+SERIES = """\
+name: series
+seed: 3
+laboratory: {name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}
+liquid: {name: water, mass: 100 g}
+pourer: beaker.yaml
+receiver: narrow.yaml
+motion: {x_offset: 70 mm, height: 60 mm}
+dispense:
+  doses: [{amount: 20 g, position: A1}, {amount: 25 g, position: A2}]
+on_unknown: repeat
+outputs: {recording: false, figures: false}
+"""
+
+
+class DosingBench(HeldBench):
+    """Reports how far a dose has come, waits for the test, and pours it on the virtual dosing bench."""
+
+    async def pour(
+        self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
+    ) -> PourMeasurement:
+        assert progress is not None
+        estimate = DoseProgress("pour", dose.amount, 0.6 * dose.amount, 0.2e-3, 5.1e-3, 0.5 * dose.amount)
+        progress(PourProgress("dose", 0.5, dose=estimate))
+        self.begun.set()
+        await self.go.wait()
+        return await asyncio.to_thread(simulated_dose, scene, dose, seed, DosingSettings())
+
+
+def held_dose() -> HeldLaboratory:
+    laboratory = HeldLaboratory(ToySimulators(), DosingBench(), ToyOptimizer())
+    laboratory.bench.go.clear()
+    return laboratory
+
+
+def test_a_queued_series_shows_its_doses_while_it_runs_and_reports_them(tmp_path: Path) -> None:
+    write_campaign(tmp_path, SERIES)
+
+    async def work() -> None:
+        async with serving(tmp_path, held_dose) as served:
+            key = await served.submit()
+            laboratory = await served.pouring()
+            live = await served.get(f"/campaigns/{key}")
+            assert live["progress"]["pour"].startswith("pour 1/2 into narrow")
+            assert "20 g wanted" in live["progress"]["pour"]
+            assert live["progress"]["dose"] == "12.0 ± 0.4 g of 20 g   5.1 g/s"
+            assert [(pour["state"], pour["action"]) for pour in live["pours_made"]] == [("under way", "20 g wanted")]
+            laboratory.bench.go.set()
+            found = await served.until(key, "finished", "failed")
+            assert found["state"] == "finished"
+            pours = found["pours_made"]
+            assert [pour["action"] for pour in pours] == ["20 g wanted", "25 g wanted"]
+            received = [float(pour["measured"].removesuffix(" g")) for pour in pours]
+            assert received == pytest.approx([20.0, 25.0], abs=2.0)
+            answer = await served.http.get(f"/api/v1/campaigns/{key}/report", headers=served.headers())
+            assert answer.status_code == 200
+            page = re.sub(r"<td[^>]*>", "<td>", answer.text)
+            assert "2 wanted amounts" in page
+            assert "A1" in page
+            for amount in received:
+                assert f"<td>{amount:.1f}" in page
+
+    run(work())

@@ -1,0 +1,132 @@
+"""The recording of a dose has what the viewer's tab "Dosing" shows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from actors.dosing.cup_flow import CupFlow
+from actors.dosing.dose_controller import DoseController, DoseOrder, TiltCommand
+from actors.dosing.dose_estimator import DoseReading
+from actors.dosing.dose_series import DoseSeries, SourceContent
+from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
+from actors.interfaces import DoseProgress, PourProgress
+from orchestrator.config.file_loading import load_campaign
+from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.requests import Pour, Poured, Slots
+from orchestrator.runs.events import (
+    CampaignClosed,
+    CampaignOpened,
+    Event,
+    PourProgressed,
+    RequestFinished,
+    RequestStarted,
+    StageOpened,
+)
+from orchestrator.strategies.dispense import Dispense
+from sim_engine.outcome import PourMeasurement
+from sim_engine.vessel.vessel import build_vessel
+from tests.support.rerun_recordings import Contents, views
+from tests.support.small_campaign import write_campaign
+from tests.support.waiting import PATIENCE
+
+AMOUNT = 0.025
+
+SERIES = """\
+name: series
+seed: 3
+laboratory: {name: small, bench: {liquid: {particles: 400}, time_scale: 0}}
+liquid: {name: water, mass: 100 g}
+pourer: beaker.yaml
+receiver: narrow.yaml
+motion: {x_offset: 70 mm, height: 60 mm}
+dispense:
+  doses: [{amount: 25 g, position: A1}]
+on_unknown: repeat
+outputs: {directory: runs}
+"""
+
+
+def dose_events(folder: Path) -> tuple[Any, list[Event], list[tuple[float, DoseProgress]]]:
+    """A campaign of one dose on the virtual dosing bench: its plan, its events, and the dose's progress."""
+    plan = load_campaign(write_campaign(folder, SERIES))
+    assert plan.dispense is not None
+    scene = plan.dispense.scenes[0]
+    bench = VirtualDosingBench(TrueCup(0.03, 0.07), scene.liquid, TrueScale(lag=0.3), 1)
+    cup, rng = CupFlow(build_vessel(scene.pourer), scene.liquid), np.random.default_rng(1)
+    series = DoseSeries(cup, DosingSettings(), SourceContent(0.1), bench.place_receiver(), rng)
+    controller: DoseController = series.controller(DoseOrder(AMOUNT, receiver_mass=bench.receiver_mass), seed=1)
+    seen: list[tuple[float, DoseProgress]] = []
+    tilts: list[float] = []
+
+    class Watched:
+        def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+            command = controller.step(time, tilt, readings)
+            reading = readings[-1].mass - bench.receiver_mass if readings else None
+            amount, deviation = controller.amount
+            seen.append((time, DoseProgress(controller.phase, AMOUNT, amount, deviation, controller.flow, reading)))
+            tilts.append(tilt)
+            return command
+
+    record = bench.dose(Watched())
+    assert controller.result is not None
+    (pour,) = Dispense(plan.dispense, plan.seed).ask(Slots(0))
+    assert isinstance(pour, Pour)
+    begin = 1.7e9
+    notes = {"dose": {"wanted": AMOUNT, "received": controller.result.amount, "end": "reached", "left": [0.075, 1e-3]}}
+    poured = Poured(PourMeasurement(0.1, record.spilled, 0.1 - record.spilled - record.received, notes))
+    events: list[Event] = [
+        CampaignOpened(
+            name=plan.name, run_directory=folder, stages=("doses",), mode="virtual", simulators=1, time=begin
+        ),
+        StageOpened(stage="doses", index=1, count=1, time=begin),
+        RequestStarted(stage="doses", id=1, request=pour, time=begin),
+        *(
+            PourProgressed(
+                stage="doses",
+                id=1,
+                number=1,
+                progress=PourProgress("dose", 0.5, tilt=tilt, balance=dose.reading, dose=dose),
+                time=begin + at,
+            )
+            for (at, dose), tilt in zip(seen, tilts, strict=True)
+        ),
+        RequestFinished(stage="doses", id=1, request=pour, outcome=poured, time=begin + record.duration + 1.0),
+        CampaignClosed(state="finished", results={}, time=begin + record.duration + 2.0),
+    ]
+    return plan, events, seen
+
+
+def test_the_tab_dosing_shows_entities_that_the_recording_of_a_dose_has(tmp_path: Path) -> None:
+    plan, events, seen = dose_events(tmp_path)
+    path = tmp_path / "dose.rrd"
+    monitor = RerunMonitor(path, plan)
+    for event in events:
+        monitor(event)
+    assert monitor.close(timeout=PATIENCE)
+    assert (monitor.failed, monitor.dropped) == (0, 0)
+    recorded = Contents(path)
+
+    def numbers(what: str) -> list[float]:
+        return [float(v[0]) for v in recorded.values(f"/balance/dose/{what}", "Scalars:scalars")]  # type: ignore[index]
+
+    assert set(numbers("target")) == {25.0}
+    assert sorted(numbers("estimated")) == pytest.approx(sorted(1e3 * dose.amount for _, dose in seen))
+    assert len(numbers("reading")) == sum(dose.reading is not None for _, dose in seen)
+    assert max(numbers("tilt")) > 30.0
+    (stop,) = numbers("stop")
+    assert stop == pytest.approx(next(1e3 * dose.amount for _, dose in seen if dose.phase == "return"))
+    assert math.isclose(stop, 25.0, abs_tol=4.0)
+
+    shown = views(path)
+    assert {"Dose: wanted, balance and estimate [g]", "Tilt [deg]", "Status", "Events and decisions"} <= set(shown)
+    for name, entities in shown.items():
+        for entity in entities:
+            there = [one for one in recorded.columns if f"{one}/".startswith(f"{entity.removesuffix('/**')}/")]
+            assert there if entity.endswith("/**") else entity in there, f"'{name}' shows {entity}, not recorded"
