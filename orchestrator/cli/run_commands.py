@@ -442,7 +442,7 @@ def _print_pours(pours: Sequence[Row], *, of_one_run: bool = False) -> None:
         mean = sum(pour["spillage"] for pour in weighed) / len(weighed)
         least = min(weighed, key=lambda pour: float(pour["spillage"]))
         print(
-            f"{len(pours)} pours, {len(weighed)} weighed: {_percent(mean)} spilled in the mean, at least "
+            f"{len(pours)} pour{'s' * (len(pours) != 1)}, {len(weighed)} weighed: {_percent(mean)} spilled in the mean, at least "
             f"{_percent(least['spillage'])} (pour {least['number']} of {least['stage']}, {least['run']})"
         )
 
