@@ -1,8 +1,8 @@
 """Picture of the live view for `docs/laboratory/live-view.md`, by a headless browser.
 
-It runs the deployment of the quickstart with `--live` in a folder of its own, and takes a screenshot while it pours. The
-simulator has the parameters of the bench instead of calibrated ones, and all six pours are made: the shipped campaign ends
-after the first good pour, often before a software rasteriser has drawn anything.
+It runs the deployment of the quickstart with `--live` in a folder of its own, and takes a screenshot while it pours.
+The simulator has the parameters of the bench instead of calibrated ones, and all six pours are made: the shipped
+campaign ends after the first good pour, often before a software rasteriser has drawn anything.
 Needs Playwright and a Chromium (`--chromium`), no display; some three minutes on two cores.
 """
 
@@ -63,7 +63,7 @@ def during_a_run(chromium: str, to: Path) -> None:
 
 
 def deployment_only(text: str) -> str:
-    """Take calibration and early ends out of the quickstart, and insert the friction and the place that its bench has."""
+    """Remove calibration and early ends from the quickstart, and insert the friction and the place of its bench."""
     text = re.sub(r"(?ms)^calibration:\n.*?(?=^deployment:)", "", text)
     text = re.sub(r"(?m)^  (stop|good_enough):.*\n", "", text)
     return re.sub(r"(friction|receiver_x): \[.*?\]", lambda found: f"{found[1]}: {BENCH[found[1]]}", text)

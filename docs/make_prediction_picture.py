@@ -1,4 +1,4 @@
-"""Draws docs/images/recorded-predictions.png: predicted against recorded spillage with 90 % intervals, all seeds together.
+"""Draws docs/images/recorded-predictions.png: predicted against recorded spillage with 90 % intervals.
 
 Run from the project's root: python docs/make_prediction_picture.py
 Its data are those of benchmarks/recorded_predictions.py --write, docs/data/recorded-predictions.json.

@@ -366,7 +366,11 @@ def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -
             action = losses[min(known)].request.action.values()
             best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
             unit = deployment_unit(plan.deployment)
-            of = f"The smallest loss of {len(known)} pours so far" if len(known) > 1 else "The loss of the only pour so far"
+            of = (
+                f"The smallest loss of {len(known)} pours so far"
+                if len(known) > 1
+                else "The loss of the only pour so far"
+            )
             said.append(f"{of} is {unit.text(min(known))}, with {best}.")
         return said
     if calibrated:
