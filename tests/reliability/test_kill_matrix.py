@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,7 +24,7 @@ from tests.reliability.case import (
     first_in_stages,
     first_of_kind,
 )
-from tests.reliability.page import RIGS, rig_of
+from tests.reliability.page import RIGS, found
 from tests.reliability.program import ProgramRig
 
 ROOT = Path(__file__).parents[2]
@@ -115,17 +114,23 @@ socket.create_connection(listening.getsockname()).close()
 """
 
 
-@pytest.fixture(params=[target for target in TARGETS if target != "program"])
-def other(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[ProgramRig]:
-    found = rig_of(request.param, tmp_path)
-    yield found  # type: ignore[misc]
-    found.close()
-
-
 @pytest.mark.slow
 @pytest.mark.ray
 @pytest.mark.realtime
-def test_a_sample_of_what_else_is_struck(other: ProgramRig) -> None:
-    cases = other.cases()
-    found = [other.play(case) for case in cases[:: max(len(cases) // 4, 1)]]
-    assert [one for one in found if one.wrong] == []
+@pytest.mark.parametrize("target", [target for target in TARGETS if target != "program"])
+def test_a_sample_of_what_else_is_struck(target: str, tmp_path: Path) -> None:
+    """In a process of its own: its lives are forked from it, and Ray does not start in a fork of what has used it."""
+    results = tmp_path / "results.jsonl"
+    command = [sys.executable, "-m", "tests.reliability.page", "--results", str(results), "--limit", "4"]
+    ended = subprocess.run(
+        [*command, "--share", target, "0", "1"],
+        check=False,
+        cwd=ROOT,
+        env=child_environment(),
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 0, ended.stderr[-4000:]
+    rows = found(results).values()
+    assert len(rows) == 4
+    assert [(row["case"], row["wrong"]) for row in rows if row["wrong"]] == []
