@@ -27,7 +27,7 @@ from actors.runtime.child_process import child_environment
 
 FOLDER = Path(__file__).parent / "images" / "daemon"
 SIZES = {"tablet": (1024, 768), "desk": (1440, 1080)}
-PATIENCE = 300.0
+PATIENCE = 900.0
 
 VESSEL = """\
 name: {name}
@@ -200,12 +200,12 @@ def draw(browser: Browser, lab: Lab) -> None:
         lab.submit(name)
     pours = 0
 
-    def fifth(question: dict[str, Any]) -> bool:
+    def third(question: dict[str, Any]) -> bool:
         nonlocal pours
         pours += question["about"] == "pourer_full"
-        return pours == 5
+        return pours == 3
 
-    lab.answer_until(fifth)
+    lab.answer_until(third)
     picture(browser, lab, "question-tablet", "tablet")
     lab.answer_until(lambda question: question["wants"] == "yes or no")
     with seen(browser, lab, "desk") as page:

@@ -1,4 +1,4 @@
-"""Draws docs/images/recorded-predictions.png: predicted against recorded spillage with 90 % intervals, over all seeds.
+"""Draws docs/images/recorded-predictions.png: predicted against recorded spillage with 90 % intervals.
 
 Run from the project's root: python docs/make_prediction_picture.py
 Its data are those of benchmarks/recorded_predictions.py --write, docs/data/recorded-predictions.json.
@@ -31,13 +31,16 @@ def main() -> None:
             held = pour["low"] <= pour["recorded"] <= pour["high"]
             color = style.POURER if held else style.SPILLED
             one.plot([x, x], [100 * pour["low"], 100 * pour["high"]], color=color, linewidth=1.0, alpha=0.5)
-            one.plot(x, y, "o", color=color, markersize=3.5)
+            one.plot(x, y, "o", color=color, markersize=3.5, clip_on=False)
         held = sum(pour["low"] <= pour["recorded"] <= pour["high"] for pour in pours)
-        one.set_title(f"{title}: {held} of {len(pours)} pours in their 90 % intervals", fontsize=10)
-        one.set_xlabel("recorded: spilled / poured [%]")
+        style.dress(
+            one,
+            title=f"{title}: {held} of {len(pours)} pours in 90 % intervals",
+            x="recorded: spilled / poured [%]",
+            y="predicted [%]",
+        )
         one.set_xlim(0, top)
         one.set_ylim(0, top)
-    axes[0].set_ylabel("predicted [%]")
     style.save(figure, PICTURE)
 
 

@@ -1,4 +1,4 @@
-"""Compose docs/images/quickstart.png from a quickstart run: a pour, all pours with predictions, the expected loss.
+"""Compose docs/images/quickstart.png from a quickstart run: a pour, the error of calibration, the expected loss.
 
 decant run configs/campaigns/quickstart.yaml
 python docs/make_quickstart_picture.py runs/quickstart-…   # its recommended action is simulated with its θ
@@ -28,7 +28,7 @@ WIDTH, HEIGHTS = 1600, (640, 480)
 """Width of the picture and heights of its two rows [pixels]."""
 
 SHARE = 0.4
-"""Share of the width that the pours have."""
+"""Share of the width that the error of calibration has."""
 
 DPI, TEXT = 100, 13.0
 """Resolution, and the one size of all text [pt]."""
@@ -46,11 +46,12 @@ def main(run: Path) -> None:
     found = decant.simulate(plan, action, theta=load_parameters(run / "theta.json", plan.parameters), seed=0)
     pour = drawn(simulation_figure(found.task, found.pours[0]), WIDTH, HEIGHTS[0])
     left = round(SHARE * WIDTH)
-    pours = drawn(figures["spillage against pours"], left, HEIGHTS[1])
+    figures["test discrepancy"].axes[0].set_ylabel("mean error of spillage [%]")  # its own label is too long here
+    calibration = drawn(figures["test discrepancy"], left, HEIGHTS[1])
     (expected,) = (figure for name, figure in figures.items() if name.startswith("loss map"))
     canvas = Image.new("RGB", (WIDTH, sum(HEIGHTS)), "white")
     canvas.paste(pour, (0, 0))
-    canvas.paste(pours, (0, HEIGHTS[0]))
+    canvas.paste(calibration, (0, HEIGHTS[0]))
     canvas.paste(drawn(expected, WIDTH - left, HEIGHTS[1]), (left, HEIGHTS[0]))
     canvas.save(ROOT / "docs/images/quickstart.png", optimize=True)
 

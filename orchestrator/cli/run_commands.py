@@ -441,9 +441,10 @@ def _print_pours(pours: Sequence[Row], *, of_one_run: bool = False) -> None:
     if weighed:
         mean = sum(pour["spillage"] for pour in weighed) / len(weighed)
         least = min(weighed, key=lambda pour: float(pour["spillage"]))
+        made = f"{len(pours)} pour{'s' * (len(pours) != 1)}, {len(weighed)} weighed"
         print(
-            f"{len(pours)} pours, {len(weighed)} weighed: {_percent(mean)} spilled in the mean, at least "
-            f"{_percent(least['spillage'])} (pour {least['number']} of {least['stage']}, {least['run']})"
+            f"{made}: {_percent(mean)} spilled in the mean, at least {_percent(least['spillage'])} "
+            f"(pour {least['number']} of {least['stage']}, {least['run']})"
         )
 
 

@@ -223,6 +223,8 @@ def _simulated_pour(simulator: PourSimulator, tasks: list[PourTask]) -> list[Sim
     runs: list[SimulatedPour] = []
 
     def doing() -> str:
+        if len(runs) == len(tasks):
+            return "stopping the simulator …"
         note = "" if runs else "; the first pour ever also compiles kernels, about 8 s"
         return f"simulating seed {len(runs) + 1} of {len(tasks)}, {time.monotonic() - begin:.0f} s so far{note}"
 

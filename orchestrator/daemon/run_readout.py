@@ -98,9 +98,10 @@ def found_at(spec: LaboratorySettings) -> dict[str, str]:
     except (LaboratoryError, OSError, ValueError) as error:
         return {"bench": f"can't be read: {error}"}
     for check in checks:
-        found[check.name] = check.found
+        if check.name != "balance tare":  # a question must not change what the balance shows
+            found[check.name] = check.found
     if spec.mode == "virtual":
-        found["note"] = "arm and balance are virtual and were started anew: they show nothing of the pour"
+        found["note"] = "arm and balance are virtual and were restarted: they show nothing of the pour"
     return found
 
 

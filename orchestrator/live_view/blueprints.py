@@ -55,7 +55,7 @@ def campaign_blueprint(
         dosing = rrb.Horizontal(
             _cell(),
             rrb.Vertical(*_dose(), row_shares=[5, 3]),
-            rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
+            rrb.Vertical(_status(), _log(), _activity(), row_shares=[5, 3, 3]),
             column_shares=[5, 7, 4],
             name="Dosing",
         )
@@ -90,14 +90,14 @@ def campaign_blueprint(
             rrb.Horizontal(calibrated(), _shares(), column_shares=[3, 4]),
             row_shares=[5, 4, 4],
         ),
-        rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
+        rrb.Vertical(_status(), _log(), _activity(), row_shares=[5, 3, 3]),
         column_shares=[5, 7, 4],
         name="Calibrating",
     )
     deploying = rrb.Horizontal(
         rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
         rrb.Vertical(rrb.Tabs(*maps()), rrb.Tabs(*losses()), rrb.Tabs(_weight(), _display()), row_shares=[5, 4, 4]),
-        rrb.Vertical(_status(), _log(), _lanes(), row_shares=[5, 3, 3]),
+        rrb.Vertical(_status(), _log(), _activity(), row_shares=[5, 3, 3]),
         column_shares=[5, 7, 4],
         name="Deploying",
     )
@@ -268,10 +268,10 @@ def _picture(entity: str, name: str) -> Any:
     return rrb.Spatial2DView(origin=entity, name=name)
 
 
-def _lanes() -> Any:
+def _activity() -> Any:
     import rerun.blueprint as rrb
 
-    return rrb.Tabs(rrb.StateTimelineView(origin="/machine/lanes", name="Activity"), _machine())
+    return rrb.Tabs(rrb.StateTimelineView(origin="/machine/activity", name="Activity"), _machine())
 
 
 def _machine() -> Any:

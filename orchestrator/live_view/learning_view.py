@@ -126,7 +126,7 @@ class LearningStage:
             mean = unit.factor * at_least_nothing(request.predicted.mean)
             self._number(f"{place}/predicted", mean, f"predicted [{unit.unit}]", style.PREDICTED)
             for name, end in zip(("low", "high"), request.predicted.of_a_pour(), strict=True):
-                label = f"{100 * LEVEL:.0f} % band, {'upper' if name == 'high' else 'lower'} end [{unit.unit}]"
+                label = f"{100 * LEVEL:.0f} % interval, {'upper' if name == 'high' else 'lower'} end [{unit.unit}]"
                 self._number(f"{place}/predicted_{name}", unit.factor * end, label, "#f0c27a", width=1.5)
         if not calibrating:
             self._least[request.scene] = least = min(shown, self._least.get(request.scene, shown))
@@ -150,7 +150,7 @@ class LearningStage:
         known = f"{len(query.data)} observations"
         if simulations := len(simulated_points(query)):
             known = f"{len(query.data)} pours and {simulations} simulations"
-        title = f"{subject}: what is known after {known}"
+        title = f"{subject}: estimates after {known}"
         self._picture(
             f"{PLACE}/{where}/surrogate",
             event.time,
@@ -282,7 +282,7 @@ def surrogate_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossU
         style.frame(panel, up, "y")
         panel.tick_params(labelsize=13, labelleft=panel is axes[0])
     axes[0].set_ylabel(style.label(up.name), fontsize=14)
-    axes[1].set_xlabel(f"{style.label(across.name)}      {_key(query, suggestion)}", fontsize=14)
+    figure.text(0.955, 0.98, _key(query, suggestion), fontsize=14, color=style.INK, ha="right", va="top")
     return figure
 
 

@@ -69,7 +69,7 @@ class MachineView:
             ("load/queue", "simulations waiting", style.PREDICTED),
             ("seconds", "one simulation [s]", style.GOOD),
             ("wait", "arm waited before the pour [s]", style.BEST),
-            ("dropped", "events that watchers missed", style.ESCAPED),
+            ("dropped", "events that subscribers missed", style.ESCAPED),
         ):
             points = name in ("seconds", "wait")
             appearance = (
@@ -83,7 +83,7 @@ class MachineView:
         """Initialise the rows for a pool of simulators, the optimiser, and an arm if there is one; all are idle."""
         self._simulators = max(simulators, 1)
         for name in (*(["arm"] if arm else []), "optimiser", *(f"simulator {n + 1}" for n in range(self._simulators))):
-            self.lane(name, None)
+            self.activity(name, None)
         self._load()
 
     def simulation_started(self, key: int, purpose: str) -> None:
@@ -91,14 +91,14 @@ class MachineView:
         taken = set(self._slots.values())
         self._slots[key] = slot = next(i for i in range(len(taken) + 1) if i not in taken)
         if slot < self._simulators:
-            self.lane(f"simulator {slot + 1}", purpose)
+            self.activity(f"simulator {slot + 1}", purpose)
         self._load()
 
     def simulation_finished(self, key: int, seconds: float) -> None:
         """Log that a simulation has finished or failed."""
         slot = self._slots.pop(key, None)
         if slot is not None and slot < self._simulators:
-            self.lane(f"simulator {slot + 1}", None)
+            self.activity(f"simulator {slot + 1}", None)
         if seconds > 0.0:
             self._number("seconds", seconds)
         self._load()
@@ -111,11 +111,11 @@ class MachineView:
     def pour_finished(self, now: float) -> None:
         """Log that a pour has ended."""
         self._poured = now
-        self.lane("arm", None)
+        self.activity("arm", None)
 
-    def lane(self, name: str, doing: str | None) -> None:
+    def activity(self, name: str, doing: str | None) -> None:
         """Log the start of an activity, or its end (None)."""
-        entity = f"{PLACE}/lanes/{safe_name(name)}"
+        entity = f"{PLACE}/activity/{safe_name(name)}"
         if entity not in self._styled:
             self._styled.add(entity)
             known = list(_PURPOSES)

@@ -140,7 +140,7 @@ class CampaignRecording:
             case PourProgressed():
                 self._cell.progress(event.progress)
                 if (doing := self._balance.progress(event.progress, event.time)) is not None:
-                    self._machine.lane("arm", doing)
+                    self._machine.activity("arm", doing)
             case StrategyProgressed():
                 self._learning.learnt(event.result, event.time)
             case DecisionMade():
@@ -175,7 +175,7 @@ class CampaignRecording:
             case Simulate() as request:
                 self._machine.simulation_started(event.id, request.purpose)
             case Suggest():
-                self._machine.lane("optimiser", "suggest")
+                self._machine.activity("optimiser", "suggest")
             case Pour() as pour:
                 self._machine.pour_started(event.time)
                 scene = self._scenes[pour.scene]
@@ -193,7 +193,7 @@ class CampaignRecording:
             case Simulate():
                 self._machine.simulation_finished(event.id, event.seconds)
             case Suggest():
-                self._machine.lane("optimiser", None)
+                self._machine.activity("optimiser", None)
             case Pour():
                 self._machine.pour_finished(event.time)
         if isinstance(event.outcome, Failed):

@@ -87,12 +87,12 @@ class Score:
         }
 
     def text(self) -> str:
-        """'mean |Δ| 1.6 %, Spearman 0.97, 15 of 16 pours inside their 90 % band'."""
+        """'mean |Δ| 1.6 %, Spearman 0.97, 15 of 16 pours inside their 90 % interval'."""
         if self.error is None:
             return "no pour with a spillage to compare"
         ranks = "" if self.correlation is None else f", Spearman {self.correlation:.2f}"
         pours = "pour" if self.pours == 1 else "pours"
-        return f"mean |Δ| {100 * self.error:.2f} %{ranks}, {self.held} of {self.pours} {pours} inside the 90 % band"
+        return f"mean |Δ| {100 * self.error:.2f} %{ranks}, {self.held} of {self.pours} {pours} inside the 90 % interval"
 
 
 def score(rows: Iterable[ScoredRow]) -> Score:
@@ -239,7 +239,7 @@ def draw_scored(rows: Sequence[ScoredRow], *, title: str, note: str) -> Figure:
     style.dress(
         axes,
         title=title,
-        x="predicted spilled / poured [%], with the band that holds nine pours in ten",
+        x="predicted spilled / poured [%], with its 90 % interval",
         y="measured spilled / poured [%]",
         grid="both",
     )

@@ -342,7 +342,7 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
             elinewidth=6.0,
             ecolor=(*_rgb(style.PREDICTED), 0.35),
             color=style.PREDICTED,
-            label=f"predicted: mean, {100 * LEVEL:.0f} % band",
+            label=f"predicted: mean, {100 * LEVEL:.0f} % interval",
             zorder=2,
         )
         # A first, uncertain prediction must not compress the measured values into the lowest tenth.
@@ -369,7 +369,7 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
     if len(failed):
         axes.plot(failed, np.full(len(failed), 0.02 * top), "x", color=style.INK, label="failed", zorder=4)
     axes.set_xlim(0.4, len(numbers) + 0.6)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     return top
 
 

@@ -240,11 +240,16 @@ def _bar(figure: Figure, axes: Axes, mesh: Any, label: str) -> None:
 def _panel_title(name: str, picture: SurrogatePicture) -> str:
     match name:
         case "mean":
-            return f"surrogate mean, {len(picture.points)} {_things(picture)}"
+            return f"surrogate mean, {_counted(picture)}"
         case "standard deviation":
             return "its standard deviation"
         case _:
-            return f"{len(picture.points)} {_things(picture)}"
+            return _counted(picture)
+
+
+def _counted(picture: SurrogatePicture) -> str:
+    number = len(picture.points)
+    return f"{number} {_things(picture)}" if number != 1 else f"1 {_things(picture)[:-1]}"
 
 
 def _things(picture: SurrogatePicture) -> str:

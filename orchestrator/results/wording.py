@@ -133,8 +133,13 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         times = "once more" if loss.count == 1 else f"{loss.count} more times"
         said.append(f"Poured {times} after the choice, its measured loss was {unit.text(loss.mean, loss.deviation)}.")
     if row.texts["best measured"]:
-        best = f"The smallest loss of {row.pours} weighed pours was {row.texts['best measured']}"
-        said.append(f"{best}; the smallest of several is partly luck, so expect more of the next pour.")
+        best = row.texts["best measured"]
+        said.append(
+            f"The smallest loss of {row.pours} weighed pours was {best}; the smallest of several is partly luck, so "
+            "expect more of the next pour."
+            if row.pours != 1
+            else f"The loss of the only weighed pour was {best}."
+        )
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
     said += [f"Pareto-optimal: {_compromise(one)}." for one in row.pareto_front or ()]
@@ -361,7 +366,12 @@ def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -
             action = losses[min(known)].request.action.values()
             best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
             unit = deployment_unit(plan.deployment)
-            said.append(f"The smallest loss of {len(known)} pours so far is {unit.text(min(known))}, with {best}.")
+            of = (
+                f"The smallest loss of {len(known)} pours so far"
+                if len(known) > 1
+                else "The loss of the only pour so far"
+            )
+            said.append(f"{of} is {unit.text(min(known))}, with {best}.")
         return said
     if calibrated:
         return [

@@ -25,8 +25,8 @@ ALL = (
     "/learning/deployment-narrow/loss/best",
     "/balance/expected/high",
     "/balance/pour/middle",
-    "/machine/lanes/simulator_1",
-    "/machine/lanes/arm",
+    "/machine/activity/simulator_1",
+    "/machine/activity/arm",
     "/machine/seconds",
 )
 

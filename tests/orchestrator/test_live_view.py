@@ -36,7 +36,7 @@ EXPECTED = (
     ("/learning/narrow_cup/loss/predicted", "Scalars:scalars"),
     ("/learning/narrow_cup/surrogate", "EncodedImage:blob"),
     ("/learning/calibration/surrogate", "EncodedImage:blob"),
-    ("/machine/lanes/simulator_1", "StateChange:state"),
+    ("/machine/activity/simulator_1", "StateChange:state"),
     ("/machine/load/busy", "Scalars:scalars"),
     ("/log/narrow_cup", "TextLog:text"),
     ("/status", "TextDocument:text"),

@@ -154,9 +154,9 @@ def test_how_a_run_ended_is_shown_wherever_the_time_cursor_is(recorded: Contents
 
 
 def test_lanes_of_the_machine_show_who_works_at_what(recorded: Contents) -> None:
-    simulators = [row[0] for row in recorded.values("/machine/lanes/simulator_1", "StateChange:state")]  # type: ignore[index]
+    simulators = [row[0] for row in recorded.values("/machine/activity/simulator_1", "StateChange:state")]  # type: ignore[index]
     assert simulators == ["idle", *["calibrate", "idle"] * 2]
-    arm = [row[0] for row in recorded.values("/machine/lanes/arm", "StateChange:state")]  # type: ignore[index]
+    arm = [row[0] for row in recorded.values("/machine/activity/arm", "StateChange:state")]  # type: ignore[index]
     assert [doing for doing in arm if doing != "idle"] == ["tilt"] * 3
     assert len(recorded.values("/machine/wait", "Scalars:scalars")) == 2
 

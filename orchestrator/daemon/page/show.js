@@ -122,7 +122,7 @@ function bar(what, done, of) {
   return el("label", { class: "bar" }, `${what} ${done} of ${of}`, el("progress", { value: Math.min(done, of), max: of }));
 }
 
-const NAMES = { done: "Done", yes: "Yes", no: "No", lost: "Lost: nobody knows", repeat: "Pour it again" };
+const NAMES = { done: "Done", yes: "Yes", no: "No", lost: "Lost: outcome unknown", repeat: "Pour it again" };
 
 /** A question with answers that a wet finger hits. `send` takes the answer and throws what is wrong with it. */
 export function questionCard(question, campaign, mode, send) {

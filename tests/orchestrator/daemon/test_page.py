@@ -345,7 +345,7 @@ def test_a_pour_without_outcome_reads_unknown_while_its_question_is_open(page: A
         lab.do(lab.served.until(key, "unknown"))
         lab.do(lab.served.post(f"/campaigns/{key}/resume"))
         lab.do(lab.served.question())
-        page.get_by_role("button", name="Lost: nobody knows").wait_for()
+        page.get_by_role("button", name="Lost: outcome unknown").wait_for()
         assert page.locator("#pours").get_by_text("UNKNOWN").count() == 1
         assert page.locator("#pours").get_by_text("under way").count() == 0
 

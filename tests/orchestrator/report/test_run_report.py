@@ -244,7 +244,7 @@ def test_a_failed_run_says_why_and_what_stands(tmp_path: Path) -> None:
     assert "Its state is 'failed'" in said
     assert "a cable came off <b>" in said
     assert "failed: the hose came off" in said
-    assert "The smallest loss of 1 pours so far is" in said
+    assert "The loss of the only pour so far is" in said
     assert "θ* with its region" in said, "calibration was closed before"
 
 
