@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from actors.interfaces import OperatorQuestion
+from orchestrator.cli import queue_commands
 from orchestrator.daemon.access_tokens import Role
+from tests.support.cli_inputs import invoke
 from tests.support.toy_daemon import HeldLaboratory, run, serving
 
 REFILL = OperatorQuestion("Refill the beaker to 100 g.", "done", about="refill", details={"load": 100.0})
@@ -97,3 +100,14 @@ def test_a_question_that_nobody_needs_any_more_is_closed(with_person: Path) -> N
             assert (found["id"], found["closed"], found["answer"]) == (question["id"], "withdrawn", None)
 
     run(work())
+
+
+def test_a_question_whose_facts_are_still_read_is_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Reading:
+        def get(self, path: str, **query: object) -> list[dict[str, str]]:
+            return [] if path == "/questions" else [{"id": "small-1a2b3c", "state": "waiting for operator"}]
+
+    monkeypatch.setattr(queue_commands, "connected_client", lambda url, state: contextlib.nullcontext(Reading()))
+    told = invoke("queue answer").stderr
+    assert "the question of small-1a2b3c is being prepared" in told
+    assert "Try again in a moment" in told
