@@ -338,14 +338,14 @@ def measure(
                 if doses is None:
                     doses = CONTROLLERS[controller](Series(group, seed, flow))
                     if dump is not None:
-                        line = {
+                        entry = {
                             "group": name,
                             "controller": controller,
                             "seed": seed,
                             "doses": list(map(asdict, doses)),
                         }
                         with dump.open("a", encoding="utf-8") as file:
-                            file.write(json.dumps(line) + "\n")
+                            file.write(json.dumps(entry) + "\n")
                 result[name][controller] += doses
             if pour:
                 say(f"{name}: series {seed}")

@@ -394,10 +394,7 @@ def dosing(group: str) -> str:
         *("controller", "mean error g", "bias g", "95 % g", "worst g", "over +1 g", "first dose, 95 % g", "spilled g"),
         *("50 g weighed, 95 % s", "200 g, 95 % s", "mean error more than particles g"),
     )
-    count, others = found["particles"]["doses"], found["PID"]["doses"]
-    doses = f"{count} doses of each controller"
-    if others < count:
-        doses = f"{count} doses with particles, {others} of each other controller"
+    doses = f"{found['particles']['doses']} doses of each controller"
     how = f"{doses}, same seeds from {found['seeds'][0]}; {found['machine']['date']}"
     return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing.py --final --json`; {how}.</sub>\n"
 
