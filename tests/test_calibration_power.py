@@ -118,6 +118,7 @@ def test_rows_are_means_over_seeds_and_folds_weigh_pours_alike(power: ModuleType
     assert folds["standard_error"] == pytest.approx(0.0645, abs=1e-4)  # s/√n of 0.1, 0.2, 0.3, 0.4
 
 
+@pytest.mark.slow
 def test_mean_of_the_others_is_what_the_records_say_it_is(power: ModuleType, calibration: CalibrationPlan) -> None:
     assert calibration.records is not None
     spillage = [pour.normalised_spillage or 0.0 for pour in calibration.records.pours]

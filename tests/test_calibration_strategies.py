@@ -123,6 +123,7 @@ def test_what_can_t_be_compared_is_refused(bench: ModuleType, monkeypatch: pytes
     assert "a campaign with recorded pours is needed" in refusal(str(quickstart))
 
 
+@pytest.mark.slow
 def test_the_table_is_of_what_was_made_and_what_was_kept_is_not_made_again(
     bench: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

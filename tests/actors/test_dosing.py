@@ -114,6 +114,7 @@ def one_dose(
     return record, controller
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amount", [0.01, 0.05, 0.1])
 @pytest.mark.parametrize("kind", ["first", "average", "switching"])
 def test_the_first_dose_meets_its_amount(amount: float, kind: str) -> None:

@@ -156,6 +156,7 @@ def test_most_pours_lie_in_the_bands_that_come_with_them():
     assert high < answer.means[0] + 2.0 * float(np.hypot(answer.deviations, answer.noises)[0])
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_share_of_pours_that_they_state():
     """Benches displaced as the priors say; pours all over the box, predicted after three others."""
     inside, number = {0.5: 0, 0.9: 0, 0.99: 0}, 0

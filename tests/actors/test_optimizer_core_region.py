@@ -128,6 +128,7 @@ def shaky(seed, *, told):
     return propose(RegressionQuery(PLANE, data, failed=tuple(failed) if told else ())).best_point
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_now_and_then_is_no_advice():
     told, untold = (sum(shaky(seed, told=told)[0] < 0.08 for seed in range(8)) for told in (True, False))
     assert told <= untold - 2

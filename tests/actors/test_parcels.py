@@ -39,6 +39,7 @@ def test_nothing_that_travels_names_a_path_of_this_machine(mug_task, tmp_path):
     assert folder in pickle.dumps(mug_task)
 
 
+@pytest.mark.slow
 def test_a_mesh_arrives_where_there_is_no_such_file(mug_task, mug, tmp_path, monkeypatch):
     expected, content = mug.content_hash(), mug.shape.path.read_bytes()
     packed, parcels = pickle.loads(pickle.dumps(Packer().pack(mug_task)))

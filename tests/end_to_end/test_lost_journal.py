@@ -126,6 +126,7 @@ def without_ledger(run: Path) -> None:
     (run / LEDGER_NAME).unlink()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [

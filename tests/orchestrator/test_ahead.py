@@ -29,6 +29,7 @@ def run(directory: Path, laboratory: ToyLaboratory, **arguments: Any) -> None:
     asyncio.run(run_toy(directory, laboratory, stages=None, **arguments))
 
 
+@pytest.mark.slow
 def test_nothing_that_is_decided_depends_on_what_was_made_beforehand(tmp_path: Path) -> None:
     run(tmp_path / "one after the other", laboratory(separate=False))
     run(tmp_path / "ahead", laboratory(separate=True))
@@ -152,6 +153,7 @@ def test_bad_luck_is_not_kept(outcome: Outcome | Exception) -> None:
     asyncio.run(check())
 
 
+@pytest.mark.slow
 def test_a_simulator_that_dies_over_a_foreseen_task_costs_nothing(tmp_path: Path) -> None:
     failing = laboratory(separate=True)
 

@@ -43,6 +43,7 @@ EXPECTED = (
 )
 
 
+@pytest.mark.slow
 def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
     plan = example_run.campaign()
     with LiveView() as live:
@@ -193,6 +194,7 @@ def test_server_ends_when_the_process_that_minds_it_is_killed() -> None:
             os.kill(server, signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_rerun_sends_no_statistics_and_touches_no_settings_of_the_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -45,6 +45,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Contents:
     return Contents(path)
 
 
+@pytest.mark.slow
 def test_recording_shows_both_vessels_and_the_particles_of_recorded_simulations(recorded: Contents) -> None:
     for entity in ("/simulation/pourer/mesh", "/simulation/receiver/mesh"):
         assert recorded.values(entity, "Mesh3D:vertex_positions")
@@ -278,6 +279,7 @@ def test_recording_that_cannot_be_written_is_reported_before_the_run(tmp_path: P
         simulation_rrd(tmp_path / "pour.rrd", task, result)
 
 
+@pytest.mark.slow
 def test_an_event_that_cannot_be_drawn_costs_only_itself(tmp_path: Path) -> None:
     plan = example_run.campaign()
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)
@@ -321,6 +323,7 @@ def test_hanging_disk_does_not_keep_the_run_from_ending() -> None:
     release.set()
 
 
+@pytest.mark.slow
 def test_dropped_events_are_said_in_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plan = example_run.campaign()
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan, capacity=1)

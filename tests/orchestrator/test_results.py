@@ -63,6 +63,7 @@ def test_a_stage_that_learnt_something_else_is_named(results: dict[str, Any]) ->
         result_of(results, "pours", Calibrated)
 
 
+@pytest.mark.slow
 def test_publishing_names_the_recording_and_can_be_done_again(tmp_path: Path, results: dict[str, Any]) -> None:
     from dataclasses import replace
 

@@ -48,6 +48,7 @@ def test_killed_at_any_point_it_makes_the_requests_it_would_have_made(tmp_path: 
     assert point > 60
 
 
+@pytest.mark.slow
 def test_killed_again_and_again_it_still_gets_there(tmp_path: Path) -> None:
     run(tmp_path / "undisturbed")
     rng, directory = random.Random(5), tmp_path / "run"
@@ -91,6 +92,7 @@ def killed_hanging(simulations: int, directory: Path) -> None:
     child.communicate()
 
 
+@pytest.mark.slow
 def test_killed_from_outside_with_everything_under_way_it_goes_on_in_another_process(tmp_path: Path) -> None:
     run(tmp_path / "undisturbed", stages=toy_stages())
     for simulations in (2, 20):

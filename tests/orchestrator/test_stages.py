@@ -123,6 +123,7 @@ def test_a_whole_campaign_calibrates_and_then_pours_with_what_it_found(tmp_path:
     assert evaluation.regression["test"] is not None
 
 
+@pytest.mark.slow
 def test_a_theta_that_the_pours_do_not_justify_is_not_deployed_and_everything_published_says_so(tmp_path: Path) -> None:
     # the toy's simulations do not depend on θ, so that no θ fits the pours better than another one
     plan = campaign(tmp_path, calibration=calibration(random_baseline=0))
@@ -199,6 +200,7 @@ def test_what_is_recommended_is_poured_again_after_each_deployment(tmp_path: Pat
     assert work_of(plan, ["confirmation:cup"])["confirmation:cup"].pours == 2
 
 
+@pytest.mark.slow
 def test_the_real_strategies_resume_as_if_nothing_had_happened(tmp_path: Path) -> None:
     run(tmp_path / "undisturbed", campaign(tmp_path))
     expected = logical_record(tmp_path / "undisturbed")

@@ -68,6 +68,7 @@ def test_without_an_operator_it_stops_with_exit_code_3_and_says_how_to_answer(un
     assert run(directory, resume=True, plan=asking(directory), ask_operator=answering("lost")).state == "finished"
 
 
+@pytest.mark.slow
 def test_a_pour_repeated_on_the_virtual_bench_is_the_same_pour(unknown: Callable[[], Path], tmp_path: Path) -> None:
     directory = unknown()
     run(directory, resume=True, plan=asking(directory), ask_operator=answering("repeat"))

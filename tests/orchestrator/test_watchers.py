@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from orchestrator.requests import Pour, Simulate
 from orchestrator.runs.events import (
     CampaignClosed,
@@ -78,6 +80,7 @@ def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path)
     assert logical_record(tmp_path / "silent") == logical_record(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_recordings_spread_over_a_stage() -> None:
     assert [n for n in range(1, 200) if is_recorded(n, 6)] == [1, 2, 4, 8, 16, 32]
     assert not any(is_recorded(n, 0) for n in range(200))

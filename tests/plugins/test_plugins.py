@@ -106,6 +106,7 @@ def write_files(folder: Path) -> None:
     (folder / "cone.yaml").write_text(CONE)
 
 
+@pytest.mark.slow
 def test_what_is_installed_is_listed_with_its_package(decant: Decant) -> None:
     listed = json.loads(decant("plugins", "--json").stdout)
     packages = {(p["group"], p["name"]): p["package"] for p in listed["plugins"]}
@@ -126,6 +127,7 @@ def test_it_is_known_to_files_and_misspelt_keys_are_guessed(decant: Decant, fold
     assert "a cone opens upwards" in said.stderr
 
 
+@pytest.mark.slow
 def test_it_is_known_to_the_schema(decant: Decant) -> None:
     vessel = json.loads(decant("schema", "vessel").stdout)
     assert "cone" in json.dumps(vessel)
@@ -134,6 +136,7 @@ def test_it_is_known_to_the_schema(decant: Decant) -> None:
     assert '"plain"' in laboratory  # the dialect
 
 
+@pytest.mark.slow
 def test_a_broken_package_is_named_and_disturbs_nobody(site: Path, broken: Path, folder: Path) -> None:
     decant = command(site, broken)
     listed = decant("plugins")
@@ -146,6 +149,7 @@ def test_a_broken_package_is_named_and_disturbs_nobody(site: Path, broken: Path,
     assert decant("validate", "cone.yaml", cwd=folder).returncode == 0
 
 
+@pytest.mark.slow
 def test_a_laboratory_that_needs_a_broken_package_is_refused_with_its_name(
     site: Path, broken: Path, folder: Path
 ) -> None:
@@ -196,6 +200,7 @@ def test_a_campaign_runs_with_an_arm_of_seven_joints(decant: Decant, folder: Pat
     assert json.loads((run / "summary.json").read_text())["pours"] == 2
 
 
+@pytest.mark.slow
 def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: Decant, folder: Path) -> None:
     (folder / "campaign.yaml").write_text(CAMPAIGN)
     ran = decant("run", "campaign.yaml", "--json", cwd=folder)
@@ -228,6 +233,7 @@ def test_a_campaign_of_things_from_outside_is_run_from_beginning_to_end(decant: 
     assert "Not installed" not in whole.stderr
 
 
+@pytest.mark.slow
 def test_the_doctor_asks_a_balance_and_an_arm_from_outside(site: Path, broken: Path, folder: Path) -> None:
     said = command(site)("robot", "check", "example.yaml", "--json", cwd=folder)
     checks = {check["name"]: check for check in json.loads(said.stdout.splitlines()[-1])["checks"]}
@@ -273,6 +279,7 @@ def test_a_dialect_from_outside_is_found_out_and_has_a_virtual_balance(site: Pat
     assert float(mass) == pytest.approx(0.2, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_the_tables_of_the_pages_know_what_is_installed(site: Path) -> None:
     program = "import runpy; print(runpy.run_path('docs/make_tables.py')['TABLES']['vessel']())"
     assert any("`cone`" in line and "A cone that opens upwards" in line for line in python(site, program))

@@ -161,6 +161,7 @@ def swung(rng: np.random.Generator) -> tuple[Scene, Action, PourMotion]:
     return scene, action, plan_motion(scene, action, A, B)
 
 
+@pytest.mark.slow
 def test_no_touch_of_a_pour_is_missed_however_long_it_is_held() -> None:
     # Poses evenly spaced in time, 121 of them, let six of these 140 touches go unseen, up to 1 mm deep.
     rng = np.random.default_rng(0)

@@ -55,6 +55,7 @@ def mug() -> Vessel:
     return build_vessel(VesselSpec(name="mug", shape=MeshShape(path=MUG, unit="mm")), use_cache=False)
 
 
+@pytest.mark.slow
 def test_mug_with_a_handle_is_centred_on_its_opening_and_measured_like_its_profile(mug: Vessel) -> None:
     # the inner profile of make_meshes.py, from the floor to the crest of the rim
     inner = [
@@ -165,6 +166,7 @@ def test_sign_of_a_mesh_is_that_of_the_same_profile(build: Make) -> None:
     assert np.abs(a - b).max() < meshed.grid.spacing
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply", "glb"])
 def test_every_format_gives_the_same_vessel(build: Make, suffix: str) -> None:
     vessel = build(cup(), suffix)
@@ -348,6 +350,7 @@ def test_cache_that_cannot_be_written_costs_no_vessel(
     assert build(cup()).capacity > 0.0
 
 
+@pytest.mark.slow
 def test_thin_walls_of_a_mesh_stay_closed(build: Make) -> None:
     vessel = build(cup(wall=1.0, radius=15.0, height=25.0))
     assert vessel.wall_thickness == pytest.approx(0.001, abs=5e-5)

@@ -60,6 +60,7 @@ def test_a_film_on_an_incline_is_slow_at_the_wall_and_as_fast_as_nusselt_s_in_th
     assert profile.y[0] < 0.5 < 1.3 < profile.y[-1]
 
 
+@pytest.mark.slow
 def test_the_thicker_the_more_stays_in_the_cup(simulator: PourSimulator) -> None:
     thin, oil, syrup = simulator.simulate_many([poured(1e-3), poured(0.08), poured(2.0)])
     left = [run.outcome.retained for run in (thin, oil, syrup)]
@@ -76,6 +77,7 @@ def test_a_batch_of_thin_and_thick_liquids_is_bit_for_bit_what_each_is_alone(sim
         assert simulator.simulate(task).outcome.curve_poured == one.curve_poured
 
 
+@pytest.mark.slow
 def test_the_factor_is_that_of_the_viscosity_and_none_to_a_liquid_as_thin_as_water(simulator: PourSimulator) -> None:
     assert (
         simulator.simulate(poured(0.1, 5.0)).outcome.curve_poured

@@ -42,6 +42,7 @@ def test_a_bench_that_is_off_and_a_pour_that_is_off_add_up() -> None:
     assert both.speed_factor == pytest.approx(1.04**2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("nuisance", "action"),
     [

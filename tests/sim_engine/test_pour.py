@@ -169,6 +169,7 @@ def test_drips_of_the_return_belong_to_the_pour(simulator: PourSimulator) -> Non
     assert kept.outcome.in_flight == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wall", "particles", "speed"),
     [

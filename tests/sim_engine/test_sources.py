@@ -27,9 +27,9 @@ def change(root: Path, file: str, old: str, new: str) -> None:
     ("file", "old", "new"),
     [
         ("fluid/step.py", "CFL = 1.5", "CFL = 1.4"),
-        ("fluid/neighbours.py", "+ (EIGHT - 1)", "+ EIGHT"),
-        ("simulator.py", "LEAD = 0.3", "LEAD = 0.2"),
-        ("vessel/wall_correction.py", "EDITION = 1", "EDITION = 2"),
+        pytest.param("fluid/neighbours.py", "+ (EIGHT - 1)", "+ EIGHT", marks=pytest.mark.slow),
+        pytest.param("simulator.py", "LEAD = 0.3", "LEAD = 0.2", marks=pytest.mark.slow),
+        pytest.param("vessel/wall_correction.py", "EDITION = 1", "EDITION = 2", marks=pytest.mark.slow),
     ],
 )
 def test_another_solver_has_another_fingerprint(copy: Path, file: str, old: str, new: str) -> None:

@@ -53,6 +53,7 @@ def test_liquid_at_rest_stands_as_high_as_its_volume(simulator: PourSimulator) -
     assert failures(measurements[:1]) == []
 
 
+@pytest.mark.slow
 def test_deep_liquid_stays_in_its_cup(simulator: PourSimulator) -> None:
     """29 layers of particles, which pressure has to pass within a step."""
     assert failures(at_rest.tall_column(5_000, suite.PLAIN)) == []
@@ -220,6 +221,7 @@ def test_the_front_of_a_dam_break_runs_as_fast_as_in_the_experiment(simulator: P
     assert with_delay.value < 0.10
 
 
+@pytest.mark.slow
 def test_cohesion_makes_a_cube_round_and_nothing_else_does(simulator: PourSimulator) -> None:
     free = SimulationParameters(cohesion=0.0, xsph_rate=0.0, friction=0.0)
     measurement = droplet.cube_to_sphere(1000, free)[0]

@@ -105,6 +105,7 @@ class WaitsForTheController(UrArm):
                 self.release()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cls", "found_by", "message"),
     [

@@ -103,6 +103,7 @@ def test_a_lost_line_ends_the_pour_and_the_arm_stands_until_released(make_rig: M
     goes_on_only_by_an_operator(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_after_a_reboot_in_mid_pour_tool_and_payload_are_set_again(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT)
@@ -402,6 +403,7 @@ def test_a_step_moves_the_tool_as_asked_and_needs_a_word_each_time(rig: Rig) -> 
     assert np.array(rig.fault("state")["pose"])[:3] == pytest.approx(before[:3], abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     ("axis", "amount", "speed"),

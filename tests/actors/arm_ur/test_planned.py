@@ -98,6 +98,7 @@ def test_what_was_executed_is_the_planned_pour_seen_through_the_encoders(planned
     assert executed.tracking["max_angle"] < 0.5 * DEG
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pour_without_a_return_is_brought_upright_on_the_way_home_even_after_a_stop(
     planned: Callable[..., Rig],

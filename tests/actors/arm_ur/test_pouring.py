@@ -137,6 +137,7 @@ def test_hands_in_ends_somebody_else_s_program(rig: Rig) -> None:
     assert rig.fault("state")["runtime_state"] == "STOPPED"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_hands_are_not_invited_by_a_controller_that_says_nothing(rig: Rig) -> None:
     rig.fault("stall")

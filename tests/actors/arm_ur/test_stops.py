@@ -12,6 +12,7 @@ from actors.arm.arm_interface import ArmNotReleasedError, ArmRefusedError, ArmSt
 from actors.arm.ur.ur_driver import AcceptedArm
 from actors.arm.ur.worker_messages import may_move, safety_mode
 from tests.support.ur_pours import HOME, START, pour_path
+from tests.support.waiting import wait_for
 
 from .conftest import Call, Rig
 
@@ -294,7 +295,7 @@ def test_a_protective_stop_names_its_code_and_is_unlocked_after_five_seconds(mak
 def test_nothing_moves_while_the_freedrive_button_is_pressed(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)
     rig.fault("freedrive")
-    assert "freedrive button is pressed" in rig.arm.facts().problem
+    wait_for(lambda: "freedrive button is pressed" in rig.arm.facts().problem, "the button in the arm's facts")
     rig.arm.release()
     with pytest.raises(ArmRefusedError, match="freedrive button is pressed"):
         rig.arm.move_to_start(rig.path)

@@ -47,6 +47,7 @@ def test_a_healthy_balance_passes_and_each_finding_says_what_is_right(checked):
     assert lag == pytest.approx(1.5 / SETTLED, abs=4.0 * error + 0.08)
 
 
+@pytest.mark.slow
 def test_a_slow_and_drifting_balance_is_named_with_what_to_do(checked):
     found = checked(ScaleSettings(settling_time=6.0, drift=2e-5))
     assert found["lag"].state == "warn"

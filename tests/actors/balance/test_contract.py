@@ -264,10 +264,11 @@ class WaitsForItsLine(SerialBalance):
             "test_a_lost_connection_is_an_error_and_no_weight",
             r"shows a stable weight after its conn",
         ),
-        (
+        pytest.param(
             WaitsForItsLine,
             "test_a_lost_connection_is_an_error_and_no_weight",
             r"weigh\(\), under way, still waits after 5 s",
+            marks=pytest.mark.slow,
         ),
     ],
 )

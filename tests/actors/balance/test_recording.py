@@ -217,6 +217,7 @@ DAYS = sorted((Path(__file__).parents[2] / "data" / "balances").glob("*.jsonl"))
 """Recordings of `decant balance record` and `decant balance check --record`."""
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("path", DAYS, ids=lambda path: path.stem)
 def test_a_recorded_day_reads_as_it_did(path):

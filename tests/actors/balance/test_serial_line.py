@@ -169,6 +169,7 @@ def test_a_port_that_does_not_exist_is_named_at_once(driver):
         balance.tare()
 
 
+@pytest.mark.slow
 def test_a_flood_of_damaged_lines_does_not_hold_a_call_beyond_its_deadline(driver, each_dialect):
     far, balance = driver(each_dialect, **SOON)
     balance.connect()

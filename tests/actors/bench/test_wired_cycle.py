@@ -20,6 +20,7 @@ from tests.support.wired_bench import ACTION, SCENE, Stage, opened_stage, reach,
 DEFAULT = (Placement.TRAY, Placement.RECEIVER, Placement.MANUAL)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     "placement",
@@ -122,6 +123,7 @@ def test_checkpoints_come_in_order_and_the_bar_never_runs_backwards(poured):
     assert max(p.balance for p in poured.seen if p.balance is not None) > 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pour_that_is_refused_asks_nobody_and_moves_nothing(open_stage):
     async def play():
@@ -154,6 +156,7 @@ def test_no_consent_no_movement(open_stage):
     assert loaded == pytest.approx(0.2, abs=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
     patience = OperatorSettings(answers="virtual", time=2.0, reminder=4.0, deadline=12.0)
@@ -170,6 +173,7 @@ def test_nobody_there_is_reminded_then_given_up_and_nothing_moves(open_stage):
     assert moved < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pourer_filled_wrongly_is_filled_anew_before_anything_is_poured(open_stage):
     async def play():
@@ -195,6 +199,7 @@ def test_a_mistyped_weight_is_asked_for_again(open_stage):
     assert measured.spilled == pytest.approx(stage.contents.on_tray, abs=3e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pour_given_up_before_consent_was_not_made(open_stage):
     seen = []

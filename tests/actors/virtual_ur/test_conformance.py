@@ -314,6 +314,7 @@ def test_what_can_not_be_reached_ends_the_program_and_a_new_upload_helps(seen: S
     assert unreachable["force mode ends program"] is True
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_two_robots_side_by_side_keep_out_of_each_other_s_way(robots: dict[str, Robot]) -> None:
     with ThreadPoolExecutor(len(robots)) as pool:
@@ -327,6 +328,7 @@ def test_two_robots_side_by_side_keep_out_of_each_other_s_way(robots: dict[str, 
 # ---- time
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(("model_name", "rate"), [("ur10e", 500), ("ur10", 125)])
 def test_in_real_time_the_clock_is_right_and_packages_come_at_the_controller_s_rate(model_name: str, rate: int) -> None:

@@ -113,6 +113,7 @@ def test_a_stop_can_be_asked_for_at_a_time(fresh: Start) -> None:
     client = moving(controller, 1.0)
     began = controller.fault("state")["time"]
     controller.fault("protective_stop", after=0.5)
+    ordered = controller.fault("state")["time"]
     client.go_on()
     client.result()
     state = controller.fault("state")
@@ -123,7 +124,7 @@ def test_a_stop_can_be_asked_for_at_a_time(fresh: Start) -> None:
         if q == following
     )
     assert state["safety_mode"] == "PROTECTIVE_STOP"
-    assert 0.5 < still - began < 1.0
+    assert began + 0.5 < still < ordered + 1.0
 
 
 @pytest.mark.realtime
@@ -249,11 +250,10 @@ def test_the_speed_slider_slows_a_move_that_runs(fresh: Start) -> None:
 def test_noise_on_joint_positions_is_seen_in_what_is_measured_only(fresh: Start) -> None:
     controller = fresh(time_scale=16.0)
     controller.fault("noise", sigma=0.01)
-    client = moving(controller, 0.6)
+    client = moving(controller, 0.1)
+    assert arrives(controller)
     client.go_on()
     seen = client.result()
-    state = controller.fault("state")
-    assert state["joints"][0] == pytest.approx(2.5)
     assert 1e-5 < abs(seen["q"][0] - 2.5) < 0.06
 
 

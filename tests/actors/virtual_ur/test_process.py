@@ -76,6 +76,7 @@ def test_an_address_that_is_taken_is_told(shared: VirtualController) -> None:
         VirtualController.start(address=shared.address)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     ("options", "says"),
@@ -186,6 +187,7 @@ def send(controller: VirtualController, text: bytes, most: float = 60.0) -> floa
     return float(controller.fault("state", patience=most)["timing"]["worst"])
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     ("text", "says"),

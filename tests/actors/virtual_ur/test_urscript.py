@@ -292,6 +292,7 @@ def test_a_program_that_would_hang_or_fill_the_controller_is_ended(text: str) ->
     assert psutil.Process().memory_info().rss - before < 4e8
 
 
+@pytest.mark.slow
 def test_a_program_that_keeps_more_and_more_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(program, "MOST_MEMORY", 50_000_000)
     text = """

@@ -457,6 +457,7 @@ def reported(wire: Wire) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 @settings(max_examples=examples(600), deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 @given(texts=st.lists(_programs, min_size=1, max_size=3))
 def test_no_program_whatever_ends_the_controller_or_keeps_the_next_from_running(texts: list[str]) -> None:

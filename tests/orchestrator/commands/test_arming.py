@@ -138,6 +138,7 @@ def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to
     assert decant("run", str(campaign), "--resume").exit_code == 2  # motion is enabled for one run only
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_settings_that_were_changed_since_stop_a_run_before_anybody_is_asked(
     campaign: Path, controller: VirtualController

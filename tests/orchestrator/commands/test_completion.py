@@ -66,6 +66,7 @@ def test_a_campaign_is_completed_and_no_other_file(place: Path, shell: str) -> N
     assert all("configs/campaigns/quickstart.yaml" in word for word in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "offered", "missing"),
     [
@@ -82,6 +83,7 @@ def test_bash_offers_the_files_of_the_kind_that_is_needed(place: Path, line: str
     assert missing not in found
 
 
+@pytest.mark.slow
 def test_bash_offers_runs_and_the_vessels_they_used(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DECANT_STATE", str(place / "state"))
     run = made(place)

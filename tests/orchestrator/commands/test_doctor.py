@@ -238,6 +238,7 @@ def joints_violation(angle: float) -> str | None:
     return SafetyConfiguration.of(MODELS["ur10"]).joints_violation(q)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "package"),
     [
@@ -370,6 +371,7 @@ def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_chang
         require_accepted("22C99AA2", None, "robot")
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(("up", "state"), [("0, 9.82, 0", "fail"), ("0, 0.5, 9.8", "ok")])
 def test_a_robot_that_hangs_where_the_file_has_it_stand_is_told(

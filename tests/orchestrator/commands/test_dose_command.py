@@ -126,6 +126,7 @@ def test_an_amount_is_needed(campaign: Path) -> None:
     assert "--amount: name the wanted amount" in result.stderr
 
 
+@pytest.mark.slow
 def test_the_same_seed_pours_the_same_doses(campaign: Path) -> None:
     lines = [
         [line for line in decant(*command).stdout.splitlines() if line.startswith("dose")]

@@ -57,6 +57,7 @@ def said(command: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "options"),
     [
@@ -107,6 +108,7 @@ def test_vessels_plugins_and_checks_print_what_is_documented(tmp_path: Path) -> 
     validated("plugins", said("plugins --json"))
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_checks_and_paths_of_the_virtual_arm_print_what_is_documented(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -147,6 +147,7 @@ def saved(figure: Figure, monkeypatch: pytest.MonkeyPatch) -> Any:
     return drawn[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("panels", [1, 6])
 def test_the_legend_lies_on_no_curve_and_no_number_is_tiny(panels: int, monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("slow pour", "standard pour", "fast pour")

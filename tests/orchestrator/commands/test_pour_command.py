@@ -132,6 +132,7 @@ def test_empty_cycle_on_hardware_asks_counts_down_goes_slowly_and_leaves_a_recor
     assert joints[-1] == pytest.approx([radians(q) for q in hardware_laboratory.HOME], abs=1e-2)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_empty_cycle_that_is_not_confirmed_moves_nothing(tmp_path: Path, controller: VirtualController) -> None:
     campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
@@ -167,7 +168,9 @@ async def is_interrupted_twice(plan: CampaignPlan, laboratory: object, directory
     raise asyncio.CancelledError
 
 
-@pytest.mark.parametrize(("ends", "code"), [(breaks_off, 3), (is_interrupted_twice, 130)])
+@pytest.mark.parametrize(
+    ("ends", "code"), [pytest.param(breaks_off, 3, marks=pytest.mark.slow), (is_interrupted_twice, 130)]
+)
 def test_pour_whose_outcome_is_unknown_doesn_t_promise_to_be_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends: Callable[..., object], code: int
 ) -> None:

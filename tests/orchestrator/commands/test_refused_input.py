@@ -114,6 +114,7 @@ def test_bad_usage_is_explained(command: str, folder: Path) -> None:
     assert BAD_USAGE[command] in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [

@@ -64,6 +64,7 @@ def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
     assert "not simulated" not in simulated.stderr
 
 
+@pytest.mark.slow
 def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path) -> None:
     done = typed("simulate small.yaml --set angular_velocity=20 --set max_angle=75 --set x_offset=70 --seeds 2", inputs)
     assert re.search(r"received \d+\.\d ± \d+\.\d %", done.stdout)
@@ -75,6 +76,7 @@ def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path
     assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
 
 
+@pytest.mark.slow
 def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
     theta = {"cohesion": 0.05}
     draws = [{"theta": {"cohesion": 0.02 * i}, "weight": 1.0} for i in range(4)]
@@ -121,6 +123,7 @@ def test_simulate_shows_the_pour_as_picture_and_recording(
     assert "pour.rrd" in simulated.stderr
 
 
+@pytest.mark.slow
 def test_simulate_takes_units_parameters_and_another_receiver(
     simulated: subprocess.CompletedProcess[str], inputs: Path
 ) -> None:

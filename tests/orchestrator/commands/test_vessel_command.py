@@ -113,11 +113,13 @@ def test_a_cup_photographed_upright_by_a_camera_on_its_side_comes_out_as_it_is(t
     assert made(tmp_path, sources) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
+@pytest.mark.slow
 def test_a_bowl_wider_than_high_comes_out_as_it_is_from_a_photograph_out_of_level(tmp_path: Path) -> None:
     of = bench("bowl")
     assert made(tmp_path, photo(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
+@pytest.mark.slow
 def test_a_large_photograph_with_little_room_beside_the_vessel_will_do(tmp_path: Path) -> None:
     from PIL import Image, ImageChops
 
@@ -177,6 +179,7 @@ def test_a_brimful_cup_that_weighs_otherwise_is_told(tmp_path: Path, capsys: pyt
     assert "# Doubtful: brimful" in (tmp_path / "wrong.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_a_sheet_is_thickened_and_holes_are_closed(tmp_path: Path) -> None:
     of = bench("bowl")
     sheet = trimesh.creation.revolve(1e3 * of.inner, sections=64)
@@ -191,6 +194,7 @@ def test_a_sheet_is_thickened_and_holes_are_closed(tmp_path: Path) -> None:
     assert capacity == pytest.approx(of.vessel.capacity, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_vessel_that_is_not_round_becomes_a_mesh(tmp_path: Path) -> None:
     of = bench("tumbler")
     oval = of.cloud(noise=1e-4) * [1.0, 0.8, 1.0]

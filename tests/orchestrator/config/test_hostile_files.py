@@ -42,6 +42,7 @@ TEXTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", TEXTS, ids=lambda case: case.replace(" ", "-"))
 def test_too_much_of_a_file_is_refused_in_time_with_the_limit(case: str, folder: Path) -> None:
     text, expected = TEXTS[case]

@@ -185,6 +185,7 @@ def quickstart() -> dict[str, Any]:
 COMMON = ("receiver", "motion", "actions", "pours")
 
 
+@pytest.mark.slow
 @given(
     calibration=strategy_of(CALIBRATIONS, CalibrationSection),
     deployment=strategy_of(DEPLOYMENTS, DeploymentSection),

@@ -188,6 +188,7 @@ def test_an_arm_that_is_set_to_carry_less_than_the_liquid_is_refused():
     assert "set to carry 50 g (arm.payload), less than the water alone, 200 g" in problem.message
 
 
+@pytest.mark.slow
 def test_a_receiver_turned_away_from_home_is_refused_soon_and_in_words_of_the_bench():
     plan = load_campaign(QUICKSTART)
     assert plan.laboratory.arm is not None

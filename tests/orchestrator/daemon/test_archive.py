@@ -102,6 +102,7 @@ def test_runs_are_compared_exported_and_their_reports_read(tmp_path: Path) -> No
     run(work())
 
 
+@pytest.mark.slow
 def test_the_command_line_answers_the_same_through_the_daemon(tmp_path: Path, state: Path) -> None:
     directory = made(tmp_path)
     real = Real(state)

@@ -13,6 +13,7 @@ from tests.support.station import content, order, rigs_in, set_up, until_pour
 from tests.support.toy_daemon import held, run, serving
 
 
+@pytest.mark.slow
 def test_a_restored_daemon_has_results_and_account_and_waits_for_an_operator(tmp_path: Path) -> None:
     here, there, archive = tmp_path / "here", tmp_path / "there", tmp_path / "backup.zip"
     here.mkdir()

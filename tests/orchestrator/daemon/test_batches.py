@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import pytest
+
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.submissions import pack
@@ -12,6 +14,7 @@ from tests.support.station import order, rigs_in, set_up, until_pour
 from tests.support.toy_daemon import run, serving
 
 
+@pytest.mark.slow
 def test_a_batch_is_taken_as_a_whole_or_not_at_all_and_reports_each_item(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:

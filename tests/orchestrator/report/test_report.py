@@ -38,6 +38,7 @@ from tests.support import example_run
 from tests.support.example_results import changed, is_picture, shown, strays
 
 
+@pytest.mark.slow
 def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], tmp_path: Path) -> None:
     drawn = draw_figures(tmp_path / "figures", example_run.campaign(), results)
     assert set(drawn) == {
@@ -56,6 +57,7 @@ def test_unfinished_run_gets_the_figures_it_can(results: dict[str, Any], tmp_pat
     assert set(only_pours) == {"spillage against pours", "loss map narrow"}
 
 
+@pytest.mark.slow
 def test_a_figure_that_fails_does_not_take_the_others_with_it(
     results: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

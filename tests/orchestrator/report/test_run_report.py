@@ -230,6 +230,7 @@ def test_a_pour_that_nobody_knows_of_is_called_so_and_its_liquid_is_not_made_up(
     assert "The software does not repeat it" in said
 
 
+@pytest.mark.slow
 def test_a_failed_run_says_why_and_what_stands(tmp_path: Path) -> None:
     plan = load_campaign(write_campaign(tmp_path))
     bench, directory = ToyBench(), create_run(plan)
@@ -253,6 +254,7 @@ def test_a_run_of_another_campaign_is_not_reported_as_this_one(made: Made, tmp_p
     assert report_of_what_stands(made.plan, tmp_path) is None
 
 
+@pytest.mark.slow
 def test_the_verb_writes_where_it_is_told_and_figures_for_latex(made: Made, tmp_path: Path) -> None:
     page = tmp_path / "meeting.html"
     done = decant(f"report {made.result.directory} --pdf -o {page} --json")
@@ -272,6 +274,7 @@ def test_the_verb_refuses_what_it_can_not_report_on(made: Made, argument: str, s
     assert said in done.output
 
 
+@pytest.mark.slow
 def test_the_library_writes_it_too(made: Made, tmp_path: Path) -> None:
     import decant as library
 

@@ -201,6 +201,7 @@ class Stopper:
                 next(t for t in asyncio.all_tasks() if t.get_coro().__name__ == "run_toy").cancel()  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ALL)
 def test_an_interrupted_run_on_a_slow_laboratory_asks_for_what_an_undisturbed_one_does(
     name: str, tmp_path: Path

@@ -316,6 +316,7 @@ def test_effects_are_differences_within_repetitions() -> None:
     assert even.probability == 1.0
 
 
+@pytest.mark.slow
 def test_half_a_study_shows_what_is_there(study: StudyPlan, tmp_path: Path) -> None:
     for cell in cells_of(study):
         if cell.repetition == 1 and cell.arm in ("C4", "D2"):

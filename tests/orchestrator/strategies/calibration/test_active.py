@@ -79,6 +79,7 @@ def test_it_simulates_what_is_to_be_deployed_and_then_pours_what_it_chose(
     assert known[-1] < 0.5 * known[0]
 
 
+@pytest.mark.slow
 def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, StrategyHarness]) -> None:
     strategy, _ = played
     plan, _ = plans()

@@ -64,6 +64,7 @@ def test_pours_go_into_all_receivers_by_turns(design: DesignedPours) -> None:
     assert [pour.scene for pour in design.result().measured] == [scene for _, scene in by_split]
 
 
+@pytest.mark.slow
 def test_what_each_receiver_tells_is_put_together(design: DesignedPours) -> None:
     plan = calibration_plan(parameters=SEARCHED, fixed_parameters={}, simulations=36, further=(WIDE,))
     measured = [scored.pour for scored in measured_pours(plan, {POURS: design.result()})]

@@ -57,6 +57,7 @@ def test_where_the_receiver_stands_is_found_and_bounded(found: Any) -> None:
     assert abs(found.theta.receiver_x - 0.008) < 0.004
 
 
+@pytest.mark.slow
 def test_what_was_measured_beforehand_narrows_what_the_pours_leave_open(found: Any) -> None:
     measured = calibrated(parameter_prior=(NormalPrior("speed_factor", 1.0, 0.005),)).found
     wide, narrow = (one.posterior.region["speed_factor"] for one in (found, measured))

@@ -92,6 +92,7 @@ def test_regions_of_nine_tenths_mostly_hold_the_truth() -> None:
     assert sum(held) >= 12  # of 16; fewer than that has a chance of 2 % if nine in ten held
 
 
+@pytest.mark.slow
 def test_parameters_that_make_up_for_each_other_are_named(tied: Any) -> None:
     posterior = tied.found.posterior
     said = " ".join(posterior.directions)

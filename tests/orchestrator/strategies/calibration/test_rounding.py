@@ -8,6 +8,7 @@ from statistics import fmean
 from typing import Any
 
 import numpy as np
+import pytest
 
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, posterior_draws, with_posterior
 from orchestrator.strategies.calibration.calibration_base import Calibrated
@@ -76,6 +77,7 @@ def predicted(found: Calibrated) -> PredictedPour:
     return strategy.result()
 
 
+@pytest.mark.slow
 def test_predictions_of_calibrations_that_differ_by_rounding_lie_in_each_others_intervals() -> None:
     predictions = [predicted(calibrated(k)) for k in range(3)]
     for one in predictions:

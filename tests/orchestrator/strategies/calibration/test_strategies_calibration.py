@@ -247,6 +247,7 @@ def test_of_four_parameters_the_result_maps_the_two_that_matter_with_the_others_
     assert mean.max() > 5 * mean.min()
 
 
+@pytest.mark.slow
 def test_those_who_watch_get_a_map_about_every_ten_simulations_and_replay_asks_for_the_same():
     _, played = calibrated_in_four()
     maps, simulations = [], 0

@@ -106,6 +106,7 @@ def test_the_last_prior_simulations_are_made_for_the_first_pour() -> None:
     assert losses(strategy)[0] < 0.05
 
 
+@pytest.mark.slow
 def test_a_bench_that_changes_is_noticed_and_said() -> None:
     poured = 0
 
@@ -164,6 +165,7 @@ def test_by_its_policy_it_asks_a_person(answer: str) -> None:
     assert believed(strategy).followed == answer
 
 
+@pytest.mark.slow
 def test_it_ends_when_no_further_pour_is_worth_it_and_says_how_many_were_saved() -> None:
     strategy = adaptive(pours=12, stop=StopSettings(min_gain=0.01))
     StrategyHarness(narrow_cup).run(strategy)
@@ -188,6 +190,7 @@ def test_good_enough_is_the_end() -> None:
     assert recommended.predicted_loss <= 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> None:
     strategy = adaptive(seed, pours=8, risk_limit=RiskLimitSettings(loss=0.15, probability=0.05, fallback="stop"))
@@ -255,6 +258,7 @@ def test_a_displacement_is_where_the_simulator_does_what_the_bench_does() -> Non
     assert done == pytest.approx({"angular_velocity": 1.1, "x_offset": 0.107, "height": 0.048, "max_angle": 1.51})
 
 
+@pytest.mark.slow
 def test_what_was_learnt_with_one_receiver_is_known_for_the_next() -> None:
     plan = deployment_plan(model="adaptive", pours=4, simulations_per_pour=1)
     first = adaptive(pours=4)
@@ -327,6 +331,7 @@ def asked_for(directory: Path) -> list[Any]:
     return [request for request in requests if request["type"] != "Ask"]
 
 
+@pytest.mark.slow
 def test_a_campaign_that_asks_pauses_and_goes_on_as_answered(tmp_path: Path) -> None:
     directory = tmp_path / "asked"
     with pytest.raises(OperatorNeededError, match=r"How to go on.*--answer 'go on'") as caught:

@@ -187,6 +187,7 @@ def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_pape
     assert [pytest.approx(point) for point in last.failed] == ([second] if warns else [])
 
 
+@pytest.mark.slow
 def test_touching_vessels_are_avoided_and_cost_no_pour():
     def touches_when_near(action, theta, rng):
         if action.x_offset < 0.10:

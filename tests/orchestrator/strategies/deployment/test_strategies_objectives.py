@@ -178,6 +178,7 @@ def test_the_best_action_of_the_toy_world_pours_and_without_a_floor_often_would_
         assert delivered(world(without)) < 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", STRATEGIES)
 @pytest.mark.parametrize("name", SETS)
 def test_no_strategy_recommends_to_pour_too_little(name: str, strategy: str) -> None:
@@ -277,6 +278,7 @@ def covered(actions: list[Action]) -> float:
     return area
 
 
+@pytest.mark.slow
 def test_a_search_for_the_front_covers_more_of_it_than_as_many_drawn_actions() -> None:
     searched, drawn = [], []
     for seed in range(3):

@@ -163,6 +163,7 @@ def test_a_plan_without_a_window_asks_for_what_it_always_did() -> None:
     assert all(request.purpose == "window" for request in checked[len(plain) :])
 
 
+@pytest.mark.slow
 def test_the_window_is_told_and_drawn(tmp_path: Path) -> None:
     result = planned(1, 0.5, plans.risk("cvar", 0.5, ERRORS))
     text = window_line(result.window, loss_unit(Loss()))
@@ -203,6 +204,7 @@ def run_risk(directory: Path, *, resume: bool = False) -> Any:
     return asyncio.run(toy_campaign.run_toy(directory, laboratory, plan=plan, stages=None, resume=resume))
 
 
+@pytest.mark.slow
 def test_killed_on_the_way_it_makes_the_requests_it_would_have_made(tmp_path: Path) -> None:
     result = run_risk(tmp_path / "undisturbed").results["deployment:cup"]
     assert result.window.checks
