@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from orchestrator.catalogue.source_account import SourceAccount
 from typer.testing import CliRunner
 
 from actors.balance.simulated_balance import SimulatedBalanceSettings
@@ -29,7 +30,6 @@ from actors.interfaces import (
 from actors.laboratory import InProcessLaboratory
 from actors.laboratory_settings import LaboratorySettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
-from orchestrator.catalogue.source_account import SourceAccount
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.config.yaml.yaml_errors import ConfigError
