@@ -59,12 +59,9 @@ def bench_of(cls: type[UrArm], model: str = "ur10e", *, polyscope_x: bool = Fals
         arm.close()
 
 
-QUICK = ("ur3e",)
-"""Models in the default suite, whose other tests use UR10 and UR10e; the rest are slow because they are many."""
-
-
+@pytest.mark.slow
 class TestUrArm(ArmContract):
-    @pytest.fixture(params=[name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in MODELS])
+    @pytest.fixture(params=MODELS)
     def bench(self, request: pytest.FixtureRequest) -> Iterator[ArmBench]:
         yield from bench_of(UrArm, request.param)
 

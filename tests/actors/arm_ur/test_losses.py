@@ -85,6 +85,7 @@ def answers(rig: Rig) -> bool:
 # ---- lines
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("fault", [pytest.param("drop", marks=pytest.mark.slow), "stall"])
 def test_a_lost_line_ends_the_pour_and_the_arm_stands_until_released(make_rig: Make, fault: str) -> None:
@@ -161,6 +162,7 @@ def test_killing_the_worker_in_mid_pour_stops_the_arm(make_rig: Make) -> None:
     goes_on_only_by_an_operator(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_program_that_a_stop_left_paused_never_goes_on(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT)
@@ -267,6 +269,7 @@ def test_an_interrupt_at_the_keyboard_stops_the_arm(make_rig: Make) -> None:
 # ---- others at the same robot
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_somebody_else_s_program_ends_the_pour(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT)
@@ -279,6 +282,7 @@ def test_somebody_else_s_program_ends_the_pour(make_rig: Make) -> None:
     assert "other" in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_program_that_runs_already_is_not_replaced(rig: Rig) -> None:
     _upload(rig, "while True:\n  sync()\n end")
@@ -296,6 +300,7 @@ def test_a_second_driver_is_told_that_somebody_has_the_robot(resting: Rig) -> No
     assert resting.arm.facts().program == "STOPPED"  # the first doesn't mind
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_another_robot_than_set_up_is_refused(make_rig: Make) -> None:
     rig = make_rig(connect=False, model="ur10")
@@ -353,6 +358,7 @@ def test_a_path_that_leaves_the_box_is_refused(resting: Rig) -> None:
         resting.arm.move_to_start(replace(pour_path(), approach=way))
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_without_the_client_library_it_is_said_which_one_is_missing(
     make_rig: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -387,6 +393,7 @@ def test_errors_survive_the_way_between_processes() -> None:
 # ---- small steps
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_step_moves_the_tool_as_asked_and_needs_a_word_each_time(rig: Rig) -> None:
     rig.arm.release()

@@ -41,6 +41,7 @@ def claim(address: str, names: list[str]) -> Iterator[None]:
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_an_arm_pours_while_another_client_holds_the_fieldbus_and_all_outputs(unconnected: Rig) -> None:
     rig = unconnected
@@ -51,6 +52,7 @@ def test_an_arm_pours_while_another_client_holds_the_fieldbus_and_all_outputs(un
         assert rig.arm.execute(rig.path).completed
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_an_input_that_another_client_writes_is_named(unconnected: Rig) -> None:
     rig = unconnected
@@ -60,6 +62,7 @@ def test_an_input_that_another_client_writes_is_named(unconnected: Rig) -> None:
     rig.arm.connect()
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_other_inputs_can_be_chosen(make_rig: Makers) -> None:
     rig = make_rig(connect=False, registers=30)
@@ -86,6 +89,7 @@ def other_client(name: str, address: str) -> Iterator[list[str]]:
             child.kill()
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("name", ["ur_rtde", "makers"])
 def test_a_client_of_other_makers_exchanges_values_while_the_arm_pours(unconnected: Rig, name: str) -> None:

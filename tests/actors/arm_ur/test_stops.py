@@ -62,6 +62,7 @@ def comes_home(rig: Rig) -> None:
 # ---- on request
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_stop_while_tilting_takes_effect_at_once_and_can_be_untilted(make_rig: Make) -> None:
     rig = make_rig(time_scale=1.0, frequency=500.0)
@@ -98,6 +99,7 @@ def test_after_a_stop_in_any_phase_the_pourer_is_brought_upright_slowly(make_rig
     comes_home(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_an_arm_stopped_on_its_way_to_the_pour_goes_back_the_way_it_came(rig: Rig) -> None:
     rig.fault("protective_stop", joint=0, above=6.0 * DEG)
@@ -159,6 +161,7 @@ def test_an_emergency_stop_is_recovered_from_once_its_button_is_released(make_ri
     comes_home(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_safeguard_stop_does_not_go_on_by_itself_when_it_is_released(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)
@@ -184,6 +187,7 @@ def test_a_protective_stop_from_before_keeps_the_arm_still(rig: Rig) -> None:
 # ---- by people at the panel
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_switching_to_local_control_stops_the_pour(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)
@@ -207,6 +211,7 @@ def test_a_slower_slider_is_refused_before_anything_moves(resting: Rig) -> None:
         resting.arm.move_to_start(resting.path)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_slider_moved_during_a_pour_is_told_with_what_was_executed(make_rig: Make) -> None:
     rig = make_rig()
@@ -278,6 +283,7 @@ def test_every_safety_mode_has_a_name_a_class_and_advice(number: int) -> None:
 # ---- causes, hands, forces
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_protective_stop_names_its_code_and_is_unlocked_after_five_seconds(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)
@@ -291,6 +297,7 @@ def test_a_protective_stop_names_its_code_and_is_unlocked_after_five_seconds(mak
     assert rig.now - begun > 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_nothing_moves_while_the_freedrive_button_is_pressed(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)
@@ -307,6 +314,7 @@ def test_nothing_moves_while_the_freedrive_button_is_pressed(make_rig: Make) -> 
     holds_until_released(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_forces_at_the_tool_and_in_the_wrist_are_recorded(rig: Rig) -> None:
     rig.fault("force", wrench=[0.0, 0.0, -3.0, 0.0, 0.0, 0.0], joint=5, above=START[5] + 0.6)
@@ -320,6 +328,7 @@ def test_forces_at_the_tool_and_in_the_wrist_are_recorded(rig: Rig) -> None:
     assert np.all(np.diff(forces["times"]) > 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_payload_on_the_controller_that_differs_from_the_file_is_refused(make_rig: Make) -> None:
     rig = make_rig(connect=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import Any
@@ -15,6 +16,7 @@ from actors.balance.serial_balance import SerialBalance
 from actors.balance.serial_port import tcp_address
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import BalanceFaults
+from actors.interfaces import LaboratoryError
 
 PACE = 20.0
 """Bench seconds per second in these tests."""
@@ -45,7 +47,7 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSetting
 def voices() -> Iterator[Callable[..., VirtualSerialBalance]]:
     """One virtual balance of each voice, started when first asked for.
 
-    They end with the file that needs them: at this pace each keeps an eighth of a core busy.
+    They end with the file that needs them: at this pace each that sends weights keeps an eighth of a core busy.
     """
     started: dict[tuple[str, bool], VirtualSerialBalance] = {}
 
@@ -62,17 +64,23 @@ def voices() -> Iterator[Callable[..., VirtualSerialBalance]]:
 
 
 @pytest.fixture
-def virtual(voices: Callable[..., VirtualSerialBalance]) -> Callable[..., VirtualSerialBalance]:
+def virtual(voices: Callable[..., VirtualSerialBalance]) -> Iterator[Callable[..., VirtualSerialBalance]]:
     """An empty, healthy virtual balance of a voice, on a serial line or over TCP."""
+    used: list[VirtualSerialBalance] = []
 
     def of(voice: str, tcp: bool = False) -> VirtualSerialBalance:
         balance = voices(voice, tcp)
+        used.append(balance)
         balance.plug()
         balance.faults(**asdict(BalanceFaults()))
         balance.prepare((1,))
         return balance
 
-    return of
+    yield of
+    for balance in used:  # none goes on sending weights to nobody
+        with contextlib.suppress(LaboratoryError):
+            balance.faults(**asdict(BalanceFaults()))
+            balance.prepare((1,))
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from orchestrator.catalogue.source_account import SourceAccount
 from typer.testing import CliRunner
 
 from actors.balance.simulated_balance import SimulatedBalanceSettings
@@ -30,6 +29,7 @@ from actors.interfaces import (
 from actors.laboratory import InProcessLaboratory
 from actors.laboratory_settings import LaboratorySettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
+from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -256,7 +256,7 @@ def test_a_campaign_with_a_pump_runs_and_is_reported(tmp_path: Path, monkeypatch
     for dose, grams in zip(result.doses, (80, 80, 80, 20), strict=True):
         assert dose.received_g == pytest.approx(grams, abs=0.5)
     assert "4 wanted amounts" in (folder / "report.html").read_text(encoding="utf-8")
-    last = SourceAccount.open().content("pump/beaker/water")
+    last = VesselAccount.open().content("pump/beaker")
     assert last is not None
     assert last.mass == pytest.approx(1e-3 * (result.doses[-1].left_g or 0.0))
     assert last.deviation < 3e-4, "the balance under the source has weighed it"

@@ -74,6 +74,7 @@ def test_a_protective_stop_in_a_move_and_the_way_back(fresh: Start) -> None:
     assert seen["moves again"] is True
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_an_emergency_stop_in_a_move_and_the_way_back(fresh: Start) -> None:
     controller = fresh(time_scale=8.0)
@@ -94,6 +95,7 @@ def test_an_emergency_stop_in_a_move_and_the_way_back(fresh: Start) -> None:
     assert seen["moves again"] is True
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_after_a_protective_stop_the_library_says_for_ever_that_the_move_is_running(fresh: Start) -> None:
     controller = fresh()
@@ -107,6 +109,7 @@ def test_after_a_protective_stop_the_library_says_for_ever_that_the_move_is_runn
     assert max(map(abs, seen["qd"])) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_stop_can_be_asked_for_at_a_time(fresh: Start) -> None:
     controller = fresh()
@@ -127,6 +130,7 @@ def test_a_stop_can_be_asked_for_at_a_time(fresh: Start) -> None:
     assert began + 0.5 < still < ordered + 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_safeguard_stop_holds_the_arm_until_it_is_released(fresh: Start) -> None:
     controller = fresh()
@@ -143,6 +147,7 @@ def test_a_safeguard_stop_holds_the_arm_until_it_is_released(fresh: Start) -> No
 # ---- lines
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_silent_controller_is_noticed_after_two_and_a_half_seconds_and_values_go_stale(fresh: Start) -> None:
     controller = fresh()
@@ -156,6 +161,7 @@ def test_a_silent_controller_is_noticed_after_two_and_a_half_seconds_and_values_
     assert controller.fault("state")["joints"][0] > seen["q"][0] + 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_controller_that_hangs_holds_the_arm_too(fresh: Start) -> None:
     controller = fresh()
@@ -172,6 +178,7 @@ def test_a_controller_that_hangs_holds_the_arm_too(fresh: Start) -> None:
     client.result()
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_cut_connections_are_noticed_and_the_arm_finishes_its_move(fresh: Start) -> None:
     controller = fresh()
@@ -187,6 +194,7 @@ def test_cut_connections_are_noticed_and_the_arm_finishes_its_move(fresh: Start)
     assert observe("connect", controller.address)["control"] == "connected"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_dropped_connections_can_be_made_anew_at_once(fresh: Start) -> None:
     controller = fresh()
@@ -199,6 +207,7 @@ def test_dropped_connections_can_be_made_anew_at_once(fresh: Start) -> None:
     assert seen["fresh"] > seen["stale"][0]
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_after_a_reboot_the_robot_is_off_and_has_forgotten_its_tool(fresh: Start) -> None:
     controller = fresh(time_scale=8.0)
@@ -215,6 +224,7 @@ def test_after_a_reboot_the_robot_is_off_and_has_forgotten_its_tool(fresh: Start
 # ---- the panel
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_in_local_control_the_library_refuses_to_connect(fresh: Start) -> None:
     controller = fresh(local=True)
@@ -225,6 +235,7 @@ def test_in_local_control_the_library_refuses_to_connect(fresh: Start) -> None:
     assert observe("connect", controller.address)["control"] == "connected"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_switching_to_local_control_stops_the_program_and_the_arm(fresh: Start) -> None:
     controller = fresh()
@@ -237,6 +248,7 @@ def test_switching_to_local_control_stops_the_program_and_the_arm(fresh: Start) 
     assert seen["q"][0] < 2.4
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_the_speed_slider_slows_a_move_that_runs(fresh: Start) -> None:
     controller = fresh()
@@ -246,6 +258,7 @@ def test_the_speed_slider_slows_a_move_that_runs(fresh: Start) -> None:
     assert client.result()["qd"][0] == pytest.approx(0.1, abs=0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_noise_on_joint_positions_is_seen_in_what_is_measured_only(fresh: Start) -> None:
     controller = fresh(time_scale=16.0)
@@ -270,6 +283,7 @@ def test_a_wrong_checksum_is_told(fresh: Start) -> None:
 # ---- watchdogs
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_watchdog_that_is_kicked_lets_the_move_go_on(fresh: Start) -> None:
     seen = observe("watched", fresh().address, kick=True)
@@ -284,6 +298,7 @@ def test_a_watchdog_that_is_not_kicked_stops_the_arm(fresh: Start) -> None:
     assert seen["q"] < 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_client_that_dies_leaves_the_watchdog_to_stop_the_arm(fresh: Start) -> None:
     controller = fresh(time_scale=1.0)

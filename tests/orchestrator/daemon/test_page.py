@@ -91,6 +91,7 @@ def asked(lab: OnPort) -> str:
     return key
 
 
+@pytest.mark.slow
 def test_who_has_no_token_is_asked_for_one_and_it_stays_in_the_tab(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path) as lab:
         page.goto(lab.url)
@@ -142,6 +143,7 @@ def test_a_keyboard_alone_answers_and_stops(page: Any, tmp_path: Path) -> None:
         assert lab.served.laboratories[0].bench.answers[0] == "no"
 
 
+@pytest.mark.slow
 def test_a_weight_is_typed_as_people_type_it_and_a_wrong_one_is_told(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, asking(text="Weigh the tray.", wants="weight", hands=False)) as lab:
         asked(lab)
@@ -187,6 +189,7 @@ def test_the_emergency_stop_is_one_press_and_is_latched_until_it_is_cleared(page
         assert lab.do(lab.served.get("/status"))["emergency"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "act", ["Enter", *(pytest.param(act, marks=pytest.mark.slow) for act in ("Escape", "second press"))]
 )
@@ -209,6 +212,7 @@ def test_the_default_answer_to_clearing_a_stop_keeps_it(page: Any, tmp_path: Pat
         assert lab.do(lab.served.get("/status"))["emergency"]["by"] == "admin"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_the_card_of_an_idle_rig_says_why_its_arm_cannot_move_and_what_to_do(page: Any, tmp_path: Path) -> None:
     with VirtualController.start("127.81.4.9", "ur10e") as controller:
@@ -223,6 +227,7 @@ def test_the_card_of_an_idle_rig_says_why_its_arm_cannot_move_and_what_to_do(pag
             page.locator("#cells li").filter(has_text="rig: arm can't move").wait_for()
 
 
+@pytest.mark.slow
 def test_with_two_rigs_each_is_stopped_and_cleared_alone_and_all_together(page: Any, tmp_path: Path) -> None:
     laboratory = tmp_path / "numbers.yaml"
     laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")
@@ -258,6 +263,7 @@ def test_with_two_rigs_each_is_stopped_and_cleared_alone_and_all_together(page: 
         lines.filter(has_text="left: idle").wait_for()
 
 
+@pytest.mark.slow
 def test_an_arm_that_did_not_confirm_its_stop_is_not_missed(page: Any, tmp_path: Path) -> None:
     text = "the arm of north did not confirm that it was stopped (no answer): use its own button"
     with on_port(tmp_path) as lab:
@@ -273,6 +279,7 @@ def test_an_arm_that_did_not_confirm_its_stop_is_not_missed(page: Any, tmp_path:
         page.get_by_text(text).wait_for(state="detached")
 
 
+@pytest.mark.slow
 def test_a_viewer_may_stop_everything_but_answers_nothing(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, asking(**REFILL)) as lab:
         asked(lab)
@@ -283,6 +290,7 @@ def test_a_viewer_may_stop_everything_but_answers_nothing(page: Any, tmp_path: P
         page.get_by_role("heading", name="Emergency stop").wait_for()
 
 
+@pytest.mark.slow
 def test_real_and_virtual_cannot_be_mistaken(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path) as lab:
         page.goto(lab.address())
@@ -298,6 +306,7 @@ def test_real_and_virtual_cannot_be_mistaken(page: Any, tmp_path: Path) -> None:
         assert page.evaluate("getComputedStyle(document.querySelector('header')).background") != virtual
 
 
+@pytest.mark.slow
 def test_the_queue_is_held_reordered_and_emptied(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path) as lab:
         lab.do(lab.served.submit())
@@ -315,6 +324,7 @@ def test_the_queue_is_held_reordered_and_emptied(page: Any, tmp_path: Path) -> N
         wait_until(page, lambda: lab.do(lab.served.get("/campaigns"))[0]["desired_state"] == "pause")
 
 
+@pytest.mark.slow
 def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path, HeldLaboratory) as lab:
         key = lab.do(lab.served.submit())
@@ -332,6 +342,7 @@ def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_
         assert cells[5].split("\n")[-1].strip() == "(spilled + retained) / loaded"
 
 
+@pytest.mark.slow
 def test_a_pour_without_outcome_reads_unknown_while_its_question_is_open(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path) as lab:
         key = lab.do(lab.served.submit())
@@ -372,6 +383,7 @@ def test_news_that_never_pause_hide_nothing(page: Any, tmp_path: Path) -> None:
         lab.sockets.clear()
 
 
+@pytest.mark.slow
 def test_a_lost_connection_is_told_with_what_to_do(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path) as lab:
         page.goto(lab.address())
@@ -408,6 +420,7 @@ def test_without_a_daemon_the_stop_is_disabled_and_the_physical_one_is_named(
         assert in_view(page.locator("#link").filter(has_text="NO CONNECTION"))
 
 
+@pytest.mark.slow
 def test_a_stop_that_is_pressed_in_vain_is_not_missed(page: Any, tmp_path: Path) -> None:
     with on_port(tmp_path) as lab:
         page.goto(lab.address())
@@ -441,6 +454,7 @@ def test_nothing_but_the_operator_scrolls_the_page(page: Any, tmp_path: Path) ->
         assert page.evaluate("scrollY") > 0
 
 
+@pytest.mark.slow
 def test_it_asks_nobody_else_and_shows_texts_as_texts(page: Any, tmp_path: Path) -> None:
     nasty = "<img src=x onerror=\"document.title='broken in'\"><script>document.title='broken in'</script>"
     with on_port(tmp_path, asking(text=nasty, wants="done", details={"note": nasty})) as lab:
@@ -480,6 +494,7 @@ LEGIBLE = """() => {
 }"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", [pytest.param("light", marks=pytest.mark.slow), "dark"])
 def test_everything_is_legible_and_large_enough(page: Any, tmp_path: Path, scheme: str) -> None:
     """Contrast 4.5 : 1 (3 : 1 for large letters; WCAG 2.2 AA), targets of 44 px."""
@@ -540,6 +555,7 @@ def test_a_screen_reader_finds_its_way(page: Any, tmp_path: Path) -> None:
         assert page.evaluate("document.activeElement.tagName") == "H2"  # the question, where nobody stood elsewhere
 
 
+@pytest.mark.slow
 def test_former_runs_are_found_and_what_is_noted_of_them_is_found_again(
     page: Any, tmp_path: Path, former: None
 ) -> None:
