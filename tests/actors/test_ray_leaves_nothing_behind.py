@@ -94,6 +94,7 @@ def assert_clean(facts, home: Path, seconds: float = 15.0) -> None:
     assert list(home.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_no_helper_of_ray_runs_that_nobody_uses_and_kill_9_leaves_nothing(tmp_path):
     program, facts = start("wait", tmp_path)
@@ -116,6 +117,7 @@ def test_ctrl_c_leaves_nothing(tmp_path):
     assert_clean(facts, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_sigterm_ends_in_order_without_a_frightening_stack(tmp_path):
     program, facts = start("wait", tmp_path)

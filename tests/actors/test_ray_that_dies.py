@@ -70,6 +70,7 @@ asyncio.run({"own": of_its_own, "kept": kept}[sys.argv[1]]())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("whose", "lost"),
     [

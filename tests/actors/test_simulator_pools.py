@@ -50,6 +50,7 @@ def make_pool(request):
     return lambda make: thread_pool(make=make)
 
 
+@pytest.mark.slow
 def test_a_dead_process_is_replaced_and_what_kills_every_one_is_given_up(fake, task, tmp_path):
     log = tmp_path / "log"
 

@@ -222,6 +222,7 @@ def test_a_cancelled_pour_stops_the_arm_and_the_liquid(open_bench, scene, action
     asyncio.run(play())
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.ray
 def test_the_death_of_the_arm_fails_the_pour_and_the_next_one_has_a_new_arm(ray_running, open_bench, scene, action):

@@ -81,6 +81,7 @@ def test_a_reader_that_never_reads_costs_nothing_and_holds_nobody_up(real: Real)
         slow.close()
 
 
+@pytest.mark.slow
 def test_two_hundred_read_at_once_and_a_stop_is_heard_all_the_same(real: Real) -> None:
     import httpx
 

@@ -103,6 +103,7 @@ def dose_events(folder: Path) -> tuple[Any, list[Event], list[tuple[float, DoseP
     return plan, events, seen
 
 
+@pytest.mark.slow
 def test_the_tab_dosing_shows_entities_that_the_recording_of_a_dose_has(tmp_path: Path) -> None:
     plan, events, seen = dose_events(tmp_path)
     path = tmp_path / "dose.rrd"

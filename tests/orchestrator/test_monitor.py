@@ -56,6 +56,7 @@ def test_recording_shows_both_vessels_and_the_particles_of_recorded_simulations(
     assert states == {0, 2, 3}
 
 
+@pytest.mark.slow
 def test_pourer_moves_in_the_recording_as_it_moved_in_the_simulation(recorded: Contents) -> None:
     quaternions = recorded.values("/simulation/pourer", "Transform3D:quaternion")
     x, y, z, w = np.array([q[0] for q in quaternions], dtype=float).T  # type: ignore[index]

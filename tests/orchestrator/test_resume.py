@@ -126,6 +126,7 @@ def test_two_processes_can_not_run_one_campaign(tmp_path: Path) -> None:
         first.communicate()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [Kind.FINISHED, Kind.POUR_FINISHED])
 def test_what_is_finished_is_told_and_not_done_again(tmp_path: Path, last: Kind) -> None:
     directory = killed_when_last(last, tmp_path)

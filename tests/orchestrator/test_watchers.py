@@ -55,6 +55,7 @@ def test_watchers_see_the_whole_run(tmp_path: Path) -> None:
     assert events[-1].state == "finished"
 
 
+@pytest.mark.slow
 def test_recorded_simulations_bring_frames_and_the_same_outcomes(tmp_path: Path) -> None:
     def recording(laboratory: ToyLaboratory) -> ToyLaboratory:
         plain = laboratory.simulators.simulate

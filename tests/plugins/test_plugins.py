@@ -160,6 +160,7 @@ def test_a_laboratory_that_needs_a_broken_package_is_refused_with_its_name(
     assert "example.yaml:6:17: balance.kind: plug-in 'elastic' (decant.balances) of decant-broken 0.3" in said.stderr
 
 
+@pytest.mark.slow
 def test_what_nobody_has_is_refused_with_what_is_meant(decant: Decant, folder: Path) -> None:
     path = folder / "example.yaml"
     path.write_text(LABORATORY.replace("kind: spring", "kind: sprong"))
@@ -306,6 +307,7 @@ class Bowl(Shape):
 """
 
 
+@pytest.mark.slow
 def test_a_class_that_leaves_out_what_its_kind_has_to_say_is_refused_with_its_package(tmp_path: Path) -> None:
     (tmp_path / "unfinished.py").write_text(UNFINISHED)
     metadata = tmp_path / "unfinished-0.1.dist-info"

@@ -48,6 +48,7 @@ def imported(text: str) -> Iterator[str]:
             yield from (f"{node.module}:{alias.name}" for alias in node.names)
 
 
+@pytest.mark.slow
 def test_importing_the_names_of_plug_ins_loads_no_heavy_package() -> None:
     done = subprocess.run(
         [sys.executable, "-c", IMPORTS],

@@ -148,6 +148,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return dict(json.loads(done.stdout))
 
 
+@pytest.mark.slow
 def test_a_campaign_may_ask_for_it_and_its_record_loads_to_the_same(known: dict[str, Any]) -> None:
     assert (known["settings"], known["strategy"]) == ("HypercubeSettings", "Hypercube")
     assert known["again"] is True

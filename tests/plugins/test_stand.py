@@ -242,6 +242,7 @@ LOST = "test_a_connection_lost_during_a_pour_is_an_error_and_the_arm_stands"
 LOST_AT_REST = "test_a_connection_lost_at_rest_is_an_error_of_the_next_call"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cls", "witness", "found_by", "message"),
     [

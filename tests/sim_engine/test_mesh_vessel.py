@@ -81,6 +81,7 @@ def test_mug_with_a_handle_is_centred_on_its_opening_and_measured_like_its_profi
     assert mug.lip_point(0.0) == pytest.approx([0.0388, 0.0, 0.088], abs=4e-4)
 
 
+@pytest.mark.slow
 def test_mug_retains_what_the_vessel_of_its_profile_retains(mug: Vessel) -> None:
     inner = [
         (0, 0),
@@ -130,6 +131,7 @@ def test_a_file_of_gigabytes_is_refused_before_it_is_read(tmp_path: Path, monkey
         build_vessel(VesselSpec(name="huge", shape=MeshShape(path=path, unit="mm")))
 
 
+@pytest.mark.slow
 def test_a_handle_of_its_own_that_touches_the_wall_belongs_to_the_vessel(build: Make) -> None:
     handle = trimesh.creation.box((20.0, 8.0, 30.0)).apply_translation([44.0, 0.0, 30.0])  # 0.1 mm off the facets
     alone, both = build(cup()), build(trimesh.util.concatenate([cup(), handle]))

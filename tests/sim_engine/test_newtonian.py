@@ -45,6 +45,7 @@ def test_the_packing_adds_little_to_a_viscosity_however_slow_the_shear(simulator
     assert value < 6e-4  # it was 11e-4 before the packing's stress was taken out of the velocities
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("viscosity", [1e-3, 2e-3])
 def test_a_tube_flows_as_fast_as_poiseuille_says(simulator: PourSimulator, viscosity: float) -> None:
     (mean,), _ = films.down_a_tube(3, viscosity, PLAIN)

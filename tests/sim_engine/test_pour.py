@@ -140,6 +140,7 @@ def test_liquid_is_hardly_compressed(simulator: PourSimulator) -> None:
     assert run(simulator, particles=2000).outcome.density_error < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [pytest.param(70, marks=pytest.mark.slow), 80])
 def test_what_is_left_shortly_after_a_turn_is_what_the_flow_over_a_weir_leaves(
     simulator: PourSimulator, angle: int

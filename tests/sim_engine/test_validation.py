@@ -99,6 +99,7 @@ def test_few_particles_are_held_back_by_a_lip_no_more_than_liquid_is(
     assert failures(measurements) == []
 
 
+@pytest.mark.slow
 def test_liquid_at_rest_needs_the_rim_lowered_and_a_stream_does_not(simulator: PourSimulator) -> None:
     as_it_is = suite.PLAIN.model_copy(update={"rim_correction": 0.0})
     measurements, _ = tilting.slow_tilt(tilting.straight_cup(), suite.LOAD, 500, as_it_is, tilting.ANGLES[:1])
@@ -232,6 +233,7 @@ def test_cohesion_makes_a_cube_round_and_nothing_else_does(simulator: PourSimula
     assert float(np.max(np.abs(radii - radii.mean()))) > 1.5
 
 
+@pytest.mark.slow
 def test_a_drop_oscillates_at_the_frequency_of_its_tension(simulator: PourSimulator) -> None:
     free = SimulationParameters(cohesion=0.0, xsph_rate=0.0, friction=0.0)
     measurements, (curve,), _ = droplet.oscillation(1_000, free)

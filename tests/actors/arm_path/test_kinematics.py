@@ -47,6 +47,7 @@ def test_all_postures_that_the_controller_finds_are_found(name, q):
         assert apart.min() < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 @given(q=regular)
 @settings(max_examples=examples(50), deadline=None, suppress_health_check=[HealthCheck.filter_too_much])

@@ -184,6 +184,7 @@ def test_a_program_that_a_stop_left_paused_never_goes_on(make_rig: Make) -> None
     assert rig.joints == pytest.approx(START, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_stop_takes_effect_while_the_worker_hangs(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT, time_scale=FASTER)

@@ -80,6 +80,7 @@ def test_local_control_is_named(rig: Rig) -> None:
         rig.arm.move_to_start(rig.path)
 
 
+@pytest.mark.slow
 def test_the_check_reads_the_robot_api_and_says_that_it_was_never_tried(rig: Rig) -> None:
     found = UrDiagnostics.at(rig.arm._spec)
     checks = {check.name: check for check in found.checks(None, accept="", virtual=True)}

@@ -130,6 +130,7 @@ def test_no_program_runs_while_hands_are_in(rig: Rig) -> None:
         rig.arm.execute(rig.path)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_hands_in_ends_somebody_else_s_program(rig: Rig) -> None:
     _upload(rig, "while True:\n sync()\n end")

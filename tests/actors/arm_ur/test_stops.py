@@ -144,6 +144,7 @@ def test_a_protective_stop_holds_the_tilted_pourer_until_an_operator_has_looked(
     comes_home(rig)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_an_emergency_stop_is_recovered_from_once_its_button_is_released(make_rig: Make) -> None:
     rig = make_rig(LONG_HOLD)

@@ -37,6 +37,7 @@ def checked() -> Iterator[Callable[..., dict[str, DeviceCheck]]]:
         one.close()
 
 
+@pytest.mark.slow
 def test_a_healthy_balance_passes_and_each_finding_says_what_is_right(checked):
     found = checked(ScaleSettings(settling_time=1.5))
     names = ["balance", "readings", "noise", "drift", "lag", "return to zero", "linearity", "vibration"]
@@ -67,6 +68,7 @@ class WrongWeights(EmulatedHands):
         return mass
 
 
+@pytest.mark.slow
 def test_a_balance_that_weighs_wrong_fails(checked):
     found = checked(ScaleSettings(), WrongWeights)
     assert found["linearity"].state == "fail"

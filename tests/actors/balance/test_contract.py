@@ -74,6 +74,7 @@ class TestABalanceOnASerialLine(BalanceContract):
         bench.driver.close()
 
 
+@pytest.mark.slow
 class TestABalanceOverTcp(BalanceContract):
     @pytest.fixture(params=["a-and-d", "mt-sics"])
     def bench(self, request: pytest.FixtureRequest, virtual: Any) -> Iterator[BalanceBench]:
@@ -246,6 +247,7 @@ class WaitsForItsLine(SerialBalance):
                 self._check_interrupted()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cheat", "found_by", "message"),
     [

@@ -23,6 +23,7 @@ from actors.balance.scale_model import Load
 from .conftest import SOON
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("voice", encoders())
 def test_a_tared_balance_weighs_what_is_added(driver, voice):

@@ -119,6 +119,7 @@ def test_behind_its_device_it_is_a_balance_like_any_other(driver):
     assert counts["lines"] > 5
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.ray
 def test_in_a_process_of_its_own_it_weighs_and_its_errors_keep_their_kind(ray_running, virtual):

@@ -27,6 +27,7 @@ def test_silence_is_not_taken_for_rest(driver, each_dialect):
     assert balance.statistics()["unanswered"] >= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dialect", dialects())
 def test_a_bad_cable_costs_time_but_never_gives_another_weight(driver, dialect):
     far, balance = driver(dialect, settling=SettlingRule(deadline=400.0), answer_time=0.05)

@@ -38,6 +38,7 @@ def test_the_lag_of_either_form_is_found_within_its_error(form, lag, put, step, 
     assert found.moved == pytest.approx(put, abs=0.08)
 
 
+@pytest.mark.slow
 def test_the_stated_error_covers_the_scatter_of_repeated_measurements():
     found = []
     for seed in range(12):

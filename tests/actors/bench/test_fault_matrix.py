@@ -275,6 +275,7 @@ def test_a_fault_of_the_balance(open_stage, name, phase):
     assert outcome.retained == pytest.approx(stage.contents.in_pourer, abs=3e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     "phase", ["tilt", *(pytest.param(p, marks=pytest.mark.slow) for p in ("approach", "hold", "return"))]

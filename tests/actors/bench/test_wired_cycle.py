@@ -218,6 +218,7 @@ def test_a_pour_given_up_before_consent_was_not_made(open_stage):
     assert asyncio.run(play()) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_pour_given_up_while_it_tilts_stops_the_arm_where_it_is(open_stage):
     seen = []

@@ -306,6 +306,7 @@ def test_a_second_control_interface_is_told_that_the_registers_are_in_use(seen: 
     assert second["first still moves"] is True
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_what_can_not_be_reached_ends_the_program_and_a_new_upload_helps(seen: Seen) -> None:
     unreachable = seen("unreachable")

@@ -66,6 +66,7 @@ def test_a_stretched_arm_is_as_long_as_its_links() -> None:
     assert point == pytest.approx((m.a2 + m.a3, -m.d4 - m.d6, m.d1 - m.d5))
 
 
+@pytest.mark.slow
 @each_model
 @given(q=joints)
 @example(q=(0.0, 0.0, 0.0, 0.0, 6.3e-07, 0.0))

@@ -323,6 +323,7 @@ def test_no_bytes_on_any_port_bring_it_down(shared: VirtualController, port: int
     assert greeting(shared.address).startswith(b"Connected")
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("port", PORTS)
 def test_connections_that_come_and_go_or_never_read_do_no_harm(shared: VirtualController, port: int) -> None:

@@ -253,6 +253,7 @@ def test_what_goes_wrong_while_it_runs_is_told_with_its_line(text: str, line: in
     assert caught.value.line == line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     [

@@ -70,6 +70,7 @@ def test_hardware_doesn_t_move_without_the_flag(campaign: Path, verb: str) -> No
     assert not (campaign.parent / "runs").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_the_flag_alone_doesn_t_arm_where_nobody_is_at_a_terminal(campaign: Path) -> None:
     for command in (["run", str(campaign)], ["robot", "jog", str(campaign.with_name("rig.yaml"))]):
@@ -173,6 +174,7 @@ def test_envelope_covers_the_actions_of_the_campaign_and_grows_with_them(campaig
     assert low.worst.high[2] + 0.05 < high.worst.high[2] < low.worst.high[2] + 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_limits_of_the_laboratory_refuse_a_campaign_that_would_break_all_of_them(campaign: Path) -> None:
     laboratory = campaign.with_name("rig.yaml")

@@ -21,6 +21,7 @@ def check(*arguments: str) -> Result:
     return CliRunner().invoke(app, ["balance", "check", *arguments], catch_exceptions=False)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_the_balance_of_a_virtual_laboratory_is_checked_and_recorded_without_a_person(tmp_path, monkeypatch):
     monkeypatch.setattr(balance_check, "REST_TIME", 5.0)

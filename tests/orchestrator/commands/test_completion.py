@@ -59,6 +59,7 @@ def completed(place: Path, shell: str, line: str, **environment: str) -> set[str
     return {word for word in done.stdout.splitlines() if word}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_campaign_is_completed_and_no_other_file(place: Path, shell: str) -> None:
     found = completed(place, shell, "decant run configs/campaigns/q")

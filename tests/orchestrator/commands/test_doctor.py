@@ -207,6 +207,7 @@ def test_stops_are_named_and_never_unlocked(tmp_path: Path) -> None:
         assert checked(path)["safety"]["found"] == "robot emergency stop"
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(
     ("fault", "arguments", "line", "why"),

@@ -29,6 +29,7 @@ def campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return small_campaign.write_campaign(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_dry_run_predicts_and_pours_nothing(campaign: Path) -> None:
     result = decant("dose", str(campaign), "--amount", "25 g", "--dry-run")
     assert result.exit_code == 0, result.output

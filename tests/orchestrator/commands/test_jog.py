@@ -120,6 +120,7 @@ def test_home_from_home_is_no_step() -> None:
     assert sum(step.amount for step in steps if step.axis == "joint 1") == pytest.approx(25.0)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_arm_of_hardware_moves_by_what_was_typed_and_ctrl_c_stops_it(tmp_path: Path) -> None:
     start = [radians(q) for q in hardware_laboratory.HOME]

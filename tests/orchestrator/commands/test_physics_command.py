@@ -72,6 +72,7 @@ def test_a_case_alone_passes_and_its_json_is_valid() -> None:
     assert spread["value"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("two_cases")
 def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -120,6 +121,7 @@ def test_a_long_case_tells_how_far_it_is_and_a_case_without_criteria_is_judged_b
     assert (result.exit_code, result.stderr.splitlines()[-1]) == (0, "nothing was judged")
 
 
+@pytest.mark.slow
 def test_many_panels_go_into_rows_and_spreads_are_bands(tmp_path: Path) -> None:
     from matplotlib.image import imread
 

@@ -168,6 +168,7 @@ async def is_interrupted_twice(plan: CampaignPlan, laboratory: object, directory
     raise asyncio.CancelledError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ends", "code"), [pytest.param(breaks_off, 3, marks=pytest.mark.slow), (is_interrupted_twice, 130)]
 )

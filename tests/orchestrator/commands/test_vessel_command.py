@@ -69,6 +69,7 @@ def mesh(of: Bench, folder: Path) -> dict[str, Any]:
     return {"mesh": folder / "scan.stl"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "door",
@@ -104,6 +105,7 @@ AS_STORED = {
 """What undoes the turn that an EXIF orientation asks for."""
 
 
+@pytest.mark.slow
 def test_a_cup_photographed_upright_by_a_camera_on_its_side_comes_out_as_it_is(tmp_path: Path) -> None:
     of = bench("tumbler")
     sources = photo(of, tmp_path)
@@ -160,6 +162,7 @@ def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsy
     assert deviations[2] < min(deviations[:2])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("door", [callipers, fill, pytest.param(photo, marks=pytest.mark.slow)])
 def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) -> None:
     made(tmp_path, door(bench("cone"), tmp_path))
@@ -227,6 +230,7 @@ def written(text: str) -> Door:
     return door
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("door", "said"),
     [

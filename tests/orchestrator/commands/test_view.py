@@ -52,6 +52,7 @@ def _journal(run: Path, notes: dict[str, object] | None = None) -> None:
             journal.append(Kind.POUR_FINISHED, {"id": key, "outcome": outcome, "seconds": 1.0}, stage=stage)
 
 
+@pytest.mark.slow
 def test_recordings_stand_beside_each_other_under_their_names(recording: Path, tmp_path: Path) -> None:
     path = put_beside({"first": recording, "second": recording}, tmp_path / "both.rrd")
     alone, both = Contents(recording), Contents(path)

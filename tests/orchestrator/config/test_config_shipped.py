@@ -54,6 +54,7 @@ def test_shipped_campaign_can_start(path: Path) -> None:
     assert check_campaign(load_campaign(path)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ur3e-kern", "ur5e-mettler", "ur10e-a-and-d"])
 def test_the_first_pours_fit_every_laboratory_of_hardware_also_with_a_calibrated_robot(name: str) -> None:
     plan = load_campaign(CONFIGS / "campaigns" / "first-pour.yaml", CONFIGS / "laboratories" / f"{name}.yaml")
@@ -170,6 +171,7 @@ def test_paths_resolve_against_the_file_that_names_them(tmp_path: Path, monkeypa
     assert load_laboratory(CONFIGS / "laboratories" / "planning.yaml").bench is None
 
 
+@pytest.mark.slow
 def test_loading_a_campaign_starts_nothing_heavy() -> None:
     code = (
         "import sys; from pathlib import Path; from orchestrator.config.file_loading import load_campaign;"

@@ -145,6 +145,7 @@ DEPLOYMENTS: dict[str, tuple[type[Any], dict[str, Any]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DEPLOYMENTS)
 def test_every_deployment_keeps_to_them_although_the_best_lies_beyond(name: str) -> None:
     kind, changes = DEPLOYMENTS[name]

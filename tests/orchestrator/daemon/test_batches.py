@@ -54,6 +54,7 @@ def test_a_batch_is_taken_as_a_whole_or_not_at_all_and_reports_each_item(tmp_pat
     run(work())
 
 
+@pytest.mark.slow
 def test_held_postponed_and_cancelled_items_do_not_start(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:
@@ -80,6 +81,7 @@ def test_held_postponed_and_cancelled_items_do_not_start(tmp_path: Path) -> None
     run(work())
 
 
+@pytest.mark.slow
 def test_a_reserved_rig_starts_nothing_of_others(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:

@@ -51,6 +51,7 @@ def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], t
     assert all(is_picture(path) for path in drawn.values())
 
 
+@pytest.mark.slow
 def test_unfinished_run_gets_the_figures_it_can(results: dict[str, Any], tmp_path: Path) -> None:
     assert draw_figures(tmp_path, example_run.campaign(), {}) == {}
     only_pours = draw_figures(tmp_path, example_run.campaign(), {"narrow cup": results["narrow cup"]})

@@ -126,6 +126,7 @@ def test_the_order_in_which_simulations_return_changes_no_request(
 NAN = math.nan
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*ALL, "D3, free", pytest.param("D3, free, varying noise", marks=pytest.mark.slow)])
 @settings(max_examples=examples(5), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**31), share=st.sampled_from([0.1, 0.5, 0.9, 1.0]))

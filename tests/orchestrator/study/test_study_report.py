@@ -153,6 +153,7 @@ def test_a_study_of_which_nothing_is_there_yet_has_a_page(study: StudyPlan, tmp_
     assert "<img" not in page
 
 
+@pytest.mark.slow
 def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
     study: StudyPlan, tmp_path: Path
 ) -> None:
@@ -242,6 +243,7 @@ def test_nothing_leaves_a_figure_no_mark_is_cut_and_no_band_fills_a_panel(study:
         assert not [c for c in one.figure.findobj(PolyCollection) if c.get_alpha() is not None], one.number
 
 
+@pytest.mark.slow
 def test_a_panel_says_what_its_bench_is_like(study: StudyPlan) -> None:
     for number in ("5a", "5b", ""):
         one = next(one for one in all_drawn(study) if one.number == number)

@@ -50,6 +50,7 @@ def found() -> Any:
     return calibrated().found
 
 
+@pytest.mark.slow
 def test_where_the_receiver_stands_is_found_and_bounded(found: Any) -> None:
     low, high = found.posterior.region["receiver_x"]
     assert low <= 0.008 <= high

@@ -144,6 +144,7 @@ def test_the_best_theta_is_one_that_the_pours_do_not_exclude(seed: int) -> None:
         assert low <= getattr(result.found.theta, name) <= high, name
 
 
+@pytest.mark.slow
 def test_what_is_expected_and_the_map_are_those_of_the_theta_that_is_recommended(tied: Any) -> None:
     grids, theta = tied.found.map, tied.found.theta.model_dump()
     assert grids.over == ("cohesion", "friction") or not grids.held

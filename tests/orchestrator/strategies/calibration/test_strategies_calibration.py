@@ -118,6 +118,7 @@ def test_holding_everything_back_is_refused():
 # -- C4 ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_c4_finds_a_theta_better_than_random_ones():
     pours = measured()
     baseline = np.median(

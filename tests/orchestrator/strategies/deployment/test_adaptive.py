@@ -63,6 +63,7 @@ def believed(strategy: Hybrid) -> Believed:
     return trust
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("simulations_per_pour", [1, "free"])
 def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(simulations_per_pour: Any) -> None:
     strategy = adaptive(pours=3, simulations_per_pour=simulations_per_pour)
@@ -152,6 +153,7 @@ def test_by_its_policy_it_ends_where_the_simulator_says_nothing() -> None:
     assert result.recommended is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("answer", ["go on", "stop"])
 def test_by_its_policy_it_asks_a_person(answer: str) -> None:
     strategy = adaptive(pours=6, discrepancy_policy=DiscrepancyPolicySettings(limit=0.7, policy="ask"))
@@ -200,6 +202,7 @@ def test_a_limit_is_kept_by_every_pour_after_the_first_good_one(seed: int) -> No
     assert max(found[good:]) <= 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [None, RiskLimitSettings()])
 def test_with_a_limit_pours_are_made_for_what_they_tell_once_one_has_kept_it(limit: Any) -> None:
     play = StrategyHarness(narrow_cup).run(adaptive(pours=3, risk_limit=limit))
@@ -209,6 +212,7 @@ def test_with_a_limit_pours_are_made_for_what_they_tell_once_one_has_kept_it(lim
     assert (problems[0].lookahead, problems[-1].lookahead) == (limit is None, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("otherwise", ["stop", "go on"])
 def test_a_limit_that_can_not_be_kept_is_said_before_the_pour(otherwise: Any) -> None:
     limit = RiskLimitSettings(loss=0.02, probability=0.001, fallback=otherwise)

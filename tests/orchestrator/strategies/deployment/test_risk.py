@@ -47,6 +47,7 @@ def true_losses(values: dict[str, float], count: int = 4000) -> np.ndarray:
     return np.array([quiet_valleys(executed(action, error)) for error in errors])
 
 
+@pytest.mark.slow
 def test_under_errors_the_broad_valley_is_chosen_and_without_them_the_narrow_one() -> None:
     plain = OneShotPlanning(deployment_plan(strategy="D1", pours=0, iterations=18, initial_samples=6), SCENE, THETA, 2)
     StrategyHarness(two_valleys).run(plain)
@@ -128,6 +129,7 @@ def touching_below(limit: float) -> Any:
     return spill
 
 
+@pytest.mark.slow
 def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_planned_no_action() -> None:
     """Without errors the best place is right at the contact; with them well away from it."""
     strategy = risky(0, iterations=14)
@@ -145,6 +147,7 @@ def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_plann
     assert plain.best_values["x_offset"] < strategy.best_values["x_offset"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", [ERRORS, PoseError(x=8e-3, tilt=1 * DEG, speed_factor=0.0)])
 def test_where_every_action_touches_nothing_is_recommended(errors: PoseError) -> None:
     strategy = risky(iterations=4, pours=1, window=plans.window(0.1), risk=plans.risk("expected", pose_error=errors))

@@ -163,6 +163,7 @@ def test_pours_of_another_motion_are_left_out(tmp_path: Path) -> None:
     assert "data.run: has no pour that this deployment could have made: 5 pours: height was 50 mm, here" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "expected"),
     [

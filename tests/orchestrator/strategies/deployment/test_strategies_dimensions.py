@@ -149,6 +149,7 @@ CASES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "dimension"), CASES)
 def test_proposals_keep_to_the_box_and_fits_see_only_what_was_measured(name: str, dimension: int) -> None:
     play = played(name, dimension)
@@ -192,6 +193,7 @@ def _costs(name: str, play: StrategyHarness) -> list[float]:
     return [*known, *(cost for costs in waiting.values() for cost in costs)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "dimension"), CASES)
 def test_whoever_returns_first_and_when_replayed_the_requests_are_the_same(name: str, dimension: int) -> None:
     first = played(name, dimension)

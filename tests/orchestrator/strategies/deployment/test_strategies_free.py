@@ -114,6 +114,7 @@ def test_a_simulator_that_fails_for_ever_is_let_alone() -> None:
     assert any("simulations failed" in d.text for d in strategy.decisions if POOL_RESTS in d.values)
 
 
+@pytest.mark.slow
 def test_a_person_who_is_asked_about_the_simulator_is_answered_before_the_next_pour() -> None:
     def wrong(action: Any, theta: Any, rng: np.random.Generator) -> float:
         return 1.0 - 0.8 * narrow_cup(action, theta, rng)

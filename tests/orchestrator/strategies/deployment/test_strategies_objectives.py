@@ -290,6 +290,7 @@ def test_a_search_for_the_front_covers_more_of_it_than_as_many_drawn_actions() -
     assert np.mean(searched) > np.mean(drawn) + 0.5 * np.std(drawn)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_a_search_for_the_front_is_repeated_by_a_replay_and_whatever_finishes_first(strategy: str) -> None:
     def fresh() -> Any:
