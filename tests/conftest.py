@@ -31,7 +31,10 @@ if "PYTEST_XDIST_WORKER" not in os.environ:
 
 
 MANY = (Path(__file__).parent / "actors", Path(__file__).parent / "orchestrator")
-"""Folders of many short files. They come last, so that no long one is alone at the end of a run on several workers."""
+"""Folders of many short files. They come last, so that no long one is alone at the end of a run on several workers.
+
+Their files alternate: many tests of the first wait for devices, and those of the second compute meanwhile.
+"""
 
 REALTIME = (Path(__file__).parent / "end_to_end", Path(__file__).parent / "reliability")
 """Folders whose tests watch other processes: each is `realtime`."""
@@ -83,7 +86,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
     Reruns are counted in the last line. A test that needs one on an idle machine has a fault.
     """
-    items.sort(key=lambda item: any(item.path.is_relative_to(folder) for folder in MANY))
+    rank: dict[Path, float] = {}
+    for folder in MANY:
+        files = list(dict.fromkeys(item.path for item in items if item.path.is_relative_to(folder)))
+        rank |= {path: (index + 1) / len(files) for index, path in enumerate(files)}
+    items.sort(key=lambda item: rank.get(item.path, 0.0))
     for item in items:
         if any(item.path.is_relative_to(folder) for folder in REALTIME):
             item.add_marker("realtime")

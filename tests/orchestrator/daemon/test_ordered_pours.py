@@ -147,6 +147,7 @@ def test_a_pour_without_outcome_is_unknown_and_blocks_its_vessels_until_an_opera
             assert (await served.post("/pours", order()))["state"] == "unknown"
             told = await served.post("/pours", order("order-2"), status=409)
             assert "order-1 has begun and has no outcome" in told["detail"]
+            await served.until(key, "unknown")
             await served.post(f"/campaigns/{key}/resume")
             question = await served.question()
             await served.post(f"/questions/{question['id']}/answer", {"answer": "lost"})
