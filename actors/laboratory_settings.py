@@ -197,7 +197,7 @@ class LaboratorySettings(Settings):
     spill_sensor: Annotated[
         Annotated[SpillSensorSettings, OneOf(lambda: SPILL_SENSORS.all)] | None, NOT_IN_FINGERPRINT
     ] = None
-    """A sensor that watches the table for spills; the campaign waits until the operator has wiped it."""
+    """A sensor that watches the table for spills; nothing more is poured until the operator has wiped it."""
 
     operator: Annotated[OperatorSettings, NOT_IN_FINGERPRINT] = OperatorSettings()
     """The operator next to the arm or the pump."""

@@ -14,7 +14,6 @@ from __future__ import annotations
 import threading
 import time
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
@@ -25,7 +24,7 @@ from actors.balance.dialect_registry import kinds
 from actors.bench.bench_clock import Pace
 from actors.interfaces import LaboratoryError
 from sim_engine.settings.model import SET_BY_PROGRAM, OneOf, Problems, Settings, Text
-from sim_engine.settings.plugin_registry import PluginRegistry
+from sim_engine.settings.plugin_registry import PluginRegistry, settings_kind
 from sim_engine.settings.quantity import Quantity
 
 Flow = Annotated[float, Quantity("m^3/s", "5 mL/s", 0.0, 1e-3, positive=True)]
@@ -183,24 +182,11 @@ class SpillSensorSettings(Settings):
         """See `PumpSettings.check_laboratory`."""
 
 
-def _kind_of(base: str) -> Callable[[object, str], Any]:
-    """Accepts settings classes that derive from a class of this module."""
-
-    def accept(loaded: object, name: str) -> Any:
-        if not (isinstance(loaded, type) and issubclass(loaded, globals()[base])):
-            raise TypeError(f"should be a class derived from decant.plugins.{base}")
-        if not issubclass(loaded, Settings) or loaded.model_fields["kind"].default != name:
-            raise TypeError(f"its field 'kind' should be Literal['{name}'] = '{name}', as it is registered")
-        return loaded
-
-    return accept
-
-
-PUMPS: PluginRegistry[type[PumpSettings]] = PluginRegistry("decant.pumps", "pump", _kind_of("PumpSettings"))
+PUMPS: PluginRegistry[type[PumpSettings]] = PluginRegistry("decant.pumps", "pump", settings_kind(PumpSettings))
 """Settings classes of all installed kinds of pumps."""
 
 SPILL_SENSORS: PluginRegistry[type[SpillSensorSettings]] = PluginRegistry(
-    "decant.spill_sensors", "spill sensor", _kind_of("SpillSensorSettings")
+    "decant.spill_sensors", "spill sensor", settings_kind(SpillSensorSettings)
 )
 """Settings classes of all installed kinds of spill sensors."""
 

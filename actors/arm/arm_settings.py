@@ -40,7 +40,7 @@ from sim_engine.settings.model import (
     Settings,
     Text,
 )
-from sim_engine.settings.plugin_registry import PluginRegistry
+from sim_engine.settings.plugin_registry import PluginRegistry, settings_kind
 from sim_engine.settings.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -252,15 +252,7 @@ class ArmSettings(Settings):
         return None
 
 
-def _arm(loaded: object, name: str) -> type[ArmSettings]:
-    if not (isinstance(loaded, type) and issubclass(loaded, ArmSettings)):
-        raise TypeError("should be a class derived from decant.plugins.ArmSettings")
-    if loaded.model_fields["kind"].default != name:
-        raise TypeError(f"its field 'kind' should be Literal['{name}'] = '{name}', as it is registered")
-    return loaded
-
-
-ARMS: PluginRegistry[type[ArmSettings]] = PluginRegistry("decant.arms", "arm", _arm)
+ARMS: PluginRegistry[type[ArmSettings]] = PluginRegistry("decant.arms", "arm", settings_kind(ArmSettings))
 """Settings classes of all installed kinds of arms."""
 
 ArmModel = Annotated[str, Choice(lambda: tuple(MODELS), similar=False)]

@@ -293,16 +293,20 @@ def _open_pump(
             await balance.put(Load((0.0,), (mass,)))
 
         hands = Hands(BenchContents(spec.balance.position), put)
-        if spec.operator.answers == "virtual":
-            operator = operator or VirtualOperator(hands, spec.operator.time / scale if scale > 0.0 else 0.0)
-        elif operator is not None:
-            operator = PlayedOperator(operator, hands)
+        operator = _operator(spec, hands, operator, scale)
     assert operator is not None
     questions = OperatorQuestions(operator, spec.operator, tell, scale if scale > 0.0 else 1.0)
     supply = opening.supply(spec.source, None if hands is None else hands.contents, scale, tell)
     watch = opening.watch(spec.spill_sensor, questions, tell)
     bench = PumpBench(spec.mode, pump, balance, spec.balance, questions, supply, watch, spec.dosing, hands, tell)
     return OpenBench(bench, opening.devices, operator=operator)
+
+
+def _operator(spec: LaboratorySettings, hands: Hands, operator: Operator | None, time_scale: float) -> Operator | None:
+    """Who answers at a virtual bench; a person's answers move its things, too."""
+    if spec.operator.answers == "virtual":
+        return operator or VirtualOperator(hands, spec.operator.time / time_scale if time_scale > 0.0 else 0.0)
+    return None if operator is None else PlayedOperator(operator, hands)
 
 
 def _discard_notice(notice: Notice) -> None:
@@ -338,10 +342,7 @@ async def _open_devices(
             ground_truth = FollowedBench(spec.bench, true_arm, emulators, hands, liquid)
         else:
             ground_truth = VirtualBench(spec.bench, arm_spec.time_scale, emulators, hands, liquid)
-        if spec.operator.answers == "virtual":
-            operator = operator or VirtualOperator(hands, spec.operator.time / arm_spec.time_scale)
-        elif operator is not None:
-            operator = PlayedOperator(operator, hands)
+        operator = _operator(spec, hands, operator, arm_spec.time_scale)
     assert operator is not None
     questions = OperatorQuestions(operator, spec.operator, tell, arm_spec.time_scale)
     supply = None if spec.source is None else opening.supply(spec.source, contents, arm_spec.time_scale, tell)

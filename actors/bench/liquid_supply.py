@@ -206,7 +206,9 @@ class SpillWatch:
         safe: Callable[[], Awaitable[Any]],
         alarm: Callable[[], Awaitable[None]] | None = None,
     ) -> PourMeasurement:
-        """Make a pour once the table is dry. Its notes get the events as `spills`.
+        """Make a pour once the table is dry. Its notes get the events since the pour before as `spills`.
+
+        A table that the pour has made wet is wiped before the next one, so that the outcome waits for nobody.
 
         Args:
             pour: makes it.
@@ -216,19 +218,18 @@ class SpillWatch:
         Raises:
             NotPouredError: the table is not dry, or the sensor cannot be read; nothing was poured.
         """
+        self._seen = []
         try:
             await self.look()
             await self._wiped(safe)
         except LaboratoryError as error:
             raise NotPouredError(f"{error}. Nothing was poured") from error
-        self._seen = []
         async with self._following(alarm):
             measured = await pour()
-        if self._spec.simulates:
-            await self._device.call("spill", measured.spilled, deadline=ANSWER_DEADLINE)
-        with contextlib.suppress(LaboratoryError):  # the pour counts; the next one does not begin before it is dry
+        with contextlib.suppress(LaboratoryError):  # the pour counts; the next one begins with another look
+            if self._spec.simulates:
+                await self._device.call("spill", measured.spilled, deadline=ANSWER_DEADLINE)
             await self.look()
-            await self._wiped(safe)
         if not self._seen:
             return measured
         return replace(measured, notes={**measured.notes, "spills": [asdict(event) for event in self._seen]})
@@ -282,13 +283,14 @@ class SpillWatch:
             failed = False
             while not over.is_set():
                 try:
-                    events, failed = await self.look(), False
+                    events = await self.look()
+                    if alarm is not None and any(event.wet for event in events):
+                        await alarm()
+                    failed = False
                 except LaboratoryError as error:
                     if not failed:
                         self._tell(Notice("warning", f"spill sensor: {error}"))
-                    events, failed = [], True
-                if alarm is not None and any(event.wet for event in events):
-                    await alarm()
+                    failed = True
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(over.wait(), LOOK)
 

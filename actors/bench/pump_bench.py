@@ -240,7 +240,6 @@ class PumpBench:
         self, scene: Scene, dose: DoseTarget, seed: int, progress: ProgressCallback | None
     ) -> PourMeasurement:
         self._density = scene.liquid.density
-        begun = time.monotonic()
         self._show(progress, "operator", dose, 0.0)
         await self.balance.device.revive()
         await self.balance.resume()
@@ -251,12 +250,9 @@ class PumpBench:
         deviation = max(self._balance_spec.deviation, self._step)
         planner = PortionPlanner.after(source.knowledge)
         enough = max(self._pump.spec.smallest * self._density, 0.5 * dose.limit)
-        received, portions, end = 0.0, list[tuple[float, float]](), DoseEnd.SHORT.value
-        while len(portions) <= self._dosing.most_top_ups:
-            missing = dose.amount - received
-            if missing <= enough:
-                end = DoseEnd.REACHED.value
-                break
+        received, portions, wet = 0.0, list[tuple[float, float]](), list[str]()
+        begun = time.monotonic()
+        while (missing := dose.amount - received) > enough and len(portions) <= self._dosing.most_top_ups and not wet:
             if self._stopped:
                 raise LaboratoryError("the pump was stopped")
             self._show(progress, "dose", dose, received)
@@ -264,11 +260,12 @@ class PumpBench:
             wet = await self._portion(nominal, (seed, len(portions)))
             before, received = received, (await self.balance.weigh()).mass - self._zero
             portions.append((nominal, received - before))
-            if wet:
-                end = f"the table became wet: {', '.join(wet)}"
-                break
-            planner.learn(nominal, received - before, math.sqrt(2.0) * deviation)
-        if received > dose.amount + dose.limit and end == DoseEnd.REACHED.value:
+            if not wet:
+                planner.learn(nominal, received - before, math.sqrt(2.0) * deviation)
+        end = DoseEnd.REACHED.value if missing <= enough else DoseEnd.SHORT.value
+        if wet:
+            end = f"the table became wet: {', '.join(wet)}"
+        elif -missing > dose.limit:
             end = "more than the tolerance"
         self._show(progress, "record", dose, received)
         left = replace(

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from sim_engine.errors import DecantError
 
@@ -120,6 +120,24 @@ class PluginRegistry(Generic[T]):
             else:
                 packages[entry.name] = package
         return dict(sorted(usable.items())), tuple(broken), packages
+
+
+def settings_kind(base: type[Any]) -> Callable[[object, str], Any]:
+    """An `accept` of `PluginRegistry` for settings classes that are told apart by their field `kind`.
+
+    Args:
+        base: class of `decant.plugins` from which they derive.
+    """
+
+    def accept(loaded: object, name: str) -> Any:
+        if not (isinstance(loaded, type) and issubclass(loaded, base)):
+            raise TypeError(f"should be a class derived from decant.plugins.{base.__name__}")
+        fields: Any = getattr(loaded, "model_fields", {})
+        if fields["kind"].default != name:
+            raise TypeError(f"its field 'kind' should be Literal['{name}'] = '{name}', as it is registered")
+        return loaded
+
+    return accept
 
 
 def _whole(found: T) -> T:
