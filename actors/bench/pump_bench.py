@@ -228,7 +228,8 @@ class PumpBench:
 
     async def _remaining(self) -> str:
         with contextlib.suppress(LaboratoryError):
-            await self._arrived()
+            await self._arrived()  # of a simulated pump that was lost nobody knows what it had moved
+            await self.balance.device.revive()
             await self.balance.resume()
             weight = await self.balance.weigh()
             return f"the balance shows {1e3 * (weight.mass - self._zero):.2f} g in the receiver"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
+import signal
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -27,7 +29,7 @@ from actors.interfaces import (
     PourProgress,
     UnknownPourError,
 )
-from actors.laboratory import InProcessLaboratory
+from actors.laboratory import InProcessLaboratory, RayLaboratory
 from actors.laboratory_settings import LaboratorySettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
 from orchestrator.catalogue.vessel_account import VesselAccount
@@ -68,7 +70,7 @@ def target(grams: float, **source: Any) -> DoseTarget:
 
 
 class Stage:
-    def __init__(self, opened: InProcessLaboratory, notices: list[Notice]) -> None:
+    def __init__(self, opened: InProcessLaboratory | RayLaboratory, notices: list[Notice]) -> None:
         assert opened.opened is not None
         assert isinstance(opened.opened.bench, PumpBench)
         self.bench, self.operator, self.notices = opened.opened.bench, opened.opened.operator, notices
@@ -86,10 +88,12 @@ class Stage:
         return measured.notes["dose"] | {"spills": measured.notes.get("spills", [])}
 
 
-def run(scenario: Callable[[Stage], Awaitable[None]], person: Any = None, **changes: Any) -> None:
+def run(
+    scenario: Callable[[Stage], Awaitable[None]], person: Any = None, *, kind: Any = InProcessLaboratory, **changes: Any
+) -> None:
     async def body() -> None:
         notices: list[Notice] = []
-        opened = InProcessLaboratory(laboratory(**changes), need_bench=True, operator=person)
+        opened = kind(laboratory(**changes), need_bench=True, operator=person)
         opened.listen(notices.append)
         async with opened:
             await scenario(Stage(opened, notices))
@@ -187,6 +191,30 @@ def test_a_stopped_pump_makes_the_amount_unknown_and_tells_the_weight() -> None:
         assert stage.contents.in_receiver < 0.045
 
     run(scenario)
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.ray
+@pytest.mark.parametrize("lost", ["pump", "balance"])
+def test_a_device_whose_process_dies_in_a_portion_leaves_the_dose_unknown_and_is_started_again(
+    ray_running: None, lost: str
+) -> None:
+    async def scenario(stage: Stage) -> None:
+        device = stage.bench._pump.device if lost == "pump" else stage.bench.balance.device
+        victim = await device.pid()
+        flows = asyncio.Event()
+        dose = asyncio.ensure_future(stage.dose(50, lambda seen: flows.set() if seen.checkpoint == "dose" else None))
+        await flows.wait()
+        os.kill(victim, signal.SIGKILL)
+        with pytest.raises(UnknownPourError, match=r"process .*died.* not the dose that was asked for"):
+            await dose
+        again = await stage.dose(20)
+        assert again["end"] == "reached"
+        assert again["received"] == pytest.approx(0.02, abs=5e-4)
+        assert await device.pid() != victim
+
+    run(scenario, kind=RayLaboratory, pump=SimulatedPumpSettings(time_scale=5.0), in_process=False)
 
 
 WET = {
