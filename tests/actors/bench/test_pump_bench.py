@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import os
 import signal
@@ -31,7 +32,8 @@ from actors.interfaces import (
 )
 from actors.laboratory import InProcessLaboratory, RayLaboratory
 from actors.laboratory_settings import LaboratorySettings
-from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
+from actors.liquid_devices import SimulatedPump, SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
+from orchestrator.bench_check import check_bench
 from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_laboratory
@@ -299,6 +301,39 @@ def test_a_campaign_with_a_pump_runs_and_is_reported(tmp_path: Path, monkeypatch
     assert last is not None
     assert last.mass == pytest.approx(1e-3 * (result.doses[-1].left_g or 0.0))
     assert last.deviation < 3e-4, "the balance under the source has weighed it"
+
+
+def test_a_dose_is_predicted_and_the_devices_are_looked_at_without_a_flow() -> None:
+    predicted = CliRunner().invoke(app, ["dose", str(shipped("campaigns/pump.yaml")), "--dry-run", "--json"])
+    assert predicted.exit_code == 0, predicted.output
+    doses = json.loads(predicted.stdout)["doses"]
+    assert [one["wanted_g"] for one in doses] == [80, 80, 80, 20]
+    for one in doses:
+        low, high = one["interval_g"]
+        assert low < one["wanted_g"] < high
+        assert high - low < 1.0
+    assert doses[3]["duration_s"] < doses[0]["duration_s"] < 30.0
+
+    looked = CliRunner().invoke(app, ["robot", "check", str(shipped("laboratories/pump.yaml")), "--json"])
+    assert looked.exit_code == 0, looked.output
+    names = [check["name"] for check in json.loads(looked.stdout)["checks"]]
+    assert {"balance", "pump", "refill", "spill sensor"} <= set(names)
+
+
+class Unplugged(SimulatedPumpSettings):
+    def driver(self) -> tuple[type[Any], tuple[Any, ...]]:
+        return UnpluggedPump, (self,)
+
+
+class UnpluggedPump(SimulatedPump):
+    def connect(self) -> str:
+        raise LaboratoryError("no answer at /dev/ttyUSB0")
+
+
+def test_a_pump_that_does_not_answer_fails_the_check() -> None:
+    spec = laboratory(pump=Unplugged(), spill_sensor=WET["spill_sensor"])
+    report = check_bench(spec, Path("pump.yaml"), None)
+    assert [(check.name, check.found) for check in report.failed] == [("pump", "no answer at /dev/ttyUSB0")]
 
 
 @pytest.mark.parametrize(
