@@ -249,7 +249,7 @@ def test_the_death_of_the_arm_fails_the_pour_and_the_next_one_has_a_new_arm(ray_
 def test_a_pour_needs_no_simulator_of_the_pool(ray_running, open_bench, scene, action, task, fake):
     async def play():
         async with open_bench(ray=True, make=fake(4.0)) as laboratory:
-            jobs = [asyncio.create_task(laboratory.simulators.simulate(task(seed=s))) for s in range(4)]
+            jobs = [asyncio.create_task(laboratory.simulators.simulate(task(seed=s))) for s in range(12)]
             await laboratory.bench.pour(scene, action, seed=5)
             waiting = sum(not job.done() for job in jobs)
             for job in jobs:
@@ -257,5 +257,5 @@ def test_a_pour_needs_no_simulator_of_the_pool(ray_running, open_bench, scene, a
             await asyncio.gather(*jobs, return_exceptions=True)
             return waiting
 
-    # The pool of one has sixteen seconds of work; the pour's own liquid takes four.
+    # The pool of one has 48 seconds of work; the pour's own liquid takes four.
     assert asyncio.run(play()) >= 2

@@ -123,7 +123,7 @@ def asynchronous(address: str) -> dict[str, Any]:
     control, receive = keep(RTDEControlInterface(address)), keep(RTDEReceiveInterface(address))
     control.moveJ(HOME, 2.0, 4.0)
     before = control.getAsyncOperationProgressEx().operationId()
-    seen: dict[str, Any] = {"started": control.moveJ([2.0, *HOME[1:]], 1.0, 1.4, True)}
+    seen: dict[str, Any] = {"started": control.moveJ([2.0, *HOME[1:]], 0.3, 1.4, True)}
     seen["new operation"] = until(lambda: control.getAsyncOperationProgressEx().operationId() != before)
     seen["running"] = control.getAsyncOperationProgressEx().isAsyncOperationRunning()
     until(lambda: receive.getActualQ()[0] > 0.5)
