@@ -42,7 +42,7 @@ lint: $(READY)
 	$(BIN)/lint-imports
 
 unit: $(READY)
-	$(BIN)/pytest -m "not slow and not physics" -n 3 $(BY_FILE)
+	$(BIN)/pytest -m "not slow and not physics" -n 4 $(BY_FILE)
 
 # What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/4 runs every fourth file.
 slow: $(READY)
@@ -58,7 +58,7 @@ docs: $(READY)
 
 # Which lines the quick tests run, in this process and in those that they start.
 coverage: $(READY)
-	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow and not physics" -n 3 $(BY_FILE) --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
+	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow and not physics" -n 4 $(BY_FILE) --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
 
 # The tests that start nothing, with the oldest dependencies that pyproject.toml allows (needs uv).
 OLDEST := build/oldest

@@ -102,6 +102,7 @@ def campaign(*, told: bool, seed: int, steps: int = 24):
     return refused, best
 
 
+@pytest.mark.slow
 def test_a_forbidden_corner_is_avoided_after_a_few_refusals():
     for seed in range(3):
         refused, best = campaign(told=True, seed=seed)

@@ -241,6 +241,7 @@ def test_event_log_tells_decisions_results_and_warnings(recorded: Contents) -> N
     assert any(line.startswith("pour 3 into narrow: 6.00 %") for line in lines)
 
 
+@pytest.mark.slow
 def test_recording_brings_its_blueprint_and_passes_the_viewers_own_check(tmp_path: Path) -> None:
     plan = example_run.campaign(pours=1)
     monitor = RerunMonitor(tmp_path / "campaign.rrd", plan)

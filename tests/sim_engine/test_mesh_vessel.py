@@ -102,6 +102,7 @@ def test_mug_retains_what_the_vessel_of_its_profile_retains(mug: Vessel) -> None
         assert kept == pytest.approx(retained_volume(twin, math.radians(tilt)), abs=0.005 * mug.capacity)
 
 
+@pytest.mark.slow
 def test_handle_is_solid_and_its_loop_is_not(mug: Vessel) -> None:
     points = np.array([[-0.065, 0.0, 0.046], [-0.05, 0.0, 0.046], [0.0, 0.0, 0.046], [0.039, 0.0, 0.046]])
     assert np.sign(mug.grid.sample(points)).tolist() == [-1.0, 1.0, 1.0, -1.0]

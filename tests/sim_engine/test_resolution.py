@@ -20,6 +20,7 @@ ELSEWHERE = (FOUND[2], FOUND[6], CHOSEN[4])
 INTO_THE_NARROW_CUP = FOUND[4]
 
 
+@pytest.mark.slow
 def test_without_a_viscosity_of_eddies_coarse_particles_scatter_their_stream(simulator: PourSimulator) -> None:
     without, with_theirs = (
         spillage(

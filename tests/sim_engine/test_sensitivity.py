@@ -148,6 +148,7 @@ def test_other_lines_of_a_page_are_no_effects() -> None:
     assert effects([line]) == [ParameterEffect("friction", "fast", "0 … 1", "spillage rises", 0.15, "0.02")]
 
 
+@pytest.mark.slow
 def test_walls_that_rub_spill_more_in_a_real_pour(simulator: PourSimulator) -> None:
     measurements, _ = sensitivity(simulator, Extent(300, 3, 2, ("fast",), ("friction",)))
     (found,) = effects([m.as_json() for m in measurements])

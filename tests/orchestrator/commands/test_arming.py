@@ -116,6 +116,7 @@ def test_a_wrong_name_moves_nothing(campaign: Path, controller: VirtualControlle
     assert joints(controller) == before
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_what_will_move_is_shown_the_name_arms_one_run_and_its_questions_come_to_the_terminal(
     campaign: Path, controller: VirtualController

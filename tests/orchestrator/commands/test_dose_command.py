@@ -42,6 +42,7 @@ def test_a_dry_run_predicts_and_pours_nothing(campaign: Path) -> None:
     assert not Path("runs").exists()
 
 
+@pytest.mark.slow
 def test_doses_are_poured_weighed_and_recorded(campaign: Path) -> None:
     result = decant("dose", str(campaign), "--amount", "25 g", "--amount", "40 g", "--in-process")
     assert result.exit_code == 0, result.output

@@ -31,6 +31,7 @@ def typed(command: str, folder: Path) -> Any:
     return done
 
 
+@pytest.mark.slow
 def test_simulate_prints_one_line_of_json_and_nothing_else(simulated: subprocess.CompletedProcess[str]) -> None:
     assert simulated.returncode == 0, simulated.stderr
     (line,) = simulated.stdout.splitlines()
@@ -46,6 +47,7 @@ def test_simulate_prints_one_line_of_json_and_nothing_else(simulated: subprocess
     assert outcome["cpu_s"] > 0.0
 
 
+@pytest.mark.slow
 def test_simulate_predicts_with_the_spread_of_its_seeds_and_says_what_it_lacks(
     simulated: subprocess.CompletedProcess[str],
 ) -> None:
@@ -114,6 +116,7 @@ def test_one_seed_has_no_spread_and_says_so() -> None:
     assert "1 seed, so no spread; --seeds 5 would tell it" in alone
 
 
+@pytest.mark.slow
 def test_simulate_shows_the_pour_as_picture_and_recording(
     simulated: subprocess.CompletedProcess[str], inputs: Path
 ) -> None:

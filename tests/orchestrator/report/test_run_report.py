@@ -86,6 +86,7 @@ def decant(command: str) -> Any:
     return CliRunner().invoke(app, shlex.split(command))
 
 
+@pytest.mark.slow
 def test_the_page_needs_nothing_beside_it(made: Made) -> None:
     assert made.page.startswith("<!doctype html>")
     assert not re.search(r'(?:src|href)="(?!data:)', made.page)

@@ -77,6 +77,7 @@ def test_the_theta_file_carries_nuisances_to_whoever_plans_with_it(found: Any, t
     assert len({row.receiver_x for row in rows}) > 10
 
 
+@pytest.mark.slow
 def test_benches_are_drawn_from_the_posterior_and_what_it_leaves_unsaid_from_tolerances(found: Any) -> None:
     complete = [SimulationParameters.from_values({**found.theta.model_dump(), **row}) for row in found.posterior.thetas]
     benches = drawn_benches(found.theta, 256, 3, posterior=complete, known=SEARCHED.names)

@@ -137,6 +137,7 @@ def test_the_central_theta_is_a_draw_on_a_bent_ridge_and_not_the_mean_beside_it(
     assert np.arctan2(at[1], at[0]) == pytest.approx(np.pi / 4, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_the_best_theta_is_one_that_the_pours_do_not_exclude(seed: int) -> None:
     result = calibrated(calibration_spill, weighed, seed)

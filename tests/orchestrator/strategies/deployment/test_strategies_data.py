@@ -124,6 +124,7 @@ def test_former_pours_count_only_where_it_is_said(tmp_path: Path) -> None:
     assert none.progress() == Progress(pours=3, of_pours=3)
 
 
+@pytest.mark.slow
 def test_a_hybrid_pours_first_where_the_former_pours_and_the_simulations_say(tmp_path: Path) -> None:
     (tmp_path / "pours.csv").write_text(CSV)
     text = CAMPAIGN.replace("D2", "D3") + "  prior_simulations: 6\n  data: {from: pours.csv}\n"

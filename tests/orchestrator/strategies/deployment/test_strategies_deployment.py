@@ -75,6 +75,7 @@ def test_with_a_right_simulator_the_first_pours_of_d3_spill_less_than_those_of_d
     assert first["D3"] < 0.5 * first["D2"]
 
 
+@pytest.mark.slow
 def test_pours_improve_on_a_simulator_that_is_somewhat_wrong():
     firsts, bests = [], []
     for seed in range(3):
