@@ -428,7 +428,7 @@ def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--final", action="store_true", help="the final seeds instead of the development seeds")
-    parser.add_argument("--series", type=int, default=20, help="development series")
+    parser.add_argument("--series", type=int, help="series; by default 20, or all of the final seeds")
     parser.add_argument("--first", type=int, default=0, help="first development seed")
     parser.add_argument("--groups", type=int, nargs="*", help="numbers of groups, from 0")
     parser.add_argument("--controllers", nargs="*", choices=list(CONTROLLERS), default=list(CONTROLLERS))
@@ -443,8 +443,8 @@ def main() -> None:
 
     def seeds(group: Group) -> range:
         if options.final:
-            return range(FIRST_FINAL_SEED, FIRST_FINAL_SEED + group.final)
-        return range(options.first, min(options.first + options.series, 100))
+            return range(FIRST_FINAL_SEED, FIRST_FINAL_SEED + (options.series or group.final))
+        return range(options.first, min(options.first + (options.series or 20), 100))
 
     result = measure(
         names,
