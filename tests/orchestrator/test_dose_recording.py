@@ -36,7 +36,7 @@ from orchestrator.runs.events import (
 from orchestrator.strategies.dispense import Dispense, Dispensed
 from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.vessel import build_vessel
-from tests.support.rerun_recordings import Contents, views
+from tests.support.rerun_recordings import Contents, timeline, views
 from tests.support.small_campaign import write_campaign
 from tests.support.waiting import PATIENCE
 
@@ -155,6 +155,9 @@ def test_the_tab_dosing_shows_entities_that_the_recording_of_a_dose_has(tmp_path
     assert stop == pytest.approx(next(1e3 * dose.amount for _, dose in seen if dose.phase == "return"))
     assert math.isclose(stop, 25.0, abs_tol=4.0)
 
+    assert timeline(path) == "wall"  # also after the end: a dose has no films
+    for line in ("reading", "estimated", "tilt"):
+        assert recorded.values(f"/balance/dose/{line}", "Clear")  # no line to the next dose
     shown = views(path)
     assert {"Dose: wanted, balance and estimate [g]", "Tilt [deg]", "Status", "Events and decisions"} <= set(shown)
     for name, entities in shown.items():
