@@ -35,7 +35,7 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSetting
         port=virtual.port,
         dialect=dialect,
         **line,
-        settling=SettlingRule(deadline=10.0),
+        settling=SettlingRule(deadline=400.0),
         answer_time=0.3,
         reconnect_time=2.0,
         time_scale=PACE,

@@ -12,7 +12,7 @@ from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.interfaces import DeviceCheck
 
-from .conftest import spec_for
+from .conftest import SOON, spec_for
 
 SCALE = 5.0
 """Bench seconds per second: a busy machine reads a little late, and lateness counts five times."""
@@ -23,9 +23,11 @@ def checked() -> Iterator[Callable[..., dict[str, DeviceCheck]]]:
     """The findings by name, the worst of each."""
     opened: list[SerialBalance | VirtualSerialBalance] = []
 
-    def of(sheet: ScaleSettings, hands: type[EmulatedHands] = EmulatedHands, **faults) -> dict[str, DeviceCheck]:
+    def of(
+        sheet: ScaleSettings, hands: type[EmulatedHands] = EmulatedHands, waits=(), **faults
+    ) -> dict[str, DeviceCheck]:
         far = VirtualSerialBalance.start("mt-sics", baud=0, scale=sheet, time_scale=SCALE, latency=0.001)
-        driver = SerialBalance(spec_for(far, "mt-sics", time_scale=SCALE, interval=0.1), "kern-1")
+        driver = SerialBalance(spec_for(far, "mt-sics", time_scale=SCALE, interval=0.1, **dict(waits)), "kern-1")
         opened.extend((driver, far))
         far.faults(**faults)
         worst = {"ok": 0, "warn": 1, "fail": 2}
@@ -77,7 +79,7 @@ def test_a_balance_that_weighs_wrong_fails(checked):
 
 
 def test_a_balance_that_never_rests_ends_the_check_with_its_error(checked):
-    found = checked(ScaleSettings(), restless=True)
+    found = checked(ScaleSettings(), waits=SOON, restless=True)
     assert found["balance"].state == "fail"
     assert "touching the tray" in found["balance"].found
     assert "lag" not in found

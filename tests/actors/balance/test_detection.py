@@ -30,7 +30,7 @@ def unknown(virtual: Callable[[str], VirtualSerialBalance]) -> Iterator[Callable
 
     def of(far: VirtualSerialBalance | str, **settings) -> tuple[VirtualSerialBalance, SerialBalance]:
         far = virtual(far) if isinstance(far, str) else far
-        spec = SerialBalanceSettings(port=far.port, time_scale=PACE, settling=SettlingRule(deadline=10.0), **settings)
+        spec = SerialBalanceSettings(port=far.port, time_scale=PACE, settling=SettlingRule(deadline=400.0), **settings)
         opened.append(SerialBalance(spec, "kern-1"))
         return far, opened[-1]
 
