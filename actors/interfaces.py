@@ -141,6 +141,8 @@ ProgressCallback = Callable[[PourProgress], None]
 class DoseKnowledge:
     """What earlier doses have shown about a source vessel and a balance; see `actors.dosing.dose_estimator`.
 
+    Before the first dose it may be what a calibration has shown; then `doses` is 0.
+
     Attributes:
         onset_flow: means of the onset bias [rad] and of the logarithm of the flow factor.
         covariance: of these two, (2, 2) by rows.
@@ -167,7 +169,7 @@ class DoseSource:
         deviation: standard deviation of the content [kg].
         fill: it is filled to this content before the dose, by the operator or a refill device.
         constants: number from which a simulated bench draws what stays the same over a series.
-        knowledge: of earlier doses; None if there are none.
+        knowledge: of earlier doses, or of a calibration; None if there is none.
         before: content before this filling [kg]; None if it is not known, or nothing is filled.
     """
 
@@ -178,6 +180,11 @@ class DoseSource:
     constants: int
     knowledge: DoseKnowledge | None = None
     before: float | None = field(default=None, metadata={"written": "if set"})
+
+    @property
+    def unused(self) -> bool:
+        """Whether no dose was poured from it before: its lip is dry."""
+        return self.knowledge is None or self.knowledge.doses == 0
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,7 @@ class FlowOrder:
         seed: of the dose.
         wetness: of the lip, 0 … 1.
         base: load on the balance without the liquid [kg].
+        held_tilt: by which the cup is held more tilted than the arm reports, besides what is drawn [rad].
     """
 
     cup: TrueCup
@@ -49,6 +50,7 @@ class FlowOrder:
     seed: int
     wetness: float
     base: float
+    held_tilt: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,13 @@ class FlowingLiquid:
         self._order, self._arm, self._history, self._put = order, arm, history, load
         scale = TrueScale()  # the balance has an emulator of its own
         self._bench = VirtualDosingBench(
-            order.cup, order.liquid, scale, order.constants, dose_seed=order.seed, wetness=order.wetness
+            order.cup,
+            order.liquid,
+            scale,
+            order.constants,
+            dose_seed=order.seed,
+            wetness=order.wetness,
+            held_tilt=order.held_tilt,
         )
         self._pour: LivePour = self._bench.pour()
         self._since = self._clock = history(1e12).now

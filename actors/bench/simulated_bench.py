@@ -53,6 +53,10 @@ class SimulatedBench(GroundTruth):
         self._pour: PourAsk | None = None
         self._liquid: asyncio.Task[Spill] | None = None
 
+    def held_tilt(self, seed: int) -> float:
+        """Tilt by which the pourer is held more than commanded in the pour of a seed [rad]."""
+        return draw_pose_error(self._spec, seed).tilt
+
     async def prepare(self, pour: PourAsk) -> None:
         """See `GroundTruth.prepare`; starts the simulation of the liquid."""
         self._pour = pour

@@ -464,8 +464,9 @@ class FollowedBench(VirtualBench):
         held = source.mass + source.deviation * float(rng.standard_normal())
         if source.fill or self.contents.in_pourer <= 0.0:
             self.contents.in_pourer = min(max(held, 1e-3), 0.99 * cup.capacity * scene.liquid.density)
-        wetness = 0.0 if source.knowledge is None else 0.2 if source.fill else 0.7
-        self._flow = FlowOrder(cup, scene.liquid, source.constants, seed, wetness, 0.0)
+        wetness = 0.0 if source.unused else 0.2 if source.fill else 0.7
+        held_tilt = draw_pose_error(self._spec, seed).tilt
+        self._flow = FlowOrder(cup, scene.liquid, source.constants, seed, wetness, 0.0, held_tilt)
         self._hands.prepare(self.contents.in_pourer, stream(seed, "arm"))
         await self.emulators.prepare(stream(seed, "balance"))
         await self.emulators.put(self.contents.carried)

@@ -44,6 +44,7 @@ class CupFlow:
 
     def __init__(self, vessel: Vessel, liquid: Liquid) -> None:
         self.capacity = vessel.capacity
+        self._radius = vessel.opening_radius
         self.density = liquid.density
         self._viscosity = liquid.kinematic_viscosity
         self._tension = liquid.surface_tension
@@ -97,6 +98,18 @@ class CupFlow:
         around = np.clip(volume + np.array([-0.02, 0.02]) * self.capacity, 0.0, self.capacity)
         low, high = self.tilt_for(around, np.full(2, head))
         return float(np.diff(around)[0] / max(low - high, 1e-4))
+
+    def wave_period(self, volume: float) -> float:
+        """Period of the first wave of an upright cup, which rises at the lip [s].
+
+        Args:
+            volume: [m³]; its mean depth counts.
+
+        Source: linear theory of a round tank: ω² = 1.841 g/R · tanh(1.841 h/R) (Lamb, Hydrodynamics, § 257).
+        """
+        depth = volume / (math.pi * self._radius**2)
+        wave_number = 1.841 / self._radius
+        return 2.0 * math.pi / math.sqrt(wave_number * GRAVITY * math.tanh(max(wave_number * depth, 0.1)))
 
     def clean_flow(self, tilt: float, weber: float = DRIBBLING_WEBER) -> float:
         """Smallest flow whose film leaves the lip with a Weber number; slower ones dribble [m³/s].

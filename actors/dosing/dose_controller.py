@@ -102,6 +102,10 @@ class DosePhase(StrEnum):
     DONE = "done"
 
 
+RETURN_RAMP = 0.6
+"""Duration in which the return reaches its speed, in periods of the liquid's first wave. An abrupt return raises a wave
+at the lip while liquid still flows; a ramp of a whole period leaves none, but cuts the stream later."""
+
 PARK = math.radians(18.0)
 """Tilt by which the cup is turned back from the end of the flow while the balance settles [rad]."""
 
@@ -116,6 +120,12 @@ LATEST_ONSET = math.radians(1.5)
 
 LONGEST_DOUBT = 1.2
 """Time with implausible readings after which the cup is turned back [s]."""
+
+EARLIEST_WEIGHING = 1.5
+"""Time after which a reading at rest may be completed with the rise that the balance still lags behind [lags]."""
+
+LARGEST_REMAINDER = (1e-3, 0.1e-3)
+"""Largest such rise, and its largest standard deviation [kg]."""
 
 LONGEST_SETTLING = 10.0
 """Time without rest of the balance after which the amount is unknown [s]."""
@@ -177,10 +187,12 @@ class DoseController:
         self._recent: list[DoseReading] = []
         self._now, self._tilt, self._speed = 0.0, 0.0, 0.0
         self._rising = 0
+        self._innovations: list[float] = []
         self._tick = 0.05
         self._doubt_since: float | None = None
         self._since = 0.0
         self._stop_tilt = 0.0
+        self._ramp_begin, self._ramp_speed, self._ramp = 0.0, 0.0, settings.acceleration
         self._expected: float | None = None
         self._end: DoseEnd | None = None
         self._top_ups = 0
@@ -272,8 +284,7 @@ class DoseController:
             return self._pour()
         self.fine_flow = fine_flow(self._cup, max(early, 0.1), self._settings)
         if self._must_stop():
-            self._turn_back()
-            return -self._settings.return_speed
+            return self._return()
         if ahead < early:
             return self._towards(early + 0.01, self._settings.approach_speed, ahead)
         aim = float(np.quantile(self._tilts_for(self.fine_flow), 0.35))
@@ -284,8 +295,7 @@ class DoseController:
 
     def _pour(self) -> float:
         if self._must_stop():
-            self._turn_back()
-            return -self._settings.return_speed
+            return self._return()
         e = self._estimator
         wanted = self._wanted_flow()
         aim = float(np.median(self._tilts_for(wanted)))
@@ -305,20 +315,43 @@ class DoseController:
         if self._tilt <= max(self._stop_tilt - PARK, 0.0) + 0.01:
             self._enter(DosePhase.SETTLE)
             return 0.0
-        return self._towards(max(self._stop_tilt - PARK, 0.0), self._settings.return_speed, self._tilt)
+        speed = self._towards(max(self._stop_tilt - PARK, 0.0), self._settings.return_speed, self._tilt)
+        # the mean of the ramp until the next call
+        first, last = (max(self._now + wait - self._ramp_begin, 0.0) for wait in (0.0, self._tick))
+        return max(speed, self._ramp_speed - self._ramp * (last**2 - first**2) / (2.0 * self._tick))
+
+    def _return_acceleration(self) -> float:
+        """Acceleration of a return that raises little of a wave [rad/s²]."""
+        s, period = self._settings, self._cup.wave_period(float(np.median(self._estimator.volume)))
+        return min(s.acceleration, s.return_speed / (RETURN_RAMP * period))
 
     def _settle(self) -> float:
         waited = self._now - self._since
         lag = float(np.median(self._estimator.lag))
         last = [r for r in self._recent if r.time > self._since][-3:]
-        if len(last) == 3 and waited > max(0.5, 3.0 * lag):
+        if len(last) == 3 and waited > max(0.5, EARLIEST_WEIGHING * lag):
             spread = max(r.mass for r in last) - min(r.mass for r in last)
-            if spread <= max(2.0 * self._step_size, 1e-4) or all(r.stable for r in last):
+            flat = spread <= max(2.0 * self._step_size, 1e-4)
+            behind = self._behind(last[-1].time) if flat else None
+            if behind is not None:
+                self._weighed(last[-1].mass + behind)
+                return 0.0
+            if waited > max(0.5, 3.0 * lag) and (flat or all(r.stable for r in last)):
                 self._weighed(math.fsum(r.mass for r in last) / 3.0)
                 return 0.0
         if waited > LONGEST_SETTLING:
             self._finish(self._end or (DoseEnd.UNSTABLE if last else DoseEnd.CONNECTION_LOST), known=False)
         return 0.0
+
+    def _behind(self, time: float) -> float | None:
+        """Mass that a reading at this time still lags behind [kg]; None while the particles do not agree about it."""
+        e = self._estimator
+        expected = max(3.0 * e.deviation(), 1.5e-4)
+        if self._doubt_since is not None or any(abs(one) >= expected for one in self._innovations):
+            return None
+        rise = e.mass - e.predicted(time)
+        middle, (largest, deviation) = float(np.median(rise)), LARGEST_REMAINDER
+        return middle if abs(middle) < largest and float(rise.std()) < deviation else None
 
     def _weighed(self, mass: float) -> None:
         assert self._zero is not None
@@ -367,13 +400,16 @@ class DoseController:
         if order.amount - float(e.mass.max()) > 1.5 * self._cup.density * float(e.flow.max()) + 1e-3:
             return False
         final = e.final_mass(
-            self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=s.acceleration
+            self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=self._return_acceleration()
         )
         middle, deviation = float(np.median(final)) + self._belief.aim, math.hypot(float(final.std()), 0.1e-3)
-        half_tick = 0.5 * self._tick * self.flow
-        if middle + half_tick < order.amount and middle + 2.33 * deviation < order.amount + order.limit:
-            return False
-        self._expected = float(np.median(final))
+        left, wait = order.amount - middle, 0.0
+        if middle + 2.33 * deviation < order.amount + order.limit:
+            wait = max(left, 0.0) / max(self.flow, 1e-6)
+            if wait >= self._tick:
+                return False
+        self._expected = float(np.median(final)) + self.flow * wait
+        self._turn_back(wait=wait, gently=True)
         return True
 
     def _towards(self, tilt: float, speed: float, ahead: float) -> float:
@@ -406,7 +442,7 @@ class DoseController:
         self._rising = (
             self._rising + 1 if net.mass > before + 0.5 * self._step_size and net.mass > base + threshold else 0
         )
-        e.update(net)
+        self._innovations = [*self._innovations[-2:], e.update(net)]
 
     def _pass_over(self, time: float, tilt: float) -> None:
         """Move the particles over a pause of the caller, in which the arm has turned back by itself."""
@@ -461,9 +497,11 @@ class DoseController:
             self._idle_since = self._now
         return self._idle_since is not None and self._now - self._idle_since > 1.0
 
-    def _turn_back(self, end: DoseEnd | None = None) -> None:
+    def _turn_back(self, end: DoseEnd | None = None, *, wait: float = 0.0, gently: bool = False) -> None:
         self._end = self._end or end
         self._stop_tilt = self._tilt
+        self._ramp_begin, self._ramp_speed = self._now + wait, self._speed
+        self._ramp = self._return_acceleration() if gently else self._settings.acceleration
         self._enter(DosePhase.RETURN)
 
     def _enter(self, phase: DosePhase) -> None:

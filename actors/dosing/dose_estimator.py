@@ -7,7 +7,8 @@ arm reports; `DoseEstimator.update` corrects them with a time-stamped reading:
     load = m(t − t_f) + ρq(t − t_f)·t_f                      (the impact of liquid that falls from rest)
     y = four first-order lags of the load in a row, of ρ_s·T, (1 − ρ_s)T/3, (1 − ρ_s)T/3, (1 − ρ_s)T/3
 
-- `DoseBelief` holds the values that one dose passes on to the next one. `DoseBelief.prior` makes the first one.
+- `DoseBelief` holds the values that one dose passes on to the next one. `DoseBelief.prior` makes the first one;
+  `calibrated_knowledge` is what a calibration adds to it.
 - `draw_lags` draws lags of the balance from the step when the empty receiver is put on it
   (`actors.balance.step_response`).
 
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from actors.balance.step_response import FILTERS, LAGS, step_response
 from actors.dosing.cup_flow import CupFlow
 from actors.interfaces import DoseKnowledge
+from sim_engine.liquids import SimulationParameters
 
 Floats = NDArray[np.float64]
 
@@ -41,6 +43,16 @@ LAG_RANGE = (0.03, 2.5)
 
 SURPRISE = 2.0
 """Innovation, in standard deviations, above which lag and shape learn less from a reading."""
+
+ONSET = (math.radians(0.8), math.radians(1.2))
+"""Onset bias before the first dose, mean and standard deviation [rad]: a dry lip holds liquid back, and the grip of the
+vessel is known to the tolerance of `SimulationParameters.tilt_zero`."""
+
+FLOW_FACTOR = (1.0, 0.2)
+"""Flow factor before the first dose: median, and standard deviation of its logarithm."""
+
+FIRST_AIM = 0.3e-3
+"""`DoseBelief.aim` of the first dose [kg]."""
 
 SHAPE_RANGE = (0.22, 1.0)
 FACTOR_RANGE = (0.05, 2.0)
@@ -83,7 +95,7 @@ class DoseBelief:
     lag: Floats
     lag_shape: Floats
     volume: Floats
-    aim: float = 0.3e-3
+    aim: float = FIRST_AIM
     doses: int = 0
 
     @classmethod
@@ -92,9 +104,6 @@ class DoseBelief:
         volume: tuple[float, float],
         lag: tuple[Floats, Floats],
         rng: np.random.Generator,
-        *,
-        onset: tuple[float, float] = (math.radians(0.8), math.radians(1.2)),
-        flow_factor: tuple[float, float] = (1.0, 0.2),
     ) -> DoseBelief:
         """A belief before the first dose.
 
@@ -102,14 +111,12 @@ class DoseBelief:
             volume: mean and standard deviation of the source's content [m³].
             lag: lags and their shapes (N,) each, see `draw_lags`.
             rng: draws the particles.
-            onset: mean and standard deviation of the onset bias [rad]; a dry lip holds liquid back.
-            flow_factor: median, and standard deviation of its logarithm.
         """
         count = len(lag[0])
         draws = np.stack([_even_normal(count, rng) for _ in range(3)])
         return cls(
-            onset[0] + onset[1] * draws[0],
-            np.clip(flow_factor[0] * np.exp(flow_factor[1] * draws[1]), *FACTOR_RANGE),
+            ONSET[0] + ONSET[1] * draws[0],
+            np.clip(FLOW_FACTOR[0] * np.exp(FLOW_FACTOR[1] * draws[1]), *FACTOR_RANGE),
             np.asarray(lag[0], dtype=float),
             np.asarray(lag[1], dtype=float),
             np.maximum(volume[0] + volume[1] * draws[2], 0.0),
@@ -368,6 +375,23 @@ class DoseEstimator:
         return DoseBelief(
             self.onset_bias, self.flow_factor, self.lag, self.lag_shape, volume, aim, self._belief.doses + 1
         )
+
+
+def calibrated_knowledge(tilt_zeros: Sequence[float]) -> DoseKnowledge:
+    """What is known before the first dose after a calibration that searched the grip of the vessel.
+
+    Outflow begins earlier by the tilt that the vessel is held in addition. The posterior of this tilt replaces its
+    tolerance in `ONSET`. What a dry lip holds back, and the flow factor, remain as they are: no parameter of the
+    simulator stands for them.
+
+    Args:
+        tilt_zeros: equally likely draws of `SimulationParameters.tilt_zero` [rad].
+    """
+    draws = np.asarray(tilt_zeros, dtype=float)
+    tolerance = SimulationParameters.info()["tilt_zero"].tolerance
+    variance = ONSET[1] ** 2 - tolerance**2 + float(draws.var())
+    pair = (ONSET[0] - float(draws.mean()), math.log(FLOW_FACTOR[0]))
+    return DoseKnowledge(pair, (variance, 0.0, 0.0, FLOW_FACTOR[1] ** 2), None, FIRST_AIM, 0)
 
 
 def draw_lags(

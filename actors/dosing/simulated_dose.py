@@ -9,15 +9,24 @@ Limitations: straight cups only, because the virtual bench has no other.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 
-from actors.dosing.dose_controller import DoseOrder, DoseResult
+from actors.dosing.dose_controller import DoseController, DoseOrder, DosePhase, DoseResult, TiltCommand
+from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
 from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DoseRecord, TrueCup, TrueScale, VirtualDosingBench
-from actors.interfaces import DoseTarget, InvalidActionError, UnknownPourError
+from actors.interfaces import (
+    DoseProgress,
+    DoseTarget,
+    InvalidActionError,
+    PourProgress,
+    ProgressCallback,
+    UnknownPourError,
+)
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.vessel.vessel import build_vessel
@@ -28,11 +37,22 @@ STRAIGHT = 0.03
 FILTERS: tuple[Literal["first", "fourth", "average"], ...] = ("first", "fourth", "average")
 """Filters that a simulated bench's balance may have."""
 
+PROGRESS_INTERVAL = 0.1
+"""Time between two reports of the progress [s of the dose]."""
+
 SIGNALS = 200
 """Largest number of samples of a dose's signals in its record."""
 
 
-def simulated_dose(scene: Scene, dose: DoseTarget, seed: int, settings: DosingSettings) -> PourMeasurement:
+def simulated_dose(
+    scene: Scene,
+    dose: DoseTarget,
+    seed: int,
+    settings: DosingSettings,
+    *,
+    held_tilt: float = 0.0,
+    progress: ProgressCallback | None = None,
+) -> PourMeasurement:
     """Pour a wanted amount out of the scene's pourer.
 
     Args:
@@ -40,6 +60,8 @@ def simulated_dose(scene: Scene, dose: DoseTarget, seed: int, settings: DosingSe
         dose: wanted amount.
         seed: of the bench and of the controller.
         settings: of the dose.
+        held_tilt: by which the pourer is held more tilted than commanded [rad].
+        progress: receives the progress, as fast as the dose is computed.
 
     Raises:
         InvalidActionError: see `check_dose` and `check_straight`.
@@ -47,10 +69,10 @@ def simulated_dose(scene: Scene, dose: DoseTarget, seed: int, settings: DosingSe
     """
     check_dose(scene, dose)
     check_straight(scene)
-    series, bench = _set_up(scene, dose, seed, settings)
+    series, bench = _set_up(scene, dose, seed, settings, held_tilt)
     loaded = bench.content
     controller = series.controller(DoseOrder(dose.amount, dose.limit, receiver_mass=bench.receiver_mass), seed=seed)
-    record = bench.dose(controller)
+    record = bench.dose(controller if progress is None else _Shown(controller, dose.amount, progress))
     result = controller.result
     assert result is not None, "a dose ends within LONGEST_DOSE"
     if result.amount is None:
@@ -60,8 +82,32 @@ def simulated_dose(scene: Scene, dose: DoseTarget, seed: int, settings: DosingSe
     return PourMeasurement(loaded, record.spilled, retained, {"dose": _notes(dose, result, record, bench, series)})
 
 
+class _Shown:
+    """A controller that reports what it estimates: ten times a second of the dose, and whenever its phase changes."""
+
+    def __init__(self, controller: DoseController, amount: float, progress: ProgressCallback) -> None:
+        self._controller, self._amount, self._progress = controller, amount, progress
+        self._phase, self._next = DosePhase.CHECK, 0.0
+        self._zero: float | None = None
+
+    def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+        """See `actors.dosing.virtual_dosing_bench.Doser`."""
+        command = self._controller.step(time, tilt, readings)
+        last, phase = readings[-1].mass if readings else None, self._controller.phase
+        if last is not None and (self._zero is None or phase is DosePhase.CHECK):
+            self._zero = last
+        if time >= self._next or phase is not self._phase:
+            self._phase, self._next = phase, time + PROGRESS_INTERVAL
+            reading = None if last is None or self._zero is None else last - self._zero
+            amount, deviation = self._controller.amount
+            shown = DoseProgress(str(phase), self._amount, amount, deviation, self._controller.flow, reading)
+            done = min(max(amount / self._amount, 0.0), 1.0)
+            self._progress(PourProgress("dose", done, tilt=tilt, balance=reading, dose=shown))
+        return command
+
+
 def _set_up(
-    scene: Scene, dose: DoseTarget, seed: int, settings: DosingSettings
+    scene: Scene, dose: DoseTarget, seed: int, settings: DosingSettings, held_tilt: float
 ) -> tuple[DoseSeries, VirtualDosingBench]:
     source = source_of(scene, dose)
     constants = seed if dose.source is None else source.constants
@@ -77,7 +123,7 @@ def _set_up(
     liquid = scene.liquid.model_copy(
         update={"mass": min(max(true, 1e-3), 0.99 * pourer.capacity * scene.liquid.density)}
     )
-    wetness = 0.0 if source.knowledge is None else 0.2 if source.fill else 0.7
+    wetness = 0.0 if source.unused else 0.2 if source.fill else 0.7
     bench = VirtualDosingBench(
         true_cup(scene),
         liquid,
@@ -85,6 +131,7 @@ def _set_up(
         constants,
         dose_seed=None if dose.source is None else seed,
         wetness=wetness,
+        held_tilt=held_tilt,
     )
     placed = bench.place_receiver()
     return series_of(scene, dose, settings, placed, rng, step=scale.step), bench

@@ -241,6 +241,7 @@ class VirtualDosingBench:
         fall_height: from the lip to the bottom of the receiver [m].
         dose_seed: of all that differs between doses; None: of the whole series, as `seed`.
         wetness: of the lip at first, 0 … 1.
+        held_tilt: by which the cup is held more tilted than the arm reports, besides what is drawn [rad].
 
     Attributes:
         volume: in the source [m³].
@@ -260,6 +261,7 @@ class VirtualDosingBench:
         fall_height: float = 0.15,
         dose_seed: int | None = None,
         wetness: float = 0.0,
+        held_tilt: float = 0.0,
     ) -> None:
         self.cup, self.liquid, self.scale = cup, liquid, scale
         self.receiver_mass, self.fall_height = receiver_mass, fall_height
@@ -270,7 +272,7 @@ class VirtualDosingBench:
         self.volume = liquid.volume
         # constants of this bench, drawn once
         wets = 0.5 if liquid.is_thick else 1.0
-        self.grip = math.radians(float(rng.normal(0.0, 0.4)))
+        self.grip = math.radians(float(rng.normal(0.0, 0.4))) - held_tilt
         self._dry_hold = 1e-3 * wets * float(rng.uniform(0.8, 2.0))
         self._wet_hold = 1e-3 * wets * float(rng.uniform(0.1, 0.5))
         self.discharge = float(rng.normal(0.60, 0.04))

@@ -166,7 +166,8 @@ class BalanceStage:
         if running is not None and running.band is not None:
             for name, value in zip(("low", "middle", "high"), running.band[:, -1], strict=True):
                 self._number(f"expected/{name}", value)
-        for ended in ("net", "expected"):  # no line between two pours
+        # no line between two pours
+        for ended in ("net", "expected", "dose/reading", "dose/estimated", "dose/tilt"):
             self._sink.clear(f"{PLACE}/{ended}", recursive=True)
         return running
 

@@ -59,7 +59,8 @@ def campaign_blueprint(
             column_shares=[5, 7, 4],
             name="Dosing",
         )
-        return _blueprint(rrb.Tabs(dosing), moment)
+        # Doses have no films: their signals are on the wall clock, also after the end.
+        return _blueprint(rrb.Tabs(dosing), "deploying")
 
     # Created again for each tab: a view has one parent, and remains empty in a second one.
     def losses() -> list[Any]:

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from actors.dosing.dose_estimator import calibrated_knowledge
+from actors.interfaces import DoseKnowledge
 from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.journal.codec import Results, result_of
 from orchestrator.requests import Order
@@ -128,12 +130,16 @@ def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
     if plan.deployment is not None:
         stages += deployment_stages(plan, plan.deployment)
     if plan.dispense is not None:
-        stages += dispense_stages(plan.dispense)
+        stages += dispense_stages(plan.dispense, plan.calibration)
     return tuple(stages)
 
 
-def dispense_stages(plan: DispensePlan) -> list[StageDefinition]:
-    """The content of the sources, which is read once, and the doses."""
+def dispense_stages(plan: DispensePlan, calibration: CalibrationPlan | None = None) -> list[StageDefinition]:
+    """The content of the sources, which is read once, and the doses.
+
+    Args:
+        calibration: that precedes the doses.
+    """
 
     def sources(results: Results, seed: int) -> Strategy:
         if not plan.as_left:
@@ -144,9 +150,28 @@ def dispense_stages(plan: DispensePlan) -> list[StageDefinition]:
             raise RunError(f"the content of the sources is not known: {error}; write 'start: filled'") from error
 
     def doses(results: Results, seed: int) -> Strategy:
-        return Dispense(plan, seed, result_of(results, SOURCES, SourcesRead).sources)
+        known = result_of(results, SOURCES, SourcesRead).sources
+        return Dispense(plan, seed, known, calibrated_sources(plan, calibration, results))
 
     return [StageDefinition(SOURCES, sources), StageDefinition(DOSES, doses, pours=True)]
+
+
+def calibrated_sources(
+    plan: DispensePlan, calibration: CalibrationPlan | None, results: Results
+) -> dict[str, DoseKnowledge]:
+    """What a calibration has shown of the sources of doses, by name: only of the vessel that it poured from.
+
+    There is nothing if it did not search the grip of the pourer, if it has no posterior, or if the weighed pours do not
+    justify θ*.
+    """
+    if calibration is None or CALIBRATION not in results:
+        return {}
+    found = calibrated_theta(results)
+    if found.posterior is None or "tilt_zero" not in found.searched or deployed_theta(results) != found.theta:
+        return {}
+    knowledge = calibrated_knowledge([row["tilt_zero"] for row in found.posterior.thetas])
+    pourer = calibration.scene.pourer
+    return {scene.pourer.name: knowledge for scene in plan.scenes if scene.pourer == pourer}
 
 
 def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None = None) -> list[StageDefinition]:

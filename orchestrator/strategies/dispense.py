@@ -165,10 +165,17 @@ class Dispense:
         plan: sources, amounts and their order.
         seed: seed of a virtual bench's random numbers.
         known: content of the sources; one that is absent is filled before its first dose.
+        calibrated: what a calibration has shown of sources, by name; it counts until the first dose of each.
     """
 
-    def __init__(self, plan: DispensePlan, seed: int, known: Mapping[str, KnownSource] | None = None) -> None:
-        self._plan = plan
+    def __init__(
+        self,
+        plan: DispensePlan,
+        seed: int,
+        known: Mapping[str, KnownSource] | None = None,
+        calibrated: Mapping[str, DoseKnowledge] | None = None,
+    ) -> None:
+        self._plan, self._calibrated = plan, dict(calibrated or {})
         self._seeds = SeedStream(seed, "dispense")
         self._constants = self._seeds.next()
         self._sources: dict[str, KnownSource] = dict(known or {})
@@ -194,6 +201,9 @@ class Dispense:
         into = f" into {planned.position}" if planned.position else ""
         filled = ", filled before" if source.fill else f", which holds {1e3 * source.mass:.0f} g"
         text = f"dose {number}/{len(self._plan.doses)}: {1e3 * planned.amount:g} g{into} from {source.name}{filled}"
+        if source.knowledge is not None and source.unused:
+            mean, deviation = source.knowledge.onset_flow[0], math.sqrt(source.knowledge.covariance[0])
+            text += f"; onset from the calibration: {math.degrees(mean):+.1f}° ± {math.degrees(deviation):.1f}°"
         self.decisions.append(Decision(text))
         return [self._pouring]
 
@@ -225,7 +235,7 @@ class Dispense:
         return sure > planned.amount + planned.limit and known.mass - planned.amount >= self._plan.refill_below
 
     def _source(self, name: str, known: KnownSource, *, fill: bool) -> DoseSource:
-        knowledge = None if known.knowledge is None else _knowledge(known.knowledge)
+        knowledge = self._calibrated.get(name) if known.knowledge is None else _knowledge(known.knowledge)
         return DoseSource(name, known.mass, known.deviation, fill, self._constants, knowledge)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
@@ -300,7 +310,7 @@ def left_after(dose: DoseTarget, outcome: Outcome) -> KnownSource | None:
     source = dose.source
     if source is None:
         return None
-    before = None if source.knowledge is None else _fields(source.knowledge)
+    before = None if source.knowledge is None or source.unused else _fields(source.knowledge)
     match outcome:
         case Poured(measured):
             about = measured.notes.get(DOSE, {})

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from actors.dosing import dose_controller
 from actors.dosing.cup_flow import CupFlow
-from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder
-from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
+from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DoseResult, TiltCommand
+from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, calibrated_knowledge, draw_lags
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
@@ -198,6 +201,106 @@ def test_a_killed_program_leaves_the_cup_upright_within_a_second_and_a_half() ->
     # 0.2 s watchdog, then 60° per second
     assert record.stopped < float(flowing[0]) + 1.0 + 0.2 + 0.4
     assert record.upright < float(flowing[0]) + 1.0 + 0.2 + 1.4
+
+
+class Interrupted:
+    """A controller that nobody calls for 0.7 s after its first 20 g, while the arm turns the cup back by itself.
+
+    Args:
+        controller: of the dose.
+        altered: what the controller sees of the readings after the pause.
+    """
+
+    def __init__(
+        self,
+        controller: DoseController,
+        altered: Callable[[Sequence[DoseReading]], Sequence[DoseReading]] = lambda readings: readings,
+    ) -> None:
+        self._controller, self._altered = controller, altered
+        self._paused: float | None = None
+
+    def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+        if self._paused is None and self._controller.amount[0] > 0.02:
+            self._paused = time
+        if self._paused is None:
+            return self._controller.step(time, tilt, readings)
+        if time < self._paused + 0.7:
+            return TiltCommand(-math.radians(60.0))
+        return self._controller.step(time, tilt, self._altered(readings))
+
+
+def interrupted_dose(
+    settings: DosingSettings,
+    altered: Callable[[Sequence[DoseReading]], Sequence[DoseReading]] = lambda readings: readings,
+) -> tuple[DoseRecord, DoseResult]:
+    """A dose of 50 g that is turned back after a little more than 20 g."""
+    bench, rng = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), 1), np.random.default_rng(1)
+    belief = DoseBelief.prior((WATER.volume, 5e-7), draw_lags(bench.place_receiver(), 80, rng), rng)
+    controller = DoseController(CUP, DoseOrder(0.05, receiver_mass=bench.receiver_mass), belief, settings, seed=1)
+    record = bench.dose(Interrupted(controller, altered))
+    assert controller.result is not None
+    return record, controller.result
+
+
+def test_a_shortage_above_the_smallest_dependable_amount_is_poured_again() -> None:
+    record, result = interrupted_dose(DosingSettings())
+    assert (result.end, result.top_ups) == (DoseEnd.REACHED, 1)
+    assert record.received == pytest.approx(0.05, abs=1.5e-3)
+    assert result.amount == pytest.approx(record.received, abs=0.3e-3)
+
+
+def test_a_shortage_below_the_smallest_dependable_amount_is_left() -> None:
+    record, result = interrupted_dose(DosingSettings(smallest_top_up=0.04))
+    assert (result.end, result.top_ups) == (DoseEnd.REACHED, 0)
+    assert 0.02 < record.received < 0.045
+    assert result.amount == pytest.approx(record.received, abs=0.3e-3)
+
+
+def swinging(readings: Sequence[DoseReading]) -> list[DoseReading]:
+    return [replace(one, mass=one.mass + 2e-3 * math.sin(7.0 * one.time), stable=False) for one in readings]
+
+
+@pytest.mark.parametrize(
+    ("altered", "end"), [(swinging, DoseEnd.UNSTABLE), (lambda readings: [], DoseEnd.CONNECTION_LOST)]
+)
+def test_a_shortage_that_is_in_doubt_is_not_poured_again(
+    altered: Callable[[Sequence[DoseReading]], Sequence[DoseReading]], end: DoseEnd
+) -> None:
+    record, result = interrupted_dose(DosingSettings(), altered)
+    assert (result.end, result.amount, result.top_ups) == (end, None, 0)
+    assert 0.02 < record.received < 0.045
+    assert result.estimate[0] == pytest.approx(record.received, abs=3e-3)
+
+
+def test_the_first_wave_of_a_beaker_has_its_known_frequency() -> None:
+    """√(1.841 g/R · tanh(1.841 h/R)): 3.3 Hz in 4 cm radius; a shallow layer is slower."""
+    assert 1.0 / CUP.wave_period(4e-4) == pytest.approx(3.36, abs=0.05)
+    assert 1.0 / CUP.wave_period(0.5e-4) < 2.3
+
+
+@pytest.mark.slow
+def test_a_return_with_a_ramp_adds_less_of_a_wave_to_a_full_cups_dose(monkeypatch: pytest.MonkeyPatch) -> None:
+    def mean_error() -> float:
+        return float(np.mean([one_dose(0.025, seed=seed, mass=0.45)[0].received - 0.025 for seed in range(6)]))
+
+    gentle = mean_error()
+    monkeypatch.setattr(dose_controller, "RETURN_RAMP", 1e-3)
+    assert mean_error() > gentle + 0.2e-3
+
+
+def test_a_first_dose_of_a_badly_held_cup_finds_its_onset_sooner_after_a_calibration_of_the_grip() -> None:
+    """The cup is held 3° less tilted than the arm reports, far outside the tolerance of a grip."""
+    found = {}
+    for name, knowledge in (("unknown", None), ("calibrated", calibrated_knowledge(np.radians([-3.2, -3.0, -2.8])))):
+        bench = VirtualDosingBench(SPOUTED, WATER, TrueScale(lag=0.3), 2, held_tilt=math.radians(-3.0))
+        content, rng = SourceContent(0.3), np.random.default_rng(2)
+        settings, placed = DosingSettings(), bench.place_receiver()
+        series = DoseSeries(CUP, settings, content, placed, rng, particles=80, knowledge=knowledge)
+        controller = series.controller(DoseOrder(0.025, receiver_mass=bench.receiver_mass), seed=2)
+        record = bench.dose(controller)
+        assert record.received == pytest.approx(0.025, abs=1.5e-3)
+        found[name] = record.duration
+    assert found["calibrated"] < found["unknown"] - 0.5
 
 
 def a_series(mass: float = 0.3, seed: int = 5) -> DoseSeries:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,7 @@ from actors.interfaces import DoseProgress, PourProgress
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.requests import Pour, Poured, Slots
+from orchestrator.run_service import RunResources, RunService, task_request
 from orchestrator.runs.events import (
     CampaignClosed,
     CampaignOpened,
@@ -29,10 +33,10 @@ from orchestrator.runs.events import (
     RequestStarted,
     StageOpened,
 )
-from orchestrator.strategies.dispense import Dispense
+from orchestrator.strategies.dispense import Dispense, Dispensed
 from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.vessel import build_vessel
-from tests.support.rerun_recordings import Contents, views
+from tests.support.rerun_recordings import Contents, timeline, views
 from tests.support.small_campaign import write_campaign
 from tests.support.waiting import PATIENCE
 
@@ -103,6 +107,32 @@ def dose_events(folder: Path) -> tuple[Any, list[Event], list[tuple[float, DoseP
     return plan, events, seen
 
 
+def test_a_dose_on_a_simulated_bench_is_shown_while_it_is_poured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
+    plan = load_campaign(write_campaign(tmp_path, SERIES.replace("{directory: runs}", "{recording: false}")))
+    plan = replace(plan, outputs=plan.outputs.model_copy(update={"directory": tmp_path / "runs", "figures": False}))
+    events: list[Event] = []
+
+    async def scenario() -> Any:
+        resources = RunResources(in_process=True, subscribers=[events.append])
+        with contextlib.closing(RunService().start(task_request(plan, "run"), resources)) as handle:
+            return await handle.wait()
+
+    result = asyncio.run(scenario()).results["doses"]
+    assert isinstance(result, Dispensed)
+    told = [event.progress for event in events if isinstance(event, PourProgressed) and event.progress.dose is not None]
+    doses = [progress.dose for progress in told if progress.dose is not None]
+    phases = ["check", "approach", "pour", "return", "settle", "done"]
+    assert list(dict.fromkeys(dose.phase for dose in doses)) == phases
+    assert {dose.target for dose in doses} == {AMOUNT}
+    assert max(dose.flow for dose in doses) > 3e-3
+    assert max(math.degrees(progress.tilt or 0.0) for progress in told) > 30.0
+    readings = [dose.reading for dose in doses if dose.reading is not None]
+    assert 1e3 * readings[-1] == pytest.approx(result.doses[0].received_g, abs=0.3)
+
+
 @pytest.mark.slow
 def test_the_tab_dosing_shows_entities_that_the_recording_of_a_dose_has(tmp_path: Path) -> None:
     plan, events, seen = dose_events(tmp_path)
@@ -125,6 +155,9 @@ def test_the_tab_dosing_shows_entities_that_the_recording_of_a_dose_has(tmp_path
     assert stop == pytest.approx(next(1e3 * dose.amount for _, dose in seen if dose.phase == "return"))
     assert math.isclose(stop, 25.0, abs_tol=4.0)
 
+    assert timeline(path) == "wall"  # also after the end: a dose has no films
+    for line in ("reading", "estimated", "tilt"):
+        assert recorded.values(f"/balance/dose/{line}", "Clear")  # no line to the next dose
     shown = views(path)
     assert {"Dose: wanted, balance and estimate [g]", "Tilt [deg]", "Status", "Events and decisions"} <= set(shown)
     for name, entities in shown.items():

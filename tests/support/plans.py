@@ -76,7 +76,9 @@ def risk(
     return RiskSettings(measure=measure, level=level, pose_error=PoseNoise(**errors), theta=theta)
 
 
-def calibrated(theta: SimulationParameters, rows: Sequence[Mapping[str, float]] = ()) -> Calibrated:
+def calibrated(
+    theta: SimulationParameters, rows: Sequence[Mapping[str, float]] = (), searched: tuple[str, ...] = ("cohesion",)
+) -> Calibrated:
     """What a calibration has found, with draws of a posterior or without."""
     posterior = PosteriorFound(
         level=0.9,
@@ -91,7 +93,7 @@ def calibrated(theta: SimulationParameters, rows: Sequence[Mapping[str, float]] 
     )
     found = CalibratedTheta(
         theta=theta,
-        searched=("cohesion",),
+        searched=searched,
         predicted_discrepancy=0.0,
         predicted_deviation=0.0,
         hyperparameters=None,

@@ -96,6 +96,18 @@ def seen(kept: Path, enough: Callable[[Contents], bool]) -> Contents:
     raise AssertionError(f"not enough came to the viewer within {PATIENCE:g} s")
 
 
+def timeline(path: Path) -> str:
+    """The timeline of the last arrangement in an .rrd."""
+    from rerun.chunk import RrdReader
+
+    reader, found = RrdReader(str(path)), ""
+    for chunk in reader.stream(store=reader.blueprints()[-1]):
+        table = chunk.to_record_batch()
+        if str(chunk.entity_path) == "/time_panel" and "TimePanelBlueprint:timeline" in table.schema.names:
+            ((found,),) = table.column("TimePanelBlueprint:timeline").to_pylist()
+    return found
+
+
 def views(path: Path) -> dict[str, list[str]]:
     """What the views of the last arrangement in an .rrd show: entities by the view's name, '/**' for all below one."""
     from rerun.chunk import RrdReader

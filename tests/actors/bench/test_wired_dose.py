@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import signal
 import subprocess
@@ -29,9 +30,11 @@ from actors.interfaces import DoseSource, DoseTarget, PourProgress, UnknownPourE
 from actors.laboratory_settings import LaboratorySettings
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign, load_laboratory
+from orchestrator.requests import Pour, Poured, Slots
 from orchestrator.run_service import RunResources, RunService, task_request
 from orchestrator.shipped import shipped
-from orchestrator.strategies.dispense import Dispensed
+from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
+from orchestrator.strategies.dispense import Dispense, Dispensed
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement
@@ -83,7 +86,7 @@ async def dosed(stage: Stage, grams: float, **changes: Any) -> PourMeasurement:
     return found
 
 
-def check_amount(stage: Stage, measured: PourMeasurement, grams: float) -> None:
+def check_amount(stage: Stage, measured: PourMeasurement, grams: float, held: float = 0.35) -> None:
     about = measured.notes["dose"]
     received = 1e3 * about["received"]
     assert about["end"] in ("reached", "short")
@@ -93,21 +96,39 @@ def check_amount(stage: Stage, measured: PourMeasurement, grams: float) -> None:
     assert received == pytest.approx(1e3 * stage.contents.in_receiver, abs=0.5)
     assert max(about["tilt_deg"]) > 40.0
     assert len(about["readings_g"]) > 20
-    assert about["left"][0] == pytest.approx(0.35 - about["received"], abs=5e-3)
+    assert about["left"][0] == pytest.approx(held - about["received"], abs=5e-3)
 
 
-def test_a_dose_is_poured_over_the_wires(open_stage: OpenStage) -> None:
+def test_a_short_series_is_poured_over_the_wires(open_stage: OpenStage) -> None:
     async def scenario() -> None:
+        planned = tuple(PlannedDose(amount, 1e-3, SCENE.receiver.name) for amount in (0.025, 0.01))
+        scene = replace(SCENE, fixed=ACTION.values())
+        strategy = Dispense(DispensePlan((scene,), planned, 0.0, False, "wires"), seed=3)
         seen: list[PourProgress] = []
         async with open_stage(dosing_spec()) as stage:
-            measured = await dosed(stage, 25, progress=seen.append)
-            check_amount(stage, measured, 25)
-            assert stage.heard == ["dose_source", "dose_receiver", "start"]
+            while not strategy.finished:
+                (request,) = strategy.ask(Slots(0))
+                assert isinstance(request, Pour)
+                assert request.dose is not None
+                seen.clear()
+                measured = await stage.bench.pour(
+                    scene, request.action, seed=request.seed, progress=seen.append, dose=request.dose
+                )
+                held = request.dose.source.mass if request.dose.source is not None else 0.0
+                check_amount(stage, measured, 1e3 * request.dose.amount, held)
+                doses = [one.dose for one in seen if one.dose is not None]
+                assert {one.phase for one in doses} >= {"approach", "settle"}
+                assert max(one.flow for one in doses) > 1e-3
+                assert doses[-1].reading == pytest.approx(measured.notes["dose"]["received"], abs=3e-4)
+                strategy.tell(request, Poured(measured))
+            # filled once; a receiver for each dose
+            first, second = ["dose_source", "dose_receiver", "start"], ["dose_cleared", "dose_receiver", "start"]
+            assert stage.heard == first + second
             assert not stage.unsafe
-        doses = [one.dose for one in seen if one.dose is not None]
-        assert {one.phase for one in doses} >= {"approach", "settle"}
-        assert max(one.flow for one in doses) > 1e-3
-        assert doses[-1].reading == pytest.approx(measured.notes["dose"]["received"], abs=3e-4)
+        poured = strategy.result().doses
+        assert [dose.filled for dose in poured] == [True, False]
+        received = math.fsum(dose.received_g or 0.0 for dose in poured)
+        assert poured[-1].left_g == pytest.approx(350.0 - received, abs=5.0)
 
     asyncio.run(scenario())
 

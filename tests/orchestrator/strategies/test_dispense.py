@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
 
+from actors.dosing.dose_estimator import ONSET
 from actors.interfaces import DoseSource
 from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.journal.codec import decode_request, decode_result, encode_request, encode_result
 from orchestrator.requests import Failed, Pour, Poured, Slots
 from orchestrator.runs.events import CampaignOpened, RequestFinished, RequestStarted
+from orchestrator.runs.stages import CALIBRATION, DOSES, SOURCES, dispense_stages
+from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
-from orchestrator.strategies.dispense import Dispense, KnownSource
+from orchestrator.strategies.dispense import Dispense, KnownSource, SourcesRead
 from sim_engine.action import Action
-from sim_engine.liquids import Liquid
+from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
+from tests.support import plans
 
 ACTION = Action(1.0, 0.09, 0.06)
 TUMBLER = cylinder("tumbler", inner_radius=0.03, inner_height=0.09)
@@ -132,6 +137,52 @@ def test_a_pour_without_an_amount_is_written_as_before() -> None:
     data = encode_request(Pour("tumbler", ACTION, 1, 3))
     assert "dose" not in data
     assert decode_request(data) == Pour("tumbler", ACTION, 1, 3)
+
+
+# ---- the calibration before the doses
+
+GRIPS = tuple({"tilt_zero": math.radians(degrees)} for degrees in (1.8, 2.0, 2.2))
+
+
+def first_sources(
+    calibrated: Calibrated, poured_from: str = "beaker", known: dict[str, KnownSource] | None = None
+) -> dict[str, DoseSource]:
+    """Sources of the first two doses, out of two vessels, after a calibration that poured from one of them."""
+    series = plan(100, 250, sources=("beaker", "jug"))
+    calibration = plans.calibration_plan(scene=scene(poured_from))
+    doses = next(stage for stage in dispense_stages(series, calibration) if stage.name == DOSES)
+    results = {CALIBRATION: calibrated, SOURCES: SourcesRead(sources=known or {})}
+    strategy = doses.build(results, 5)
+    assert isinstance(strategy, Dispense)
+    found = {}
+    while not strategy.finished:
+        pour = asked(strategy)
+        found[source_of(pour).name] = source_of(pour)
+        strategy.tell(pour, poured(pour, 1e3 * (pour.dose.amount if pour.dose else 0.0)))
+    return found
+
+
+def test_a_first_dose_begins_with_the_grip_that_the_calibration_found() -> None:
+    """A cup that is held 2° more tilted pours 2° earlier; its grip is known to 0.2° instead of 0.7°."""
+    theta = SimulationParameters.from_values(GRIPS[1])
+    sources = first_sources(plans.calibrated(theta, GRIPS, ("tilt_zero",)))
+    knowledge = sources["beaker"].knowledge
+    assert knowledge is not None
+    assert sources["beaker"].unused
+    assert knowledge.onset_flow[0] == pytest.approx(ONSET[0] - math.radians(2.0), abs=1e-4)
+    assert math.degrees(math.sqrt(knowledge.covariance[0])) == pytest.approx(math.sqrt(1.2**2 - 0.7**2), abs=0.02)
+    assert sources["jug"].knowledge is None  # the calibration says nothing of another vessel's grip
+
+
+def test_only_a_posterior_of_the_grip_counts_and_what_doses_have_shown_counts_more() -> None:
+    theta = SimulationParameters.from_values(GRIPS[1])
+    with_posterior = plans.calibrated(theta, GRIPS, ("tilt_zero",))
+    for found in (plans.calibrated(theta, (), ("tilt_zero",)), plans.calibrated(theta, [{"cohesion": 0.03}])):
+        assert first_sources(found)["beaker"].knowledge is None
+    known = {"beaker": KnownSource(mass=0.3, deviation=1e-3, knowledge=KNOWLEDGE)}
+    knowledge = first_sources(with_posterior, known=known)["beaker"].knowledge
+    assert knowledge is not None
+    assert (knowledge.onset_flow, knowledge.doses) == ((0.01, 0.0), 1)
 
 
 # ---- the account of the sources
