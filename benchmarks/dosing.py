@@ -19,6 +19,7 @@ import json
 import math
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,7 +31,7 @@ from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseOrder, fine_flow
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.dosing_settings import DosingSettings
-from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
+from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from sim_engine.liquids import Liquid
 from sim_engine.vessel import profile
 from sim_engine.vessel.shapes import MeshShape, VesselSpec, cylinder
@@ -424,6 +425,69 @@ def picture(path: Path, seed: int = 3) -> None:
     figure.savefig(path, dpi=120)
 
 
+FIRST_FAULT_SEED = 9900
+
+FAULTS = {
+    "knock on the balance, 5 g for 0.2 s": DosingFault("knock", 1.5),
+    "balance swings by 2 g": DosingFault("unstable"),
+    "line of the balance cut in the flow": DosingFault("line cut", 1.5),
+    "program pauses for 0.7 s": DosingFault("stall", 1.0),
+    "program killed in the flow": DosingFault("killed", 1.0),
+    "stream misses from the start": DosingFault("miss", 0.0),
+    "stream misses after 1.5 s": DosingFault("miss", 1.5),
+    "receiver missing": DosingFault("receiver missing"),
+}
+
+
+def faults(count: int = 10) -> list[dict[str, Any]]:
+    """First doses of 100 g from the group 'round rim', each with one fault; one row per fault."""
+    cups, rows = cup_flows(), []
+    for name, fault in FAULTS.items():
+        ends, above, misreported, spilled, upright = Counter[str](), [0.0], [0.0], [], []
+        for seed in range(FIRST_FAULT_SEED, FIRST_FAULT_SEED + count):
+            series = Series(GROUPS["round rim"], seed, cups)
+            if series.bench.content < 0.15:
+                series.bench.refill(0.8 * series.bench.cup.capacity * series.density)
+            placed = series.bench.place_receiver()
+            doses = DoseSeries(
+                series.cup,
+                DosingSettings(),
+                SourceContent(series.weighed_content()),
+                placed,
+                np.random.default_rng((seed, 3)),
+                particles=PARTICLES,
+                step=series.scale.step,
+            )
+            controller = doses.controller(DoseOrder(0.1, receiver_mass=series.bench.receiver_mass), seed=seed)
+            record = series.bench.dose(controller, fault)
+            result = controller.result
+            ends["no program" if result is None else str(result.end)] += 1
+            above.append(1e3 * (record.received - 0.1))
+            spilled.append(1e3 * record.spilled)
+            if result is not None and result.amount is not None:
+                misreported.append(1e3 * abs(result.amount - record.received))
+            flowing = record.times[record.flow > 1e-4]
+            if len(flowing):
+                upright.append(record.upright - float(flowing[0]) - fault.at)
+        rows.append(
+            {
+                "fault": name,
+                "ends": dict(ends),
+                "most_above": max(above),
+                "misreported": max(misreported),
+                "spilled": float(np.mean(spilled)),
+                "upright": max(upright, default=0.0) if fault.kind == "killed" else None,
+            }
+        )
+    return rows
+
+
+def write(update: dict[str, Any]) -> None:
+    """Replace a part of docs/data/dosing.json."""
+    data = json.loads(DATA.read_text(encoding="utf-8")) if DATA.exists() else {"groups": {}}
+    DATA.write_text(json.dumps(data | update, indent=1) + "\n", encoding="utf-8")
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -436,9 +500,19 @@ def main() -> None:
     parser.add_argument("--dump", type=Path, help="file of all doses; continue if it exists")
     parser.add_argument("--as-dumped", action="store_true", help="pour nothing: the figures of the doses in --dump")
     parser.add_argument("--picture", type=Path, help="draw one dose, and nothing else")
+    parser.add_argument("--faults", action="store_true", help="doses with a fault each, and nothing else")
     options = parser.parse_args()
     if options.picture:
         return picture(options.picture)
+    if options.faults:
+        rows = faults()
+        for row in rows:
+            print(row)
+        if options.json:
+            from machine import describe
+
+            write({"faults": {"rows": rows, "seeds": [FIRST_FAULT_SEED, 10], "machine": describe()}})
+        return None
     names = list(GROUPS) if options.groups is None else [list(GROUPS)[k] for k in options.groups]
 
     def seeds(group: Group) -> range:
@@ -469,7 +543,7 @@ def main() -> None:
             measured |= {"paired": {c: paired(by["particles"], d) for c, d in by.items() if c != "particles"}}
             first = [d.seed for d in by["particles"]]
             data["groups"][name] = measured | {"machine": describe(), "seeds": [min(first), max(first)]}
-        DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        write(data)
 
 
 if __name__ == "__main__":

@@ -399,6 +399,26 @@ def dosing(group: str) -> str:
     return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing.py --final --json`; {how}.</sub>\n"
 
 
+def dosing_faults() -> str:
+    """Doses of the virtual bench with a fault each."""
+    data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))["faults"]
+    rows = [
+        (
+            row["fault"],
+            ", ".join(f"{count} {end}" for end, count in row["ends"].items()),
+            f"{row['most_above']:+.1f}" if row['most_above'] > 0.0 else "none",
+            f"{row['misreported']:.1f}",
+            f"{row['spilled']:.1f}",
+            "" if row["upright"] is None else f"{row['upright']:.1f}",
+        )
+        for row in data["rows"]
+    ]
+    head = ("fault", "ends", "most above 100 g", "reported amount off by at most g", "spilled g", "upright after s")
+    first, count = data["seeds"]
+    how = f"{count} doses each, seeds from {first}; {data['machine']['date']}"
+    return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing.py --faults --json`; {how}.</sub>\n"
+
+
 def dosing_particles() -> str:
     """Doses of the virtual bench against a particle simulation of the same tilt."""
     data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))["particle_simulation"]
@@ -571,6 +591,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
     **{f"result-{name}": partial(measured, name) for name in MEASURED},
     **{name: partial(dosing, group) for name, group in DOSING.items()},
+    "dosing-faults": dosing_faults,
     "dosing-particles": dosing_particles,
     "command-line": command_line,
     "output": json_output,
