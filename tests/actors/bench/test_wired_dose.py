@@ -28,6 +28,7 @@ from actors.balance.balance_settings import SerialBalanceSettings
 from actors.bench.virtual_bench import BenchEmulators
 from actors.interfaces import DoseSource, DoseTarget, PourProgress, UnknownPourError
 from actors.laboratory_settings import LaboratorySettings
+from actors.liquid_devices import SimulatedPumpSettings, SourceSettings
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign, load_laboratory
 from orchestrator.requests import Pour, Poured, Slots
@@ -139,6 +140,27 @@ def test_a_dose_over_other_balances(open_stage: OpenStage, dialect: str) -> None
     async def scenario() -> None:
         async with open_stage(dosing_spec(dialect)) as stage:
             check_amount(stage, await dosed(stage, 50), 50)
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.slow
+def test_a_refill_device_fills_the_cup_of_an_arm(open_stage: OpenStage) -> None:
+    async def scenario() -> None:
+        refill = SourceSettings(refill=SimulatedPumpSettings(time_scale=0.0, factor=1.0))
+        async with open_stage(dosing_spec().with_values(source=refill)) as stage:
+            first = await dosed(stage, 50)
+            about, held = first.notes["dose"], stage.contents.in_pourer
+            asked = len(stage.heard)
+            source = DoseSource("beaker", 0.35, 5e-4, fill=True, constants=11, before=about["left"][0])
+            order = replace(target(25), source=source)
+            second = await stage.bench.pour(SCENE, ACTION, seed=6, dose=order)
+            assert "dose_source" not in stage.heard[asked:]
+            assert not stage.unsafe
+            received = second.notes["dose"]["received"]
+            assert received == pytest.approx(0.025, abs=4e-3)
+            assert stage.contents.in_pourer == pytest.approx(held + 0.35 - about["left"][0] - received, abs=5e-3)
+            assert second.notes["dose"]["left"][1] > 1.5e-3, "a refilled amount is less certain than a weighed one"
 
     asyncio.run(scenario())
 
