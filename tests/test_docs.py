@@ -242,6 +242,22 @@ def test_claims_name_tests_and_pages_that_exist() -> None:
         assert not test or f"def {test}(" in text_of(ROOT / path), f"{path}::{test}"
 
 
+def criteria_of(chapters: str) -> tuple[int, int]:
+    """How many criteria are met there, and how many there are."""
+    met = chapters.count("| pass |")
+    return met, met + chapters.count("| **fails** |")
+
+
+def test_counts_of_physical_criteria_are_those_of_the_validation_page() -> None:
+    page = text_of(ROOT / "docs" / "evidence" / "validation.md")
+    met, judged = criteria_of(page)
+    assert f"{met} of {judged} criteria are met" in page
+    assert f"| {met} of {judged} physical criteria are met |" in text_of(ROOT / "docs" / "evidence" / "claims.md")
+    met, judged = criteria_of(page.partition("## The solver's own viscosity")[2])
+    liquids = " ".join(text_of(ROOT / "docs" / "experiments" / "liquids.md").split())
+    assert f"of {judged} criteria for thick liquids and contact angles, {met} are met" in liquids
+
+
 def test_the_site_is_short() -> None:
     """Hand-written words: without generated tables, code, and what is generated as a whole."""
     words = 0
