@@ -25,7 +25,7 @@ def introduction() -> str:
 
 <!-- written by benchmarks/make_page.py from docs/data/performance.json -->
 
-What a simulated pour costs, and how that compares with SPlisHSPlasH, the fastest open CPU solver that we know of. This
+The cost of a simulated pour, and a comparison with SPlisHSPlasH, the fastest open CPU solver that we know of. This
 command measures everything again and writes the page:
 
 <!-- needs: checkout and minutes -->
