@@ -10,6 +10,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Files of tests to workers, in the order in which they were collected.
 BY_FILE := --dist loadfile --no-loadscope-reorder
+# The tests start hundreds of Python processes: each module is compiled once, also where the environment says otherwise.
+unexport PYTHONDONTWRITEBYTECODE
 READY := $(VENV)/.ready
 
 .PHONY: install demo test lint unit slow physics docs coverage oldest lock clean

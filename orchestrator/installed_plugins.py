@@ -43,8 +43,9 @@ def installed() -> list[Plugin]:
 def packages() -> dict[str, tuple[str, list[str]]]:
     """Other packages that register plug-ins: version, and the plug-ins ('decant.balances: spring'). Loads nothing."""
     found: dict[str, tuple[str, list[str]]] = {}
+    everything = entry_points()  # reads every installed package: once, not once per registry
     for door in doors():
-        for entry in entry_points(group=door.group):
+        for entry in everything.select(group=door.group):
             if entry.dist is not None and entry.dist.name != DISTRIBUTION:
                 _, names = found.setdefault(entry.dist.name, (entry.dist.version, []))
                 names.append(f"{door.group}: {entry.name}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import functools
 import gc
 import os
 import re
@@ -13,11 +14,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import typer.testing
 
 from orchestrator.catalogue.run_registry import VARIABLE
 from tests.support.hypothesis_examples import load_profile
 
 load_profile()
+
+# Typer builds the whole tree of commands anew for each invocation, which takes longer than most commands do.
+typer.testing._get_command = functools.cache(typer.testing._get_command)
 
 # A shell that starts something in the background has it ignore Ctrl-C, and its children with it: those that are
 # interrupted here would go on.

@@ -44,6 +44,7 @@ def test_a_program_asks_for_pours_and_reads_them_as_a_table_with_units(tmp_path:
             station.batch("plate-2", [{"source": "beaker"}])
 
 
+@pytest.mark.slow
 def test_a_campaign_is_checked_without_running_and_started_with_progress(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

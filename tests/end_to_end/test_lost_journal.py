@@ -28,6 +28,8 @@ from tests.support.waiting import PATIENCE
 
 CAMPAIGN = small_campaign.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, recording: false,")
 
+pytestmark = pytest.mark.slow  # the same losses of a toy run: tests/orchestrator/test_journal.py
+
 RUN = ("run", "small.yaml", "--in-process")
 RESUME = (*RUN, "--resume", "--run")
 WAL = f"{JOURNAL_NAME}-wal"
@@ -126,17 +128,14 @@ def without_ledger(run: Path) -> None:
     (run / LEDGER_NAME).unlink()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("damage", "problem"),
     [
-        pytest.param(
-            without_journal, "journal.sqlite is missing, but the folder has resolved.json", marks=pytest.mark.slow
-        ),
-        pytest.param(truncated, "journal.sqlite is empty, but the folder has resolved.json", marks=pytest.mark.slow),
+        pytest.param(without_journal, "journal.sqlite is missing, but the folder has resolved.json"),
+        pytest.param(truncated, "journal.sqlite is empty, but the folder has resolved.json"),
         (with_another_weight, "(pour.finished) was changed after it was written"),
-        pytest.param(without_its_last_entries, "entries were lost", marks=pytest.mark.slow),
-        pytest.param(without_ledger, "pours.jsonl, the ledger of pours, is missing", marks=pytest.mark.slow),
+        pytest.param(without_its_last_entries, "entries were lost"),
+        pytest.param(without_ledger, "pours.jsonl, the ledger of pours, is missing"),
     ],
 )
 def test_a_run_with_a_damaged_journal_is_refused_with_the_pours_that_were_made(
@@ -169,7 +168,7 @@ def test_a_run_with_a_damaged_journal_is_refused_with_the_pours_that_were_made(
         find_run(plan)  # without a name it is found by its journal, or by its ledger
 
 
-@pytest.mark.parametrize("lost", ["deleted", pytest.param("damaged", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("lost", ["deleted", "damaged"])
 def test_a_lost_write_ahead_log_repeats_no_pour(place: Workplace, lost: str) -> None:
     run = place.run_directory()
     before = pours_begun(run)

@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -243,30 +244,28 @@ def pour(journal: Journal, number: int) -> None:
     journal.append(Kind.POUR_FINISHED, {"id": number, "outcome": outcome}, stage="pours")
 
 
-def poured(path: Path, *, until: str) -> None:
-    """Two pours by a process that is killed right after a statement in this module's journal."""
-    code = f"""
-        import os, signal
-        from pathlib import Path
-        from orchestrator import journal as module
-        from orchestrator.journal.journal import Journal, Kind
-        from orchestrator.journal.journal_file import Header
-        from tests.orchestrator.test_journal import pour
-        journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
-        pour(journal, 1)
-        {until}
-        pour(journal, 2)
-        os.kill(os.getpid(), signal.SIGKILL)
-    """
-    process = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=False, env={**os.environ})
-    assert process.returncode == -signal.SIGKILL
+def poured(path: Path, *, between: Callable[[Journal], object] = lambda _: None) -> None:
+    """Two pours by a process that is killed right after them; `between` the two it does something more."""
+    child = os.fork()
+    if child == 0:
+        try:
+            journal = Journal.create(path, HEADER)
+            pour(journal, 1)
+            between(journal)
+            pour(journal, 2)
+        finally:
+            os.kill(os.getpid(), signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    assert os.WTERMSIG(status) == signal.SIGKILL
 
 
-KILLED_BEFORE_THE_LEDGER = "journal._ledger.append = lambda lines: os.kill(os.getpid(), signal.SIGKILL)"
+def kill_before_the_ledger(journal: Journal) -> None:
+    """Its process is killed as soon as it writes to its ledger."""
+    journal._ledger.append = lambda lines: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[method-assign]
 
 
 def test_at_a_pour_the_entries_leave_the_write_ahead_log(path: Path) -> None:
-    poured(path, until="")
+    poured(path)
     for suffix in ("-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
     with JournalReader(path) as reader:
@@ -291,7 +290,7 @@ def test_a_log_that_a_reader_kept_from_being_copied_and_that_is_lost_is_detected
 
 
 def test_a_process_killed_between_journal_and_ledger_is_resumed_and_the_ledger_completed(path: Path) -> None:
-    poured(path, until=KILLED_BEFORE_THE_LEDGER)
+    poured(path, between=kill_before_the_ledger)
     kinds = [line.kind for line in read_ledger(path.with_name(LEDGER_NAME))]
     assert kinds == [BEGUN, Kind.POUR_STARTED, Kind.POUR_FINISHED]
     Journal.resume(path, HEADER).close()
@@ -302,7 +301,7 @@ def test_a_process_killed_between_journal_and_ledger_is_resumed_and_the_ledger_c
 
 
 def test_a_half_written_last_line_of_the_ledger_is_no_damage(path: Path) -> None:
-    poured(path, until="")
+    poured(path)
     ledger = path.with_name(LEDGER_NAME)
     whole = ledger.read_bytes()
     ledger.write_bytes(whole[:-10])
@@ -313,7 +312,7 @@ def test_a_half_written_last_line_of_the_ledger_is_no_damage(path: Path) -> None
 
 @pytest.mark.parametrize("edit", [(b'"spilled":0.003', b'"spilled":0.002'), (b'"pour.started"', b'"pour.withdrawn"')])
 def test_a_changed_ledger_is_detected(path: Path, edit: tuple[bytes, bytes]) -> None:
-    poured(path, until="")
+    poured(path)
     ledger = path.with_name(LEDGER_NAME)
     ledger.write_bytes(ledger.read_bytes().replace(*edit, 1))
     with pytest.raises(JournalDamagedError, match=r"pours.jsonl, line [23]: was changed after it was written"):

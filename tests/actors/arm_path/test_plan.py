@@ -138,7 +138,7 @@ def test_a_full_pourer_travels_upright_and_gently(action):
         assert np.abs(np.diff(part.joints, axis=0) / np.diff(part.times)[:, None]).max() <= SPEC.approach_speed
 
 
-@pytest.mark.parametrize("campaign", ["quickstart", "paper"])
+@pytest.mark.parametrize("campaign", ["quickstart", pytest.param("paper", marks=pytest.mark.slow)])
 def test_every_corner_of_the_shipped_campaigns_can_be_poured(campaign):
     plan = load_campaign(CONFIGS / "campaigns" / f"{campaign}.yaml")
     assert plan.calibration is not None

@@ -162,6 +162,7 @@ def test_a_controller_may_get_another_address_between_two_parts_of_a_run_and_the
 QUICKSTART = CONFIGS / "campaigns" / "quickstart.yaml"
 
 
+@pytest.mark.slow
 def test_a_campaign_that_the_arm_can_t_make_is_refused_before_anything_starts():
     plan = load_campaign(QUICKSTART)
     assert check_campaign(plan) == []

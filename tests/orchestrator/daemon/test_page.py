@@ -519,9 +519,8 @@ def test_everything_is_legible_and_large_enough(page: Any, tmp_path: Path, schem
         assert page.evaluate(LEGIBLE) == []
 
 
-@pytest.mark.parametrize(
-    "size", [pytest.param(size, marks=pytest.mark.slow if size in ("phone", "tablet") else ()) for size in SIZES]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("size", SIZES)
 def test_it_fits_every_screen_with_the_stop_in_reach(page: Any, tmp_path: Path, size: str) -> None:
     width, height = SIZES[size]
     page.set_viewport_size({"width": width, "height": height})

@@ -108,7 +108,7 @@ def spill(name: str) -> Callable[..., float]:
     return calibration_spill if name in CALIBRATIONS else narrow_cup
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name == "C4" else ()) for name in ALL])
 @settings(max_examples=examples(4), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**31), slots=st.integers(1, 7), shuffle=st.integers(0, 1000))
 def test_the_order_in_which_simulations_return_changes_no_request(

@@ -66,6 +66,7 @@ def test_what_was_measured_beforehand_narrows_what_the_pours_leave_open(found: A
     assert narrow[0] < 1.0 < narrow[1]
 
 
+@pytest.mark.slow
 def test_the_theta_file_carries_nuisances_to_whoever_plans_with_it(found: Any, tmp_path: Path) -> None:
     import json
 
