@@ -14,10 +14,13 @@ from typing import Any
 
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.bench.bench_factory import MakeDevice, OpenBench, open_bench
+from actors.bench.pump_bench import predict_pump_dose
 from actors.bench.virtual_bench import BenchEmulators
+from actors.dosing.dose_series import DoseForecast, predict_dose
 from actors.interfaces import (
     Bench,
     BenchLostError,
+    DoseTarget,
     Laboratory,
     LaboratoryError,
     Notice,
@@ -35,6 +38,7 @@ from actors.simulators.local_worker import process_pool, thread_pool
 from actors.simulators.pool import PoolShare, WorkerPool
 from actors.simulators.ray_worker import ray_pool
 from sim_engine.resources import EXTRAS, PACKAGES, installed
+from sim_engine.scene import Scene
 
 
 def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool = False) -> None:
@@ -104,6 +108,26 @@ def reached(spec: LaboratorySettings) -> Iterator[LaboratorySettings]:
         yield spec.with_values(arm=where.arm, balance=where.balance)
     finally:
         emulators.close()
+
+
+def predicted_dose(
+    spec: LaboratorySettings, scene: Scene, dose: DoseTarget, seed: int, count: int = 20
+) -> DoseForecast:
+    """Predict a dose of a laboratory: poured from a cup, or by its pump. Nothing starts.
+
+    Args:
+        spec: of the laboratory.
+        scene: source, receiver and liquid.
+        dose: wanted amount.
+        seed: of the prediction.
+        count: number of simulated doses.
+
+    Raises:
+        InvalidActionError: the dose is impossible.
+    """
+    if spec.pump is None:
+        return predict_dose(scene, dose, seed, spec.dosing, count)
+    return predict_pump_dose(scene, dose, seed, spec.pump, spec.dosing)
 
 
 def _without_ray(spec: LaboratorySettings, *, need_bench: bool, brief: bool) -> bool:

@@ -15,14 +15,14 @@ import threading
 import time
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
 
 import numpy as np
 
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.dialect_registry import kinds
 from actors.bench.bench_clock import Pace
-from actors.interfaces import LaboratoryError
+from actors.interfaces import DeviceCheck, LaboratoryError
 from sim_engine.settings.model import SET_BY_PROGRAM, OneOf, Problems, Settings, Text
 from sim_engine.settings.plugin_registry import PluginRegistry, settings_kind
 from sim_engine.settings.quantity import Quantity
@@ -245,6 +245,38 @@ def check_devices(
         problems.add("is not emulated at the source; write 'kind: simulated'", "source", "balance")
     else:
         source.balance.check_laboratory(inner, mode=mode)
+
+
+def device_checks(
+    pump: PumpSettings | None, source: SourceSettings | None, sensor: SpillSensorSettings | None
+) -> list[DeviceCheck]:
+    """Connect each device of a laboratory in turn, and release it; nothing flows.
+
+    Args:
+        pump, source, sensor: the sections; None if they are missing.
+    """
+    devices: list[tuple[str, PumpSettings | SpillSensorSettings | None]] = [
+        ("pump", pump),
+        ("refill", None if source is None else source.refill),
+        ("spill sensor", sensor),
+    ]
+    return [_device_check(name, device) for name, device in devices if device is not None]
+
+
+def _device_check(name: str, settings: PumpSettings | SpillSensorSettings) -> DeviceCheck:
+    cls, arguments = settings.driver()
+    driver: Pump | SpillSensor = cls(*arguments)
+    try:
+        found = driver.connect()
+        if isinstance(settings, SpillSensorSettings):
+            wet = [event.place for event in cast("SpillSensor", driver).events() if event.wet]
+            if wet:
+                return DeviceCheck(name, "warn", f"{found}; wet: {', '.join(wet)}", "wipe it before the first pour")
+        return DeviceCheck(name, "ok", found)
+    except LaboratoryError as error:
+        return DeviceCheck(name, "fail", str(error), "check power, cable and address")
+    finally:
+        driver.close()
 
 
 class SimulatedPumpSettings(PumpSettings):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from actors.balance.balance_settings import balance_diagnostics
 from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import check_laboratory, reached
 from actors.laboratory_settings import LaboratorySettings
+from actors.liquid_devices import device_checks
 from orchestrator.installed_plugins import broken
 
 
@@ -74,7 +75,7 @@ def check_bench(
     """Check everything that a pour needs. Nothing moves; for a virtual laboratory, its devices are started meanwhile.
 
     Args:
-        spec: of the laboratory; with an arm.
+        spec: of the laboratory; with an arm or a pump.
         path: its file, for the advice.
         record: accepted safety settings; None: none, or the laboratory is virtual.
         tare: also tare the balance.
@@ -83,14 +84,22 @@ def check_bench(
     Raises:
         LaboratoryError: a package is missing, or a virtual device does not start.
     """
-    with reached(spec) as ready:
-        assert ready.arm is not None
-        found = ready.arm.diagnostics()
-        if read is not None:
-            record = read(found)
-        accept = f"decant robot check {path} --accept-safety"
-        checks = found.checks(record, accept=accept, virtual=spec.mode != "hardware")
-        checks += balance_diagnostics(ready.balance, tare=tare)
+    checks: list[DeviceCheck] = []
+    if spec.arm is not None:
+        with reached(spec) as ready:
+            assert ready.arm is not None
+            found = ready.arm.diagnostics()
+            if read is not None:
+                record = read(found)
+            accept = f"decant robot check {path} --accept-safety"
+            checks += found.checks(record, accept=accept, virtual=spec.mode != "hardware")
+            checks += balance_diagnostics(ready.balance, tare=tare)
+    else:
+        checks += balance_diagnostics(spec.balance, tare=tare)
+    if spec.mode == "hardware" and spec.source is not None and spec.source.balance is not None:
+        under_source = balance_diagnostics(spec.source.balance, tare=False)
+        checks += [replace(check, name=f"source {check.name}") for check in under_source]
+    checks += device_checks(spec.pump, spec.source, spec.spill_sensor)
     try:
         check_laboratory(spec.with_values(ray=None), need_bench=True)
     except LaboratoryError as error:

@@ -2,7 +2,8 @@
 
 A dose is a large portion and a few small ones, each weighed. The first portion is so small that, with the doubt about
 the pump's flow, an excess beyond the tolerance has a probability of 1 %. Each weight corrects the estimate of the flow,
-which passes to the next dose. `PortionPlanner` decides the portions, `PumpBench` is the bench.
+which passes to the next dose. `PortionPlanner` decides the portions, `predict_pump_dose` predicts a dose, and
+`PumpBench` is the bench.
 
 Limitations: no pump was tried. The liquid in the tube behind a valve counts as delivered when the weight is stable.
 """
@@ -13,9 +14,12 @@ import asyncio
 import contextlib
 import math
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings
@@ -23,7 +27,7 @@ from actors.balance.scale_model import Load
 from actors.bench.bench_operators import Hands, OperatorQuestions
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.dosing.dose_controller import DoseEnd
-from actors.dosing.dose_series import check_dose, source_of
+from actors.dosing.dose_series import DoseForecast, check_dose, source_of
 from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import (
     DoseKnowledge,
@@ -39,6 +43,7 @@ from actors.interfaces import (
     ProgressCallback,
     UnknownPourError,
 )
+from actors.liquid_devices import PumpSettings
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 
@@ -53,6 +58,9 @@ SCATTER = 0.01
 
 SURE = 2.33
 """Standard deviations for a probability of 1 %."""
+
+WEIGHING = 3.0
+"""Time until the weight of a portion is stable, as predictions assume it [s]."""
 
 LIGHTEST_RECEIVER = 5e-3
 """Smallest rise of the weight that counts as a receiver [kg]."""
@@ -106,6 +114,66 @@ class PortionPlanner:
     def knowledge(self) -> DoseKnowledge:
         """For the next dose of the series: a flow factor, and no onset."""
         return DoseKnowledge((0.0, self.mean), (0.0, 0.0, 0.0, self.variance), None, 0.0, self.doses + 1)
+
+
+def smallest_shortage(pump: PumpSettings, density: float, limit: float) -> float:
+    """Shortage that is not topped up [kg].
+
+    Args:
+        pump: its settings.
+        density: of the liquid [kg/m³].
+        limit: accepted excess [kg].
+    """
+    return max(pump.smallest * density, 0.5 * limit)
+
+
+def predict_pump_dose(
+    scene: Scene, dose: DoseTarget, seed: int, pump: PumpSettings, dosing: DosingSettings, count: int = 200
+) -> DoseForecast:
+    """Predict a dose of a pump whose flow is as uncertain as it is known.
+
+    Args:
+        scene: source vessel, receiver and liquid.
+        dose: wanted amount.
+        seed: of the prediction.
+        pump: its settings.
+        dosing: how often a dose is topped up.
+        count: number of simulated doses.
+
+    Raises:
+        InvalidActionError: see `check_dose`.
+    """
+    check_dose(scene, dose)
+    source, density = source_of(scene, dose), scene.liquid.density
+    rng = np.random.default_rng((seed, 33))
+    enough = smallest_shortage(pump, density, dose.limit)
+    amounts, durations, ends = np.zeros(count), np.zeros(count), Counter[DoseEnd]()
+    for number in range(count):
+        planner = PortionPlanner.after(source.knowledge)
+        factor = math.exp(rng.normal(planner.mean, math.sqrt(planner.variance)))
+        received = seconds = 0.0
+        for _ in range(dosing.most_top_ups + 1):
+            nominal = max(planner.portion(dose.amount - received, dose.limit), pump.smallest * density)
+            moved = nominal * factor * rng.normal(1.0, SCATTER)
+            received += moved
+            seconds += nominal / (pump.flow * density) + WEIGHING
+            planner.learn(nominal, moved, 0.0)
+            if dose.amount - received <= enough:
+                break
+        amounts[number], durations[number] = received, seconds
+        ends[DoseEnd.REACHED if dose.amount - received <= enough else DoseEnd.SHORT] += 1
+    low, high = np.quantile(amounts, (0.05, 0.95))
+    content = rng.normal(source.mass, source.deviation, count)
+    return DoseForecast(
+        float(amounts.mean()),
+        (float(low), float(high)),
+        float(durations.mean()),
+        float(np.quantile(durations, 0.95)),
+        float(np.mean(content >= dose.amount)),
+        pump.flow * density,
+        0.0,
+        dict(ends),
+    )
 
 
 class PumpBench:
@@ -228,7 +296,8 @@ class PumpBench:
 
     async def _remaining(self) -> str:
         with contextlib.suppress(LaboratoryError):
-            await self._arrived()
+            await self._arrived()  # of a simulated pump that was lost nobody knows what it had moved
+            await self.balance.device.revive()
             await self.balance.resume()
             weight = await self.balance.weigh()
             return f"the balance shows {1e3 * (weight.mass - self._zero):.2f} g in the receiver"
@@ -249,7 +318,7 @@ class PumpBench:
         source = await self._prepared(scene, dose, seed)
         deviation = max(self._balance_spec.deviation, self._step)
         planner = PortionPlanner.after(source.knowledge)
-        enough = max(self._pump.spec.smallest * self._density, 0.5 * dose.limit)
+        enough = smallest_shortage(self._pump.spec, self._density, dose.limit)
         received, portions, wet = 0.0, list[tuple[float, float]](), list[str]()
         begun = time.monotonic()
         while (missing := dose.amount - received) > enough and len(portions) <= self._dosing.most_top_ups and not wet:

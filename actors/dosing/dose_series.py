@@ -69,7 +69,8 @@ class DoseForecast:
         longest: duration that 95 % of the doses do not exceed [s].
         enough: probability that the source holds the amount.
         fine_flow: at the end of the dose [kg/s].
-        clean_flow: smallest flow that leaves the lip cleanly; a slower stream may run down the outside [kg/s].
+        clean_flow: smallest flow that leaves the lip cleanly; a slower stream may run down the outside [kg/s]. 0 for a
+            pump, which has no lip.
         ends: number of simulated doses by their end.
     """
 

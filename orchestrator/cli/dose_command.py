@@ -118,8 +118,6 @@ def _chosen(
     plan = read_campaign(path, laboratory)
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
-    if dry_run and plan.laboratory.pump is not None:
-        raise RefusalError("--dry-run: doses of a pump are not predicted; 'decant validate' checks them", BAD_INPUT)
     series = plan.dispense
     if not amounts:
         if series is None or not dry_run:
@@ -168,8 +166,8 @@ def _known(plan: DispensePlan) -> dict[str, KnownSource]:
 
 def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
     """Predict one dose after the other; each leaves the source with its expected content."""
-    from actors.dosing.dose_series import predict_dose
     from actors.interfaces import DoseTarget
+    from actors.laboratory import predicted_dose
     from orchestrator.strategies.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, Dispense, KnownSource
     from orchestrator.strategies.trials import SeedStream
 
@@ -183,7 +181,7 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
         source = strategy.next_source(planned)
         scene = series.scene(source.name, planned.receiver)
         target = DoseTarget(planned.amount, planned.limit, planned.position, source)
-        found = predict_dose(scene, target, seeds.next() % 2**32, plan.laboratory.dosing, count)
+        found = predicted_dose(plan.laboratory, scene, target, seeds.next() % 2**32, count)
         left = max(source.mass - found.amount, 0.0)
         deviation = max(source.deviation, FILL_DEVIATION) + WEIGHED_DEVIATION
         strategy.assume(source.name, KnownSource(mass=left, deviation=deviation))
@@ -229,7 +227,9 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
     low, high = (1e3 * value for value in predicted.interval)
     fine, clean = 1e3 * predicted.fine_flow, 1e3 * predicted.clean_flow
     risk = f"the last stream has {fine:.1f} g/s and leaves the lip cleanly"
-    if fine < clean:
+    if clean == 0.0:
+        risk = f"a pump's stream has {fine:.1f} g/s and runs down no lip"
+    elif fine < clean:
         risk = f"the last stream has {fine:.1f} g/s only; a part may run down the outside of the pourer"
     place = f" into {planned.position}" if planned.position else ""
     filled = "filled before; " if source.fill else ""

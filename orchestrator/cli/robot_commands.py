@@ -58,8 +58,9 @@ def check(
 ) -> None:
     """Check everything that a pour needs, and print advice: network, controller, safety settings, balance.
 
-    Nothing moves and no setting is changed. For a virtual laboratory, controller and balance are started for the check.
-    Exit code 1 if a check fails.
+    Nothing moves, nothing flows, and no setting is changed. For a virtual laboratory, controller and balance are
+    started for the check. Pump, refill device and spill sensor are connected where the laboratory has them. Exit code 1
+    if a check fails.
     """
     from actors.interfaces import LaboratoryError
     from actors.laboratory import check_bench_packages
@@ -68,7 +69,10 @@ def check(
     from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
     spec = read_laboratory(laboratory)
-    if spec.arm is None:
+    if spec.pump is not None and (accept_safety or record_to is not None):
+        text = f"--accept-safety and --record read the controller of an arm; laboratory {spec.name} pours with a pump"
+        raise RefusalError(text, BAD_INPUT)
+    if spec.arm is None and spec.pump is None:
         raise without_arm(
             laboratory,
             spec,
@@ -77,7 +81,7 @@ def check(
     virtual = spec.mode != "hardware"
     print_message(
         f"laboratory {spec.name}, {spec.mode}"
-        + (": no robot, no balance; both are started for this" if virtual else "")
+        + (": no robot, no balance; both are started for this" if virtual and spec.arm is not None else "")
     )
     try:
         record = None if virtual else read_record(laboratory)

@@ -21,9 +21,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from actors.dosing.dose_series import check_dose, predict_dose
+from actors.dosing.dose_series import check_dose
 from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
+from actors.laboratory import predicted_dose
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.catalogue.vessel_account import Transfer
 from orchestrator.config.action_assignments import AssignmentError, assigned_action, set_action
@@ -332,7 +333,7 @@ class PlannedOrder:
 
     def _forecast(self) -> dict[str, Any]:
         assert self.target is not None
-        found = predict_dose(self.scene, self.target, self.order.seed, self.plan.laboratory.dosing)
+        found = predicted_dose(self.plan.laboratory, self.scene, self.target, self.order.seed)
         wanted = self.target.amount
         bench = self.plan.laboratory.bench
         low, high = (1e3 * value for value in found.interval)

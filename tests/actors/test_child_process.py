@@ -13,7 +13,6 @@ from collections.abc import Iterator, MutableMapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import psutil
 import pytest
 
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
@@ -26,7 +25,7 @@ from actors.runtime.child_process import (
     run,
     run_async,
 )
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, alive, wait_for
 
 ROOT = Path(__file__).parents[2]
 PRODUCT = ("decant", "orchestrator", "actors", "sim_engine")
@@ -201,10 +200,8 @@ def test_children_end_with_a_parent_that_is_killed(waits: str, options: str) -> 
         environment={"PYTHONPATH": str(ROOT)},
     )
     pid = int(parent.read_line(PATIENCE))
-    child = psutil.Process(pid)
     parent.kill()
-    gone, _ = psutil.wait_procs([child], PATIENCE)
-    assert gone == [child]
+    wait_for(lambda: not alive(pid), "end of the child")
     parent.release()
 
 

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 from tests.reliability import strikes
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import alive, wait_for
 
 pytestmark = pytest.mark.ray
 
@@ -100,7 +100,7 @@ def test_whoever_asks_simulators_or_optimiser_is_told_what_ray_has_lost(whose: s
                 assert strikes.cut(p.pid for p in children if p.name() in ("raylet", "gcs_server")) > 2
                 # Ray ends its workers as soon as it notices; until then a quick simulation still has a result.
                 workers = [p for p in children if p.name() in ("ray::SimulatorProcess", "ray::Proposer")]
-                assert psutil.wait_procs(workers, PATIENCE)[1] == []
+                wait_for(lambda: not any(alive(p.pid) for p in workers), "end of Ray's workers")
             program.stdin.write("\n")
             program.stdin.flush()
             simulator, optimiser, closing, said = [json.loads(line) for line in program.stdout if line[0] == '"']

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
 from actors.arm.simulated_arm import SimulatedArm, SimulatedArmSettings
@@ -21,7 +20,7 @@ from actors.runtime.remote_object import RayDevice
 from actors.simulators import pool as pools
 from actors.simulators.local_worker import process_pool, thread_pool
 from actors.simulators.ray_worker import ray_pool
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, alive
 
 
 async def until(what, timeout=PATIENCE):
@@ -68,7 +67,7 @@ def test_a_dead_process_is_replaced_and_what_kills_every_one_is_given_up(fake, t
 
     assert asyncio.run(play()) == [1, 2]
     assert count(log, "made") == 2 + 1 + 2, "those that died are made anew"
-    assert not any(psutil.pid_exists(int(line.split()[1])) for line in lines(log))
+    assert not any(alive(int(line.split()[1])) for line in lines(log))
 
 
 def test_a_process_that_hangs_holds_nobody_up(fake, task, tmp_path, monkeypatch):
@@ -367,7 +366,7 @@ def test_a_closed_pool_lets_no_process_live_and_says_so(ray_running, fake, task)
         pool = ray_pool(2, make=fake())
         members = await pool.pids()
         await pool.close()
-        await until(lambda: not any(psutil.pid_exists(pid) for pid in members))
+        await until(lambda: not any(map(alive, members)))
         with pytest.raises(SimulationError, match="closed"):
             await pool.simulate(task())
 

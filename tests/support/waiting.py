@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+import psutil
+
 T = TypeVar("T")
 
 PATIENCE = 600.0
@@ -14,6 +16,14 @@ PATIENCE = 600.0
 
 POLL = 0.01
 """Interval at which a condition is tested [s]."""
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs. One that has ended and that nobody has waited for does not."""
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def wait_for(found: Callable[[], T], what: str = "", patience: float = PATIENCE, poll: float = POLL) -> T:

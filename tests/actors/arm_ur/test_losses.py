@@ -28,7 +28,7 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import child_environment
 from tests.support.loopback import free_address
 from tests.support.ur_pours import START, pour_path, settings
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, alive
 
 from .conftest import Call, Rig
 
@@ -219,7 +219,7 @@ def test_killing_the_driver_s_process_in_mid_pour_stops_the_arm(make_rig: Make, 
         process.kill()
         process.wait()
         stood_soon(rig, began, 1.5)
-        rig.await_that(lambda: not Path(f"/proc/{worker}").exists(), "the worker's end", 5.0)
+        rig.await_that(lambda: not alive(worker), "the worker's end")
     finally:
         process.kill()
         process.wait()

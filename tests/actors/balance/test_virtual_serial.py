@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 import serial
 
@@ -20,7 +19,7 @@ from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import Emulation
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import child_environment
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, alive
 
 from .conftest import spec_for
 
@@ -419,11 +418,11 @@ def test_it_dies_with_a_parent_that_was_killed():
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=child_environment())
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
-    assert psutil.pid_exists(child)
+    assert alive(child)
     os.kill(parent.pid, 9)
     parent.wait()
     parent.stdout.close()
     end = time.monotonic() + PATIENCE
-    while time.monotonic() < end and psutil.pid_exists(child) and psutil.Process(child).status() != "zombie":
+    while time.monotonic() < end and alive(child):
         time.sleep(0.05)
-    assert not psutil.pid_exists(child) or psutil.Process(child).status() == "zombie"
+    assert not alive(child)

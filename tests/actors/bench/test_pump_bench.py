@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
+import os
+import signal
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -27,9 +30,10 @@ from actors.interfaces import (
     PourProgress,
     UnknownPourError,
 )
-from actors.laboratory import InProcessLaboratory
+from actors.laboratory import InProcessLaboratory, RayLaboratory
 from actors.laboratory_settings import LaboratorySettings
-from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
+from actors.liquid_devices import SimulatedPump, SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
+from orchestrator.bench_check import check_bench
 from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.cli.app import app
 from orchestrator.config.file_loading import load_laboratory
@@ -68,7 +72,7 @@ def target(grams: float, **source: Any) -> DoseTarget:
 
 
 class Stage:
-    def __init__(self, opened: InProcessLaboratory, notices: list[Notice]) -> None:
+    def __init__(self, opened: InProcessLaboratory | RayLaboratory, notices: list[Notice]) -> None:
         assert opened.opened is not None
         assert isinstance(opened.opened.bench, PumpBench)
         self.bench, self.operator, self.notices = opened.opened.bench, opened.opened.operator, notices
@@ -86,10 +90,12 @@ class Stage:
         return measured.notes["dose"] | {"spills": measured.notes.get("spills", [])}
 
 
-def run(scenario: Callable[[Stage], Awaitable[None]], person: Any = None, **changes: Any) -> None:
+def run(
+    scenario: Callable[[Stage], Awaitable[None]], person: Any = None, *, kind: Any = InProcessLaboratory, **changes: Any
+) -> None:
     async def body() -> None:
         notices: list[Notice] = []
-        opened = InProcessLaboratory(laboratory(**changes), need_bench=True, operator=person)
+        opened = kind(laboratory(**changes), need_bench=True, operator=person)
         opened.listen(notices.append)
         async with opened:
             await scenario(Stage(opened, notices))
@@ -189,6 +195,30 @@ def test_a_stopped_pump_makes_the_amount_unknown_and_tells_the_weight() -> None:
     run(scenario)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.ray
+@pytest.mark.parametrize("lost", ["pump", "balance"])
+def test_a_device_whose_process_dies_in_a_portion_leaves_the_dose_unknown_and_is_started_again(
+    ray_running: None, lost: str
+) -> None:
+    async def scenario(stage: Stage) -> None:
+        device = stage.bench._pump.device if lost == "pump" else stage.bench.balance.device
+        victim = await device.pid()
+        flows = asyncio.Event()
+        dose = asyncio.ensure_future(stage.dose(50, lambda seen: flows.set() if seen.checkpoint == "dose" else None))
+        await flows.wait()
+        os.kill(victim, signal.SIGKILL)
+        with pytest.raises(UnknownPourError, match=r"process .*died.* not the dose that was asked for"):
+            await dose
+        again = await stage.dose(20)
+        assert again["end"] == "reached"
+        assert again["received"] == pytest.approx(0.02, abs=5e-4)
+        assert await device.pid() != victim
+
+    run(scenario, kind=RayLaboratory, pump=SimulatedPumpSettings(time_scale=5.0), in_process=False)
+
+
 WET = {
     "pump": SimulatedPumpSettings(time_scale=0.0, missed=2e-3),
     "spill_sensor": SimulatedSpillSensorSettings(place="left of the balance"),
@@ -271,6 +301,39 @@ def test_a_campaign_with_a_pump_runs_and_is_reported(tmp_path: Path, monkeypatch
     assert last is not None
     assert last.mass == pytest.approx(1e-3 * (result.doses[-1].left_g or 0.0))
     assert last.deviation < 3e-4, "the balance under the source has weighed it"
+
+
+def test_a_dose_is_predicted_and_the_devices_are_looked_at_without_a_flow() -> None:
+    predicted = CliRunner().invoke(app, ["dose", str(shipped("campaigns/pump.yaml")), "--dry-run", "--json"])
+    assert predicted.exit_code == 0, predicted.output
+    doses = json.loads(predicted.stdout)["doses"]
+    assert [one["wanted_g"] for one in doses] == [80, 80, 80, 20]
+    for one in doses:
+        low, high = one["interval_g"]
+        assert low < one["wanted_g"] < high
+        assert high - low < 1.0
+    assert doses[3]["duration_s"] < doses[0]["duration_s"] < 30.0
+
+    looked = CliRunner().invoke(app, ["robot", "check", str(shipped("laboratories/pump.yaml")), "--json"])
+    assert looked.exit_code == 0, looked.output
+    names = [check["name"] for check in json.loads(looked.stdout)["checks"]]
+    assert {"balance", "pump", "refill", "spill sensor"} <= set(names)
+
+
+class Unplugged(SimulatedPumpSettings):
+    def driver(self) -> tuple[type[Any], tuple[Any, ...]]:
+        return UnpluggedPump, (self,)
+
+
+class UnpluggedPump(SimulatedPump):
+    def connect(self) -> str:
+        raise LaboratoryError("no answer at /dev/ttyUSB0")
+
+
+def test_a_pump_that_does_not_answer_fails_the_check() -> None:
+    spec = laboratory(pump=Unplugged(), spill_sensor=WET["spill_sensor"])
+    report = check_bench(spec, Path("pump.yaml"), None)
+    assert [(check.name, check.found) for check in report.failed] == [("pump", "no answer at /dev/ttyUSB0")]
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_a_program_gets_the_report_that_the_command_prints(laboratory: Path) -> 
     assert not report.ready  # nobody has accepted its safety settings
     assert "accepted by nobody" in str(report)
     assert "accepted by nobody" in report._repr_html_()
-    with pytest.raises(decant.InvalidArgumentError, match="has no 'arm'"):
+    with pytest.raises(decant.InvalidArgumentError, match="has neither 'arm' nor 'pump'"):
         decant.doctor("configs/laboratories/planning.yaml")
 
 
