@@ -24,9 +24,8 @@ def scenes(record: Record | None) -> str:
     ]
     head = ("scenes in a call", "CPU s a pour", "one by one", "ratio", "pours a minute", "process [MB]")
     about = prose(
-        f"""Standard pours with {r["particles"]:,} particles, many in one call and the same pours one by one, in the
-        same process ({r["backend"]}). On a CPU the scenes of a call follow each other, so that a call costs what its
-        pours cost, and memory does not grow with it."""
+        f"""Standard pours with {r["particles"]:,} particles, many in one call and one by one, in the same process
+        ({r["backend"]}). On a CPU the scenes of a call follow each other: a call costs the sum of its pours."""
     )
     return f"## {title}\n\n{about}\n\n{table(head, rows, 'rrrrrr')}\n{settings([record])}"
 
@@ -48,9 +47,9 @@ def plan(record: Record | None) -> str:
         for row in r["plans"]
     ]
     about = prose(
-        f"""Seconds that `decant plan` takes with the quickstart's pour into cups that it never saw: fresh processes,
-        start, figures and report included, bytecode and kernels there. Required on two cores: {r["limit_s"]:g} s
-        (median {r["seconds"]:.1f}, {_met(r["within_limit"])})."""
+        f"""Seconds of `decant plan` for the quickstart's pour into unseen cups: fresh processes with start, figures and
+        report; kernels cached. Required on two cores: {r["limit_s"]:g} s (median {r["seconds"]:.1f},
+        {_met(r["within_limit"])})."""
     )
     titles = ("into", "s", "CPU s", "simulations", "predicted to spill")
     return f"## {title}\n\n{about}\n\n{table(titles, rows, 'lrrrr')}\n{settings([record])}"
@@ -64,9 +63,8 @@ def validate(record: Record | None) -> str:
     r = record["result"]
     rows = [(f"`{row['file']}`", f"{row['cpu_s']:.2f}") for row in r["files"]]
     about = prose(
-        f"""CPU seconds, user and system, of `decant validate` for every shipped file: medians of {r["repeats"]} fresh
-        processes, start and imports included, with a warm cache. Required: {r["limit_s"]:g}
-        ({_met(r["within_limit"])})."""
+        f"""CPU seconds of `decant validate`: medians of {r["repeats"]} fresh processes with a warm cache, with their
+        start. Required: {r["limit_s"]:g} ({_met(r["within_limit"])})."""
     )
     return f"## {title}\n\n{about}\n\n{table(('file', 'CPU s'), rows, 'lr')}\n{settings([record])}"
 
@@ -78,9 +76,9 @@ def pool(record: Record | None) -> str:
         return missing(title, "pool_speed.py")
     r = record["result"]
     about = prose(
-        f"""{r["workers"]} simulators of the pool (Ray actors) compared with {r["workers"]} plain processes without Ray,
-        the same {r["pours"]} standard pours with {r["particles"]:,} particles each, in turns, in one go; medians.
-        Overhead is the time of a worker without simulating, per simulation, while all had work."""
+        f"""{r["workers"]} simulators of the pool (Ray actors) compared with {r["workers"]} plain processes, the same
+        {r["pours"]} standard pours with {r["particles"]:,} particles, in turns; medians. Overhead: time of a busy
+        worker without simulating, per simulation."""
     )
     rows = [
         ("pours a minute, pool", f"{r['pours_per_minute_pool']:.0f}", "", ""),

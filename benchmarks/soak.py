@@ -335,7 +335,7 @@ def draw(folder: Path) -> dict[str, Any]:
                 label = name if rows is rest else None
                 axes.plot(minutes, [s[key] for s in rows], marker, color=colour, ms=3, lw=1.2, alpha=alpha, label=label)
     minutes = [s["minute"] for s in rest]
-    names = {"daemon": "queue, questions, deeds", "events": "events", "ray": "Ray's logs"}
+    names = {"daemon": "queue, questions, audit entries", "events": "events", "ray": "Ray's logs"}
     for (key, name), colour in zip(names.items(), (style.MEASURED, style.PREDICTED, style.GOOD), strict=True):
         disk.plot(minutes, [size[key](s) for s in rest], "o-", color=colour, ms=3, lw=1.2, label=name)
     begin = campaigns[0]["began"]
@@ -354,7 +354,7 @@ def draw(folder: Path) -> dict[str, Any]:
         "open handles": lambda s: float(s["handles"]),
         "threads": lambda s: float(s["threads"]),
         "processes": lambda s: float(s["processes"]),
-        "queue, questions, deeds with their WAL [MB]": size["daemon"],
+        "queue, questions, audit entries with their WAL [MB]": size["daemon"],
         "events with their WAL [MB]": size["events"],
         "Ray's folder [MB]": size["ray"],
     }

@@ -141,7 +141,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=4, help="of each simulated pour")
     asked = parser.parse_args()
     lines = [
-        "| vessel | door | profile, mean / largest [mm] | capacity [%] | spillage of two pours |",
+        "| vessel | source | profile, mean / largest [mm] | capacity [%] | spillage of two pours |",
         "|---|---|---|---|---|",
     ]
     for row in measure(asked.seeds):

@@ -461,7 +461,7 @@ def command_line() -> str:
     def add(command: Any, words: tuple[str, ...]) -> None:
         if isinstance(getattr(command, "commands", None), dict):
             if len(words) > 1:
-                parts.append(f"## `{' '.join(words)} …`\n\n{_prose(command.help)}\n")
+                parts.append(f"## `{' '.join(words)} …`\n\n{_prose(command.help)}\n\n{_examples(command.epilog)}")
             for name, below in command.commands.items():
                 if not below.hidden:
                     add(below, (*words, name))
@@ -476,6 +476,7 @@ def command_line() -> str:
         ]
         if rows:
             parts.append(_table(("option", "meaning"), rows))
+        parts.append(f"{_examples(command.epilog)}")
 
     add(typer.main.get_command(app), ("decant",))
     return "\n".join(parts)
@@ -523,6 +524,12 @@ def _usage(argument: Any) -> str:
     name = str(argument.metavar or argument.name.upper())
     name = f"{name}…" if argument.nargs == -1 else name
     return name if argument.required else f"[{name}]"
+
+
+def _examples(epilog: str | None) -> str:
+    """The examples at the end of a command's help, as a list."""
+    commands = [line for line in (epilog or "").splitlines() if line.startswith("`")]
+    return "Examples:\n\n" + "\n".join(f"- {command}" for command in commands) + "\n"
 
 
 def _prose(text: str | None) -> str:

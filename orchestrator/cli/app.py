@@ -68,9 +68,17 @@ def decant(
     """Options that precede the command."""
 
 
-def _group(name: str, text: str) -> typer.Typer:
-    """Add a group of commands."""
-    group = typer.Typer(name=name, cls=Commands, no_args_is_help=True, rich_markup_mode="markdown", help=text)
+def _group(name: str, text: str, *shown: str) -> typer.Typer:
+    """Add a group of commands.
+
+    Args:
+        name: its name.
+        text: its help text.
+        shown: examples: how its commands are used together.
+    """
+    group = typer.Typer(
+        name=name, cls=Commands, no_args_is_help=True, rich_markup_mode="markdown", help=text, epilog=examples(*shown)
+    )
     app.add_typer(group)
     return group
 
@@ -110,7 +118,7 @@ _add(
     "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
 )
 _add(file_commands.validate, "decant validate my.yaml vase.yaml", "decant validate configs/campaigns/*.yaml")
-_add(file_commands.migrate, "decant migrate my.yaml rig.yaml")
+_add(file_commands.migrate, "decant migrate my.yaml rig.yaml   # keep a copy: the files are rewritten")
 _add(file_commands.init, "decant init lab", "decant run lab/campaigns/quickstart.yaml")
 _add(file_commands.schema, "decant schema > campaign.json", "decant schema result > result.json")
 _add(
@@ -156,7 +164,12 @@ _add(
 
 app.add_typer(run_commands.runs)
 
-_study = _group("study", "Compare strategies with repetitions, on virtual benches that differ from the simulator.")
+_study = _group(
+    "study",
+    "Compare strategies with repetitions, on virtual benches that differ from the simulator.",
+    "decant study run configs/studies/quick.yaml",
+    "decant study report configs/studies/quick.yaml   # again, from the results that there are",
+)
 _add(
     study_command.run_study,
     "decant study run configs/studies/quick.yaml",
@@ -167,7 +180,12 @@ _add(
 )
 _add(study_command.report_study, "decant study report configs/studies/quick.yaml", name="report", to=_study)
 
-_robot = _group("robot", "Check and move the arm of a laboratory.")
+_robot = _group(
+    "robot",
+    "Check and move the arm of a laboratory.",
+    "decant robot check configs/laboratories/ur10-kern.yaml                  # moves nothing",
+    "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion    # small steps, typed",
+)
 _add(
     robot_commands.check,
     "decant robot check configs/laboratories/virtual.yaml",
@@ -193,7 +211,12 @@ _add(
     to=_robot,
 )
 
-_balance = _group("balance", "Check a balance before the first pour, and record its raw traffic.")
+_balance = _group(
+    "balance",
+    "Check a balance before the first pour, and record its raw traffic.",
+    "decant balance check configs/laboratories/ur10-kern.yaml",
+    "decant balance check /dev/serial/by-id/usb-FTDI_FT232R-if00-port0   # no laboratory file yet",
+)
 _add(
     balance_commands.check,
     "decant balance check configs/laboratories/virtual.yaml       # practise without a balance",
@@ -207,7 +230,12 @@ _add(
     to=_balance,
 )
 
-_server = _group("server", "Run a laboratory as a service.")
+_server = _group(
+    "server",
+    "Run a laboratory as a service.",
+    "decant server start --state ./lab            # prints the address of its page; runs until Ctrl-C",
+    "decant server backup lab.zip --state ./lab   # also while it runs",
+)
 _add(
     queue_commands.start,
     "decant server start",
@@ -215,11 +243,19 @@ _add(
     "decant server start --state ./trials --in-process",
     to=_server,
 )
-_add(queue_commands.shutdown, "decant server stop", name="stop", to=_server)
+_add(
+    queue_commands.shutdown, "decant server stop   # finishes and weighs a pour that has begun", name="stop", to=_server
+)
 _add(station_commands.backup, "decant server backup decant-2030-03-01.zip", to=_server)
 _add(station_commands.restore, "decant server restore decant-2030-03-01.zip --state ./restored", to=_server)
 
-_queue = _group("queue", "Submit campaigns to the server, follow and control them, and answer their questions.")
+_queue = _group(
+    "queue",
+    "Submit campaigns to the server, follow and control them, and answer their questions.",
+    "decant queue submit configs/campaigns/quickstart.yaml   # prints the campaign's id",
+    "decant queue logs quickstart-3f2a1c -f                  # follow it",
+    "decant queue answer                                     # list what the laboratory asks",
+)
 _add(
     queue_commands.submit,
     "decant queue submit configs/campaigns/quickstart.yaml",
@@ -228,21 +264,21 @@ _add(
     to=_queue,
 )
 _add(queue_commands.list_campaigns, "decant queue list", "decant queue list --json", name="list", to=_queue)
-_add(queue_commands.show, "decant queue show quickstart-3f2a1c", to=_queue)
+_add(queue_commands.show, "decant queue show quick   # the first letters of an id suffice", to=_queue)
 _add(queue_commands.logs, "decant queue logs -f", "decant queue logs quickstart-3f2a1c --json", to=_queue)
 _add(queue_commands.pause, "decant queue pause quickstart-3f2a1c", "decant queue pause   # the queue", to=_queue)
 _add(queue_commands.resume, "decant queue resume quickstart-3f2a1c", "decant queue resume   # the queue", to=_queue)
-_add(queue_commands.stop, "decant queue stop quickstart-3f2a1c", to=_queue)
+_add(queue_commands.stop, "decant queue stop quickstart-3f2a1c   # its results so far are kept", to=_queue)
 _add(queue_commands.abort, "decant queue abort quickstart-3f2a1c", to=_queue)
 _add(
     queue_commands.answer,
     "decant queue answer",
     "decant queue answer 7 done",
-    "decant queue answer 8 weighed 3.2 0.4",
+    "decant queue answer 8 weighed 3.2 0.4   # spilled and retained [g]",
     to=_queue,
 )
 _add(queue_commands.enable, "decant queue enable narrow-1b2c3d", to=_queue)
-_add(queue_commands.move, "decant queue move narrow-1b2c3d --first", to=_queue)
+_add(queue_commands.move, "decant queue move narrow-1b2c3d --first   # the next to run", to=_queue)
 _add(
     station_commands.order,
     "decant queue pour plan-17:4 --from beaker-1 --into vial-7 --amount '30 g'",
@@ -250,12 +286,17 @@ _add(
     name="pour",
     to=_queue,
 )
-_add(station_commands.batch, "decant queue batch plate.json", to=_queue)
+_add(station_commands.batch, "decant queue batch plate.json   # again: nothing is queued twice", to=_queue)
 _add(station_commands.batch_status, "decant queue batch-status plate-1", name="batch-status", to=_queue)
 _add(station_commands.hold, "decant queue hold narrow-1b2c3d", "decant queue hold narrow-1b2c3d --release", to=_queue)
 _add(station_commands.reserve, "decant queue reserve left --hours 2", to=_queue)
 
-_materials = _group("materials", "See what is left in vessels, and enter weighings and pours made by hand.")
+_materials = _group(
+    "materials",
+    "See what is left in vessels, and enter weighings and pours made by hand.",
+    "decant materials weigh virtual/beaker '412.3 g' --liquid water   # after filling it",
+    "decant materials list                                            # what the pours since then left",
+)
 _add(
     materials_commands.list_vessels, "decant materials list", "decant materials list --json", name="list", to=_materials
 )
@@ -272,7 +313,12 @@ _add(
     to=_materials,
 )
 
-_add(queue_commands.estop, "decant estop", "decant estop --rig left", "decant estop --clear")
+_add(
+    queue_commands.estop,
+    "decant estop",
+    "decant estop --rig left",
+    "decant estop --clear   # accept work again",
+)
 
 
 def main() -> None:

@@ -147,7 +147,7 @@ def migrate(
 
 
 def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one that does not exist yet.")]) -> None:
-    """Copy example files into a folder: campaigns, laboratories, studies, vessels and weighed pours."""
+    """Copy example files into a folder: campaigns, laboratories, studies, vessels and recorded pours."""
     from orchestrator.shipped import starting_set
 
     try:

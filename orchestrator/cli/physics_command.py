@@ -52,9 +52,8 @@ INTRODUCTION = """# Validation
 
 <!-- written by `decant validate-solver`; edit the cases, not this page -->
 
-Results of the solver in cases whose outcome is known from theory, experiments or other solvers. Every quantity
-is measured, not assumed, and judged by a criterion that was set beforehand; what fails is shown as failing. The page is
-written by
+Results of the solver in cases whose outcome is known from theory, experiments or other solvers. Criteria were set
+beforehand. This command measures everything and writes the page:
 
 <!-- needs: checkout and minutes -->
 ```
@@ -373,10 +372,12 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint:
     failed = sum(not m["passed"] for m in judged)
     parts = [INTRODUCTION.format(theta=theta)]
     parts.append(f"{len(judged) - failed} of {len(judged)} criteria are met.\n")
+    older = {name: " †" for name, record in records.items() if record["solver"] != fingerprint}
+    if older:
+        parts.append(f"† Measured before the solver's sources last changed; again: `{AGAIN} CASE`\n")
     for name, record in records.items():
-        parts.append(f"## {record['title']}\n\n{record['about']} (`decant validate-solver {name}`)\n")
-        if record["solver"] != fingerprint:
-            parts.append(f"Measured before the solver's sources last changed; again: `{AGAIN} {name}`\n")
+        command = f"(`decant validate-solver {name}`){older.get(name, '')}"
+        parts.append(f"## {record['title']}\n\n{record['about']} {command}\n")
         lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]
         for m in record["measurements"]:
             word = {"FAIL": "**fails**"}.get(verdict(m), verdict(m))

@@ -31,9 +31,9 @@ NO_MEANING: dict[tuple[str, str], str] = {
         for target in ("simulator", "optimiser", "worker", "controller", "balance")
         for clock in (AHEAD, BACK)
     },
-    ("simulator", FULL): "keeps nothing on the disk but caches, which are made anew; its results go to the program",
+    ("simulator", FULL): "keeps nothing on the disk but caches, which are rebuilt; its results go to the program",
     ("optimiser", FULL): "writes nothing",
-    ("worker", FULL): "writes nothing but complaints of its library",
+    ("worker", FULL): "writes nothing but messages of its library",
     ("controller", FULL): "writes nothing",
     ("balance", FULL): "writes nothing",
     ("ray", AHEAD): _ANOTHER_TIME,

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import shlex
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn, get_args
+from typing import Any, NoReturn, get_args
 
 import pytest
+import typer.main
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
@@ -38,6 +41,28 @@ def test_help_teaches_units_and_shows_examples(verb: str) -> None:
     assert result.exit_code == 0
     for words in HELP[verb]:
         assert words in result.stdout
+
+
+def below(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """A command with its words, and everything below it."""
+    yield words, command
+    for name, found in getattr(command, "commands", {}).items():
+        yield from below(found, (*words, name))
+
+
+def test_help_of_every_command_and_group_ends_with_examples_that_are_understood() -> None:
+    program = typer.main.get_command(app)
+    for words, command in below(program, ("decant",)):
+        text = command.epilog or command.help
+        lines = [shlex.split(line.strip(" `"), comments=True) for line in text.splitlines()]
+        shown = [line for line in lines if tuple(line[: len(words)]) == words]
+        assert shown, f"the help of '{' '.join(words)}' has no example of it"
+        for line in shown:
+            end = min((line.index(word) for word in ("&&", ">") if word in line), default=None)
+            found, rest = program, line[1:end]
+            while rest and rest[0] in getattr(found, "commands", {}):
+                found = found.commands[rest.pop(0)]  # type: ignore[attr-defined]
+            found.make_context(line[0], rest).close()  # raises on an argument or option that the command lacks
 
 
 def test_help_of_answer_names_all_that_may_be_answered() -> None:

@@ -86,10 +86,11 @@ def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured
     assert (tmp_path / "images" / "validation-good.png").read_bytes()[:4] == b"\x89PNG"
     monkeypatch.setattr(sources, "solver_fingerprint", lambda: "another")
     runner.invoke(app, ["validate-solver", "good", "--write", str(tmp_path)])
-    good, bad = (tmp_path / physics_command.PAGE_NAME).read_text(encoding="utf-8").partition("## Bad")[::2]
-    assert "Measured before" not in page
-    assert "Measured before" not in good
-    assert "Measured before" in bad
+    marked = (tmp_path / physics_command.PAGE_NAME).read_text(encoding="utf-8")
+    assert "†" not in page
+    assert "† Measured before the solver's sources last changed" in marked
+    assert "(`decant validate-solver good`)\n" in marked
+    assert "(`decant validate-solver bad`) †\n" in marked
 
 
 def test_a_wrong_name_and_a_missing_folder_are_refused_before_anything_runs(tmp_path: Path) -> None:
