@@ -406,7 +406,7 @@ def dosing_faults() -> str:
         (
             row["fault"],
             ", ".join(f"{count} {end}" for end, count in row["ends"].items()),
-            f"{row['most_above']:+.1f}" if row['most_above'] > 0.0 else "none",
+            f"{row['most_above']:+.1f}" if row["most_above"] > 0.0 else "none",
             f"{row['misreported']:.1f}",
             f"{row['spilled']:.1f}",
             "" if row["upright"] is None else f"{row['upright']:.1f}",
