@@ -104,6 +104,7 @@ def test_a_quick_command_does_what_the_page_says(
     assert done.exit_code == 0, f"{command}\n{done.output}\n{HOW}"
 
 
+@pytest.mark.realtime  # some move an emulated arm in real time, which stops on a starved machine, as it should
 @pytest.mark.slow
 @pytest.mark.parametrize("command", LONG)
 def test_a_long_command_does_what_the_page_says(command: str, scratch: tuple[Path, str]) -> None:
