@@ -127,7 +127,8 @@ def predicted_dose(
     """
     if spec.pump is None:
         return predict_dose(scene, dose, seed, spec.dosing, count)
-    return predict_pump_dose(scene, dose, seed, spec.pump, spec.dosing)
+    deviation = 0.0 if spec.balance is None else spec.balance.deviation
+    return predict_pump_dose(scene, dose, seed, spec.pump, spec.dosing, deviation)
 
 
 def _without_ray(spec: LaboratorySettings, *, need_bench: bool, brief: bool) -> bool:

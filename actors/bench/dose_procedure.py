@@ -34,7 +34,6 @@ from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
 from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import (
-    DoseProgress,
     DoseTarget,
     InvalidActionError,
     LaboratoryError,
@@ -401,9 +400,7 @@ class DoseProcedure:
     def _show(self, controller: DoseController, state: ArmState, tilt: float) -> None:
         last = self._readings.all[-1:]
         reading = last[0].mass - self._zero if last else None
-        amount, deviation = controller.amount
-        progress = DoseProgress(controller.phase, self._dose.amount, amount, deviation, controller.flow, reading)
-        self._report.dose(tilt, state.joints, progress)
+        self._report.dose(tilt, state.joints, controller.progress(reading))
 
     def _seen(self, state: ArmState) -> None:
         self._report.stand(state.joints, state.pourer)

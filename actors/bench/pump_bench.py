@@ -128,7 +128,13 @@ def smallest_shortage(pump: PumpSettings, density: float, limit: float) -> float
 
 
 def predict_pump_dose(
-    scene: Scene, dose: DoseTarget, seed: int, pump: PumpSettings, dosing: DosingSettings, count: int = 200
+    scene: Scene,
+    dose: DoseTarget,
+    seed: int,
+    pump: PumpSettings,
+    dosing: DosingSettings,
+    deviation: float,
+    count: int = 200,
 ) -> DoseForecast:
     """Predict a dose of a pump whose flow is as uncertain as it is known.
 
@@ -138,6 +144,7 @@ def predict_pump_dose(
         seed: of the prediction.
         pump: its settings.
         dosing: how often a dose is topped up.
+        deviation: standard deviation of a weight [kg].
         count: number of simulated doses.
 
     Raises:
@@ -151,17 +158,18 @@ def predict_pump_dose(
     for number in range(count):
         planner = PortionPlanner.after(source.knowledge)
         factor = math.exp(rng.normal(planner.mean, math.sqrt(planner.variance)))
-        received = seconds = 0.0
+        received = weighed = seconds = 0.0
         for _ in range(dosing.most_top_ups + 1):
-            nominal = max(planner.portion(dose.amount - received, dose.limit), pump.smallest * density)
+            nominal = max(planner.portion(dose.amount - weighed, dose.limit), pump.smallest * density)
             moved = nominal * factor * rng.normal(1.0, SCATTER)
             received += moved
             seconds += nominal / (pump.flow * density) + WEIGHING
-            planner.learn(nominal, moved, 0.0)
-            if dose.amount - received <= enough:
+            before, weighed = weighed, received + rng.normal(0.0, deviation)
+            planner.learn(nominal, weighed - before, math.sqrt(2.0) * deviation)
+            if dose.amount - weighed <= enough:
                 break
         amounts[number], durations[number] = received, seconds
-        ends[DoseEnd.REACHED if dose.amount - received <= enough else DoseEnd.SHORT] += 1
+        ends[DoseEnd.REACHED if dose.amount - weighed <= enough else DoseEnd.SHORT] += 1
     low, high = np.quantile(amounts, (0.05, 0.95))
     content = rng.normal(source.mass, source.deviation, count)
     return DoseForecast(

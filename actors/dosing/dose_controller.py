@@ -27,7 +27,7 @@ import numpy as np
 from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
 from actors.dosing.dosing_settings import DosingSettings
-from actors.interfaces import DoseTarget
+from actors.interfaces import DoseProgress, DoseTarget
 
 
 @dataclass(frozen=True)
@@ -215,6 +215,14 @@ class DoseController:
     def flow(self) -> float:
         """Estimated flow [kg/s]."""
         return self._cup.density * float(np.median(self._estimator.flow))
+
+    def progress(self, reading: float | None) -> DoseProgress:
+        """What is shown of the dose now.
+
+        Args:
+            reading: last one of the balance, without the receiver [kg]; None before the first one.
+        """
+        return DoseProgress(str(self.phase), self._order.amount, *self.amount, self.flow, reading)
 
     # ---- decisions
 

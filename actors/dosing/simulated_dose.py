@@ -20,7 +20,6 @@ from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series
 from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DoseRecord, TrueCup, TrueScale, VirtualDosingBench
 from actors.interfaces import (
-    DoseProgress,
     DoseTarget,
     InvalidActionError,
     PourProgress,
@@ -72,7 +71,7 @@ def simulated_dose(
     series, bench = _set_up(scene, dose, seed, settings, held_tilt)
     loaded = bench.content
     controller = series.controller(DoseOrder(dose.amount, dose.limit, receiver_mass=bench.receiver_mass), seed=seed)
-    record = bench.dose(controller if progress is None else _Shown(controller, dose.amount, progress))
+    record = bench.dose(controller if progress is None else _Shown(controller, progress))
     result = controller.result
     assert result is not None, "a dose ends within LONGEST_DOSE"
     if result.amount is None:
@@ -85,8 +84,8 @@ def simulated_dose(
 class _Shown:
     """A controller that reports what it estimates: ten times a second of the dose, and whenever its phase changes."""
 
-    def __init__(self, controller: DoseController, amount: float, progress: ProgressCallback) -> None:
-        self._controller, self._amount, self._progress = controller, amount, progress
+    def __init__(self, controller: DoseController, progress: ProgressCallback) -> None:
+        self._controller, self._progress = controller, progress
         self._phase, self._next = DosePhase.CHECK, 0.0
         self._zero: float | None = None
 
@@ -99,9 +98,8 @@ class _Shown:
         if time >= self._next or phase is not self._phase:
             self._phase, self._next = phase, time + PROGRESS_INTERVAL
             reading = None if last is None or self._zero is None else last - self._zero
-            amount, deviation = self._controller.amount
-            shown = DoseProgress(str(phase), self._amount, amount, deviation, self._controller.flow, reading)
-            done = min(max(amount / self._amount, 0.0), 1.0)
+            shown = self._controller.progress(reading)
+            done = min(max(shown.amount / shown.target, 0.0), 1.0)
             self._progress(PourProgress("dose", done, tilt=tilt, balance=reading, dose=shown))
         return command
 
