@@ -57,10 +57,13 @@ def _address(text: str) -> str:
     )
 
 
+RayAddress = Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
+
+
 class RaySettings(Settings):
     """An existing Ray cluster; Decant connects to it and does not stop it."""
 
-    address: Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
+    address: RayAddress
     """Address of its head node, host:port."""
 
     bench_resource: Name = "decant_bench"
