@@ -65,7 +65,7 @@ def stops(found: Mapping[str, Any]) -> str:
     return (
         f"Median / worst of {found['times']} [ms], on {found['cores']} cores with a load of {found['load before']} "
         f"beforehand; the first simulation of a submitted plan began after {first} ms.\n\n"
-        + _table(("", "until", *loads.values()), rows)
+        + markdown_table(("", "until", *loads.values()), rows)
     )
 
 
@@ -76,7 +76,8 @@ def soak(found: Mapping[str, Any]) -> str:
     return (
         f"{found['minutes']:.0f} minutes, {found['campaigns']} campaigns, {100 * found['cpu share']:.0f} % of a core "
         f"on average; the journal of a plain campaign took {first} kB in the first half and {second} kB in the second "
-        "(medians). Looked at between campaigns:\n\n" + _table(("", "after a third", "at the end", "an hour"), rows)
+        "(medians). Looked at between campaigns:\n\n"
+        + markdown_table(("", "after a third", "at the end", "an hour"), rows)
     )
 
 
@@ -92,14 +93,15 @@ def idle_time(found: Mapping[str, Any]) -> str:
     return (
         f"On {found['cores']} cores with a load of {found['load before']} beforehand, in turn, "
         f"{times}:\n\n"
-        + _table(("campaign", "simulations ahead", "wall", "the arm's own", "the rest", "same decisions"), rows)
+        + markdown_table(("campaign", "simulations ahead", "wall", "the arm's own", "the rest", "same decisions"), rows)
     )
 
 
 TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {"stops": stops, "soak": soak, "idle-time": idle_time}
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
 

@@ -61,6 +61,7 @@ DISK = 900
 SETTINGS = """\
 rigs: {left: left.yaml, right: right.yaml}
 simulators: 1
+in_process: true
 keep_free: 40 MB
 events: 2000
 recordings: {keep: 3}
@@ -109,6 +110,9 @@ ORDER = ("plain", "paused", "plan", "plain", "stopped", "plain", "aborted", "rec
 
 FULL_FOR = 30.0
 """Time for which the disk is full [s]."""
+
+ENDS_WITHIN = 60.0
+"""Longest time for the daemon to end by itself [s]."""
 
 ENDED = ("finished", "stopped", "withdrawn")
 RESTS = ("paused", "failed", "unknown")
@@ -172,7 +176,7 @@ class Laboratory:
         if process is not None:
             process.send_signal(number)
             try:
-                process.wait(PATIENCE)
+                process.wait(ENDS_WITHIN)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -362,7 +366,7 @@ def ordering(lab: Laboratory, begun: float) -> None:
                     with contextlib.suppress(DaemonError):
                         lab.call("post", f"/pours/{key}/resume")
                 time.sleep(0.4)
-        lab.over.wait(max(4.0 - (time.monotonic() - begun) % 4.0, 0.5))
+        lab.over.wait(max(10.0 - (time.monotonic() - begun) % 10.0, 0.5))
 
 
 def answering(lab: Laboratory) -> None:
@@ -503,7 +507,7 @@ def _append(path: Path, row: dict[str, Any]) -> None:
 # ---- the whole
 
 
-def soak(folder: Path, minutes: float, campaigns: int, every: float) -> None:
+def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) -> None:
     """Keep a daemon busy, then check what it has kept.
 
     Args:
@@ -511,9 +515,11 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float) -> None:
         minutes: for so long.
         campaigns: largest number of each rig.
         every: between two samples [s].
+        ray: whether simulator, arm and balance are processes of Ray; else they are threads of the daemon.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "settings.yaml").write_text(SETTINGS, encoding="utf-8")
+    settings = SETTINGS.replace("in_process: true\n", "") if ray else SETTINGS
+    (folder / "settings.yaml").write_text(settings, encoding="utf-8")
     for rig, text in RIGS.items():
         (folder / f"{rig}.yaml").write_text(text, encoding="utf-8")
     with small_disk(folder / "disk") as disk, tempfile.TemporaryDirectory(prefix="k", dir="/tmp") as mark:
@@ -553,6 +559,7 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float) -> None:
     result = {
         "minutes": round(took / 60.0, 1),
         "time_scale": TIME_SCALE,
+        "ray": ray,
         "restart_s": [round(one, 1) for one in lab.restarts],
         "cpu_s": round(lab.spent, 1),
         "counts": dict(lab.counts),
@@ -593,7 +600,9 @@ def checked(lab: Laboratory, campaigns: list[Any], pours: list[Any], account: li
     runs = collections.Counter(one["run"] for one in campaigns if one["run"])
     return {
         "campaigns": len(acknowledged),
-        "states": dict(collections.Counter(f"{one['kind']}: {one['state']}" for one in items if one["what"] == "campaign")),
+        "states": dict(
+            collections.Counter(f"{one['kind']}: {one['state']}" for one in items if one["what"] == "campaign")
+        ),
         "campaigns lost": [key for key in acknowledged if not listed[key]],
         "campaigns with the run of another": [run for run, count in runs.items() if count > 1],
         "orders": len(orders),
@@ -719,6 +728,7 @@ def main() -> None:
     parser.add_argument("--into", type=Path, default=Path("soak"))
     parser.add_argument("--campaigns", type=int, default=1000, help="most of each rig")
     parser.add_argument("--every", type=float, default=30.0, help="seconds between two samples")
+    parser.add_argument("--ray", action="store_true", help="with processes of Ray: takes several times as long")
     parser.add_argument("--draw", type=Path, help="draw what was found there")
     arguments = parser.parse_args()
     if arguments.draw is not None:
@@ -726,7 +736,7 @@ def main() -> None:
         return
     end_in_order()
     os.environ.pop("DECANT_STATE", None)
-    soak(arguments.into.resolve(), arguments.minutes, arguments.campaigns, arguments.every)
+    soak(arguments.into.resolve(), arguments.minutes, arguments.campaigns, arguments.every, arguments.ray)
 
 
 if __name__ == "__main__":
