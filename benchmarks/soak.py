@@ -88,14 +88,14 @@ calibration:
   motion: {x_offset: 75 mm, height: 80 mm}
   actions: {angular_velocity: [60 deg/s, 100 deg/s], max_angle: [80 deg, 115 deg]}
   pours: {count: 3, holdout: 1}
-  simulations: 5
+  simulations: 4
   initial_samples: 3
 deployment:
   strategy: D3
   receiver: {name: narrow, profile: {unit: mm, inner: [[0, 0], [20, 0], [20, 90]], wall: 4 mm, floor: 4 mm}}
   motion: {max_angle: 115 deg, height: 80 mm}
   actions: {angular_velocity: [60 deg/s, 100 deg/s], x_offset: [70 mm, 100 mm]}
-  prior_simulations: 3
+  prior_simulations: 2
   pours: 2
   simulations_per_pour: 1
 on_unknown: ask
@@ -327,7 +327,7 @@ def followed(lab: Laboratory, key: str, kind: str, chance: random.Random) -> str
             elif state in RESTS and found["desired_state"] != "run":
                 lab.call("post", f"/campaigns/{key}/resume")
                 lab.counts[f"resumed after {state}"] += 1
-        time.sleep(0.4)
+        time.sleep(0.6)
 
 
 def ordering(lab: Laboratory, begun: float) -> None:
@@ -383,7 +383,7 @@ def answering(lab: Laboratory) -> None:
 def visiting(lab: Laboratory, number: int) -> None:
     """A client that comes and goes: it reads, follows events for a while, or leaves in the middle of a request."""
     chance = random.Random(number)
-    while not lab.over.wait(chance.uniform(0.5, 4.0)):
+    while not lab.over.wait(chance.uniform(1.0, 6.0)):
         lab.counts["visits"] += 1
         with contextlib.suppress(DaemonError, OSError):
             match chance.randrange(3):
@@ -393,7 +393,7 @@ def visiting(lab: Laboratory, number: int) -> None:
                 case 1:
                     with lab.client() as client:
                         end = time.monotonic() + chance.uniform(1.0, 5.0)
-                        for _ in client.events(0):
+                        for _ in client.events(chance.choice((0, None))):
                             if time.monotonic() > end or lab.over.is_set():
                                 break
                 case 2:
@@ -629,7 +629,7 @@ def _vessels(pours: list[Any], key: str) -> list[str]:
 
 # ---- the result
 
-FIGURE = ROOT / "docs" / "images" / "daemon" / "soak.png"
+FIGURE = ROOT / "docs" / "images" / "daemon" / "day.png"
 
 
 def draw(folder: Path) -> dict[str, Any]:
@@ -686,6 +686,7 @@ def draw(folder: Path) -> dict[str, Any]:
         "orders ended": result["orders ended"],
         "counts": counts,
         "restart [s]": round(statistics.median(result["restart_s"][1:]), 1),
+        "ray": result["ray"],
         "cpu share": round(result["cpu_s"] / 60.0 / result["minutes"], 3),
         "finished": result["requests finished"],
         "lost or doubled": {
@@ -732,7 +733,7 @@ def main() -> None:
     parser.add_argument("--draw", type=Path, help="draw what was found there")
     arguments = parser.parse_args()
     if arguments.draw is not None:
-        keep("soak", draw(arguments.draw))
+        keep("day", draw(arguments.draw))
         return
     end_in_order()
     os.environ.pop("DECANT_STATE", None)
