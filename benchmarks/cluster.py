@@ -159,9 +159,8 @@ async def queue_of(workers: int, mean: float, jobs: int) -> dict[str, Any]:
         "decisions_per_cpu_s": round((jobs - 2 * workers) / spent),
         "idle_ms_median": round(1e3 * statistics.median(idle[:part]), 2),
         "idle_ms_p99": round(1e3 * float(np.quantile(idle[:part], 0.99)), 2),
-        "efficiency": round((jobs - 2 * workers) * mean / (stretch * workers), 3),
+        "efficiency": round(busy / (stretch * workers), 3),
         "driver_kb_per_queued_job": round((queued - before) / jobs / 1e3, 2),
-        "busy_s": round(busy),
     }
 
 
