@@ -28,7 +28,7 @@ from tests.support.study_files import read, without, written
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.realtime]
 
 LABORATORY = "{name: NAME, bench: {liquid: {particles: 400, cohesion: 0.05 N/m}, time_scale: 0}}\n"
-CAMPAIGN = small_campaign.CAMPAIGN.replace("  simulations: 6\n", "  simulations: 30\n").replace("300", "800")
+CAMPAIGN = small_campaign.CAMPAIGN.replace("  simulations: 6\n", "  simulations: 20\n")
 
 
 @pytest.fixture
@@ -49,6 +49,8 @@ def until(what: Callable[[], Any], process: subprocess.Popen[str]) -> Any:
 
 
 def entries(run: Path) -> list[Any]:
+    if not (run / "journal.sqlite").is_file():
+        return []
     with JournalReader(run / "journal.sqlite") as journal:
         return list(journal.entries())
 
@@ -77,7 +79,7 @@ def test_two_rigs_of_a_daemon_share_the_simulators_of_a_cluster_that_loses_a_nod
 
                 def at_work(key: str) -> bool:
                     run = client.get(f"/campaigns/{key}")["run"]
-                    return run is not None and finished_in("calibration", entries(state / "runs" / run)) >= 5
+                    return run is not None and finished_in("calibration", entries(state / "runs" / run)) >= 3
 
                 until(lambda: all(map(at_work, sent)), process)
                 assert cluster.workers(1), "simulators are on both nodes"
