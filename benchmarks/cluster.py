@@ -96,7 +96,12 @@ class VirtualWorker:
     def __init__(self, mean: float, seed: int, idle: list[float]) -> None:
         self._rng, self._mean, self._idle = np.random.default_rng(seed), mean, idle
         self._alone, self._ended = asyncio.Lock(), -1.0
+        self._begun, self._busy, self._works = 0.0, 0.0, False
         self._answer = outcome()
+
+    def busy(self, now: float) -> float:
+        """Time spent on jobs until now [s]."""
+        return self._busy + (now - self._begun if self._works else 0.0)
 
     async def start(self) -> Greeting:
         """See `Worker.start`."""
@@ -109,8 +114,10 @@ class VirtualWorker:
             if self._ended >= 0.0:
                 self._idle.append(clock() - self._ended)
             seconds = self._mean * float(self._rng.lognormal(-0.125, 0.5))
+            self._begun, self._works = clock(), True
             await asyncio.sleep(seconds)
-            self._ended = clock()
+            self._ended, self._works = clock(), False
+            self._busy += self._ended - self._begun
         return WorkerReply(self._answer, seconds)
 
     def cancel(self, number: int) -> None:
@@ -120,10 +127,15 @@ class VirtualWorker:
         """See `Worker.close`."""
 
 
-def virtual_pool(workers: int, mean: float, idle: list[float]) -> WorkerPool:
-    """A pool of virtual workers."""
-    seeds = iter(range(10**9))
-    return WorkerPool(workers, lambda: VirtualWorker(mean, next(seeds), idle), ahead=1, deadline=1e9)
+def virtual_pool(workers: int, mean: float, idle: list[float]) -> tuple[WorkerPool, list[VirtualWorker]]:
+    """A pool of virtual workers, and the workers."""
+    made: list[VirtualWorker] = []
+
+    def make() -> VirtualWorker:
+        made.append(VirtualWorker(mean, len(made), idle))
+        return made[-1]
+
+    return WorkerPool(workers, make, ahead=1, deadline=1e9), made
 
 
 def skipping(work: Callable[[], Any]) -> Any:
@@ -135,7 +147,7 @@ def skipping(work: Callable[[], Any]) -> Any:
 async def queue_of(workers: int, mean: float, jobs: int) -> dict[str, Any]:
     """All jobs queued at once; how busy the workers are until the first one has nothing to do, and what it costs."""
     idle: list[float] = []
-    pool = virtual_pool(workers, mean, idle)
+    pool, made = virtual_pool(workers, mean, idle)
     await pool.pids()
     task = standard_task(2000, 1)
     before = psutil.Process().memory_info().rss
@@ -147,7 +159,7 @@ async def queue_of(workers: int, mean: float, jobs: int) -> dict[str, Any]:
     for answered, _ in enumerate(asyncio.as_completed(waiting), start=1):
         await _
         if answered == jobs - 2 * workers:
-            stretch, busy, part = clock() - begun, pool.statistics().busy_s, len(idle)
+            stretch, busy, part = clock() - begun, sum(one.busy(clock()) for one in made), len(idle)
             spent = time.thread_time() - cpu
     await pool.close()
     return {
@@ -166,7 +178,7 @@ async def queue_of(workers: int, mean: float, jobs: int) -> dict[str, Any]:
 
 async def fairness(workers: int, mean: float) -> dict[str, Any]:
     """Two users of one pool, of whom one has queued ten times as much: when the small one has all its answers."""
-    pool = virtual_pool(workers, mean, [])
+    pool, _ = virtual_pool(workers, mean, [])
     many, few = pool.share(), pool.share()
     task = standard_task(2000, 1)
     clock = asyncio.get_running_loop().time
@@ -210,7 +222,7 @@ async def whole_run(workers: int, slots: int, mean: float) -> dict[str, Any]:
     cell = next(one for one in cells_of(study) if one.id == GRID)
     with tempfile.TemporaryDirectory() as place:
         plan, stages = campaign_of(study, cell, lambda key: {}, Path(place))
-        pool = virtual_pool(workers, mean, idle)
+        pool, _ = virtual_pool(workers, mean, idle)
         await pool.pids()
         request = RunRequest(replace(plan, parallel_simulations=slots), stages, Path(place))
         handle = RunService().start(request, RunResources(laboratory=partial(VirtualLaboratory, pool)))  # type: ignore[arg-type]

@@ -1,11 +1,11 @@
 """A day of a laboratory in scaled time: a daemon with two rigs, campaigns, ordered pours, faults, and clients.
 
-Two rigs of simulated benches get campaigns over HTTP, one after the other: plans, calibrations with deployments, with
-and without a recording, some paused, stopped or aborted and resumed. On the right rig an operator answers questions.
-Another client orders pours and repeats every order with the same id. Other clients read, follow events and leave, some
-in the middle of a request. In the first part the daemon is killed (SIGKILL) or ended again and again, and its disk is
-filled up; the second part is undisturbed but for one full disk, so that growth of memory can be seen. Every half minute
-the clients wait until nothing runs, and all processes and files are measured.
+Two rigs of simulated benches get campaigns over HTTP from two clients each: plans, calibrations with deployments, and
+deployments alone, with and without a recording, some paused, stopped or aborted and resumed. On the right rig an
+operator answers questions. Another client orders pours and repeats every order with the same id. Other clients read,
+follow events and leave, some in the middle of a request. In the first part the daemon is killed (SIGKILL) or ended
+again and again, and its disk is filled up; the second part is undisturbed but for one full disk, so that growth of
+memory can be seen. From time to time the clients wait until nothing runs, and all processes and files are measured.
 
 At the end every journal, the queue and the account of materials are compared with what the clients were promised.
 The state directory is a small file system in memory, so that it can be full: root is needed. From the project's root:
@@ -105,8 +105,21 @@ outputs: {recording: false, figures: false}
 BEAKER = {"profile": {"unit": "mm", "inner": [[0, 0], [30, 0], [30, 70]], "wall": "4 mm", "floor": "4 mm"}}
 VIAL = {"profile": {"unit": "mm", "inner": [[0, 0], [20, 0], [20, 90]], "wall": "4 mm", "floor": "4 mm"}}
 
-ORDER = ("plain", "paused", "plan", "plain", "stopped", "plain", "aborted", "recorded")
-"""Kinds of campaigns, again and again."""
+ORDER = (
+    "short",
+    "paused",
+    "short",
+    "plan",
+    "short",
+    "stopped",
+    "plain",
+    "short",
+    "aborted",
+    "short",
+    "recorded",
+    "short",
+)
+"""Kinds of campaigns, again and again. Plain ones and plans calibrate and deploy; the others only pour."""
 
 FULL_FOR = 30.0
 """Time for which the disk is full [s]."""
@@ -271,9 +284,18 @@ def small_disk(place: Path) -> Iterator[Path]:
 def texts(folder: Path) -> dict[str, tuple[str, Files]]:
     """What is submitted, by kind."""
     yaml = YAML()
+
+    def short(campaign: dict[str, Any], pours: int) -> None:
+        del campaign["calibration"]
+        campaign["simulator"]["parameters"]["friction"] = 0.3
+        kept = {key: campaign["deployment"][key] for key in ("receiver", "motion", "actions")}
+        campaign["deployment"] = {"strategy": "D2", **kept, "pours": pours}
+
     changes: dict[str, Callable[[dict[str, Any]], object]] = {
         "plain": lambda campaign: None,
-        "recorded": lambda campaign: campaign.update(outputs={"recorded_simulations": 1}),
+        "short": lambda campaign: short(campaign, 2),
+        "paused": lambda campaign: short(campaign, 4),
+        "recorded": lambda campaign: (short(campaign, 2), campaign.update(outputs={"recorded_simulations": 1})),
     }
     found = {}
     for kind, change in changes.items():
@@ -283,14 +305,19 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
         yaml.dump(campaign, text)
         (folder / f"{kind}.yaml").write_text(text.getvalue(), encoding="utf-8")
         found[kind] = pack(load_campaign(folder / f"{kind}.yaml"))
-    return {**dict.fromkeys(ORDER, found["plain"]), **found}
+    return {**dict.fromkeys(ORDER, found["paused"]), **found, "plan": found["plain"]}
 
 
-def submitting(lab: Laboratory, rig: str, most: int) -> None:
-    """A client of one rig: one campaign after the other."""
+def submitting(lab: Laboratory, rig: str, first: int, most: int) -> None:
+    """A client of one rig: one campaign after the other.
+
+    Args:
+        first: number of its first campaign in `ORDER`.
+        most: number of campaigns.
+    """
     sent = texts(lab.folder)
-    chance = random.Random(rig)
-    for number in range(most):
+    chance = random.Random(f"{rig} {first}")
+    for number in range(first, first + most):
         if lab.over.is_set():
             return
         with lab.item():
@@ -513,7 +540,7 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
     Args:
         folder: where it is done; samples.jsonl, items.jsonl and result.json are written there.
         minutes: for so long.
-        campaigns: largest number of each rig.
+        campaigns: largest number of each of the four clients.
         every: between two samples [s].
         ray: whether simulator, arm and balance are processes of Ray; else they are threads of the daemon.
     """
@@ -526,7 +553,7 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
         lab = Laboratory(folder, disk, mark)
         lab.start()
         begun = time.monotonic()
-        work = [partial(submitting, lab, rig, campaigns) for rig in RIGS]
+        work = [partial(submitting, lab, rig, first, campaigns) for rig in RIGS for first in (0, 5)]
         others: list[Callable[[], None]] = [
             partial(ordering, lab, begun),
             partial(answering, lab),
@@ -727,8 +754,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=40.0)
     parser.add_argument("--into", type=Path, default=Path("soak"))
-    parser.add_argument("--campaigns", type=int, default=1000, help="most of each rig")
-    parser.add_argument("--every", type=float, default=30.0, help="seconds between two samples")
+    parser.add_argument("--campaigns", type=int, default=1000, help="most of each of four clients")
+    parser.add_argument("--every", type=float, default=100.0, help="seconds between two samples")
     parser.add_argument("--ray", action="store_true", help="with processes of Ray: takes several times as long")
     parser.add_argument("--draw", type=Path, help="draw what was found there")
     arguments = parser.parse_args()
