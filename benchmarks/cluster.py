@@ -2,7 +2,7 @@
 
     python benchmarks/cluster.py scheduler      1,000 workers that answer after a drawn time; needs no Ray
     python benchmarks/cluster.py nodes          Ray clusters of 1 to 3 nodes of one core, on loopback addresses
-    python benchmarks/cluster.py page           the tables of docs/laboratory/cluster.md from what was measured
+    python benchmarks/cluster.py page           the tables of docs/laboratory/cluster.md from the figures
 
 Scheduler: the real pool, and a whole run with its journal, on an event loop whose time is the CPU time of its thread
 plus skipped waits (`skipping_clock`). The figures are therefore those of a core with nothing else to do. A worker has
@@ -38,7 +38,7 @@ import psutil
 from daemon_page import MARKED, markdown_table
 from machine import ROOT, describe, say
 from skipping_clock import SkippingLoop
-from standard_pour import short_task, standard_task
+from standard_pour import standard_task
 
 from actors.laboratory import open_laboratory
 from actors.laboratory_settings import LaboratorySettings, RaySettings
@@ -145,7 +145,7 @@ def skipping(work: Callable[[], Any]) -> Any:
 
 
 async def queue_of(workers: int, mean: float, jobs: int) -> dict[str, Any]:
-    """All jobs queued at once; how busy the workers are until the first one has nothing to do, and what it costs."""
+    """All jobs queued at once: efficiency of the workers while jobs wait, and cost of the decisions."""
     idle: list[float] = []
     pool, made = virtual_pool(workers, mean, idle)
     await pool.pids()
@@ -304,7 +304,7 @@ async def drive(address: str, kind: str, jobs: int) -> None:
         laboratory.listen(lambda notice: print(json.dumps({"notice": notice.text, "at": time.time()}), flush=True))
         pool = cast(WorkerPool, laboratory.simulators)
         size = len(await pool.pids())
-        tasks = [(standard_task if kind == "real" else short_task)(PARTICLES)] * jobs
+        tasks = [standard_task(PARTICLES, 1)] * jobs
         first = [asyncio.ensure_future(pool.simulate(task)) for task in tasks[: 2 * size]]
         await asyncio.gather(*first)  # kernels, first calls
         process = psutil.Process()
@@ -465,7 +465,7 @@ def nodes_table(found: dict[str, Any]) -> str:
 
 
 def scheduler_table(found: dict[str, Any]) -> str:
-    """What the scheduler can do, by workers and duration."""
+    """Speed of the scheduler, by workers and duration."""
     rows = [
         (
             f"{one['workers']:,}",

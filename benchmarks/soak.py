@@ -7,7 +7,7 @@ follow events and leave, some in the middle of a request. In the first part the 
 again and again, and its disk is filled up; the second part is undisturbed but for one full disk, so that growth of
 memory can be seen. From time to time the clients wait until nothing runs, and all processes and files are measured.
 
-At the end every journal, the queue and the account of materials are compared with what the clients were promised.
+At the end every journal, the queue and the account of materials are compared with the answers to the clients.
 The state directory is a small file system in memory, so that it can be full: root is needed. From the project's root:
 
     python benchmarks/soak.py --minutes 40 --into soak     # writes soak/samples.jsonl, items.jsonl, result.json
@@ -282,7 +282,7 @@ def small_disk(place: Path) -> Iterator[Path]:
 
 
 def texts(folder: Path) -> dict[str, tuple[str, Files]]:
-    """What is submitted, by kind."""
+    """Submissions by kind."""
     yaml = YAML()
 
     def short(campaign: dict[str, Any], pours: int) -> None:

@@ -42,7 +42,7 @@ class ClusterTask:
         return bool(ray.wait([self._reference], timeout=0.0)[0])
 
     def result(self) -> Any:
-        """What the function has returned.
+        """The value that the function has returned.
 
         Raises:
             LaboratoryError: the function failed, or its process died each time.

@@ -124,7 +124,7 @@ def packed(folder: Path) -> bytes | None:
 
 
 def unpack_whole(content: bytes, folder: Path) -> None:
-    """Make a folder from an archive, in place of an existing one: a crash leaves no partial folder."""
+    """Make a folder from an archive, or replace it. A crash leaves no partial folder."""
     draft = folder.with_name(f"{folder.name}.part")
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
