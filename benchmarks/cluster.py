@@ -446,10 +446,23 @@ def render(page: str, figures: dict[str, Any]) -> str:
 def nodes_table(found: dict[str, Any]) -> str:
     """Speed-up and efficiency by number of nodes."""
     rows = [
-        (one["kind"], one["nodes"], one["jobs"], one["each_s"], one["wall_s"], one["speed_up"], one["efficiency"])
+        (
+            *(one[key] for key in ("kind", "nodes", "jobs", "each_s", "wall_s", "speed_up")),
+            f"{100 * one['efficiency']:.0f} %",
+            f"{100 * one['busy']:.0f} %",
+        )
         for one in sorted(found["nodes"], key=lambda one: (one["kind"] != "waiting", one["nodes"]))
     ]
-    head = ("job", "nodes of one core", "jobs", "each [s]", "wall time [s]", "speed-up", "efficiency")
+    head = (
+        "job",
+        "nodes of one core",
+        "jobs",
+        "each [s]",
+        "wall time [s]",
+        "speed-up",
+        "efficiency",
+        "simulators busy",
+    )
     calls, lost, queue = found["calls"], found["lost"], found["queue"]
     return (
         markdown_table(head, rows)
