@@ -299,7 +299,7 @@ async def drive(address: str, kind: str, jobs: int) -> None:
     seconds = {"wait": WAIT, "nothing": 0.0, "queue": WAIT}.get(kind)
     make: Callable[[], Simulator] = pour_simulator if seconds is None else partial(Waiting, seconds)
     spec = LaboratorySettings(name="benchmark", ray=RaySettings(address=address))
-    laboratory = open_laboratory(spec, need_bench=False, make=make)
+    laboratory: Any = open_laboratory(spec, need_bench=False, make=make)
     async with laboratory:
         laboratory.listen(lambda notice: print(json.dumps({"notice": notice.text, "at": time.time()}), flush=True))
         pool = cast(WorkerPool, laboratory.simulators)
@@ -321,8 +321,8 @@ async def drive(address: str, kind: str, jobs: int) -> None:
             print(json.dumps({"memory_mb": memory / 1e6, "rss_mb": process.memory_info().rss / 1e6}), flush=True)
             return
         answers = []
-        for one in asyncio.as_completed(waiting):
-            await one
+        for answer in asyncio.as_completed(waiting):
+            await answer
             answers.append(time.time() - begun)
         spent = sum(process.cpu_times()[:2]) - cpu
         found = {"wall_s": answers[-1], "answers": answers, "busy_s": pool.statistics().busy_s - busy}

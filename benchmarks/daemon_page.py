@@ -69,18 +69,6 @@ def stops(found: Mapping[str, Any]) -> str:
     )
 
 
-def soak(found: Mapping[str, Any]) -> str:
-    """What there was at a third of the time, at the end, and how it went."""
-    rows = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
-    first, second = found["journal of one campaign [kB]"]
-    return (
-        f"{found['minutes']:.0f} minutes, {found['campaigns']} campaigns, {100 * found['cpu share']:.0f} % of a core "
-        f"on average; the journal of a plain campaign took {first} kB in the first half and {second} kB in the second "
-        "(medians). Looked at between campaigns:\n\n"
-        + markdown_table(("", "after a third", "at the end", "an hour"), rows)
-    )
-
-
 def day(found: Mapping[str, Any]) -> str:
     """A day in scaled time: what was done to the daemon, what was lost, and what has grown."""
     counts = found["counts"]
@@ -102,7 +90,9 @@ def day(found: Mapping[str, Any]) -> str:
     begin, end = found["undisturbed [min]"]
     grown = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
     return (
-        markdown_table(("", ""), rows)
+        "Two rigs on simulated benches without Ray, in scaled time; in the first part a fault every 90 seconds. Each "
+        "order is sent three times or more. If a pour is killed, the operator declares it lost.\n\n"
+        + markdown_table(("", ""), rows)
         + "\nLost or doubled, by the journals, the queue and the account of materials:\n\n"
         + markdown_table(("", "number"), lost)
         + f"\nBetween campaigns, from minute {begin:.0f} to {end:.0f}, when the daemon was not restarted; "
@@ -138,7 +128,6 @@ def idle_time(found: Mapping[str, Any]) -> str:
 
 TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "stops": stops,
-    "soak": soak,
     "day": day,
     "idle-time": idle_time,
 }

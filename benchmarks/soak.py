@@ -166,7 +166,7 @@ class Laboratory:
         begun = time.monotonic()
         with (self.folder / "log").open("a") as log:
             command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "server", "start"]
-            options = [self.folder / "settings.yaml", "--state", self.state, "--port", str(self._port)]
+            options = [str(self.folder / "settings.yaml"), "--state", str(self.state), "--port", str(self._port)]
             self._process = started(
                 [*command, *options], stdout=log, stderr=log, start_new_session=True,
                 env={**os.environ, "TMPDIR": self.mark},
@@ -285,8 +285,9 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
     """Submissions by kind."""
     yaml = YAML()
 
-    def short(campaign: dict[str, Any], pours: int) -> None:
+    def short(campaign: dict[str, Any], pours: int, outputs: dict[str, Any] | None = None) -> None:
         del campaign["calibration"]
+        campaign["outputs"] = outputs or campaign["outputs"]
         campaign["simulator"]["parameters"]["friction"] = 0.3
         kept = {key: campaign["deployment"][key] for key in ("receiver", "motion", "actions")}
         campaign["deployment"] = {"strategy": "D2", **kept, "pours": pours}
@@ -295,7 +296,7 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
         "plain": lambda campaign: None,
         "short": lambda campaign: short(campaign, 2),
         "paused": lambda campaign: short(campaign, 4),
-        "recorded": lambda campaign: (short(campaign, 2), campaign.update(outputs={"recorded_simulations": 1})),
+        "recorded": lambda campaign: short(campaign, 2, {"recorded_simulations": 1}),
     }
     found = {}
     for kind, change in changes.items():
@@ -364,8 +365,8 @@ def ordering(lab: Laboratory, begun: float) -> None:
         *[("/materials/vessels", {"id": f"beaker-{rig}", "shape": BEAKER}) for rig in RIGS],
         *[("/materials/vessels", {"id": f"vial-{rig}", "shape": VIAL}) for rig in RIGS],
     ]
-    for path, body in setting_up:
-        lab.call("post", path, body)
+    for path, made in setting_up:
+        lab.call("post", path, made)
     for number in range(100_000):
         rig = ("left", "right")[number % 2]
         with lab.item(), contextlib.suppress(DaemonError):
@@ -376,7 +377,14 @@ def ordering(lab: Laboratory, begun: float) -> None:
             key = f"order-{number}"
             action = {"angular_velocity": "100 deg/s", "x_offset": "70 mm"}
             vessels = {"source": f"beaker-{rig}", "receiver": f"vial-{rig}"}
-            body = {"id": key, "rig": rig, **vessels, "action": action, "predict": False, "priority": 10}
+            body: dict[str, Any] = {
+                "id": key,
+                "rig": rig,
+                **vessels,
+                "action": action,
+                "predict": False,
+                "priority": 10,
+            }
             ordered = lab.call("post", "/pours", body)
             lab.note(what="order", id=key, campaign=ordered.get("campaign"))
             for repetition in range(100_000):
@@ -470,12 +478,12 @@ def look(lab: Laboratory) -> dict[str, Any]:
         with contextlib.suppress(psutil.Error, OSError):
             with process.oneshot():
                 name = _name(process)
-                found = {"pss": process.memory_full_info().pss / 1e6}
+                found: dict[str, Any] = {"pss": process.memory_full_info().pss / 1e6}
                 found |= {"threads": process.num_threads(), "handles": process.num_fds(), "processes": 1}
             memory[name] += found["pss"]
-            totals.update(found)  # type: ignore[arg-type]
+            totals.update(found)
             if name == "daemon":
-                totals.update({f"daemon {k}": v for k, v in found.items() if k != "processes"})  # type: ignore[misc]
+                totals.update({f"daemon {k}": v for k, v in found.items() if k != "processes"})
     sizes = {path.name: path.stat().st_size / 1e6 for path in lab.state.glob("*.sqlite*")}
     sizes["runs"], sizes["campaigns"] = (_size(lab.state / name) / 1e6 for name in ("runs", "campaigns"))
     sizes["ray"] = _size(Path(lab.mark)) / 1e6
@@ -553,7 +561,9 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
         lab = Laboratory(folder, disk, mark)
         lab.start()
         begun = time.monotonic()
-        work = [partial(submitting, lab, rig, first, campaigns) for rig in RIGS for first in (0, 5)]
+        work: list[Callable[[], None]] = [
+            partial(submitting, lab, rig, first, campaigns) for rig in RIGS for first in (0, 5)
+        ]
         others: list[Callable[[], None]] = [
             partial(ordering, lab, begun),
             partial(answering, lab),
@@ -561,7 +571,7 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
             partial(striking, lab, begun, 0.4 * 60.0 * minutes),
             partial(sampling, lab, every, begun),
         ]
-        threads = [threading.Thread(target=one, daemon=True) for one in (*work, *others)]
+        threads = [threading.Thread(target=one, daemon=True) for one in [*work, *others]]
         try:
             for thread in threads:
                 thread.start()
