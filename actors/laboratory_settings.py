@@ -32,7 +32,6 @@ from actors.liquid_devices import (
 from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.settings.model import (
-    MADE,
     NOT_IN_FINGERPRINT,
     SET_BY_PROGRAM,
     Count,
@@ -116,7 +115,6 @@ def _hidden_liquid() -> type[HiddenLiquidBase]:
         __base__=HiddenLiquidBase,
         __doc__=HiddenLiquidBase.__doc__,
         __module__=__name__,
-        __cls_kwargs__=MADE,
         **fields,
     )
     return model
