@@ -38,6 +38,7 @@ from actors.optimizer.questions import (
     SuggestionQuery,
     SurrogateMap,
     SurrogateQuery,
+    found_good,
 )
 from actors.optimizer.risk_measures import RiskProcess
 from actors.optimizer.surrogate_models import Model, QueryArrays, array, fit, tuples
@@ -292,7 +293,8 @@ def _seeks_minimum(query: SurrogateQuery) -> bool:
 def _fills_space(query: ProposalQuery, arrays: QueryArrays, model: Model, index: int) -> bool:
     """Whether the next point only fills space: every third one, while the costs may be pure noise.
 
-    Without replicates, every third one always does, and two of three while the costs may be pure noise.
+    Without replicates, every third one always does, and two of three until a good one was found: a smooth plateau
+    would make the surrogate certain that there is no valley.
 
     On a plateau the best pours look like a slope by chance. Following them, mostly along the faces of the cube, would
     use up the whole budget. Only a `MinimumQuery` does so, without `plain` and with a constant mean.
@@ -302,7 +304,7 @@ def _fills_space(query: ProposalQuery, arrays: QueryArrays, model: Model, index:
     number = len(arrays.known) + len(arrays.busy) + index
     if query.replicates:
         return number % FILL_EVERY == FILL_EVERY - 1 and model.process.evidence < STRUCTURE
-    return (number % FILL_EVERY == FILL_EVERY - 1) if model.process.evidence >= STRUCTURE else number % FILL_EVERY != 0
+    return (number % FILL_EVERY == FILL_EVERY - 1) if found_good(arrays.costs) else number % FILL_EVERY != 0
 
 
 def _kappa(query: ProposalQuery, model: Model) -> float:
