@@ -409,7 +409,7 @@ def proposals(
         simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
     else:
         known = np.concatenate([arrays.simulated, arrays.busy])
-        simulations = acquisition.spread_out(query.count - 1, known, arrays.region, rng, feasibility)
+        simulations = acquisition.between(query.count - 1, known, arrays.region, rng, feasibility)
     return np.concatenate([pour[None, :], simulations])
 
 

@@ -274,7 +274,9 @@ def _search(
         pending = np.concatenate([arrays.busy, np.array(chosen).reshape(-1, query.space.dimension)])
         if _fills_space(query, arrays, model, index):
             avoided = np.concatenate([arrays.known, pending, arrays.refused])
-            chosen.append(acquisition.spread_out(1, avoided, arrays.region, rng, feasibility)[0])
+            describes = isinstance(query, MinimumQuery) and not query.replicates
+            fill = acquisition.between if describes else acquisition.spread_out
+            chosen.append(fill(1, avoided, arrays.region, rng, feasibility)[0])
             continue
         conclude = _seeks_minimum(query) and index == 0
         score = acquisition.lower_confidence_bound(surrogate, 0.0 if conclude else _kappa(query, model))
