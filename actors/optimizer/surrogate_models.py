@@ -202,6 +202,8 @@ def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
     describes = isinstance(query, MinimumQuery) and not query.replicates
     averages = isinstance(query, PourQuery) and query.discrepancy is not None
     prior = OBLIQUE_PRIOR if describes or averages else CONSTANT_PRIOR
+    if averages and first.start is not None and len(first.start) < 2 + query.space.dimension**2:
+        first = AFRESH  # of a run begun with an earlier version, without shears
     if isinstance(query, PourQuery | SimulationQuery) and len(arrays.simulated) >= 2:
         if isinstance(query, SimulationQuery) and query.coupling == "scaled":
             process = joint_process(
