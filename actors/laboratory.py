@@ -52,6 +52,8 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
     Raises:
         LaboratoryError: with the problem and its remedy.
     """
+    if need_bench:
+        _check_not_external(spec)
     if spec.arm is not None and need_bench and (missing := spec.arm.missing()) is not None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
@@ -66,6 +68,14 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
         )
     if spec.ray is not None and not spec.in_process:
         check_cluster(spec.ray, need_bench=need_bench)
+
+
+def _check_not_external(spec: LaboratorySettings) -> None:
+    if spec.mode == "external":
+        raise LaboratoryError(
+            f"laboratory {spec.name} is external: a program makes its pours and asks for them with decant.AskTell; "
+            "'decant plan', and 'decant calibrate' on weighed pours, need no pours"
+        )
 
 
 def check_bench_packages(spec: LaboratorySettings) -> None:
@@ -161,7 +171,9 @@ def open_laboratory(
     Raises:
         LaboratoryError: a bench is needed and there is none, or it has no operator, or the mode is unknown.
     """
-    if spec.mode not in ("virtual", "hardware"):
+    if need_bench:
+        _check_not_external(spec)
+    if spec.mode not in ("virtual", "hardware", "external"):
         raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not known; 'virtual' and 'hardware' are")
     if need_bench and not spec.pours:
         raise LaboratoryError(f"laboratory {spec.name} has no bench, but the campaign pours: add a 'bench' to it")

@@ -20,6 +20,8 @@ from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.page import page_router
 from orchestrator.daemon.schemas import HealthOut, ProblemOut
 from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.strategies.stage_result import ResultPart
+from sim_engine.settings.model import meanings
 
 V1 = "/api/v1"
 
@@ -89,7 +91,16 @@ def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None], 
 
 def openapi_text() -> str:
     """Return the API's OpenAPI description, as in docs/openapi.json."""
-    return json.dumps(create_app().openapi(), indent=1, ensure_ascii=False) + "\n"
+    document = create_app().openapi()
+    waiting: list[type[ResultPart]] = [ResultPart]
+    while waiting:
+        model = waiting.pop()
+        waiting += model.__subclasses__()
+        properties = document["components"]["schemas"].get(model.__name__, {}).get("properties", {})
+        for name, text in meanings(model).items():
+            if text and name in properties:
+                properties[name].setdefault("description", text)
+    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
 
 
 def write_openapi(path: Path) -> None:

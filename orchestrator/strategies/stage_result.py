@@ -21,7 +21,7 @@ from sim_engine.search_space import Space
 class ResultPart(BaseModel):
     """Part of a result. It is immutable, and its JSON form has exactly the declared fields."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, defer_build=True)
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
 
 
 class StageResult(ResultPart):
