@@ -1,6 +1,6 @@
 """A station as a bluesky device, and a plan that fills vials. It needs bluesky and httpx, and no ophyd.
 
-With the queue server, this file is the startup script; the queue's item is then
+With the queue server, this file is one of the startup files, next to one that makes the run engine; the queue's item is
 {"name": "fill_vials", "args": ["plate-1", "beaker-1", "30 g", ["vial-1", "vial-2"]], "item_type": "plan"}.
 """
 

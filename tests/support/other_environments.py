@@ -54,15 +54,20 @@ def running(python: str, code: str | Path, *arguments: str) -> Iterator[subproce
     """Run a program next to the test, which reads its lines; it is killed at the end."""
     program = [str(code)] if isinstance(code, Path) else ["-c", code]
     process = subprocess.Popen(
-        [python, *program, *arguments], stdout=subprocess.PIPE, text=True, env=child_environment(ALONE)
+        [python, *program, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=child_environment(ALONE),
     )
     try:
         yield process
     finally:
         process.kill()
         process.wait()
-        assert process.stdout is not None
-        process.stdout.close()
+        for stream in (process.stdin, process.stdout):
+            assert stream is not None
+            stream.close()
 
 
 def line(process: subprocess.Popen[str], start: str) -> str:

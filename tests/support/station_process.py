@@ -113,7 +113,7 @@ async def serve(folder: Path, stage: str, port: int = 0, node_port: int = 0) -> 
     if stage in ("node", "station", "held"):
         materials = Materials(daemon.store)
         materials.add_liquid("water", "", {})
-        for vessel, shape in (("beaker", BEAKER), ("vial-1", VIAL)):
+        for vessel, shape in (("beaker", BEAKER), ("vial-1", VIAL), *([("vial-2", VIAL)] if stage == "held" else [])):
             materials.add_vessel(vessel, "", shape, "", "test")
         materials.weigh("beaker", 0.1, 1e-4, "water", "test")
     for each in sockets:
