@@ -183,10 +183,9 @@ def settled(key):
 
 CANCEL = """
 pouring = started()
-while pouring.action_id not in client.get_status().running_actions:
-    time.sleep(0.05)
-print("POURING", flush=True)
 waiting = started("vial-2")
+print("STARTED", flush=True)
+sys.stdin.readline()
 cancelled = client.send_admin_command(AdminCommands.CANCEL).success
 left = settled(waiting.action_id)
 print("CANCELLED", flush=True)
@@ -200,8 +199,11 @@ print("TOLD " + json.dumps({"cancelled": cancelled, "waiting": left.status.value
 def test_a_cancel_of_madsci_ends_what_waits_and_finishes_the_pour_that_has_begun(tmp_path: Path) -> None:
     python = python_with("madsci.client", "MADSCI")
     with station_process(tmp_path, "held") as (_, node, _), running(python, PATIENT + CANCEL, node) as client:
-        line(client, "POURING")
+        line(client, "STARTED")
         wait_for(lambda: poured(tmp_path) == 1, "the pour begins")
+        assert client.stdin is not None
+        client.stdin.write("go on\n")
+        client.stdin.flush()
         line(client, "CANCELLED")
         (tmp_path / "go").touch()
         found = json.loads(line(client, "TOLD "))

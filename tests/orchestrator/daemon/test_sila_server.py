@@ -183,7 +183,7 @@ def test_orders_that_wait_are_paused_resumed_and_cancelled(tmp_path: Path) -> No
             own.post("/queue/resume")
             assert process.stdin is not None
             process.stdin.write("go on\n")
-            process.stdin.close()
+            process.stdin.flush()
             found = json.loads(line(process, "TOLD "))
     assert (found["queued"], found["paused"]) == (["queued", "queued"], "paused")
     assert found["gone"][0] == "OrderCancelledError"
