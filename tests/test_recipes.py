@@ -73,7 +73,7 @@ def test_the_script_pours_once_and_waits_for_the_operator_after_the_daemon_was_k
             daemon.kill()
             daemon.wait()
             ports = (int(one.rpartition(":")[2]) for one in (url, node))
-            with station_process(tmp_path, "none", *ports) as (url, _, _), api(tmp_path, url) as own:
+            with station_process(tmp_path, "none", *ports), api(tmp_path, url) as own:
                 question = wait_for(lambda: next(iter(own.get("/questions")), {}), "a question")
                 own.post(f"/questions/{question['id']}/answer", {"answer": "weighed 2 60"})
                 said, _ = process.communicate(timeout=PATIENCE)
@@ -99,6 +99,7 @@ def test_a_flow_of_prefect_fills_vials_and_pours_nothing_again_in_its_second_run
             **access(tmp_path, url),
             "PREFECT_HOME": str(tmp_path / "prefect"),
             "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+            "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "300",
             "DO_NOT_TRACK": "1",
         }
         arguments = (str(RECIPES / "prefect_flow.py"), "plate-1", "beaker", "30 g", "vial-1")
@@ -150,7 +151,7 @@ def test_a_plan_of_bluesky_fills_vials_and_its_documents_have_the_weights(tmp_pa
 QUEUE = """
 import json, sys, time
 from bluesky_queueserver import ZMQCommSendThreads
-manager = ZMQCommSendThreads(zmq_server_address=sys.argv[1])
+manager = ZMQCommSendThreads(zmq_server_address=sys.argv[1], timeout_recv=200_000)
 def ask(method, **params):
     answer = manager.send_message(method=method, params=params or None)
     assert answer.get("success", True), answer

@@ -84,7 +84,7 @@ class PylabrobotScale:
             raise LaboratoryError(f"balance {self._name}: tare: {_text(error)}") from error
         rest = self._settled("tare", kept=True).mass
         if abs(rest) > 2.0 * self._spec.step:
-            raise LaboratoryError(f"balance {self._name}: the tare had no effect, it shows {1e3 * rest:g} g. Try its key")
+            raise LaboratoryError(f"balance {self._name}: the tare had no effect, it shows {1e3 * rest:g} g")
         self._lost = False
 
     def weigh(self) -> Weight:
@@ -124,7 +124,7 @@ class PylabrobotScale:
     # ---- waiting, in the caller's thread
 
     def _settled(self, what: str, *, kept: bool, still: bool = True) -> Weight:
-        """Wait for a stable weight of readings from now on, or for any reading; `kept`: also after a lost connection."""
+        """Wait for a stable weight of readings from now on, or any reading; `kept`: also after a lost connection."""
         self._start()
         since, problem = time.monotonic(), ""
         with self._changed:

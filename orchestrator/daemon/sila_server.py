@@ -40,8 +40,8 @@ PORT = 50052
 INTERVAL = 0.5
 """Interval at which the state of the daemon is read [s]."""
 
-PATIENCE = 60.0
-"""Time for which an unreachable daemon is called again [s]; a daemon that is restarted answers within it."""
+PATIENCE = 120.0
+"""Time from the first failed call for which an unreachable daemon is called again [s]; a restart takes less."""
 
 LIFETIME = 3600.0
 """Time for which the result of a command is kept after its last change of state [s]."""
@@ -352,16 +352,18 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
             yield value
 
     async def _changes(self, read: Callable[[], Any]) -> AsyncIterator[Any]:
-        """Yield the value, and every value that differs from the one before."""
+        """Yield the value, and every value that differs from the one before; none while the daemon is unreachable."""
         last = ""
         while True:
             try:
                 value = await self._in_thread(read)
             except DaemonError as error:
-                _refuse(error)
-            if repr(value) != last:  # a mass that is not a number equals nothing
-                last = repr(value)
-                yield value
+                if not error.unreachable:
+                    _refuse(error)
+            else:
+                if repr(value) != last:  # a mass that is not a number equals nothing
+                    last = repr(value)
+                    yield value
             await asyncio.sleep(INTERVAL)
 
     # ---- calls to the daemon
@@ -380,12 +382,13 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
         return await self._repeated(self._client.post, path, body)
 
     async def _repeated(self, call: Callable[..., Any], *arguments: Any) -> Any:
-        end = time.monotonic() + PATIENCE
+        failed: float | None = None
         while True:
             try:
                 return await self._in_thread(call, *arguments)
             except DaemonError as error:
-                if not error.unreachable or time.monotonic() > end:
+                failed = failed or time.monotonic()
+                if not error.unreachable or time.monotonic() > failed + PATIENCE:
                     _refuse(error)
             await asyncio.sleep(INTERVAL)
 
@@ -540,8 +543,8 @@ def check_address(host: str, certificate: Path | None, key: Path | None, clients
         loopback = False
     if not loopback and certificate is None:
         raise SilaServerError(
-            f"--host {host}: other machines reach this address, and SiLA 2 requires encryption there; add --certificate "
-            "and --key, and --clients to admit only clients with a certificate"
+            f"--host {host}: other machines reach this address, and SiLA 2 requires encryption there; add "
+            "--certificate and --key, and --clients to admit only clients with a certificate"
         )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from decant.plugins import LaboratoryError
+from decant.plugins import LaboratoryError, Load
 from decant.plugins.testing import BalanceBench, BalanceContract, VirtualSerialBalance
 
 RECIPE = Path(__file__).parents[2] / "docs" / "recipes" / "pylabrobot_scale.py"
@@ -64,7 +64,8 @@ class TestAMettlerBalance(BalanceContract):
             capacity=50.0,
             unplug=far.unplug,
             plug=far.plug,
-            restless=lambda active: far.faults(restless=active),
+            # The emulator's fault would only change the balance's sign of stability, which PyLabRobot does not pass on.
+            restless=lambda active: far.put(Load((0.0, 3600.0), (0.0, 18.0)) if active else 0.0),
             ignore_tare=lambda active: far.faults(powerless=active),
             lost_within=60.0,
             make=(recipe.PylabrobotScale, spec),

@@ -233,7 +233,7 @@ print("TOLD " + json.dumps([[one.action_id, one.status.value, one.json_result["r
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["queued", "leased", "pouring", "poured", "weighed"])
+@pytest.mark.parametrize("stage", ["queued", "leased", "pouring"])
 def test_a_daemon_that_is_killed_and_started_again_in_the_middle_pours_once_for_madsci(
     tmp_path: Path, stage: str
 ) -> None:
