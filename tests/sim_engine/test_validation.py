@@ -291,7 +291,6 @@ NOT_MET: dict[str, str] = {
     "retention": "12 mL too much with 500 particles at 80°, where 10 are allowed",
     "landing": "the spread at 30 °/s is 1.2 mm more with 1,000 particles than with 10,000",
     "convergence": "a fast pour into a bowl splashes out the more the finer the particles are",
-    "film": "films of two and three spacings are 16 and 22 % too fast",
     "tube": "no pressure holds a falling plug together",
     "drainage": "a vertical film runs off too early",
     "thick-outflow": ".1 Pa s leave later than in SPlisHSPlasH, where they leave as water does",
