@@ -32,7 +32,6 @@ from actors.liquid_devices import (
 from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.settings.model import (
-    MADE,
     NOT_IN_FINGERPRINT,
     SET_BY_PROGRAM,
     Count,
@@ -57,10 +56,16 @@ def _address(text: str) -> str:
     )
 
 
+RayAddress = Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
+
+MODE_LABELS = {"virtual": "VIRTUAL", "hardware": "REAL", "external": "EXTERNAL"}
+"""How reports, lists and the live view write a laboratory's mode."""
+
+
 class RaySettings(Settings):
     """An existing Ray cluster; Decant connects to it and does not stop it."""
 
-    address: Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
+    address: RayAddress
     """Address of its head node, host:port."""
 
     bench_resource: Name = "decant_bench"
@@ -112,7 +117,6 @@ def _hidden_liquid() -> type[HiddenLiquidBase]:
         __base__=HiddenLiquidBase,
         __doc__=HiddenLiquidBase.__doc__,
         __module__=__name__,
-        __cls_kwargs__=MADE,
         **fields,
     )
     return model
@@ -164,8 +168,8 @@ class LaboratorySettings(Settings):
     name: Annotated[Name, Example("virtual")]
     """Its name in journals and banners."""
 
-    mode: Literal["virtual", "hardware"] = "virtual"
-    """'virtual' moves nothing, 'hardware' moves an arm."""
+    mode: Literal["virtual", "hardware", "external"] = "virtual"
+    """'virtual' moves nothing, 'hardware' moves an arm. 'external': your program pours; see `decant.AskTell`."""
 
     simulators: Annotated[Count, Field(le=10_000), NOT_IN_FINGERPRINT] = 0
     """Number of simulators in the pool; 0: one per core of this machine or of the cluster."""
@@ -214,7 +218,7 @@ class LaboratorySettings(Settings):
     @property
     def pours(self) -> bool:
         """Whether there is a bench."""
-        return self.dispenses or self.bench is not None
+        return self.dispenses or self.bench is not None or self.mode == "external"
 
     @property
     def dispenses(self) -> bool:
@@ -271,6 +275,9 @@ class LaboratorySettings(Settings):
         """See `Settings.check_values`."""
         if self.mode == "hardware":
             self._check_hardware(problems)
+        if self.mode == "external":
+            self._check_external(problems)
+            return
         check_devices(problems, self.mode, self.pump, self.source, self.spill_sensor)
         if self.pump is not None:
             self._check_with_pump(problems)
@@ -296,6 +303,12 @@ class LaboratorySettings(Settings):
         if not self.dispenses:
             text = "a laboratory of hardware needs its arm; add an 'arm' and a 'cell' section, or a 'pump'"
             problems.add(text, key=True, of="arm")
+
+    def _check_external(self, problems: Problems) -> None:
+        for key in ("arm", "cell", "pump", "balance", "source", "spill_sensor", "operator", "bench"):
+            if key in self.model_fields_set and problems.valid(key):
+                text = "an external laboratory has no devices of Decant: your program pours and weighs; remove it"
+                problems.add(text, key, key=True)
 
     def _check_with_pump(self, problems: Problems) -> None:
         for key, why in (

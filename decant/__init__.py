@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from actors.interfaces import LaboratoryError
+    from decant.ask_tell import AskedPour, AskTell
     from decant.catalogue_tables import find_pours, find_runs
     from decant.run_results import Run, open_run, publish
     from decant.running import (
@@ -45,6 +46,8 @@ if TYPE_CHECKING:
     from sim_engine.vessel.shapes import VesselSpec
 
 __all__ = [
+    "AskTell",
+    "AskedPour",
     "AssignmentError",
     "BenchReport",
     "CampaignPlan",
@@ -86,6 +89,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "decant.ask_tell": ("AskTell", "AskedPour"),
     "decant.catalogue_tables": ("find_pours", "find_runs"),
     "decant.running": (
         *("build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"),

@@ -54,7 +54,7 @@ from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquids import KNOWN, ROOM, LiquidSettings, SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.scene import PoseErrorSettings
-from sim_engine.settings.model import Choice, Settings
+from sim_engine.settings.model import Choice, Settings, meanings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
 from sim_engine.vessel.shapes import ProfileShape
@@ -114,6 +114,7 @@ SECTIONS: dict[str, type[Settings]] = {
 OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BenchBalance": "[display](#display)",
+    "ClusterSettings": "`{address: host:port}`",
     **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm)"),
     "RobotCell": "[cell](#cell)",
     "ArmLimits": "[limits](#limits)",
@@ -295,7 +296,7 @@ def section(model: type[Settings]) -> str:
         value = _value(info.annotation, info.metadata)
         if model is Objective and name == model.tag:
             value = ", ".join(f"`{word}`" for word in OBJECTIVES.names)
-        rows.append((f"`{key}`", value, default, _one_line(info.description or "")))
+        rows.append((f"`{key}`", value, default, _one_line(meanings(model)[name])))
     return _table(("key", "value", "unless given", "meaning"), rows)
 
 
@@ -309,7 +310,7 @@ def variants(models: Mapping[str, type[Settings]], common: type[Settings]) -> st
             if field in common.model_fields or field == tag:
                 continue
             described = _value(info.annotation, info.metadata), _default(key, info, model)
-            owners.setdefault((f"`{key}`", *described, _one_line(info.description or "")), []).append(name)
+            owners.setdefault((f"`{key}`", *described, _one_line(meanings(model)[field])), []).append(name)
     rows = [("all" if len(names) == len(models) else ", ".join(names), *row) for row, names in owners.items()]
     return _table(("of", "key", "value", "unless given", "meaning"), rows)
 

@@ -13,12 +13,10 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-import typer.main
 from ruamel.yaml import YAML
 
 from actors.runtime.child_process import child_environment
 from orchestrator.cli import foreground_run as common
-from orchestrator.cli.app import app
 from orchestrator.config.campaign_file import CampaignFile
 from orchestrator.config.file_loading import load_campaign, load_vessel
 from orchestrator.config.search_ranges import EXAMPLES
@@ -32,6 +30,7 @@ from sim_engine import model_validity as regimes
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.lip_flow import EDGE
 from sim_engine.settings.model import Settings
+from tests.support.cli_inputs import command_tree
 
 ROOT = Path(__file__).parent.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "configs").rglob("*.md")])
@@ -75,12 +74,12 @@ def tables() -> ModuleType:
 
 def test_pages_show_commands_to_check() -> None:
     verbs = {command.split()[1] for page in PAGES for command in commands_of(page)}
-    assert set(typer.main.get_command(app).commands) <= verbs  # type: ignore[attr-defined]
+    assert set(command_tree().commands) <= verbs
 
 
 @each_page
 def test_shown_commands_are_understood(page: Path) -> None:
-    verbs = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    verbs = command_tree().commands
     for line in commands_of(page):
         _, verb, *arguments = shlex.split(line, comments=True)
         if verb.startswith("--"):

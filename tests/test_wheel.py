@@ -175,6 +175,7 @@ def test_without_extras_one_simulates_and_plans(tmp_path: Path) -> None:
     assert "pip install 'decant-pouring[lab]'" in done.stderr
 
 
+@pytest.mark.slow
 def test_without_extras_a_table_says_what_to_install(tmp_path: Path) -> None:
     code = f"{BLOCKED}\nfrom decant.run_results import _frame\n_frame(iter([]))"
     done = run(code, tmp_path)

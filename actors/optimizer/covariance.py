@@ -4,7 +4,8 @@
     f_r = ρ f_s + β + δ                     the real one: β ~ N(0, τ²), δ ~ GP(0, σ_δ² M_ℓδ)
     y_i = f + ε_i,  ε_i ~ N(0, n_i²)        n_i: one per source, and it may depend on the action
 
-M is the Matérn 5/2 correlation. Without simulations only σ, ℓ and n are left: ordinary regression.
+M is the Matérn 5/2 correlation. Without simulations only σ, ℓ and n are left: ordinary regression. With a prior for
+shears, M_ℓ is a function of T x instead of x; T has ones on its diagonal, and its other elements are fitted.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ class HyperPrior:
 
     Attributes:
         length: of each axis' lengthscale.
+        shear: of the elements of T beside its diagonal (mean, standard deviation); None: T = 1.
         signal: of the signal's standard deviation.
         noise: of the observations' standard deviation.
         simulated_noise: of the simulations' standard deviation, discrepancy included.
@@ -43,6 +45,7 @@ class HyperPrior:
     """
 
     length: tuple[float, float] = (0.35, 0.7)
+    shear: tuple[float, float] | None = None
     signal: tuple[float, float] = (1.0, 0.5)
     noise: tuple[float, float] = (0.1, 1.0)
     simulated_noise: tuple[float, float] = (0.1, 1.0)
@@ -54,6 +57,7 @@ class HyperPrior:
 
 
 LENGTH_BOUNDS = (0.03, 5.0)
+SHEAR_BOUNDS = (-3.0, 3.0)
 SIGNAL_BOUNDS = (0.05, 6.0)
 NOISE_BOUNDS = (1e-3, 3.0)
 OFFSET_BOUNDS = (1e-3, 3.0)
@@ -153,6 +157,8 @@ class Covariance:
             *[("length", prior.length, LENGTH_BOUNDS, True)] * dimension,
             ("noise", prior.noise, NOISE_BOUNDS, True),
         ]
+        if prior.shear is not None:
+            rows += [("shear", prior.shear, SHEAR_BOUNDS, False)] * (dimension * (dimension - 1))
         if real is not None:
             rows += [
                 ("simulated_noise", prior.simulated_noise, NOISE_BOUNDS, True),
@@ -164,6 +170,8 @@ class Covariance:
         if growth is not None:
             rows += [("noise_growth", prior.noise_growth, GROWTH_BOUNDS, False)] * growth.shape[1]
         self.names = tuple(row[0] for row in rows)
+        self._shears = [i for i, name in enumerate(self.names) if name == "shear"]
+        self._beside_diagonal = ~np.eye(dimension, dtype=np.bool_)
         self.centre: Array = np.array([np.log(pair[0]) if log else pair[0] for _, pair, _, log in rows])
         self.deviation: Array = np.array([pair[1] for _, pair, _, _ in rows])
         self.bounds: Array = np.array([np.log(limits) if log else limits for _, _, limits, log in rows])
@@ -178,6 +186,14 @@ class Covariance:
     def lengths(self, theta: Array) -> Array:
         """(dimension,) lengthscales of the signal."""
         return np.exp(theta[1 : 1 + self.points.shape[1]])
+
+    def sheared(self, theta: Array, points: Array) -> Array:
+        """T x of points (m, d)."""
+        if not self._shears:
+            return points
+        T = np.eye(points.shape[1])
+        T[self._beside_diagonal] = theta[self._shears]
+        return np.asarray(points @ T.T)
 
     def growth(self, theta: Array) -> Array:
         """(q,) coefficients of the noise's logarithm."""
@@ -194,7 +210,8 @@ class Covariance:
         """Covariance of the observations (n, n), and its pullback: symmetric W (n, n) → Σ W_ij ∂K_ij/∂θ (p,)."""
         d, mask, real = self.points.shape[1], self._mask, self._loads
         lengths, rho = self.lengths(theta), self.value(theta, "rho")
-        correlation, slope = matern(self.points, self.points, lengths)
+        points = self.sheared(theta, self.points)
+        correlation, slope = matern(points, points, lengths)
         variance = self.value(theta, "signal") ** 2
         base = variance * correlation
         a = np.where(mask, rho, 1.0)
@@ -217,8 +234,11 @@ class Covariance:
             weighted = W * np.outer(a, a) if joint else W
             diagonal = 2.0 * np.diagonal(W) * noise
             gradient = [2.0 * float(np.vdot(weighted, base))]
-            gradient += list(variance * _by_length(self.points, weighted * slope) / lengths**2)
+            gradient += list(variance * _by_length(points, weighted * slope) / lengths**2)
             gradient.append(float(diagonal[mask].sum()))
+            if self._shears:
+                by_shear = _by_shear(points, self.points, weighted * slope) / lengths[:, None] ** 2
+                gradient += list(-variance * by_shear[self._beside_diagonal])
             if joint:
                 gradient += [float(diagonal[~mask].sum()), 2.0 * offset * float(real @ W @ real)]
                 block = W[np.ix_(mask, mask)]
@@ -235,7 +255,7 @@ class Covariance:
     def cross(self, theta: Array, points: Array) -> Array:
         """Covariance of the noise-free real cost at points (m, d) with the observations: (m, n)."""
         rho = self.value(theta, "rho")
-        K = matern_correlation(points, self.points, self.lengths(theta))
+        K = self._correlation(theta, points, self.points)
         if self._real is None and self._known is None:
             K *= self.value(theta, "signal") ** 2
             return K
@@ -245,8 +265,7 @@ class Covariance:
 
     def between(self, theta: Array, first: Array, second: Array) -> Array:
         """Covariance of the noise-free real cost at points (m, d) and (k, d): (m, k)."""
-        correlation = matern_correlation(first, second, self.lengths(theta))
-        K = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2 * correlation
+        K = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2 * self._correlation(theta, first, second)
         K += self._remainder(theta, first, second)
         return K if self._known is None else K + self._known.covariance(first, second) / self._unit**2
 
@@ -254,7 +273,7 @@ class Covariance:
         """Covariance of the noise-free simulated cost at points (m, d) with the observations: (m, n)."""
         if self._known is not None:
             return self._known.covariance(points, self.points) / self._unit**2
-        K = self.value(theta, "signal") ** 2 * matern_correlation(points, self.points, self.lengths(theta))
+        K = self.value(theta, "signal") ** 2 * self._correlation(theta, points, self.points)
         return K * np.where(self._mask, self.value(theta, "rho"), 1.0)
 
     def between_simulated(self, theta: Array, first: Array, second: Array, *, real: bool) -> Array:
@@ -262,7 +281,7 @@ class Covariance:
         if self._known is not None:
             return self._known.covariance(first, second) / self._unit**2
         rho = self.value(theta, "rho") if real else 1.0
-        return self.value(theta, "signal") ** 2 * rho * matern_correlation(first, second, self.lengths(theta))
+        return self.value(theta, "signal") ** 2 * rho * self._correlation(theta, first, second)
 
     def variance(self, theta: Array, points: Array) -> Array:
         """Variance of the noise-free real cost at points (m, d): (m,)."""
@@ -270,6 +289,10 @@ class Covariance:
         value += self.value(theta, "offset") ** 2 + self.value(theta, "delta_signal") ** 2
         known = 0.0 if self._known is None else (self._known.predict(points)[1] / self._unit) ** 2
         return np.full(len(points), value) + known
+
+    def _correlation(self, theta: Array, first: Array, second: Array) -> Array:
+        """Correlation of the signal between points (m, d) and (k, d): (m, k)."""
+        return matern_correlation(self.sheared(theta, first), self.sheared(theta, second), self.lengths(theta))
 
     def _remainder(self, theta: Array, first: Array, second: Array) -> Array | float:
         """Covariance of β + δ."""
@@ -286,3 +309,8 @@ def _by_length(points: Array, G: Array) -> Array:
         return np.zeros(points.shape[1])
     centred = points - points.mean(axis=0)
     return np.asarray(2.0 * (centred**2).T @ G.sum(axis=1) - 2.0 * np.einsum("ij,ij->j", centred, G @ centred))
+
+
+def _by_shear(sheared: Array, points: Array, G: Array) -> Array:
+    """Σ_ab G_ab (z_ai − z_bi)(x_aj − x_bj) of points x and z = T x (n, dimension), G symmetric."""
+    return np.asarray(2.0 * (sheared.T * G.sum(axis=1)) @ points - 2.0 * sheared.T @ G @ points)

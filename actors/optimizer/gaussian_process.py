@@ -125,6 +125,10 @@ class Surrogate(Protocol):
 
 
 CONSTANT_PRIOR = HyperPrior()
+OBLIQUE_PRIOR = HyperPrior(length=(0.25, 0.5), shear=(0.0, 0.5))
+"""For a simulated valley, which is oblique to the axes: a faster pour reaches farther. With lengthscales along the axes
+alone, the valley would be known only next to the simulations in it."""
+
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
 """Prior of the difference between reality and simulation: smaller than the cost itself, but free to be as large."""
 
@@ -337,11 +341,16 @@ AFRESH = HyperparameterSearch()
 
 
 def constant_mean_process(
-    points: Array, costs: Array, *, varying: bool = False, search: HyperparameterSearch = AFRESH
+    points: Array,
+    costs: Array,
+    *,
+    varying: bool = False,
+    prior: HyperPrior = CONSTANT_PRIOR,
+    search: HyperparameterSearch = AFRESH,
 ) -> GaussianProcess:
     """GP whose prior mean is the mean of the data: (n, dimension), (n,)."""
     centre = float(costs.mean())
-    return _fitted(points, costs, _constant(centre), _scale(costs - centre, costs), varying, search=search)
+    return _fitted(points, costs, _constant(centre), _scale(costs - centre, costs), varying, prior, search)
 
 
 def zero_mean_process(

@@ -76,7 +76,14 @@ from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
 from actors.optimizer.gaussian_process import GaussianProcess
 from actors.optimizer.model_discrepancy import ModelAveragedProcess, clipped_mean, shortfall
-from actors.optimizer.questions import BenchOffset, DiscrepancyFound, ModelDiscrepancy, PourQuery, SimulationQuery
+from actors.optimizer.questions import (
+    BenchOffset,
+    DiscrepancyFound,
+    ModelDiscrepancy,
+    PourQuery,
+    SimulationQuery,
+    found_good,
+)
 from actors.optimizer.surrogate_models import QueryArrays, tuples
 
 Array = NDArray[np.float64]
@@ -398,7 +405,11 @@ def proposals(
     left, allowed = min(query.discrepancy.pours_left, FORESIGHT), _allowed(process, query.discrepancy, feasibility)
     if query.discrepancy.lookahead and len(known):
         pour = looked_ahead(process, pour, candidates, known, left, allowed, feasibility)
-    simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
+    if found_good(arrays.simulated_costs) or found_good(arrays.costs):
+        simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
+    else:
+        known = np.concatenate([arrays.simulated, arrays.busy])
+        simulations = acquisition.between(query.count - 1, known, arrays.region, rng, feasibility)
     return np.concatenate([pour[None, :], simulations])
 
 

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
@@ -44,6 +45,16 @@ class Limit:
 
     loss: float
     probability: float
+
+
+FOUND = 0.25
+"""Cost of a good action, relative to the largest observed one, at most. Without any, a search has not ended."""
+
+
+def found_good(costs: Iterable[float]) -> bool:
+    """Whether one of some costs is that of a good action."""
+    known = tuple(costs)
+    return min(known, default=0.0) < FOUND * max(known, default=0.0)
 
 
 @dataclass(frozen=True)
@@ -355,7 +366,8 @@ class MinimumQuery(ProposalQuery):
         mean: prior mean of the surrogate. 'constant' is fitted; 'zero' is the paper's.
         plain: 'lcb' as in the paper: κ is constant, and no point only fills space on a plateau.
         replicates: whether a proposal may repeat an observation. Without replicates the observations describe the whole
-            cost: one point in three fills space, and the others are where the surrogate is uncertain.
+            cost: one point in three fills space (two, until a good one was found), the others are where the surrogate
+            is uncertain, and its lengthscales may be oblique to the axes.
     """
 
     acquisition: AcquisitionName = "lcb"

@@ -38,6 +38,7 @@ from actors.optimizer.questions import (
     SuggestionQuery,
     SurrogateMap,
     SurrogateQuery,
+    found_good,
 )
 from actors.optimizer.risk_measures import RiskProcess
 from actors.optimizer.surrogate_models import Model, QueryArrays, array, fit, tuples
@@ -273,7 +274,9 @@ def _search(
         pending = np.concatenate([arrays.busy, np.array(chosen).reshape(-1, query.space.dimension)])
         if _fills_space(query, arrays, model, index):
             avoided = np.concatenate([arrays.known, pending, arrays.refused])
-            chosen.append(acquisition.spread_out(1, avoided, arrays.region, rng, feasibility)[0])
+            describes = isinstance(query, MinimumQuery) and not query.replicates
+            fill = acquisition.between if describes else acquisition.spread_out
+            chosen.append(fill(1, avoided, arrays.region, rng, feasibility)[0])
             continue
         conclude = _seeks_minimum(query) and index == 0
         score = acquisition.lower_confidence_bound(surrogate, 0.0 if conclude else _kappa(query, model))
@@ -292,7 +295,8 @@ def _seeks_minimum(query: SurrogateQuery) -> bool:
 def _fills_space(query: ProposalQuery, arrays: QueryArrays, model: Model, index: int) -> bool:
     """Whether the next point only fills space: every third one, while the costs may be pure noise.
 
-    Without replicates, every third one always does, and two of three while the costs may be pure noise.
+    Without replicates, every third one always does, and two of three until a good one was found: a smooth plateau
+    would make the surrogate certain that there is no valley.
 
     On a plateau the best pours look like a slope by chance. Following them, mostly along the faces of the cube, would
     use up the whole budget. Only a `MinimumQuery` does so, without `plain` and with a constant mean.
@@ -302,7 +306,7 @@ def _fills_space(query: ProposalQuery, arrays: QueryArrays, model: Model, index:
     number = len(arrays.known) + len(arrays.busy) + index
     if query.replicates:
         return number % FILL_EVERY == FILL_EVERY - 1 and model.process.evidence < STRUCTURE
-    return (number % FILL_EVERY == FILL_EVERY - 1) if model.process.evidence >= STRUCTURE else number % FILL_EVERY != 0
+    return (number % FILL_EVERY == FILL_EVERY - 1) if found_good(arrays.costs) else number % FILL_EVERY != 0
 
 
 def _kappa(query: ProposalQuery, model: Model) -> float:

@@ -17,6 +17,8 @@ from scipy.special import ndtr
 from actors.optimizer.feasible_region import Feasibility, Kind, Region
 from actors.optimizer.gaussian_process import (
     AFRESH,
+    CONSTANT_PRIOR,
+    OBLIQUE_PRIOR,
     GaussianProcess,
     HyperparameterSearch,
     Surrogate,
@@ -197,13 +199,18 @@ def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
     """Fit the surrogate of a query; None with too few observations."""
     points, costs = arrays.points, arrays.costs
     varying, first = query.noise == "varying", _search_for(query, 0)
+    describes = isinstance(query, MinimumQuery) and not query.replicates
+    averages = isinstance(query, PourQuery) and query.discrepancy is not None
+    prior = OBLIQUE_PRIOR if describes or averages else CONSTANT_PRIOR
+    if averages and first.start is not None and len(first.start) < 2 + query.space.dimension**2:
+        first = AFRESH  # of a run begun with an earlier version, without shears
     if isinstance(query, PourQuery | SimulationQuery) and len(arrays.simulated) >= 2:
         if isinstance(query, SimulationQuery) and query.coupling == "scaled":
             process = joint_process(
                 arrays.simulated, arrays.simulated_costs, points, costs, varying=varying, search=first
             )
             return Model(process, process, process.lengths, (process,))
-        simulated = constant_mean_process(arrays.simulated, arrays.simulated_costs, search=first)
+        simulated = constant_mean_process(arrays.simulated, arrays.simulated_costs, prior=prior, search=first)
         if isinstance(query, PourQuery) and query.discrepancy is not None:
             averaged = ModelAveragedProcess(simulated, points, costs, query.discrepancy)
             return Model(averaged, simulated, simulated.lengths, (simulated,), averaged)
@@ -215,7 +222,10 @@ def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
     if len(points) < 2:
         return None
     zero = isinstance(query, RegressionQuery | MinimumQuery) and query.mean == "zero"
-    process = (zero_mean_process if zero else constant_mean_process)(points, costs, varying=varying, search=first)
+    if zero:
+        process = zero_mean_process(points, costs, varying=varying, search=first)
+    else:
+        process = constant_mean_process(points, costs, varying=varying, prior=prior, search=first)
     lengths = process.lengths[: query.space.dimension]
     if isinstance(query, RiskQuery):
         return Model(RiskProcess.of(process, query.risk), process, lengths, (process,))

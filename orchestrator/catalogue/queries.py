@@ -51,7 +51,7 @@ _AGO = {"m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 _DATES = (("%Y-%m-%dT%H:%M:%S", 0), ("%Y-%m-%dT%H:%M", 60), ("%Y-%m-%d", 86_400), ("%Y-%m", -1), ("%Y", -12))
 """Formats of a date, and the length of the period [s]; -1 and -12: one month and twelve months."""
 
-MODES = {"virtual": "virtual", "real": "hardware", "hardware": "hardware"}
+MODES = {"virtual": "virtual", "real": "hardware", "hardware": "hardware", "external": "external"}
 
 _LISTS = ("liquid", "pourer", "receiver", "strategy")
 _SEARCHED = ("run", "path", "campaign", "mode", "state", "reason", "laboratory", *_LISTS, "tags", "notes")

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,11 @@ from actors.interfaces import DeviceCheck
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, StatusOut
 from orchestrator.daemon.station_schemas import AccountOut, BatchOut, ContentOut, PourOut
-from orchestrator.results.run_summary import ReceiverSummary, RunSummary, UntitledSchema
+from orchestrator.results.run_summary import ReceiverSummary, RunSummary
 from orchestrator.strategies.dispense import Dose
 from orchestrator.strategies.single_action import WeighedPour
 from sim_engine.liquids import SimulationParameters
+from sim_engine.settings.model import DescribedSchema, meanings
 
 
 class _Output(BaseModel):
@@ -86,7 +88,12 @@ _PLANNED = ("prediction", "prediction_interval", "at_bounds", "predicted_deliver
 
 def _part(model: type[BaseModel], names: Any) -> dict[str, Any]:
     """Fields of another model, for `create_model`."""
-    return {name: (model.model_fields[name].annotation, model.model_fields[name]) for name in names}
+    found = {}
+    for name in names:
+        field = copy(model.model_fields[name])
+        field.description = meanings(model)[name] or None
+        found[name] = (field.annotation, field)
+    return found
 
 
 PlannedOutput = create_model(
@@ -547,5 +554,5 @@ def output_schema() -> dict[str, Any]:
     """JSON schema of all outputs: the properties are the commands."""
     fields: dict[str, Any] = {name: (model, ...) for name, model in OUTPUTS.items()}
     model = create_model("Output", __doc__="Output of commands with --json, by command.", **fields)
-    schema = model.model_json_schema(mode="serialization", schema_generator=UntitledSchema)
+    schema = model.model_json_schema(mode="serialization", schema_generator=DescribedSchema)
     return {**{name: part for name, part in schema.items() if name != "required"}, "title": "Output"}

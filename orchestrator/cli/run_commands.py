@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from actors.laboratory_settings import MODE_LABELS
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, print_note
@@ -401,8 +402,8 @@ def rebuild(state: State = None) -> None:
 
 
 def _mode(text: str | None) -> str:
-    """Return 'REAL' or 'VIRTUAL', so that the two kinds of bench can't be confused."""
-    return "REAL" if text == "hardware" else "VIRTUAL" if text else ""
+    """Return 'REAL' or 'VIRTUAL', so that the kinds of benches can't be confused."""
+    return MODE_LABELS.get(text, "VIRTUAL") if text else ""
 
 
 _OPEN = "has begun and has no outcome: under way, or UNKNOWN"

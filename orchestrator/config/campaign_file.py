@@ -26,7 +26,6 @@ from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES, ca
 from sim_engine.liquids import LiquidSettings
 from sim_engine.outcome import Loss
 from sim_engine.settings.model import (
-    MADE,
     Example,
     FilePath,
     Name,
@@ -267,7 +266,7 @@ def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Setting
     for name, own in settings.items():
         learns = issubclass(own, DeploymentSettings) and own.learns_on_pours
         bases = (own, LearningSettings if learns else base)
-        found[name] = create_model(f"{name}Settings", __base__=bases, __doc__=own.__doc__, __cls_kwargs__=MADE)
+        found[name] = create_model(f"{name}Settings", __base__=bases, __doc__=own.__doc__)
         found[name].required = own.required | base.required
     return found
 

@@ -23,7 +23,7 @@ from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_
 from orchestrator.journal.upgrade import upgraded_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import RETIRED_PARAMETERS, Liquid, LiquidSettings, SimulationParameters
-from sim_engine.settings.model import MADE, Settings
+from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import VesselSpec
 
@@ -157,7 +157,7 @@ def _theta_model() -> type[_ThetaBase]:
     for name, info in SimulationParameters.info().items():
         loose = _LooseQuantity(info.unit, info.example, info.lower, info.upper, whole=info.integer)
         fields[name] = (Annotated[float, loose] | None, None)
-    model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, __cls_kwargs__=MADE, **fields)
+    model: type[_ThetaBase] = create_model("Theta", __base__=_ThetaBase, **fields)
     return model
 
 

@@ -21,7 +21,7 @@ from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquids import RETIRED_PARAMETERS, ParameterInfo, SimulationParameters
 from sim_engine.scene import Pivot
 from sim_engine.search_space import Axis, Scale, Space
-from sim_engine.settings.model import MADE, Problems, Settings, Text
+from sim_engine.settings.model import Problems, Settings, Text
 from sim_engine.settings.quantity import Quantity
 
 EXAMPLES = {
@@ -85,11 +85,10 @@ def _section(
     name: str, base: type[Settings], types: Mapping[str, Any], meanings: Mapping[str, str] | None = None
 ) -> Any:
     """A section with optional keys of these types; keys that `base` declares keep their descriptions."""
-    described = {key: info.description for key, info in base.model_fields.items()} | dict(meanings or {})
     fields: Any = {
-        key: (kind | None, Field(default=None, description=described[key] or None)) for key, kind in types.items()
+        key: (kind | None, Field(default=None, description=(meanings or {}).get(key))) for key, kind in types.items()
     }
-    return create_model(name, __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields)
+    return create_model(name, __base__=base, __doc__=base.__doc__, **fields)
 
 
 def _range(quantity: Quantity) -> Any:

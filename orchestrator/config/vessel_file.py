@@ -9,7 +9,7 @@ from pydantic import Field, create_model
 
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.yaml_source import Place, Report
-from sim_engine.settings.model import MADE, Example, FilePath, Name, Problems, Settings
+from sim_engine.settings.model import Example, FilePath, Name, Problems, Settings
 from sim_engine.vessel.shapes import VESSELS, LengthUnit, MeshShape, ProfileShape, Shape, VesselSpec
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
@@ -60,9 +60,7 @@ def _vessel_file() -> type[VesselBase]:
         kind: (shape | None, Field(default=None, description=inspect.getdoc(shape)))
         for kind, shape in further_sources().items()
     }
-    model: type[VesselBase] = create_model(
-        "VesselFile", __base__=VesselBase, __doc__=VesselBase.__doc__, __cls_kwargs__=MADE, **fields
-    )
+    model: type[VesselBase] = create_model("VesselFile", __base__=VesselBase, __doc__=VesselBase.__doc__, **fields)
     return model
 
 

@@ -18,6 +18,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
+from actors.laboratory_settings import MODE_LABELS
 from sim_engine.settings.model import Settings, Text
 from sim_engine.settings.quantity import Quantity
 
@@ -198,7 +199,7 @@ class Notifier:
         if occasion not in self._about:
             return None
         news = self._news.get(campaign)
-        mode = "" if news is None else {"hardware": "REAL ", "virtual": "VIRTUAL "}.get(news.mode, "")
+        mode = f"{MODE_LABELS[news.mode]} " if news is not None and news.mode in MODE_LABELS else ""
         rig = "" if news is None or not news.rig else f" at {news.rig}"
         title = f"Decant: {what}" if not campaign else f"Decant, {mode}{campaign}{rig}: {what}"
         return Notification(occasion, title, "\n".join(filter(None, (*lines, self._page))) or title)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 
+from actors.laboratory_settings import MODE_LABELS
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
@@ -167,8 +168,8 @@ class StatusView:
 
     @property
     def reality(self) -> str:
-        """'VIRTUAL' or 'REAL'."""
-        return "REAL" if self._plan.laboratory.mode == "hardware" else "VIRTUAL"
+        """'VIRTUAL', 'REAL' or 'EXTERNAL'."""
+        return MODE_LABELS[self._plan.laboratory.mode]
 
     def take(self, event: Event) -> None:
         """Process an event."""

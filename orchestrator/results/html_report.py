@@ -16,9 +16,9 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from actors.laboratory_settings import MODE_LABELS
 from orchestrator.results import wording
 from orchestrator.results.run_summary import RunSummary
-from orchestrator.results.summarise import MODES
 from orchestrator.states import State
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         title=f"{summary.campaign}: {summary.run}",
         kicker=f"Report of a pouring campaign · run {summary.run}",
         heading=summary.campaign,
-        mode=MODES.get(summary.mode, summary.mode),
+        mode=MODE_LABELS.get(summary.mode, "SIMULATION ONLY"),
         mode_look=summary.mode,
         finished=summary.state == State.FINISHED,
         lead=f"Begun {_date(summary.began_at)}, last entry {_date(summary.ended_at)}.{seed}",

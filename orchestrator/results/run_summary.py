@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 from pydantic import Field, SerializeAsAny, create_model
-from pydantic.json_schema import GenerateJsonSchema
 
 from orchestrator.journal.codec import kinds
 from orchestrator.journal.run_record import PourState
@@ -28,6 +27,7 @@ from orchestrator.strategies.stage_result import ResultPart, StageResult
 from sim_engine.liquids import SimulationParameters
 from sim_engine.model_validity import NotCovered
 from sim_engine.prediction_band import PredictionInterval, SampleStatistics
+from sim_engine.settings.model import DescribedSchema
 
 SUMMARY_NAME = "summary.json"
 
@@ -367,19 +367,11 @@ class RunSummary(Totals):
     """Results of the stages, in order."""
 
 
-class UntitledSchema(GenerateJsonSchema):
-    """JSON schema without titles, which only repeat the keys."""
-
-    def field_title_should_be_set(self, schema: Any) -> bool:
-        """Always false."""
-        return False
-
-
 def summary_schema() -> dict[str, Any]:
     """JSON schema of `summary.json`, with all kinds of results of the installed packages."""
     tagged: Any = Annotated[reduce(or_, cast("Any", kinds())), Field(discriminator="kind")]
     documented = create_model("RunSummary", __base__=RunSummary, __doc__=RunSummary.__doc__, results=dict[str, tagged])
-    schema = documented.model_json_schema(mode="serialization", schema_generator=UntitledSchema)
+    schema = documented.model_json_schema(mode="serialization", schema_generator=DescribedSchema)
     return {**schema, "title": "Result"}
 
 

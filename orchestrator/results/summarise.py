@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from actors.laboratory_settings import MODE_LABELS
 from orchestrator.journal.codec import Results
 from orchestrator.journal.journal_check import JournalCheck
 from orchestrator.journal.journal_file import Header
@@ -53,9 +54,6 @@ from orchestrator.strategies.dispense import spilled_mass
 from orchestrator.strategies.single_action import Confirmed, PredictedPour
 from sim_engine.model_validity import NotCovered
 from sim_engine.outcome import normalised_spillage
-
-MODES = {"virtual": "VIRTUAL", "hardware": "REAL", "none": "SIMULATION ONLY"}
-"""Text of the badge by the bench's mode."""
 
 MOST_DECISIONS = 300
 """Largest number of decisions in a summary, the most recent ones."""
@@ -466,7 +464,7 @@ def _settings(
         "campaign": Path(versions.get("campaign", plan.source)).name,
         "seed": str(plan.seed),
         "minimised": "" if plan.deployment is None else deployment_unit(plan.deployment).label,
-        "laboratory": f"{plan.laboratory.name} ({MODES.get(plan.laboratory.mode, plan.laboratory.mode)})",
+        "laboratory": f"{plan.laboratory.name} ({MODE_LABELS[plan.laboratory.mode]})",
         "simulations side by side": str(plan.parallel_simulations),
         **_programs(versions),
         "recording": "none" if recording is None else f"{recording.name}, next to this page",

@@ -98,6 +98,8 @@ async def run_campaign(
 def _default_deadlines(plan: CampaignPlan) -> Deadlines:
     """Deadlines of a plan: with an operator who weighs, a pause waits for a pour as long as a question may take."""
     usual, laboratory = Deadlines(), plan.laboratory
+    if laboratory.mode == "external":  # whoever pours there may do so tomorrow
+        return replace(usual, pour=30 * 86400.0)
     if not laboratory.needs_person:
         return usual
     return replace(usual, pour_grace=max(usual.pour_grace, laboratory.operator.deadline))

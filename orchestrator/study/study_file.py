@@ -42,7 +42,6 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.search_space import Space
 from sim_engine.settings.model import (
-    MADE,
     Example,
     FilePath,
     Name,
@@ -56,6 +55,7 @@ from sim_engine.settings.model import (
     Settings,
     SimulationCount,
     Text,
+    meanings,
 )
 
 
@@ -85,12 +85,12 @@ def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
     """
     fields: Any = {}
     for key in (*required, *keys):
-        info = settings.model_fields[key]
+        info, meaning = settings.model_fields[key], meanings(settings)[key]
         value: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
         if key in required:
-            fields[key] = (Annotated[value, Example(required[key])], Field(description=info.description))
+            fields[key] = (Annotated[value, Example(required[key])], Field(description=meaning))
         else:
-            fields[key] = (value | None, Field(None, description=info.description))
+            fields[key] = (value | None, Field(None, description=meaning))
     strategy = settings.model_fields["strategy"].default
     model = create_model(f"{strategy}ArmSettings", __base__=ArmSettings, __doc__=ArmSettings.__doc__, **fields)
     model.variant = strategy
@@ -183,10 +183,10 @@ def _with_others(base: type[Settings], installed: Mapping[str, type[StrategySett
     for name, settings in installed.items():
         if name not in base.model_fields:
             own = settings.model_fields.keys() - {"strategy"}
-            meaning = settings.model_fields["strategy"].description
+            meaning = meanings(settings)["strategy"]
             fields[name] = (_arm(settings, *sorted(own)) | None, Field(None, description=meaning))
     name = base.__name__.replace("Base", "Settings")
-    return create_model(name, __base__=base, __doc__=base.__doc__, __cls_kwargs__=MADE, **fields)
+    return create_model(name, __base__=base, __doc__=base.__doc__, **fields)
 
 
 CalibrationsSettings: Any = _with_others(CalibrationsBase, calibrations())

@@ -11,10 +11,12 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import functools
 import inspect
 import operator
+import textwrap
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -261,9 +263,7 @@ class Settings(BaseModel):
     `check_values`, so that all errors of a file are reported at once. The program receives it only without problems.
     """
 
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, populate_by_name=False, use_attribute_docstrings=True, defer_build=True
-    )
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=False, defer_build=True)
 
     required: ClassVar[dict[str, str]] = {}
     """Keys that are mandatory in files although their fields have defaults, each with an example."""
@@ -362,9 +362,6 @@ def _example(metadata: Sequence[Any]) -> str:
     return given or next((m.example for m in metadata if isinstance(m, Quantity)), "…")
 
 
-MADE: dict[str, Any] = {"use_attribute_docstrings": False}
-"""For sections made from tables: no source is searched for the keys' meanings, which takes a second."""
-
 S = TypeVar("S", bound=Settings)
 
 
@@ -415,7 +412,56 @@ PathOr = Annotated[
 """The path of a file that holds the section (relative to the file that names it), or the section itself."""
 
 
-class SchemaGenerator(GenerateJsonSchema):
+@functools.cache
+def meanings(model: type[BaseModel]) -> dict[str, str]:
+    """The texts below the fields of a model, by field; '' for a field without one.
+
+    Schemas and tables need them. Pydantic's `use_attribute_docstrings` would read and parse the source of every model
+    whenever a program starts, which takes a quarter of its start.
+    """
+    found: dict[str, str] = {}
+    for each in reversed(model.__mro__):
+        if issubclass(each, BaseModel) and each is not BaseModel:
+            found |= _texts(each)
+    own = {name: field.description for name, field in model.model_fields.items() if field.description}
+    return {name: inspect.cleandoc(own.get(name) or found.get(name, "")) for name in model.model_fields}
+
+
+def _texts(model: type) -> dict[str, str]:
+    """The texts below the fields that a class itself declares; none if a program has made the class."""
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(model)))
+    except (OSError, TypeError):
+        return {}
+    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
+    found = {}
+    for node, after in zip(body, [*body[1:], None], strict=True):
+        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            value = after.value.value if is_text else ""  # type: ignore[union-attr]
+            found[node.target.id] = value if isinstance(value, str) else ""
+    return found
+
+
+class DescribedSchema(GenerateJsonSchema):
+    """JSON schema with the meanings of fields, and without titles, which only repeat the keys."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        """Always false."""
+        return False
+
+    def model_schema(self, schema: Any) -> JsonSchemaValue:
+        """The schema with the meaning of each field."""
+        form = super().model_schema(schema)
+        texts = meanings(schema["cls"])
+        for name, field in schema["cls"].model_fields.items():
+            part = form.get("properties", {}).get(field.alias or name)
+            if texts[name] and part is not None:
+                part["description"] = texts[name]
+        return form
+
+
+class SchemaGenerator(DescribedSchema):
     """JSON schema of sections: required keys as declared there, and no null (an empty value is an error)."""
 
     def nullable_schema(self, schema: Any) -> JsonSchemaValue:
@@ -429,10 +475,6 @@ class SchemaGenerator(GenerateJsonSchema):
             form.pop("default", None)
         return form
 
-    def field_title_should_be_set(self, schema: Any) -> bool:
-        """No titles: they only repeat the keys."""
-        return False
-
     def model_schema(self, schema: Any) -> JsonSchemaValue:
         """The schema with the keys that the section requires."""
         form = super().model_schema(schema)
@@ -441,9 +483,4 @@ class SchemaGenerator(GenerateJsonSchema):
             form["required"] = list(required)
         for name in [name for name, mark in marks_of(model).items() if mark == SET_BY_PROGRAM]:
             form["properties"].pop(name, None)
-        for name, field in model.model_fields.items():
-            # Pydantic leaves it out for references, depending on which models were built before.
-            part = form.get("properties", {}).get(field.alias or name)
-            if field.description and part is not None:
-                part.setdefault("description", inspect.cleandoc(field.description))
         return form

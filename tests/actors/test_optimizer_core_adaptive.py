@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.distance import cdist
 
 from actors.optimizer.gaussian_process import highest_density_intervals
 from actors.optimizer.knowledge_gradient import predicted_minimum
@@ -207,6 +208,31 @@ def test_simulations_beside_a_pour_are_made_around_what_is_in_doubt():
     beside = np.array(answer.points[1:])
     assert len({tuple(p) for p in beside}) == 3
     assert np.all((beside >= 0.0) & (beside <= 1.0))
+
+
+def hidden(points):
+    """A narrow valley in a plateau with a slope."""
+    x, y = np.atleast_2d(points).T
+    return 0.6 + 0.2 * (x + y) - 0.6 * np.exp(-((np.hypot(x - 0.7, y - 0.75) / 0.13) ** 2))
+
+
+def test_a_slope_of_the_plateau_leaves_no_hole_between_simulations():
+    points = [(0.1, 0.1), (0.9, 0.2), (0.3, 0.9), (0.5, 0.5)]
+    while len(points) < 22:
+        slope = 0.6 + 0.2 * np.sum(points, axis=1)
+        points += propose(MinimumQuery(PLANE, data_of(points, slope), replicates=False, seed=len(points))).points
+    assert cdist(np.random.default_rng(2).random((500, 2)), points).min(axis=1).max() < 0.25
+
+
+def test_beside_lost_pours_simulations_search_the_valley_that_none_has_shown():
+    lost = [(0.8, 0.8), (0.7, 0.2)]
+    told = asked(hidden, [], acquisition="least_loss", count=3, data=Data(tuple(lost), (1.0, 1.0)))
+    corner = [i for i, point in enumerate(told.simulated.points) if max(point) > 0.5]
+    points, costs = (tuple(part[i] for i in corner) for part in (told.simulated.points, told.simulated.costs))
+    beside = np.array(
+        propose(replace(told, simulated=Data(points, tuple(max(cost, 0.6) for cost in costs)))).points[1:]
+    )
+    assert np.all(beside < 0.6), "nothing was simulated there"
 
 
 def test_what_was_learnt_with_one_receiver_makes_the_first_prediction_for_the_next_better():

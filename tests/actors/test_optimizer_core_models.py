@@ -56,7 +56,7 @@ def error(answer):
     return float(np.sqrt(np.mean((np.array(answer.predictions) - cup(ASK)) ** 2)))
 
 
-@pytest.mark.parametrize("kind", [{}, {"joint": 1}, {"growth": 1}])
+@pytest.mark.parametrize("kind", [{}, {"joint": 1}, {"growth": 1}, {"shear": (0.0, 0.5)}])
 def test_the_likelihoods_gradient_is_that_of_the_likelihood(kind):
     points, costs = points_of(20, 3, 3), np.random.default_rng(4).standard_normal(20)
     terms = {}
@@ -64,11 +64,24 @@ def test_the_likelihoods_gradient_is_that_of_the_likelihood(kind):
         terms["real"] = np.arange(20) >= 13
     if "growth" in kind:
         terms["growth"] = points_of(20, 5) - 0.5
-    covariance = Covariance(points, HyperPrior(), **terms)
+    covariance = Covariance(points, HyperPrior(shear=kind.get("shear")), **terms)
     theta = covariance.centre + 0.3 * np.random.default_rng(6).standard_normal(len(covariance.centre))
     numeric = approx_fprime(theta, lambda t: fitting.negative_log_likelihood(covariance, costs, t)[0], 1e-6)
     exact = fitting.negative_log_likelihood(covariance, costs, theta)[1]
     assert exact == pytest.approx(numeric, rel=1e-3, abs=1e-3)
+
+
+def test_a_valley_oblique_to_the_axes_is_known_between_the_simulations_in_it():
+    def jet(points):
+        """A faster pour reaches farther; nothing is spilled on a strip."""
+        across = np.asarray(points) @ (-0.6, 1.0) - 0.2
+        return 1.0 - np.exp(-(np.maximum(np.abs(across) / 0.05 - 1.0, 0.0) ** 1.5))
+
+    points = points_of(36, 4)
+    along = tuple((x, 0.2 + 0.6 * x) for x in np.linspace(0.05, 0.95, 19).tolist())
+    query = MinimumQuery(PLANE, data_of(points, jet(points)), count=0, predict_at=along)
+    axes, oblique = (np.mean(propose(replace(query, replicates=told)).predictions) for told in (True, False))
+    assert abs(oblique) < 0.1 < 0.3 < axes
 
 
 @pytest.mark.parametrize("coupling", ["residual", "scaled"])

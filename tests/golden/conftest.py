@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 
 from orchestrator.catalogue.run_registry import VARIABLE
+from sim_engine.resources import cache_directory
 from tests.golden.golden import Golden
 
 REGENERATE = "--regenerate"
+
+CACHE = str(cache_directory())
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -42,6 +45,7 @@ def neutral(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
         "NO_COLOR": "1",
         "TERM": "dumb",
     }
+    values |= {"DECANT_CACHE_DIR": CACHE}  # with the home directory's own, a simulator would compile its kernels again
     values |= {"COLUMNS": "120", "LINES": "40", "TERMINAL_WIDTH": "120", "MPLBACKEND": "agg"}
     for name in ("FORCE_COLOR", "PY_COLORS", "XDG_DATA_HOME", "XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)

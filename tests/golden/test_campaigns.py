@@ -119,7 +119,11 @@ FURTHER = sorted(path.stem for path in VARIANTS.glob("*.yaml"))
 
 @pytest.mark.parametrize(
     ("name", "further"),
-    [(name, seed) for name in PLAYED for seed in SEEDS],
+    [
+        pytest.param(name, seed, id=f"{name}-{seed}", marks=[pytest.mark.slow] * (seed > 0))
+        for name in PLAYED
+        for seed in SEEDS
+    ],
 )
 def test_shipped_campaign_makes_the_same_requests_and_decisions(name: str, further: int, golden: Golden) -> None:
     plan = load_campaign(CAMPAIGNS / f"{name}.yaml")

@@ -7,16 +7,14 @@ folder of files, the command, and further files, each as a text or as an edit of
 from __future__ import annotations
 
 import base64
-import functools
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.main import get_command
 from typer.testing import CliRunner
 
 from orchestrator.catalogue.run_registry import VARIABLE
@@ -29,14 +27,6 @@ SHIPPED = "configs/"
 """What edits of shipped files begin with."""
 
 pytestmark = pytest.mark.timeout(120)  # should a command no longer refuse its input, it may begin to work
-
-
-@pytest.fixture(autouse=True, scope="module")
-def parsed_once() -> Iterator[None]:
-    """The command's options are read from its functions once, not for every case: that takes 0.1 s."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("typer.testing._get_command", functools.cache(get_command))
-        yield
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,6 @@ from typing import Any
 
 import pytest
 from rich.console import Console
-from typer.main import get_command
 from typer.testing import CliRunner
 
 import decant
@@ -81,8 +80,6 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         moved = path.read_text(encoding="utf-8").replace(str(old_runs.HERE), str(folder))
         path.write_text(moved, encoding="utf-8")
     monkeypatch.chdir(folder)
-    command = get_command(app)
-    monkeypatch.setattr("typer.testing._get_command", lambda app: command)
     return folder
 
 

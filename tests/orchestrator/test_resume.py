@@ -36,8 +36,8 @@ from tests.support.waiting import PATIENCE
 def test_killed_at_any_point_it_makes_the_requests_it_would_have_made(tmp_path: Path, after_commit: bool) -> None:
     run(tmp_path / "undisturbed")
     expected = logical_record(tmp_path / "undisturbed")
-    # in `make slow` every point; else two of nine, so that no kind of write is always passed over
-    steps = itertools.repeat(1) if THOROUGH else itertools.cycle((2, 7))
+    # in `make slow` every point; else two of sixteen, so that no kind of write is always passed over
+    steps = itertools.repeat(1) if THOROUGH else itertools.cycle((5, 11))
     for point in itertools.accumulate(steps):
         directory = tmp_path / str(point)
         if not killed_at(point, after_commit=after_commit, directory=directory):

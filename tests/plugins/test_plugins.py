@@ -274,6 +274,7 @@ def python(folder: Path, program: str) -> list[str]:
     return ran.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_a_dialect_from_outside_is_found_out_and_has_a_virtual_balance(site: Path) -> None:
     said, mass = python(site, DIALECT)
     assert said.startswith("Example's plain balance on ")

@@ -108,6 +108,7 @@ def test_handle_is_solid_and_its_loop_is_not(mug: Vessel) -> None:
     assert np.sign(mug.grid.sample(points)).tolist() == [-1.0, 1.0, 1.0, -1.0]
 
 
+@pytest.mark.slow
 def test_overlap_of_two_bodies_is_solid(mug: Vessel) -> None:
     # where the handle's ends are sunk into the wall
     ends = np.array([[-0.0397, 0.0, 0.022], [-0.0397, 0.002, 0.070], [-0.0397, -0.002, 0.071]])
@@ -181,7 +182,7 @@ def test_every_format_gives_the_same_vessel(build: Make, suffix: str) -> None:
     ("up", "turn"),
     [
         ("y", (1, 0, 0)),
-        ("-x", (0, 1, 0)),
+        pytest.param("-x", (0, 1, 0), marks=pytest.mark.slow),
         pytest.param("-z", (1, 0, 0), marks=pytest.mark.slow),
         pytest.param("x", (0, 1, 0), marks=pytest.mark.slow),
     ],
@@ -198,6 +199,7 @@ def test_up_axis_of_the_mesh_becomes_the_axis_of_the_vessel(build: Make, up: str
     assert np.einsum("ij,ij->", a, np.cross(b, c)) > 0.0
 
 
+@pytest.mark.slow
 def test_mesh_turned_inside_out_is_turned_back(build: Make) -> None:
     mesh = cup()
     mesh.invert()
@@ -259,6 +261,7 @@ def test_implausible_size_names_the_likely_unit(build: Make, unit: str | None, s
         build(cup().apply_scale(scale), unit=unit)
 
 
+@pytest.mark.slow
 def test_metres_need_no_unit(build: Make) -> None:
     assert build(cup().apply_scale(1e-3), unit=None).rim_height == pytest.approx(0.064, abs=1e-5)
 

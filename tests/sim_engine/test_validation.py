@@ -87,6 +87,7 @@ def test_the_standard_pour_flows_as_that_of_infinitely_fine_particles(simulator:
     assert failures(measurements) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("angle", "loads"), [pytest.param(0, 5, marks=pytest.mark.slow), pytest.param(1, 5, marks=pytest.mark.slow), (2, 1)]
 )
@@ -256,6 +257,7 @@ def test_a_thousand_particles_spill_as_fine_ones_do(simulator: PourSimulator) ->
     assert max(figure.series[0].x) == pytest.approx(measurements[-1].value)
 
 
+@pytest.mark.slow
 def test_walls_that_hold_particles_off_are_far_from_the_limit(simulator: PourSimulator) -> None:
     """What the criterion must see: liquid that keeps a spacing and a half from solid, as between walls of particles."""
     thick = suite.PLAIN.model_copy(update={"wall_distance": 1.5, "friction": 0.3})

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import trimesh
+import typer.testing
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
@@ -25,6 +26,12 @@ angular_velocity_deg_s,max_angle_deg,poured_g,spilled_g,retained_g,split
 """
 
 RECORDED = small_campaign.CAMPAIGN.replace("{count: 3, holdout: 1}", "{from: pours.csv}")
+
+
+def command_tree() -> Any:
+    """The program's commands as a tree of click, built once for each process of tests (see `tests/conftest.py`)."""
+    return typer.testing._get_command(app)
+
 
 SIMULATE = "simulate small.yaml --set angular_velocity=100 --set x_offset=70"
 

@@ -22,6 +22,7 @@ from actors.optimizer.questions import (
     SimulationQuery,
     Suggestion,
     SuggestionQuery,
+    found_good,
 )
 from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Request, Simulate, Simulated, Slots
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Premises
@@ -165,9 +166,9 @@ class D3Settings(SearchSettings):
         return (FreeHybrid if self.beside is None else Hybrid)(plan, scene, parameters, seed)
 
 
-AIMED, TOGETHER, FOUND = 3, 4, 0.5
-"""One prior simulation in this many is made for the decision about the first pour; how many of them at once; and the
-loss that a simulated action must keep below, relative to the largest one: otherwise the search goes on."""
+AIMED, TOGETHER = 3, 4
+"""One prior simulation in this many is made for the decision about the first pour, once a good action was found; and
+how many of them at once."""
 
 
 class Hybrid(Deployment[D3Settings]):
@@ -243,7 +244,7 @@ class Hybrid(Deployment[D3Settings]):
             known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
             left = self._settings.prior_simulations - self._spent
             aimed = self._acquisition == "least_loss" and left <= self._settings.prior_simulations // AIMED
-            if aimed and min(known.costs, default=0.0) < FOUND * max(known.costs, default=0.0):
+            if aimed and found_good(known.costs):
                 # those for the first pour: where it may be made, and where it tells the hypotheses apart
                 count = 1 + min(left, TOGETHER)
                 about = self._informed(self._real(), known, count=count, acquisition="least_loss", pending=pending)

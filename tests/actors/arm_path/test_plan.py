@@ -68,6 +68,7 @@ def test_the_encoders_would_see_the_pour_that_was_asked_for(action):
     assert len(pour.times) <= 1200
 
 
+@pytest.mark.slow
 @given(action=actions, direction=st.sampled_from([75, 90, 100]), tilt=st.floats(60, 140))
 @settings(max_examples=examples(12), deadline=None)
 def test_what_is_accepted_stays_inside_all_limits(action, direction, tilt):

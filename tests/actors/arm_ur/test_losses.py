@@ -148,6 +148,7 @@ def test_a_controller_that_accepts_and_says_nothing_does_not_hang_the_driver() -
 # ---- processes
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_killing_the_worker_in_mid_pour_stops_the_arm(make_rig: Make) -> None:
     rig = make_rig(LONG_TILT, time_scale=FASTER)

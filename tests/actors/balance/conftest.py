@@ -43,15 +43,14 @@ def spec_for(virtual: Any, dialect: str, **changes: Any) -> SerialBalanceSetting
     return spec.with_values(**changes)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def voices() -> Iterator[Callable[..., VirtualSerialBalance]]:
-    """One virtual balance of each voice, started when first asked for.
-
-    They end with the file that needs them: at this pace each that sends weights keeps an eighth of a core busy.
-    """
+    """One virtual balance of each voice, started when first asked for; `anew` replaces it."""
     started: dict[tuple[str, bool], VirtualSerialBalance] = {}
 
-    def of(voice: str, tcp: bool = False) -> VirtualSerialBalance:
+    def of(voice: str, tcp: bool = False, *, anew: bool = False) -> VirtualSerialBalance:
+        if anew and (voice, tcp) in started:
+            started.pop((voice, tcp)).close()
         if (voice, tcp) not in started:
             started[voice, tcp] = VirtualSerialBalance.start(
                 voice, baud=0, scale=ScaleSettings(settling_time=0.4), time_scale=PACE, latency=0.001, tcp=tcp
@@ -64,12 +63,15 @@ def voices() -> Iterator[Callable[..., VirtualSerialBalance]]:
 
 
 @pytest.fixture
-def virtual(voices: Callable[..., VirtualSerialBalance]) -> Iterator[Callable[..., VirtualSerialBalance]]:
+def virtual(
+    voices: Callable[..., VirtualSerialBalance], request: pytest.FixtureRequest
+) -> Iterator[Callable[..., VirtualSerialBalance]]:
     """An empty, healthy virtual balance of a voice, on a serial line or over TCP."""
     used: list[VirtualSerialBalance] = []
+    tried_again = getattr(request.node, "execution_count", 1) > 1
 
     def of(voice: str, tcp: bool = False) -> VirtualSerialBalance:
-        balance = voices(voice, tcp)
+        balance = voices(voice, tcp, anew=tried_again)
         used.append(balance)
         balance.plug()
         balance.faults(**asdict(BalanceFaults()))

@@ -261,6 +261,7 @@ def test_a_fault_of_the_arm(open_stage, name, phase):
     assert f"{1e3 * loaded:.1f}"[:4] in str(outcome)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize(("name", "phase"), cases(BALANCE))
 def test_a_fault_of_the_balance(open_stage, name, phase):

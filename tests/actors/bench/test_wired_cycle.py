@@ -188,6 +188,7 @@ def test_a_pourer_filled_wrongly_is_filled_anew_before_anything_is_poured(open_s
     assert measured.loaded == pytest.approx(0.2, abs=5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_mistyped_weight_is_asked_for_again(open_stage):
     async def play():

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any, NoReturn, get_args
 
 import pytest
-import typer.main
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
 from orchestrator.cli.command_options import Answer
 from orchestrator.runs.resume import LOST, REPEAT
 from orchestrator.strategies.deployment.model_monitoring import OPTIONS
-from tests.support.cli_inputs import ROOT, invoke, write_inputs
+from tests.support.cli_inputs import ROOT, command_tree, invoke, write_inputs
 
 HELP = {
     "": ["decant run configs/campaigns/quickstart.yaml", "2 bad input", "130 interrupted"],
@@ -51,7 +50,7 @@ def below(command: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...
 
 
 def test_help_of_every_command_and_group_ends_with_examples_that_are_understood() -> None:
-    program = typer.main.get_command(app)
+    program = command_tree()
     for words, command in below(program, ("decant",)):
         text = command.epilog or command.help
         lines = [shlex.split(line.strip(" `"), comments=True) for line in text.splitlines()]

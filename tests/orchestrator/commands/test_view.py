@@ -62,6 +62,7 @@ def test_recordings_stand_beside_each_other_under_their_names(recording: Path, t
     assert both.blueprints == 1
 
 
+@pytest.mark.slow
 def test_recording_is_served_without_a_display_until_ctrl_c(recording: Path, tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "view", str(recording)],

@@ -13,7 +13,7 @@ from actors.arm.arm_settings import UrArmSettings
 from orchestrator.config.yaml.section_validation import PlacedProblems, validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
-from sim_engine.settings.model import Settings
+from sim_engine.settings.model import Settings, meanings
 from tests.support.campaign_files import written_out
 
 
@@ -163,7 +163,7 @@ def test_all_mistakes_come_at_once():
 def test_keys_are_typed_in_the_sections_that_say_them():
     # every key has a sentence for the editor's tooltip
     def sentences(model: type[Settings]) -> list[str | None]:
-        return [model.model_fields[name].description for name in model.written_keys().values()]
+        return [meanings(model)[name] for name in model.written_keys().values()]
 
     assert all(sentences(UrArmSettings))
     assert all(sentences(RobotCell))

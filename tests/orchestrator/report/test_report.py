@@ -109,6 +109,7 @@ def test_map_of_three_parameters_says_where_the_third_was_held_and_marks_theta(r
     assert dots.get_offsets()[0].tolist() == pytest.approx([picture.points[0]["particles"], 0.1])
 
 
+@pytest.mark.slow
 def test_three_parameters_get_their_trials_against_each_of_them_as_well(
     results: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -72,6 +72,7 @@ def tied() -> Any:
     )
 
 
+@pytest.mark.slow
 def test_the_region_holds_the_truth_and_is_smaller_than_what_was_searched(determined: Any) -> None:
     posterior = determined.found.posterior
     assert PosteriorFound.model_validate_json(json.dumps(posterior.model_dump(), allow_nan=False)) == posterior

@@ -118,6 +118,7 @@ def test_c3_learns_from_every_theta_before_the_next_one():
     assert [len(q.data) for q in questions] == [8, 9, 10, 11]
 
 
+@pytest.mark.slow
 def test_c3_comes_closer_than_as_many_stratified_theta():
     def score(strategy):
         StrategyHarness(calibration_spill).run(strategy)

@@ -103,7 +103,7 @@ def test_the_last_prior_simulations_are_made_for_the_first_pour() -> None:
     (poured,) = strategy.result().weighed
     points = np.array([ACTIONS.encode(one.action_si) for one in strategy.result().simulated[:24]])
     away = np.linalg.norm(points - ACTIONS.encode(poured.action_si), axis=1)
-    assert np.median(away[16:]) < 0.5 * np.median(away[:16])
+    assert (away[16:] < 0.25).sum() >= 3, "the others are where the hypotheses disagree"
     assert losses(strategy)[0] < 0.05
 
 

@@ -67,6 +67,7 @@ def test_same_seed_same_requests_and_a_replay_repeats_them(name):
     assert replay(make(name, 3, pours=3, simulations_per_pour=2), first) == first.asked
 
 
+@pytest.mark.slow
 def test_with_a_right_simulator_the_first_pours_of_d3_spill_less_than_those_of_d2():
     first = {
         name: np.mean([StrategyHarness(narrow_cup).run(make(name, seed, pours=3)).real_spills for seed in range(4)])

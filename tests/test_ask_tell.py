@@ -1,0 +1,140 @@
+"""Pours that the caller makes: each is asked for once, and its outcome is told once, also over several processes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import decant
+from orchestrator.cli.app import main
+from tests.support.waiting import PATIENCE
+
+ROOT = Path(__file__).parents[1]
+
+
+def vessel(name: str, radius: float, height: float) -> dict[str, Any]:
+    inner = [[0, 0], [radius, 0], [radius, height]]
+    return {"name": name, "profile": {"unit": "mm", "inner": inner, "wall": "4 mm", "floor": "4 mm"}}
+
+
+def campaign() -> decant.CampaignPlan:
+    """Four pours at actions that need no simulation."""
+    content = {
+        "name": "mine",
+        "seed": 3,
+        "laboratory": {"name": "bench", "mode": "external"},
+        "liquid": {"name": "water", "mass": "100 g"},
+        "pourer": vessel("beaker", 30, 70),
+        "motion": {"hold_time": "0.3 s", "return_velocity": "100 deg/s"},
+        "deployment": {
+            "strategy": "D2",
+            "receiver": vessel("bowl", 60, 50),
+            "motion": {"max_angle": "120 deg", "height": "115 mm"},
+            "actions": {"angular_velocity": ["30 deg/s", "90 deg/s"], "x_offset": ["95 mm", "115 mm"]},
+            "pours": 4,
+        },
+    }
+    return decant.build_campaign(content)
+
+
+def test_what_was_told_is_what_the_campaign_learns_from(tmp_path: Path) -> None:
+    asked = []
+    with decant.AskTell(campaign(), tmp_path / "run") as session:
+        while (pour := session.ask()) is not None:
+            assert session.ask() is pour, "it is asked for until it is told"
+            asked.append(pour)
+            if pour.number == 3:
+                session.fail(pour, "the cup fell over")
+            else:
+                session.tell(pour, spilled_g=1.5 * pour.number, received_g=95.0, notes={"robot": "mine"})
+        assert session.ask() is None
+    run = session.run
+    assert run is not None
+    assert [pour.number for pour in asked] == [1, 2, 3, 4]
+    assert len({tuple(pour.settings.items()) for pour in asked}) == 4
+    assert all(30.0 <= (pour.settings["angular_velocity_deg_s"] or 0.0) <= 90.0 for pour in asked)
+    assert run.pours["spilled_g"].dropna().tolist() == pytest.approx([1.5, 3.0, 6.0])
+    assert run.pours["failed"].dropna().tolist() == ["pour_failed: the cup fell over"]
+    assert run.summary.mode == "external"
+    assert "recommended for bowl" in run._repr_html_()
+    assert "angular_velocity" in run._repr_html_()
+    pytest.importorskip("pyarrow")
+    import pandas as pd
+
+    run.save_tables()
+    units = pd.read_parquet(run.directory / "tables" / "pours.parquet").attrs["units"]
+    assert (units["angular_velocity_deg_s"], units["spilled_g"], units["seconds"]) == ("deg/s", "g", "s")
+
+
+def test_a_pour_that_nothing_was_told_of_is_never_asked_for_as_a_new_one(tmp_path: Path) -> None:
+    left = (
+        "import os, tests.test_ask_tell as here, decant, sys\n"
+        "pour = decant.AskTell(here.campaign(), sys.argv[1]).ask()\n"
+        "print(pour.number, flush=True)\n"
+        "os._exit(9)"
+    )
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    killed = subprocess.run(
+        [sys.executable, "-c", left, str(tmp_path / "run")],
+        env=env, timeout=PATIENCE, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert (killed.returncode, killed.stdout) == (9, "1\n"), killed.stderr
+    with decant.AskTell(campaign(), tmp_path / "run") as session:
+        first = session.ask()
+        assert first is not None
+        assert (first.number, first.unknown) == (1, True)
+        session.tell(first, spilled_g=2.0, retained_g=0.5)
+        second = session.ask()
+        assert second is not None
+        assert (second.number, second.unknown) == (2, False)
+    with decant.AskTell(campaign(), tmp_path / "run") as session:
+        again = session.ask()
+        assert again is not None
+        assert (again.number, again.unknown, again.settings) == (2, True, second.settings)
+        session.fail(again, "nobody knows")
+        third = session.ask()
+        assert third is not None
+        assert third.number == 3
+        session.close()
+        with pytest.raises(decant.InvalidArgumentError, match="continues it"):
+            session.ask()
+    run = decant.open_run(tmp_path / "run", campaign())
+    assert run.pours["spilled_g"].dropna().tolist() == pytest.approx([2.0])
+
+
+def test_what_can_not_be_is_refused_and_nothing_is_told(tmp_path: Path) -> None:
+    with decant.AskTell(campaign(), tmp_path / "run") as session:
+        pour = session.ask()
+        assert pour is not None
+        with pytest.raises(decant.InvalidArgumentError, match="300 g spilled and"):
+            session.tell(pour, spilled_g=300.0, received_g=0.0)
+        with pytest.raises(decant.InvalidArgumentError, match="either received_g or retained_g"):
+            session.tell(pour, spilled_g=3.0)
+        with pytest.raises(decant.InvalidArgumentError, match="the pour was to have a load of 100 g"):
+            session.tell(pour, spilled_g=3.0, received_g=300.0, loaded_g=310.0)
+        session.tell(pour, spilled_g=3.0, received_g=97.4)  # more than was loaded, by the noise of a balance
+        with pytest.raises(decant.InvalidArgumentError, match="told once"):
+            session.tell(pour, spilled_g=3.0, received_g=96.0)
+    with pytest.raises(decant.InvalidArgumentError, match="mode: external"):
+        decant.AskTell(decant.load_campaign(decant.shipped("campaigns/quickstart.yaml")))
+
+
+def test_no_other_program_pours_in_an_external_laboratory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with (
+        pytest.warns(UserWarning, match="dribbling"),
+        pytest.raises(decant.LaboratoryError, match="is external: a program makes its pours"),
+    ):
+        decant.run(campaign())
+    (tmp_path / "bench.yaml").write_text("name: bench\nmode: external\nbalance: {placement: manual}\n")
+    monkeypatch.setattr("sys.argv", ["decant", "validate", str(tmp_path / "bench.yaml")])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert "an external laboratory has no devices of Decant" in capsys.readouterr().err
