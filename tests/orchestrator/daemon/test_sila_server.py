@@ -197,10 +197,11 @@ for step in command.subscribe_to_intermediate_responses():
     print("STATE", step.State, flush=True)
     if step.State in ("unknown", "waiting for operator"):
         break
+questions = []
+while not questions:
+    questions = list(station.Questions.get())
 print("QUESTION", flush=True)
-while not list(station.Questions.get()):
-    time.sleep(0.1)
-tell({"questions": list(station.Questions.get()), "made": end(command), "again": end(pour("plan:1"))})
+tell({"questions": questions, "made": end(command), "again": end(pour("plan:1"))})
 """
 
 
