@@ -198,7 +198,7 @@ class Laboratory:
         """A client; it may meet a daemon that does not run."""
         return Client(f"http://127.0.0.1:{self._port}", self.state)
 
-    def call(self, method: str, path: str, body: Any = None, *, repeat: bool = True) -> Any:
+    def call(self, method: str, path: str, body: Any = None, *, repeat: bool = True, **query: Any) -> Any:
         """A request, repeated until a daemon answers.
 
         Raises:
@@ -209,7 +209,7 @@ class Laboratory:
                 if not hasattr(self._own, "client"):  # of this thread
                     self._own.client = self.client()
                 client = self._own.client
-                return client.get(path) if method == "get" else client.post(path, body)
+                return client.get(path, **query) if method == "get" else client.post(path, body)
             except DaemonError as error:
                 again = error.unreachable and repeat
                 self.counts["connections lost"] += bool(error.unreachable)
@@ -581,9 +581,9 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
             lab.make_room()
             lab.calm(PATIENCE)
             promised = (
-                lab.call("get", "/campaigns?limit=1000"),
-                lab.call("get", "/pours?limit=1000"),
-                lab.call("get", "/materials/account?limit=100000"),
+                lab.call("get", "/campaigns", limit=1000),
+                lab.call("get", "/pours", limit=1000),
+                lab.call("get", "/materials/account", limit=100_000),
             )
         finally:
             lab.over.set()
