@@ -28,7 +28,7 @@ from actors.interfaces import (
     Optimizer,
     SimulatorPool,
 )
-from actors.laboratory_settings import LaboratorySettings
+from actors.laboratory_settings import LaboratorySettings, RaySettings
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.ray_cluster import JoinedCluster, check_cluster, versions
 from actors.runtime.ray_runtime import forget_ray_logs, open_ray, ray_lost, stop_ray, watch_ray
@@ -164,8 +164,8 @@ def open_laboratory(
             private Ray. Ignored if a bench is needed or a cluster is named.
         make: creates simulators in their processes.
         operator: answers questions, if a person does.
-        kept: simulators to use instead of its own (`WarmSimulators.share`); they stay open. Not on a
-            cluster, whose nodes change.
+        kept: simulators to use instead of its own (`WarmSimulators.share`); they stay open. If they are on the
+            cluster that `spec` names, arm, balance and bench are on this machine.
         optimizer: an optimiser to use instead of its own; it is stateless.
 
     Raises:
@@ -186,8 +186,6 @@ def open_laboratory(
         kind = partial(InProcessLaboratory, processes=0 if spec.in_process else spec.simulator_count)
     else:
         kind = RayLaboratory
-        if spec.ray is not None:
-            kept = optimizer = None
     return kind(spec, make, need_bench=need_bench, operator=operator, kept=kept, optimizer=optimizer)
 
 
@@ -333,9 +331,14 @@ class InProcessLaboratory(_OpenLaboratory):
 class RayLaboratory(_OpenLaboratory):
     """Runs everything in separate processes: on this machine, or on the machines of a cluster.
 
-    `spec` gives the size of the pool, the memory, and the cluster to join, if any.
+    `spec` gives the size of the pool, the memory, and the cluster to join, if any. On a cluster, the bench is on the
+    node that offers its resource; with simulators of another laboratory, it is on this machine.
+
+    Attributes:
+        lost: why this machine is cut off from the cluster; '' while it is not.
     """
 
+    lost = ""
     _cluster: JoinedCluster | None = None
     _liquid: WorkerPool | None = None
     _monitoring: asyncio.Task[None] | None = None
@@ -345,7 +348,7 @@ class RayLaboratory(_OpenLaboratory):
         try:
             if self._spec.ray is not None:
                 self._cluster = JoinedCluster(self._spec.ray, self._report, self._lose_bench, self._lose_all)
-                await self._cluster.open(need_bench=self._needs_bench)
+                await self._cluster.open(need_bench=self._needs_bench and self._pool is None)
             else:
                 self._monitoring = asyncio.create_task(watch_ray(self._ray_died))
             await self._open_all()
@@ -362,7 +365,7 @@ class RayLaboratory(_OpenLaboratory):
             self._optimizer = self._open_optimizer(optimizer)
         if not self._needs_bench:
             return
-        node = None if self._cluster is None else self._cluster.bench
+        node = None if self._cluster is None else self._cluster.bench or here
         if self._spec.bench is not None:
             # The hidden liquid's simulator, on the arm's machine. It reserves no core: the pool's size is the
             # campaign's choice, and a pour must never wait for it.
@@ -398,6 +401,7 @@ class RayLaboratory(_OpenLaboratory):
 
     def _lose_all(self, reason: str) -> None:
         """Handle the loss of Ray on this machine, which ends all of its actors."""
+        self.lost = reason
         self._lose_bench(reason)
         for pool in self._own_pools:
             if pool is not self._liquid:
@@ -427,8 +431,9 @@ class WarmSimulators:
     Processes and compiled kernels are ready before they are needed.
 
     Args:
-        simulators: size of the pool; 0: one per core.
+        simulators: size of the pool; 0: one per core of this machine or of the cluster.
         in_process: one simulator in this process, without Ray.
+        ray: cluster on which the simulators run; None: a private Ray on this machine.
         make: creates simulators in their processes.
         tell: called with a message about losses.
     """
@@ -438,12 +443,13 @@ class WarmSimulators:
         simulators: int = 0,
         *,
         in_process: bool = False,
+        ray: RaySettings | None = None,
         make: Callable[[], Simulator] = pour_simulator,
         tell: Callable[[str], None] = lambda text: None,
     ) -> None:
-        self._spec = LaboratorySettings(name="shared", simulators=simulators, in_process=in_process)
+        self._spec = LaboratorySettings(name="shared", simulators=simulators, in_process=in_process, ray=ray)
         self._make, self._report = make, tell
-        self._laboratory: Laboratory | None = None
+        self._laboratory: InProcessLaboratory | RayLaboratory | None = None
         self._opening = asyncio.Lock()
 
     @property
@@ -496,9 +502,16 @@ class WarmSimulators:
         return self._laboratory.optimizer
 
     @property
+    def ray(self) -> RaySettings | None:
+        """The cluster on which the simulators run; None without one."""
+        return None if self._spec.in_process else self._spec.ray
+
+    @property
     def lost(self) -> str:
         """The lost part of Ray, which makes the simulators unusable; empty while nothing is lost."""
-        return "" if self._laboratory is None or self._spec.in_process else ray_lost()
+        if not isinstance(self._laboratory, RayLaboratory):
+            return ""
+        return ray_lost() or ("connection to the cluster" if self._laboratory.lost else "")
 
     async def tidy(self) -> None:
         """Release logs and memory left by laboratories that are closed."""

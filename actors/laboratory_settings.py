@@ -56,6 +56,8 @@ def _address(text: str) -> str:
     )
 
 
+RayAddress = Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
+
 MODE_LABELS = {"virtual": "VIRTUAL", "hardware": "REAL", "external": "EXTERNAL"}
 """How reports, lists and the live view write a laboratory's mode."""
 
@@ -63,7 +65,7 @@ MODE_LABELS = {"virtual": "VIRTUAL", "hardware": "REAL", "external": "EXTERNAL"}
 class RaySettings(Settings):
     """An existing Ray cluster; Decant connects to it and does not stop it."""
 
-    address: Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
+    address: RayAddress
     """Address of its head node, host:port."""
 
     bench_resource: Name = "decant_bench"

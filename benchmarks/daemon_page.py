@@ -65,19 +65,49 @@ def stops(found: Mapping[str, Any]) -> str:
     return (
         f"Median / worst of {found['times']} [ms], on {found['cores']} cores with a load of {found['load before']} "
         f"beforehand; the first simulation of a submitted plan began after {first} ms.\n\n"
-        + _table(("", "until", *loads.values()), rows)
+        + markdown_table(("", "until", *loads.values()), rows)
     )
 
 
-def soak(found: Mapping[str, Any]) -> str:
-    """What there was at a third of the time, at the end, and how it went."""
-    rows = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
-    first, second = found["journal of one campaign [kB]"]
+def day(found: Mapping[str, Any]) -> str:
+    """A day in scaled time: what was done to the daemon, what was lost, and what has grown."""
+    counts = found["counts"]
+    states = ", ".join(f"{name} {count}" for name, count in sorted(_by_state(found["states"]).items()))
+    ended = ", ".join(f"{name} {count}" for name, count in sorted(found["orders ended"].items()))
+    rows = [
+        ("scaled time, two rigs", f"{found['hours scaled']:.0f} h in {found['minutes']:.0f} min"),
+        ("campaigns", f"{found['campaigns']} ({states})"),
+        ("ordered pours", f"{found['orders']} ({ended}), sent again {counts['orders repeated']} times"),
+        ("finished simulations, pours", f"{found['finished']['finished']}, {found['finished']['pour.finished']}"),
+        ("`kill -9`, SIGTERM", f"{counts.get('killed', 0)}, {counts.get('ended by SIGTERM', 0)}"),
+        ("full disk for 30 s", f"{counts.get('full disks', 0) + counts.get('full disks later', 0)}"),
+        ("restart until it serves, median", f"{found['restart [s]']} s"),
+        ("visits of other clients, connections lost", f"{counts['visits']}, {counts['connections lost']}"),
+        ("campaigns resumed after a fault", f"{sum(n for name, n in counts.items() if name.startswith('resumed'))}"),
+        ("pours declared lost after a kill", f"{counts.get('pours declared lost by the operator', 0)}"),
+    ]
+    lost = [(name, count) for name, count in found["lost or doubled"].items()]
+    begin, end = found["undisturbed [min]"]
+    grown = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
     return (
-        f"{found['minutes']:.0f} minutes, {found['campaigns']} campaigns, {100 * found['cpu share']:.0f} % of a core "
-        f"on average; the journal of a plain campaign took {first} kB in the first half and {second} kB in the second "
-        "(medians). Looked at between campaigns:\n\n" + _table(("", "after a third", "at the end", "an hour"), rows)
+        "Two rigs on simulated benches without Ray, in scaled time; in the first part a fault every 90 seconds. Each "
+        "order is sent three times or more. If a pour is killed, the operator declares it lost.\n\n"
+        + markdown_table(("", ""), rows)
+        + "\nLost or doubled, by the journals, the queue and the account of materials:\n\n"
+        + markdown_table(("", "number"), lost)
+        + f"\nBetween campaigns, from minute {begin:.0f} to {end:.0f}, when the daemon was not restarted; "
+        f"{100 * found['cpu share']:.0f} % of a core on average:\n\n"
+        + markdown_table(("", "after a third", "at the end", "an hour"), grown)
     )
+
+
+def _by_state(states: Mapping[str, int]) -> dict[str, int]:
+    """Numbers by the last word of their names."""
+    found: dict[str, int] = {}
+    for name, count in states.items():
+        state = name.rpartition(" ")[2]
+        found[state] = found.get(state, 0) + count
+    return found
 
 
 def idle_time(found: Mapping[str, Any]) -> str:
@@ -92,14 +122,19 @@ def idle_time(found: Mapping[str, Any]) -> str:
     return (
         f"On {found['cores']} cores with a load of {found['load before']} beforehand, in turn, "
         f"{times}:\n\n"
-        + _table(("campaign", "simulations ahead", "wall", "the arm's own", "the rest", "same decisions"), rows)
+        + markdown_table(("campaign", "simulations ahead", "wall", "the arm's own", "the rest", "same decisions"), rows)
     )
 
 
-TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {"stops": stops, "soak": soak, "idle-time": idle_time}
+TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {
+    "stops": stops,
+    "day": day,
+    "idle-time": idle_time,
+}
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
 

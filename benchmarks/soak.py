@@ -1,12 +1,16 @@
-"""A daemon that is kept busy for an hour or a week: does anything of it grow?
+"""A day of a laboratory in scaled time: a daemon with two rigs, campaigns, ordered pours, faults, and clients.
 
-A daemon with one simulator gets campaigns over HTTP, one after the other, on benches whose clock is scaled:
-plans, calibrations with deployments, with and without a recording, with an operator whose questions are answered over
-the API, paused and resumed, aborted while the arm tilts and resumed with its question, stopped, and some over wires.
-Every minute all processes that it has started are looked at, and everything that it keeps. It waits between campaigns
-so that it takes no more of a core than it may. Run from the project's root:
+Two rigs of simulated benches get campaigns over HTTP from two clients each: plans, calibrations with deployments, and
+deployments alone, with and without a recording, some paused, stopped or aborted and resumed. On the right rig an
+operator answers questions. Another client orders pours and repeats every order with the same id. Other clients read,
+follow events and leave, some in the middle of a request. In the first part the daemon is killed (SIGKILL) or ended
+again and again, and its disk is filled up; the second part is undisturbed but for one full disk, so that growth of
+memory can be seen. From time to time the clients wait until nothing runs, and all processes and files are measured.
 
-    python benchmarks/soak.py --minutes 60 --into soak     # writes soak/samples.jsonl and soak/campaigns.jsonl
+At the end every journal, the queue and the account of materials are compared with the answers to the clients.
+The state directory is a small file system in memory, so that it can be full: root is needed. From the project's root:
+
+    python benchmarks/soak.py --minutes 40 --into soak     # writes soak/samples.jsonl, items.jsonl, result.json
     python benchmarks/soak.py --draw soak                  # the picture, and its table in docs/evidence/reliability.md
 """
 
@@ -15,10 +19,15 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
-import itertools
 import json
 import os
+import random
+import shutil
+import signal
+import socket
 import statistics
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -31,28 +40,45 @@ from typing import Any
 import numpy as np
 import psutil
 from daemon_page import keep
-from daemon_process import end_in_order, serving
+from daemon_process import PATIENCE, await_, end_in_order, started
 from ruamel.yaml import YAML
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.submissions import Files, pack
-from orchestrator.journal.journal import JOURNAL_NAME
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.journal_check import check_journal
 from orchestrator.results import figure_style as style
 
 ROOT = Path(__file__).parents[1]
 
+TIME_SCALE = 60
+"""Bench seconds per second: 24 minutes are a day."""
+
+DISK = 900
+"""Size of the file system of the state directory [MB]."""
+
 SETTINGS = """\
+rigs: {left: left.yaml, right: right.yaml}
 simulators: 1
+in_process: true
 keep_free: 40 MB
 events: 2000
 recordings: {keep: 3}
 """
 """Bounds that are reached within minutes, as days reach the usual ones."""
 
+BENCH = f"bench: {{liquid: {{particles: 200}}, time_scale: {TIME_SCALE}}}"
+RIGS = {
+    "left": f"{{name: left, {BENCH[:-1]}, operator_time: 20 s}}}}\n",
+    "right": f"{{name: right, {BENCH}, arm: {{kind: simulated}}, balance: {{kind: simulated, placement: tray}}, "
+    "operator: {answers: person}}\n",
+}
+"""Laboratories: without devices, and with an arm whose operator answers over the API."""
+
 CAMPAIGN = """\
 name: soak
-laboratory: {name: numbers, bench: {liquid: {particles: 200}, time_scale: 60, operator_time: 20 s}}
+laboratory: left.yaml
 liquid: {name: water, mass: 100 g}
 pourer: {name: beaker, profile: {unit: mm, inner: [[0, 0], [30, 0], [30, 70]], wall: 4 mm, floor: 4 mm}}
 motion: {hold_time: 0.3 s, return_velocity: 100 deg/s}
@@ -62,48 +88,215 @@ calibration:
   motion: {x_offset: 75 mm, height: 80 mm}
   actions: {angular_velocity: [60 deg/s, 100 deg/s], max_angle: [80 deg, 115 deg]}
   pours: {count: 3, holdout: 1}
-  simulations: 5
+  simulations: 4
   initial_samples: 3
 deployment:
   strategy: D3
   receiver: {name: narrow, profile: {unit: mm, inner: [[0, 0], [20, 0], [20, 90]], wall: 4 mm, floor: 4 mm}}
   motion: {max_angle: 115 deg, height: 80 mm}
   actions: {angular_velocity: [60 deg/s, 100 deg/s], x_offset: [70 mm, 100 mm]}
-  prior_simulations: 3
+  prior_simulations: 2
   pours: 2
   simulations_per_pour: 1
 on_unknown: ask
 outputs: {recording: false, figures: false}
 """
 
+BEAKER = {"profile": {"unit": "mm", "inner": [[0, 0], [30, 0], [30, 70]], "wall": "4 mm", "floor": "4 mm"}}
+VIAL = {"profile": {"unit": "mm", "inner": [[0, 0], [20, 0], [20, 90]], "wall": "4 mm", "floor": "4 mm"}}
+
 ORDER = (
-    "plan",
-    "plain",
+    "short",
     "paused",
-    "asked",
+    "short",
     "plan",
+    "short",
     "stopped",
     "plain",
+    "short",
     "aborted",
+    "short",
     "recorded",
-    "plain",
-    "asked",
-    "wired",
+    "short",
 )
-"""Kinds of campaigns, again and again."""
+"""Kinds of campaigns, again and again. Plain ones and plans calibrate and deploy; the others only pour."""
+
+FULL_FOR = 30.0
+"""Time for which the disk is full [s]."""
+
+ENDS_WITHIN = 60.0
+"""Longest time for the daemon to end by itself [s]."""
+
+ENDED = ("finished", "stopped", "withdrawn")
+RESTS = ("paused", "failed", "unknown")
 
 
-# ---- campaigns
+# ---- the daemon and its disk
+
+
+class Laboratory:
+    """A daemon on a small disk, and what its clients share.
+
+    Args:
+        folder: for settings, log and results.
+        disk: of the state directory.
+        mark: folder for temporary files, by which its processes are found.
+    """
+
+    def __init__(self, folder: Path, disk: Path, mark: str) -> None:
+        self.folder, self.disk, self.mark = folder, disk, mark
+        self.over, self.go = threading.Event(), threading.Event()
+        self.go.set()
+        self.counts: collections.Counter[str] = collections.Counter()
+        self.restarts: list[float] = []
+        self.spent = 0.0
+        self._active, self._lock, self._own = 0, threading.Lock(), threading.local()
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+        self._process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def state(self) -> Path:
+        """The state directory."""
+        return self.disk / "state"
+
+    def start(self) -> None:
+        """Start the daemon and wait until it serves."""
+        begun = time.monotonic()
+        with (self.folder / "log").open("a") as log:
+            command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "server", "start"]
+            options = [str(self.folder / "settings.yaml"), "--state", str(self.state), "--port", str(self._port)]
+            self._process = started(
+                [*command, *options], stdout=log, stderr=log, start_new_session=True,
+                env={**os.environ, "TMPDIR": self.mark},
+            )  # fmt: skip
+        process = self._process
+
+        def up() -> bool:
+            if process.poll() is not None:
+                raise SystemExit(f"the daemon did not start:\n{(self.folder / 'log').read_text()[-2000:]}")
+            with self.client() as client:
+                return bool(client.get("/status"))
+
+        await_(up)
+        self.restarts.append(time.monotonic() - begun)
+
+    def end(self, number: int = signal.SIGTERM) -> None:
+        """End the daemon by a signal."""
+        self.spent += _cpu(self.mark)
+        process, self._process = self._process, None
+        if process is not None:
+            process.send_signal(number)
+            try:
+                process.wait(ENDS_WITHIN)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def client(self) -> Client:
+        """A client; it may meet a daemon that does not run."""
+        return Client(f"http://127.0.0.1:{self._port}", self.state)
+
+    def call(self, method: str, path: str, body: Any = None, *, repeat: bool = True) -> Any:
+        """A request, repeated until a daemon answers.
+
+        Raises:
+            DaemonError: it was refused, or no answer came and it may not be repeated.
+        """
+        while True:
+            try:
+                if not hasattr(self._own, "client"):  # of this thread
+                    self._own.client = self.client()
+                client = self._own.client
+                return client.get(path) if method == "get" else client.post(path, body)
+            except DaemonError as error:
+                again = error.unreachable and repeat
+                self.counts["connections lost"] += bool(error.unreachable)
+                if not again or self.over.wait(0.3):
+                    raise
+
+    @contextlib.contextmanager
+    def item(self) -> Iterator[None]:
+        """An item of a client: it begins when nothing has to be calm."""
+        while not self.go.wait(0.2):
+            if self.over.is_set():
+                break
+        with self._lock:
+            self._active += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._active -= 1
+
+    def calm(self, patience: float) -> bool:
+        """Let clients begin nothing, and wait until nothing runs. Returns whether that was so in time."""
+        self.go.clear()
+        end = time.monotonic() + patience
+        while time.monotonic() < end and self._active:
+            time.sleep(0.1)
+        return not self._active
+
+    def fill(self) -> None:
+        """Leave no byte on the disk."""
+        with (self.disk / "filler").open("ab", buffering=0) as file:
+            for size in (1 << 20, 4096, 1):
+                with contextlib.suppress(OSError):
+                    while True:
+                        file.write(bytes(size))
+
+    def make_room(self) -> None:
+        """Free the disk."""
+        (self.disk / "filler").unlink(missing_ok=True)
+
+    def note(self, **row: Any) -> None:
+        """Append to the items."""
+        with self._lock:
+            _append(self.folder / "items.jsonl", row)
+
+
+@contextlib.contextmanager
+def small_disk(place: Path) -> Iterator[Path]:
+    """A file system in memory.
+
+    Raises:
+        SystemExit: this user may not mount one.
+    """
+    place.mkdir(parents=True, exist_ok=True)
+    made = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={DISK}m", "tmpfs", str(place)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if made.returncode != 0:
+        raise SystemExit(f"only root may mount a small disk: {made.stderr.strip()}")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", "--lazy", str(place)], check=True)
+
+
+# ---- clients
 
 
 def texts(folder: Path) -> dict[str, tuple[str, Files]]:
-    """What is submitted, by kind."""
+    """Submissions by kind."""
     yaml = YAML()
+
+    def short(campaign: dict[str, Any], pours: int, outputs: dict[str, Any] | None = None) -> None:
+        del campaign["calibration"]
+        campaign["outputs"] = outputs or campaign["outputs"]
+        campaign["simulator"]["parameters"]["friction"] = 0.3
+        kept = {key: campaign["deployment"][key] for key in ("receiver", "motion", "actions")}
+        campaign["deployment"] = {"strategy": "D2", **kept, "pours": pours}
+
     changes: dict[str, Callable[[dict[str, Any]], object]] = {
         "plain": lambda campaign: None,
-        "asked": lambda campaign: campaign.update(laboratory=_asked()),
-        "recorded": lambda campaign: campaign.update(outputs={"recorded_simulations": 1}),
-        "wired": lambda campaign: campaign.update(laboratory=_wired()),
+        "short": lambda campaign: short(campaign, 2),
+        "paused": lambda campaign: short(campaign, 4),
+        "recorded": lambda campaign: short(campaign, 2, {"recorded_simulations": 1}),
     }
     found = {}
     for kind, change in changes.items():
@@ -113,81 +306,195 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
         yaml.dump(campaign, text)
         (folder / f"{kind}.yaml").write_text(text.getvalue(), encoding="utf-8")
         found[kind] = pack(load_campaign(folder / f"{kind}.yaml"))
-    return {**dict.fromkeys(ORDER, found["plain"]), **found}
+    return {**dict.fromkeys(ORDER, found["paused"]), **found, "plan": found["plain"]}
 
 
-def _asked() -> Any:
-    bench = {"liquid": {"particles": 200}, "time_scale": 60}
-    person = {"answers": "person"}
-    return {
-        "name": "asked",
-        "bench": bench,
-        "arm": {"kind": "numbers"},
-        "balance": {"kind": "numbers"},
-        "operator": person,
-    }
+def submitting(lab: Laboratory, rig: str, first: int, most: int) -> None:
+    """A client of one rig: one campaign after the other.
+
+    Args:
+        first: number of its first campaign in `ORDER`.
+        most: number of campaigns.
+    """
+    sent = texts(lab.folder)
+    chance = random.Random(f"{rig} {first}")
+    for number in range(first, first + most):
+        if lab.over.is_set():
+            return
+        with lab.item():
+            kind, begun = ORDER[number % len(ORDER)], time.time()
+            body = {"text": sent[kind][0], "files": sent[kind][1], "task": "plan" if kind == "plan" else "run"}
+            if kind != "plan":
+                body["rig"] = rig
+            try:
+                key = lab.call("post", "/campaigns", body, repeat=False)["id"]
+            except DaemonError as error:
+                lab.counts["submissions without an answer" if error.unreachable else "submissions refused"] += 1
+                lab.over.wait(1.0)
+                continue
+            with contextlib.suppress(DaemonError):
+                state = followed(lab, key, kind, chance)
+                lab.note(
+                    what="campaign", id=key, kind=kind, rig=rig, state=state, began=begun, seconds=time.time() - begun
+                )
 
 
-def _wired() -> Any:
-    laboratory = YAML().load(ROOT / "configs/laboratories/virtual.yaml")
-    laboratory["simulators"] = 1
-    laboratory["bench"]["liquid"]["particles"] = 200
-    return laboratory
+def followed(lab: Laboratory, key: str, kind: str, chance: random.Random) -> str:
+    """Have a campaign run to its end, whatever happens on the way; the state that it ends in."""
+    verb = {"paused": "pause", "stopped": "stop", "aborted": "abort"}.get(kind, "")
+    when = time.monotonic() + chance.uniform(1.0, 6.0)
+    while True:
+        found = lab.call("get", f"/campaigns/{key}")
+        state = str(found["state"])
+        if state in ENDED:
+            return state
+        with contextlib.suppress(DaemonError):
+            if verb and state == "running" and time.monotonic() > when:
+                lab.call("post", f"/campaigns/{key}/{verb}")
+                verb = ""
+            elif state in RESTS and found["desired_state"] != "run":
+                lab.call("post", f"/campaigns/{key}/resume")
+                lab.counts[f"resumed after {state}"] += 1
+        time.sleep(0.6)
 
 
-def one(client: Client, kind: str, sent: tuple[str, Files]) -> str:
-    """Have a campaign run to its end, whatever is done to it on the way; the state that it ends in."""
-    last = client.get("/status")["last_event"]
-    verb = "plan" if kind == "plan" else "run"
-    key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "task": verb})["id"]
-    done = False
-    for told in client.events(last, key):
-        match told.type:
-            case "QuestionAsked":
-                question = told.data["question"]
-                said = {"done": "done", "yes or no": "yes"}.get(question["wants"], "repeat")
-                client.post(f"/questions/{question['id']}/answer", {"answer": said})
-            case "PourProgressed" if not done and told.data["progress"]["checkpoint"] == "tilt":
-                if kind in ("paused", "stopped", "aborted"):
-                    done = True
-                    client.post(f"/campaigns/{key}/{ {'paused': 'pause', 'stopped': 'stop'}.get(kind, 'abort') }")
-            case "CampaignRests":
-                state = str(told.data["state"])
-                if done and kind in ("paused", "aborted") and state in ("paused", "unknown"):
-                    client.post(f"/campaigns/{key}/resume")
-                else:
-                    return state
-    raise AssertionError("the stream of events has ended")
+def ordering(lab: Laboratory, begun: float) -> None:
+    """A client that orders pours on both rigs by turns, and sends every order three times or more."""
+    setting_up = [
+        ("/materials/liquids", {"id": "water", "properties": {"name": "water"}}),
+        *[("/materials/vessels", {"id": f"beaker-{rig}", "shape": BEAKER}) for rig in RIGS],
+        *[("/materials/vessels", {"id": f"vial-{rig}", "shape": VIAL}) for rig in RIGS],
+    ]
+    for path, made in setting_up:
+        lab.call("post", path, made)
+    for number in range(100_000):
+        rig = ("left", "right")[number % 2]
+        with lab.item(), contextlib.suppress(DaemonError):
+            if lab.over.is_set():
+                return
+            for vessel, mass in ((f"beaker-{rig}", "100 g"), (f"vial-{rig}", "0 g")):
+                lab.call("post", f"/materials/vessels/{vessel}/weighed", {"mass": mass, "liquid": "water"})
+            key = f"order-{number}"
+            action = {"angular_velocity": "100 deg/s", "x_offset": "70 mm"}
+            vessels = {"source": f"beaker-{rig}", "receiver": f"vial-{rig}"}
+            body: dict[str, Any] = {
+                "id": key,
+                "rig": rig,
+                **vessels,
+                "action": action,
+                "predict": False,
+                "priority": 10,
+            }
+            ordered = lab.call("post", "/pours", body)
+            lab.note(what="order", id=key, campaign=ordered.get("campaign"))
+            for repetition in range(100_000):
+                if repetition < 2 or repetition % 8 == 0:
+                    again = lab.call("post", "/pours", body)
+                    lab.counts["orders repeated"] += 1
+                    if again.get("campaign") != ordered.get("campaign"):
+                        lab.counts["another pour for the same order"] += 1
+                state = str(lab.call("get", f"/pours/{key}")["state"])
+                if state in ("weighed", "failed", "cancelled"):
+                    lab.note(what="order ended", id=key, state=state)
+                    break
+                if state == "paused":
+                    with contextlib.suppress(DaemonError):
+                        lab.call("post", f"/pours/{key}/resume")
+                time.sleep(0.4)
+        lab.over.wait(max(10.0 - (time.monotonic() - begun) % 10.0, 0.5))
 
 
-# ---- looking
+def answering(lab: Laboratory) -> None:
+    """The operator of the right rig, who is also asked about pours that a kill has left unknown."""
+    while not lab.over.is_set():
+        with contextlib.suppress(DaemonError):
+            for question in lab.call("get", "/questions"):
+                said = {"done": "done", "yes or no": "yes", "weight": "100 g"}.get(question["wants"], "lost")
+                lab.call("post", f"/questions/{question['id']}/answer", {"answer": said})
+                lab.counts["pours declared lost by the operator" if said == "lost" else "questions answered"] += 1
+        lab.over.wait(0.15)
 
 
-def look(folder: Path, mark: str) -> dict[str, Any]:
+def visiting(lab: Laboratory, number: int) -> None:
+    """A client that comes and goes: it reads, follows events for a while, or leaves in the middle of a request."""
+    chance = random.Random(number)
+    while not lab.over.wait(chance.uniform(1.0, 6.0)):
+        lab.counts["visits"] += 1
+        with contextlib.suppress(DaemonError, OSError):
+            match chance.randrange(3):
+                case 0:
+                    for path in ("/status", "/campaigns", "/runs", "/materials"):
+                        lab.call("get", path, repeat=False)
+                case 1:
+                    with lab.client() as client:
+                        end = time.monotonic() + chance.uniform(1.0, 5.0)
+                        for _ in client.events(chance.choice((0, None))):
+                            if time.monotonic() > end or lab.over.is_set():
+                                break
+                case 2:
+                    with lab.client() as client, socket.create_connection(("127.0.0.1", int(client.url[-5:]))) as raw:
+                        raw.sendall(b"POST /api/v1/pours HTTP/1.1\r\nHost: x\r\nContent-Length: 400\r\n\r\n{")
+
+
+# ---- faults and samples
+
+
+def striking(lab: Laboratory, begun: float, disturbed: float) -> None:
+    """Kill or end the daemon every minute and a half, and fill its disk, until `disturbed` [s]; later fill it once."""
+    for number in range(100_000):
+        if lab.over.wait(90.0):
+            return
+        calm = time.monotonic() - begun > disturbed
+        if calm and lab.counts["full disks later"]:
+            continue
+        if calm or number % 4 == 2:
+            lab.counts["full disks later" if calm else "full disks"] += 1
+            lab.fill()
+            lab.over.wait(FULL_FOR)
+            lab.make_room()
+        else:
+            kind = signal.SIGTERM if number % 4 == 3 else signal.SIGKILL
+            lab.counts["ended by SIGTERM" if kind == signal.SIGTERM else "killed"] += 1
+            lab.end(kind)
+            lab.start()
+
+
+def sampling(lab: Laboratory, every: float, begun: float) -> None:
+    """Measure every so often, between items if they end in time."""
+    while not lab.over.wait(every):
+        calm = lab.calm(60.0)
+        try:
+            row = {"minute": (time.monotonic() - begun) / 60.0, "at rest": calm, **look(lab)}
+            _append(lab.folder / "samples.jsonl", row)
+        finally:
+            lab.go.set()
+
+
+def look(lab: Laboratory) -> dict[str, Any]:
     """Everything that might grow, now: memory [MB], counts, sizes on disk [MB]."""
     memory: collections.Counter[str] = collections.Counter()
     totals: collections.Counter[str] = collections.Counter()
-    for process in ours(mark):
+    for process in ours(lab.mark):
         with contextlib.suppress(psutil.Error, OSError):
             with process.oneshot():
                 name = _name(process)
-                found = {"pss": process.memory_full_info().pss, "rss": process.memory_info().rss}
+                found: dict[str, Any] = {"pss": process.memory_full_info().pss / 1e6}
                 found |= {"threads": process.num_threads(), "handles": process.num_fds(), "processes": 1}
             memory[name] += found["pss"]
             totals.update(found)
             if name == "daemon":
                 totals.update({f"daemon {k}": v for k, v in found.items() if k != "processes"})
-    state = folder / "state"
-    sizes = {path.name: path.stat().st_size for path in state.glob("*.sqlite*")}
-    sizes["runs"], sizes["ray"] = _size(state / "runs"), _size(Path(mark))
-    counts = {k: v for k, v in totals.items() if "ss" not in k.split()[-1] or k == "processes"}
+    sizes = {path.name: path.stat().st_size / 1e6 for path in lab.state.glob("*.sqlite*")}
+    sizes["runs"], sizes["campaigns"] = (_size(lab.state / name) / 1e6 for name in ("runs", "campaigns"))
+    sizes["ray"] = _size(Path(lab.mark)) / 1e6
     return {
         "time": time.time(),
-        "cpu": round(_cpu(mark), 1),
-        **counts,
-        **{k: round(v / 1e6, 2) for k, v in totals.items() if k not in counts},
-        "memory of": {k: round(v / 1e6, 1) for k, v in memory.items()},
-        "size of": {k: round(v / 1e6, 3) for k, v in sizes.items()},
+        "starts": len(lab.restarts),
+        "items": lab.counts["items"],
+        "cpu": round(lab.spent + _cpu(lab.mark), 1),
+        **{key: round(value, 2) for key, value in totals.items()},
+        "memory of": {key: round(value, 1) for key, value in memory.items()},
+        "size of": {key: round(value, 3) for key, value in sizes.items()},
     }
 
 
@@ -202,13 +509,9 @@ def ours(mark: str) -> Iterator[psutil.Process]:
 def _name(process: psutil.Process) -> str:
     words = process.cmdline()
     line = " ".join(words)
-    if "serve" in words:
+    if "server" in words and "start" in words:
         return "daemon"
-    for part, name in (
-        ("virtual_ur", "controller"),
-        ("ur.worker", "worker of the arm"),
-        ("orchestrator.live_view", "recording"),
-    ):
+    for part, name in (("SimulatorProcess", "simulators"), ("Proposer", "optimiser"), ("live_view", "recording")):
         if part in line:
             return name
     return "Ray" if "ray" in line else process.name()
@@ -222,60 +525,6 @@ def _size(folder: Path) -> int:
     return total
 
 
-# ---- the hour
-
-
-def soak(folder: Path, minutes: float, share: float, every: float) -> None:
-    """Keep a daemon busy.
-
-    Args:
-        folder: where it is done; samples.jsonl and campaigns.jsonl are appended to.
-        minutes: for so long.
-        share: of a core that it may take, on average.
-        every: between two samples [s].
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "settings.yaml").write_text(SETTINGS, encoding="utf-8")
-    sent = texts(folder)
-    ended, at_rest = threading.Event(), threading.Event()
-    count = itertools.count()
-    with tempfile.TemporaryDirectory(prefix="k", dir="/tmp") as mark:  # short, since Ray puts sockets in it
-        begin, spent = time.time(), 0.0
-        with serving(folder, str(folder / "settings.yaml"), environment={"TMPDIR": mark}) as client:
-            sampler = threading.Thread(target=_sample, args=(folder, mark, every, ended, at_rest, begin), daemon=True)
-            sampler.start()
-            try:
-                while time.time() < begin + 60.0 * minutes:
-                    number = next(count)
-                    kind = ORDER[number % len(ORDER)]
-                    before = time.time()
-                    at_rest.clear()
-                    try:
-                        state = one(client, kind, sent[kind])
-                    except DaemonError as error:
-                        state = f"refused: {error}"
-                    row = {
-                        "number": number,
-                        "kind": kind,
-                        "state": state,
-                        "began": before,
-                        "seconds": time.time() - before,
-                    }
-                    _append(folder / "campaigns.jsonl", {**row, **_newest_journal(folder / "state/runs")})
-                    spent = max(spent, _cpu(mark))
-                    time.sleep(2.0)
-                    at_rest.set()
-                    time.sleep(1.0)
-                    while spent > share * (time.time() - begin) and time.time() < begin + 60.0 * minutes:
-                        time.sleep(1.0)
-            finally:
-                ended.set()
-                sampler.join()
-        time.sleep(2.0)
-        left = [f"{process.pid} {_name(process)}" for process in ours(mark)]
-        print(f"{next(count)} campaigns in {(time.time() - begin) / 60:.0f} min; left behind: {left or 'nothing'}")
-
-
 def _cpu(mark: str) -> float:
     """CPU time of the daemon and all that it has started [s], with those that have ended and were waited for."""
     spent = 0.0
@@ -285,63 +534,165 @@ def _cpu(mark: str) -> float:
     return spent
 
 
-def _sample(
-    folder: Path, mark: str, every: float, ended: threading.Event, at_rest: threading.Event, begin: float
-) -> None:
-    """Every so often, once while a campaign runs and once between two."""
-    while not ended.is_set():
-        for rests in (False, True):
-            while at_rest.is_set() != rests and not ended.wait(0.2):
-                pass
-            row = {"minute": (time.time() - begin) / 60.0, "at rest": at_rest.is_set(), **look(folder, mark)}
-            _append(folder / "samples.jsonl", row)
-        ended.wait(every)
-
-
-def _newest_journal(runs: Path) -> dict[str, Any]:
-    found = max(runs.glob("*"), key=lambda path: path.stat().st_mtime, default=None)
-    if found is None:
-        return {}
-    journals = [path.stat().st_size for path in found.glob(f"{JOURNAL_NAME}*")]
-    return {"journal": sum(journals), "folder": _size(found)}
-
-
 def _append(path: Path, row: dict[str, Any]) -> None:
     with path.open("a", encoding="utf-8") as file:
         file.write(json.dumps(row) + "\n")
 
 
-# ---- what came of it
+# ---- the whole
 
-FIGURE = ROOT / "docs" / "images" / "daemon" / "soak.png"
+
+def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) -> None:
+    """Keep a daemon busy, then check what it has kept.
+
+    Args:
+        folder: where it is done; samples.jsonl, items.jsonl and result.json are written there.
+        minutes: for so long.
+        campaigns: largest number of each of the four clients.
+        every: between two samples [s].
+        ray: whether simulator, arm and balance are processes of Ray; else they are threads of the daemon.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    settings = SETTINGS.replace("in_process: true\n", "") if ray else SETTINGS
+    (folder / "settings.yaml").write_text(settings, encoding="utf-8")
+    for rig, text in RIGS.items():
+        (folder / f"{rig}.yaml").write_text(text, encoding="utf-8")
+    with small_disk(folder / "disk") as disk, tempfile.TemporaryDirectory(prefix="k", dir="/tmp") as mark:
+        lab = Laboratory(folder, disk, mark)
+        lab.start()
+        begun = time.monotonic()
+        work: list[Callable[[], None]] = [
+            partial(submitting, lab, rig, first, campaigns) for rig in RIGS for first in (0, 5)
+        ]
+        others: list[Callable[[], None]] = [
+            partial(ordering, lab, begun),
+            partial(answering, lab),
+            *(partial(visiting, lab, number) for number in range(4)),
+            partial(striking, lab, begun, 0.4 * 60.0 * minutes),
+            partial(sampling, lab, every, begun),
+        ]
+        threads = [threading.Thread(target=one, daemon=True) for one in [*work, *others]]
+        try:
+            for thread in threads:
+                thread.start()
+            while time.monotonic() < begun + 60.0 * minutes and any(one.is_alive() for one in threads[: len(work)]):
+                time.sleep(1.0)
+            took = time.monotonic() - begun
+            lab.make_room()
+            lab.calm(PATIENCE)
+            promised = (
+                lab.call("get", "/campaigns?limit=1000"),
+                lab.call("get", "/pours?limit=1000"),
+                lab.call("get", "/materials/account?limit=100000"),
+            )
+        finally:
+            lab.over.set()
+            for thread in threads:
+                thread.join(PATIENCE)
+            lab.end()
+        found = checked(lab, *promised)
+        left = [f"{process.pid} {_name(process)}" for process in ours(mark)]
+        shutil.copytree(lab.state, folder / "state", dirs_exist_ok=True)
+    result = {
+        "minutes": round(took / 60.0, 1),
+        "time_scale": TIME_SCALE,
+        "ray": ray,
+        "restart_s": [round(one, 1) for one in lab.restarts],
+        "cpu_s": round(lab.spent, 1),
+        "counts": dict(lab.counts),
+        "left behind": left,
+        **found,
+    }
+    (folder / "result.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(result, indent=1))
+
+
+def checked(lab: Laboratory, campaigns: list[Any], pours: list[Any], account: list[Any]) -> dict[str, Any]:
+    """Compare what the daemon has kept with what its clients were promised.
+
+    Args:
+        campaigns, pours, account: as the daemon listed them at the end.
+    """
+    items = [json.loads(line) for line in (lab.folder / "items.jsonl").read_text().splitlines()]
+    acknowledged = [one["id"] for one in items if one["what"] == "campaign"]
+    listed = collections.Counter(one["id"] for one in campaigns)
+    orders = {one["id"] for one in items if one["what"] == "order"}
+    ended = {one["id"]: one["state"] for one in items if one["what"] == "order ended"}
+    known = collections.Counter(one["id"] for one in pours)
+    entered = collections.Counter((one["pour"], one["vessel"]) for one in account if one["kind"] == "poured")
+    twice, damaged, finished = 0, [], collections.Counter[str]()
+    for folder in sorted((lab.state / "runs").iterdir()):
+        if not (folder / JOURNAL_NAME).is_file():
+            continue
+        try:
+            check_journal(folder / JOURNAL_NAME).require()
+        except Exception as error:
+            damaged.append(f"{folder.name}: {error}")
+        with JournalReader(folder / JOURNAL_NAME) as journal:
+            counted: collections.Counter[Any] = collections.Counter()
+            for entry in journal.entries(kinds=(Kind.FINISHED, Kind.POUR_FINISHED)):
+                counted[entry.stage, entry.body["id"]] += 1
+                finished[str(entry.kind)] += 1
+            twice += sum(count > 1 for count in counted.values())
+    runs = collections.Counter(one["run"] for one in campaigns if one["run"])
+    return {
+        "campaigns": len(acknowledged),
+        "states": dict(
+            collections.Counter(f"{one['kind']}: {one['state']}" for one in items if one["what"] == "campaign")
+        ),
+        "campaigns lost": [key for key in acknowledged if not listed[key]],
+        "campaigns with the run of another": [run for run, count in runs.items() if count > 1],
+        "orders": len(orders),
+        "orders ended": dict(collections.Counter(ended.values())),
+        "orders lost": sorted(orders - set(known)),
+        "orders doubled": [key for key in orders if known[key] > 1],
+        "weighed orders not in the account once": [
+            key for key, state in ended.items() if state == "weighed" and any(
+                entered[one["campaign"], vessel] != 1 and entered[key, vessel] != 1
+                for one in items if one["what"] == "order" and one["id"] == key
+                for vessel in _vessels(pours, key)
+            )
+        ],
+        "requests finished": dict(finished),
+        "requests finished twice": twice,
+        "journals damaged": damaged,
+    }  # fmt: skip
+
+
+def _vessels(pours: list[Any], key: str) -> list[str]:
+    one = next(one for one in pours if one["id"] == key)
+    return [one["source"], one["receiver"]]
+
+
+# ---- the result
+
+FIGURE = ROOT / "docs" / "images" / "daemon" / "day.png"
 
 
 def draw(folder: Path) -> dict[str, Any]:
     """Draw a soak; what its table says."""
     samples = [json.loads(line) for line in (folder / "samples.jsonl").read_text().splitlines()]
-    campaigns = [json.loads(line) for line in (folder / "campaigns.jsonl").read_text().splitlines()]
-    rest, busy = ([s for s in samples if s["at rest"] is which] for which in (True, False))
-    size = {name: partial(_kept, name) for name in ("daemon", "events", "ray")}
+    result: dict[str, Any] = json.loads((folder / "result.json").read_text())
+    last = max(one["starts"] for one in samples)
+    size = {name: partial(_kept, name) for name in ("daemon", "events", "vessels", "ray", "runs", "campaigns")}
     figure, panels = style.new_figure(2, 2, size=(9.2, 6.0), sharex=True)
     memory, handles, threads, disk = panels.flat
-    for rows, marker, alpha in ((rest, "o-", 1.0), (busy, ".", 0.45)):
-        minutes = [s["minute"] for s in rows]
+    for starts in range(1, last + 1):
+        rows = [one for one in samples if one["starts"] == starts and "daemon pss" in one]
+        minutes = [one["minute"] for one in rows]
         for axes, curves in (
             (memory, {"all processes": "pss", "the daemon": "daemon pss"}),
             (handles, {"all processes": "handles", "the daemon": "daemon handles"}),
             (threads, {"threads": "threads", "processes": "processes"}),
         ):
             for (name, key), colour in zip(curves.items(), (style.MEASURED, style.PREDICTED), strict=True):
-                label = name if rows is rest else None
-                axes.plot(minutes, [s[key] for s in rows], marker, color=colour, ms=3, lw=1.2, alpha=alpha, label=label)
-    minutes = [s["minute"] for s in rest]
-    names = {"daemon": "queue, questions, audit entries", "events": "events", "ray": "Ray's logs"}
-    for (key, name), colour in zip(names.items(), (style.MEASURED, style.PREDICTED, style.GOOD), strict=True):
-        disk.plot(minutes, [size[key](s) for s in rest], "o-", color=colour, ms=3, lw=1.2, label=name)
-    begin = campaigns[0]["began"]
-    ran = [c for c in campaigns if c["kind"] == "plain"]
-    when = [(c["began"] - begin) / 60.0 for c in ran]
-    disk.plot(when, [c["journal"] / 1e6 for c in ran], "x", color=style.BEST, ms=5, label="journal of one campaign")
+                label = name if starts == last else None
+                axes.plot(minutes, [one[key] for one in rows], "o-", color=colour, ms=3, lw=1.2, label=label)
+    minutes = [one["minute"] for one in samples]
+    names = {"daemon": "queue, questions, audit entries", "events": "events", "vessels": "materials", "ray": "Ray"}
+    colours = (style.MEASURED, style.PREDICTED, style.GOOD, style.BEST)
+    for (key, name), colour in zip(names.items(), colours, strict=True):
+        disk.plot(minutes, [size[key](one) for one in samples], "o-", color=colour, ms=3, lw=1.2, label=name)
     titles = {memory: "Memory [MB]", handles: "Open handles", threads: "Threads and processes", disk: "On disk [MB]"}
     for axes, title in titles.items():
         style.dress(axes, title=title, x="minutes" if axes in (threads, disk) else "")
@@ -356,20 +707,43 @@ def draw(folder: Path) -> dict[str, Any]:
         "processes": lambda s: float(s["processes"]),
         "queue, questions, audit entries with their WAL [MB]": size["daemon"],
         "events with their WAL [MB]": size["events"],
+        "materials with their WAL [MB]": size["vessels"],
         "Ray's folder [MB]": size["ray"],
+        "run folders [MB]": size["runs"],
+        "submitted campaigns [MB]": size["campaigns"],
     }
-    states = collections.Counter(f"{c['kind']}: {c['state']}" for c in campaigns)
-    last = rest[-1]["minute"]
+    undisturbed = [one for one in samples if one["starts"] == last and one["at rest"]]
+    counts = result["counts"]
     return {
-        "minutes": round(last, 1),
-        "campaigns": len(campaigns),
-        "states": dict(states),
-        "cpu share": round(max(s["cpu"] for s in samples) / (60.0 * last), 3),
-        "journal of one campaign [kB]": [
-            round(statistics.median(c["journal"] / 1e3 for c in half))
-            for half in (ran[: len(ran) // 2], ran[len(ran) // 2 :])
-        ],
-        "at rest": [{"what": name, **_course(rest, value)} for name, value in shown.items()],
+        "minutes": result["minutes"],
+        "hours scaled": round(result["minutes"] * result["time_scale"] / 60.0, 1),
+        "campaigns": result["campaigns"],
+        "states": result["states"],
+        "orders": result["orders"],
+        "orders ended": result["orders ended"],
+        "counts": counts,
+        "restart [s]": round(statistics.median(result["restart_s"][1:]), 1),
+        "ray": result["ray"],
+        "cpu share": round(result["cpu_s"] / 60.0 / result["minutes"], 3),
+        "finished": result["requests finished"],
+        "lost or doubled": {
+            name: len(result[name])
+            for name in (
+                "campaigns lost",
+                "campaigns with the run of another",
+                "orders lost",
+                "orders doubled",
+                "weighed orders not in the account once",
+                "journals damaged",
+                "left behind",
+            )
+        }
+        | {
+            "requests finished twice": result["requests finished twice"],
+            "another pour for the same order": counts.get("another pour for the same order", 0),
+        },
+        "undisturbed [min]": [round(one["minute"], 1) for one in (undisturbed[0], undisturbed[-1])],
+        "at rest": [{"what": name, **_course(undisturbed, value)} for name, value in shown.items()],
     }
 
 
@@ -379,7 +753,8 @@ def _kept(name: str, sample: dict[str, Any]) -> float:
 
 def _course(rows: list[dict[str, Any]], value: Callable[[dict[str, Any]], float]) -> dict[str, float]:
     """At a third of the time, at the end, and how it went on average in the time between [1/h]."""
-    late = [row for row in rows if row["minute"] >= rows[-1]["minute"] / 3.0]
+    begin, end = rows[0]["minute"], rows[-1]["minute"]
+    late = [row for row in rows if row["minute"] >= begin + (end - begin) / 3.0]
     slope = float(np.polyfit([row["minute"] / 60.0 for row in late], [value(row) for row in late], 1)[0])
     return {"third": round(value(late[0]), 2), "end": round(value(late[-1]), 2), "an hour": round(slope, 2)}
 
@@ -387,18 +762,19 @@ def _course(rows: list[dict[str, Any]], value: Callable[[dict[str, Any]], float]
 def main() -> None:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--minutes", type=float, default=40.0)
     parser.add_argument("--into", type=Path, default=Path("soak"))
-    parser.add_argument("--share", type=float, default=0.3, help="of a core, on average")
-    parser.add_argument("--every", type=float, default=60.0, help="seconds between two samples")
+    parser.add_argument("--campaigns", type=int, default=1000, help="most of each of four clients")
+    parser.add_argument("--every", type=float, default=100.0, help="seconds between two samples")
+    parser.add_argument("--ray", action="store_true", help="with processes of Ray: takes several times as long")
     parser.add_argument("--draw", type=Path, help="draw what was found there")
     arguments = parser.parse_args()
     if arguments.draw is not None:
-        keep("soak", draw(arguments.draw))
+        keep("day", draw(arguments.draw))
         return
     end_in_order()
     os.environ.pop("DECANT_STATE", None)
-    soak(arguments.into.resolve(), arguments.minutes, arguments.share, arguments.every)
+    soak(arguments.into.resolve(), arguments.minutes, arguments.campaigns, arguments.every, arguments.ray)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,8 @@ def find_runs(*words: str, **conditions: Unpack[Conditions]) -> pd.DataFrame:
             `state` as `decant runs` shows it ('finished', 'interrupted' …). All given conditions must hold.
 
     Returns:
-        One row for each run; the data dictionary of `decant runs export` describes the columns.
+        One row for each run; the data dictionary of `decant runs export` describes the columns. `attrs['units']` has
+        the units, in Parquet files, too. Numbers of things are of type Int64, texts of type string.
 
     Raises:
         ValueError: a date or the mode is invalid.
@@ -58,11 +59,18 @@ def _catalogue() -> Catalogue:
     return catalogue
 
 
+_DTYPES = {"text": "string", "integer": "Int64", "number": "float64"}
+"""Types of pandas, by the type of a column; each knows missing values."""
+
+
 def _table(name: str, rows: list[Row]) -> pd.DataFrame:
     import pandas as pd
 
-    table = pd.DataFrame(rows, columns=[column.name for column in TABLES[name]])
-    for column in TABLES[name]:
+    columns = TABLES[name]
+    table = pd.DataFrame(rows, columns=[column.name for column in columns])
+    for column in columns:
         if column.type == "time":
             table[column.name] = pd.to_datetime(table[column.name], unit="s", utc=True)
+    table = table.astype({column.name: _DTYPES[column.type] for column in columns if column.type in _DTYPES})
+    table.attrs["units"] = {column.name: column.unit for column in columns if column.unit}
     return table

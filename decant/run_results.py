@@ -6,6 +6,7 @@ files. This module does not start or resume runs.
 
 from __future__ import annotations
 
+import html
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,8 @@ from orchestrator.strategies.calibration.calibration_base import Calibrated, Cal
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.stage_result import displayed_action
+from orchestrator.strategies.stage_result import UNIT_SUFFIXES, displayed_action
+from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import SampleStatistics
@@ -45,7 +47,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Run:
-    """A run. Its tables are pandas.DataFrames, created on access.
+    """A run. Its tables are pandas.DataFrames, created on access; `attrs['units']` has the units of their columns.
 
     Attributes:
         campaign: its campaign.
@@ -169,6 +171,15 @@ class Run:
             paths.append(path)
         return paths
 
+    def _repr_html_(self) -> str:
+        """Campaign, folder and recommended actions, in notebooks."""
+        rows = [("campaign", self.campaign.name), ("state", str(self.result.state)), ("folder", str(self.directory))]
+        rows.append(("done", f"{self.result.pours} pours, {self.result.simulations} simulations"))
+        for name, one in self.recommended.items():
+            rows.append((f"recommended for {name}", described(one.action_si)))
+        cells = (f"<tr><th>{html.escape(name)}</th><td>{html.escape(text)}</td></tr>" for name, text in rows)
+        return f"<table>{''.join(cells)}</table>"
+
     # -- rows --------------------------------------------------------------------------------------------------------
 
     def _pours(self) -> Iterator[Row]:
@@ -271,4 +282,10 @@ def _frame(rows: Iterator[Row]) -> pd.DataFrame:
     require("pandas", "A table")
     import pandas as pd
 
-    return pd.DataFrame(list(rows))
+    table = pd.DataFrame(list(rows))
+    ends = {f"_{suffix}": unit for unit, suffix in UNIT_SUFFIXES.items()} | {"_g": "g"}
+    units = {name: next((unit for end, unit in ends.items() if name.endswith(end)), "") for name in table.columns}
+    table.attrs["units"] = {name: unit for name, unit in units.items() if unit} | dict.fromkeys(
+        set(table.columns) & {"seconds"}, "s"
+    )
+    return table

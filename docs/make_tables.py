@@ -114,6 +114,7 @@ SECTIONS: dict[str, type[Settings]] = {
 OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BenchBalance": "[display](#display)",
+    "ClusterSettings": "`{address: host:port}`",
     **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm)"),
     "RobotCell": "[cell](#cell)",
     "ArmLimits": "[limits](#limits)",

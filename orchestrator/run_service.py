@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
-from actors.laboratory_settings import LaboratorySettings
+from actors.laboratory_settings import LaboratorySettings, RaySettings
 from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
@@ -104,7 +104,8 @@ class RunResources:
     Attributes:
         in_process: everything in this process, without Ray.
         brief: simulators in plain processes; see `actors.laboratory.open_laboratory`.
-        simulators: a shared pool instead of the laboratory's own; the run then joins no cluster.
+        simulators: a shared pool instead of the laboratory's own.
+        ray: cluster on which the shared pool runs. The cluster of the campaign's laboratory is then not used.
         optimizer: a shared one instead of the laboratory's own.
         operator: answers the questions of the bench, where a person does.
         ask_operator: asked about pours whose outcome is unknown; None: the run pauses.
@@ -117,6 +118,7 @@ class RunResources:
     in_process: bool = False
     brief: bool = False
     simulators: SimulatorPool | None = None
+    ray: RaySettings | None = None
     optimizer: Optimizer | None = None
     operator: Operator | None = None
     ask_operator: AskOperator | None = None
@@ -131,7 +133,7 @@ class RunResources:
         return spec.with_values(
             in_process=self.in_process or spec.in_process,
             accepted_checksum=self.approved_checksum,
-            ray=None if self.simulators is not None else spec.ray,
+            ray=self.ray if self.simulators is not None else spec.ray,
         )
 
 

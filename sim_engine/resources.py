@@ -160,6 +160,7 @@ EXTRAS = {
     "skimage": "vessels",
     "pandas": "tables",
     "pyarrow": "tables",
+    "unitelabs": "sila",
 }
 """Importable name → extra."""
 
@@ -168,6 +169,7 @@ PACKAGES = {
     "rtde_receive": "ur-rtde",
     "skimage": "scikit-image",
     "pythonjsonlogger": "python-json-logger",
+    "unitelabs": "unitelabs-cdk",
 }
 """Importable name → name of the package that provides it, if they differ."""
 

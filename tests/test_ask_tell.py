@@ -61,7 +61,14 @@ def test_what_was_told_is_what_the_campaign_learns_from(tmp_path: Path) -> None:
     assert run.pours["spilled_g"].dropna().tolist() == pytest.approx([1.5, 3.0, 6.0])
     assert run.pours["failed"].dropna().tolist() == ["pour_failed: the cup fell over"]
     assert run.summary.mode == "external"
-    assert "bowl" in run.recommended
+    assert "recommended for bowl" in run._repr_html_()
+    assert "angular_velocity" in run._repr_html_()
+    pytest.importorskip("pyarrow")
+    import pandas as pd
+
+    run.save_tables()
+    units = pd.read_parquet(run.directory / "tables" / "pours.parquet").attrs["units"]
+    assert (units["angular_velocity_deg_s"], units["spilled_g"], units["seconds"]) == ("deg/s", "g", "s")
 
 
 def test_a_pour_that_nothing_was_told_of_is_never_asked_for_as_a_new_one(tmp_path: Path) -> None:

@@ -281,3 +281,17 @@ def test_what_was_measured_of_the_daemon_stands_on_its_page() -> None:
     written = daemon_page.render(page, {"stops": found, "idle-time": ahead})
     assert "| emergency stop over wires | likewise | 12 / 46 |  |  |" in written
     assert "| quickstart | 18 of them | 300 s | 220 s | 80 s | NO |" in written
+
+
+def test_what_was_measured_of_clusters_stands_on_its_page() -> None:
+    import cluster
+
+    page = cluster.PAGE.read_text(encoding="utf-8")
+    assert cluster.render(page, json.loads(cluster.DATA.read_text())) == page, "run: python benchmarks/cluster.py page"
+
+
+def test_a_busy_user_of_virtual_workers_does_not_hold_up_another_one() -> None:
+    import cluster
+
+    found = cluster.skipping(lambda: cluster.fairness(4, 10.0))
+    assert found["few_s"] < 0.7 * found["all_s"]

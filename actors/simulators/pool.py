@@ -201,6 +201,7 @@ class _Member:
 
     Attributes:
         started: done when the worker is up, or has failed to start.
+        greeting: None unless the worker is up. Stored, since a pool of thousands reads it at every decision.
         sent: jobs in the order in which they run; the first one is running.
         overdue: fires when the first job takes too long.
         begun: start of the first job [s of time.monotonic()].
@@ -208,15 +209,10 @@ class _Member:
 
     worker: Worker
     started: asyncio.Task[Greeting]
+    greeting: Greeting | None = None
     sent: deque[_SentJob] = field(default_factory=deque)
     overdue: asyncio.TimerHandle | None = None
     begun: float = 0.0
-
-    @property
-    def greeting(self) -> Greeting | None:
-        """None unless the worker is up."""
-        done = self.started.done() and not self.started.cancelled() and self.started.exception() is None
-        return self.started.result() if done else None
 
     @property
     def spare(self) -> _SentJob | None:
@@ -391,6 +387,8 @@ class WorkerPool:
     def _started(self, member: _Member, started: asyncio.Task[Greeting]) -> None:
         """A worker is up, or does not start."""
         error = None if started.cancelled() else started.exception()
+        if error is None and not started.cancelled():
+            member.greeting = started.result()
         if member not in self._members:
             return
         if isinstance(error, WorkerUnusableError):
@@ -463,7 +461,10 @@ class WorkerPool:
 
     def _next_member(self) -> _Member | None:
         """The worker that is expected to begin another job first."""
-        free = [member for member in self._up if len(member.sent) <= self._ahead]
+        idle = next((member for member in self._members if not member.sent and member.greeting is not None), None)
+        if idle is not None:
+            return idle
+        free = [member for member in self._members if len(member.sent) <= self._ahead and member.greeting is not None]
         return min(free, key=lambda member: (len(member.sent), member.begun), default=None)
 
     def _level(self) -> None:
@@ -546,7 +547,7 @@ class WorkerPool:
 
     def _limit_wait(self) -> None:
         """Limit the wait of jobs while no worker is up. If none is starting, they fail at once."""
-        if not self._queue or self._up:
+        if not self._queue or any(member.greeting is not None for member in self._members):
             self._stop_waiting()
         elif not self._members:
             self._fail_waiting(self._no_worker())

@@ -2,7 +2,8 @@
 
 - `RayWorker` is this program's side, `SimulatorProcess` runs inside the actor. `ray_pool` makes a pool of them.
 - `Packer` and `unpack` transfer meshes as bytes, since a path is valid on one machine only. Both machines then have
-  the same content, so that everything derived from it (distance grids, outcomes) has the same keys.
+  the same content, so that everything derived from it (distance grids, outcomes) has the same keys. `portable` does the
+  same for any value that contains meshes, such as the plan of a study.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ import asyncio
 import contextlib
 import dataclasses
 import hashlib
+import io
 import os
+import pickle
 import socket
 import tempfile
 import time
@@ -220,7 +223,7 @@ class Packer:
         def packed(vessel: VesselSpec) -> VesselSpec:
             if not isinstance(vessel.shape, MeshShape):
                 return vessel
-            mesh = self._serialized(vessel.shape)
+            mesh = self.serialized(vessel.shape)
             meshes.append(mesh)
             return _with_path(vessel, vessel.shape, mesh.key)
 
@@ -236,7 +239,12 @@ class Packer:
                 self._references[mesh.key] = ray.put(mesh)
         return packed, [self._references[mesh.key] for mesh in meshes]
 
-    def _serialized(self, shape: MeshShape) -> SerializedMesh:
+    def serialized(self, shape: MeshShape) -> SerializedMesh:
+        """The file of a mesh.
+
+        Raises:
+            SimulationError: it cannot be read.
+        """
         if shape not in self._meshes:
             try:
                 content = shape.path.read_bytes()
@@ -245,6 +253,42 @@ class Packer:
             key = Path(hashlib.sha256(content).hexdigest()[:24]) / shape.path.name
             self._meshes[shape] = SerializedMesh(key, np.frombuffer(content, np.uint8))
         return self._meshes[shape]
+
+
+def portable(value: Any) -> bytes:
+    """Serialize a value for another machine, with the content of its meshes.
+
+    Raises:
+        SimulationError: a mesh cannot be read.
+    """
+    content = io.BytesIO()
+    _PortablePickler(content, pickle.HIGHEST_PROTOCOL).dump(value)
+    return content.getvalue()
+
+
+def from_portable(content: bytes) -> Any:
+    """Return the value of `portable`, with its meshes as files of this machine.
+
+    Raises:
+        OSError: the cache directory cannot be written.
+    """
+    return pickle.loads(content)
+
+
+class _PortablePickler(pickle.Pickler):
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self._packer = Packer()
+
+    def reducer_override(self, value: Any) -> Any:
+        if type(value) is not MeshShape:
+            return NotImplemented
+        values = {name: getattr(value, name) for name in MeshShape.model_fields if name != "path"}
+        return _written_mesh, (values, self._packer.serialized(value))
+
+
+def _written_mesh(values: Mapping[str, Any], mesh: SerializedMesh) -> MeshShape:
+    return MeshShape(path=_write(mesh), **values)
 
 
 def unpack(task: PourTask, meshes: Sequence[SerializedMesh]) -> PourTask:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     )
     from actors.arm.arm_settings import ArmDiagnostics, ArmSettings
     from actors.arm.planned_pour import ExecutedMotion, MotionPath
-    from actors.balance.balance_interface import BalanceDriver, Weight
+    from actors.balance.balance_interface import BalanceDriver, ReferenceLostError, Weight
     from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, SerialBalanceSettings
     from actors.balance.dialects.dialect import Dialect, LineSettings
     from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingStatus, Reply
@@ -201,6 +201,7 @@ __all__ = [
     "Quantity",
     "Reading",
     "ReadingStatus",
+    "ReferenceLostError",
     "RegressionQuery",
     "Reply",
     "Request",
@@ -315,7 +316,7 @@ _SOURCES = {
     # Objectives
     "orchestrator.strategies.deployment.objectives": ("Objective", "Objectives"),
     # Balances
-    "actors.balance.balance_interface": ("BalanceDriver", "Weight"),
+    "actors.balance.balance_interface": ("BalanceDriver", "ReferenceLostError", "Weight"),
     "actors.balance.balance_settings": ("BalanceSettings", "BalanceEmulator", "SerialBalanceSettings"),
     "actors.balance.dialects.dialect": ("Dialect", "LineSettings"),
     "actors.balance.readings": ("Acknowledgement", "LineError", "Reading", "ReadingStatus", "Reply"),

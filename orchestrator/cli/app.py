@@ -246,6 +246,13 @@ _add(
 _add(
     queue_commands.shutdown, "decant server stop   # finishes and weighs a pour that has begun", name="stop", to=_server
 )
+_add(
+    station_commands.serve_sila,
+    "decant server sila   # for the daemon of this machine, on loopback",
+    "decant server sila --host 192.0.2.7 --certificate station.pem --key station.key --clients authority.pem",
+    name="sila",
+    to=_server,
+)
 _add(station_commands.backup, "decant server backup decant-2030-03-01.zip", to=_server)
 _add(station_commands.restore, "decant server restore decant-2030-03-01.zip --state ./restored", to=_server)
 

@@ -1,7 +1,8 @@
-"""Commands for pours and batches of the daemon, and for backups of its state."""
+"""Commands for pours and batches of the daemon, for its SiLA 2 server, and for backups of its state."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 from pathlib import Path
@@ -125,6 +126,49 @@ def reserve(
     with connected_client(url, state) as client:
         found = client.post("/reservations", {"rig": rig, "begins": now, "ends": now + 3600.0 * hours, "note": note})
     print(f"reservation {found['id']}: {rig} until {time.strftime('%H:%M', time.localtime(found['ends']))}")
+
+
+def serve_sila(
+    url: Url = None,
+    state: State = None,
+    host: Annotated[str, typer.Option(help="Address to listen at; another one than loopback needs TLS.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 selects a free one.")] = 50052,
+    certificate: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Certificate for TLS (PEM).", show_default=False)
+    ] = None,
+    key: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Key of the certificate (PEM).", show_default=False)
+    ] = None,
+    clients: Annotated[
+        Path | None,
+        typer.Option(
+            exists=True, dir_okay=False, help="Admit only clients with a certificate of this authority (PEM).",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:  # fmt: skip
+    """Serve a running daemon to SiLA 2 clients: pour, weigh, run a campaign, observe the state.
+
+    It is a process of its own over the daemon's HTTP API, with an operator's token. Ending it ends no pour. The
+    motion of hardware is enabled with 'decant queue enable' only.
+    """
+    from orchestrator.run_errors import RunError
+    from sim_engine.resources import MissingExtraError, require
+
+    with Refused(MissingExtraError):
+        require("unitelabs", "the SiLA 2 server")
+    from orchestrator.daemon import sila_server
+
+    with connected_client(url, state) as client:
+        client.get("/status")
+        files = {"certificate": certificate, "key": key, "clients": clients}
+        told = "with TLS" if certificate is not None else "without encryption"
+
+        def ready(address: str) -> None:
+            print_message(f"serving SiLA 2 at {address} {told}, for the daemon at {client.url}; Ctrl-C ends it")
+
+        with Refused(RunError):
+            asyncio.run(sila_server.serve(client, ready, host=host, port=port, **files))
 
 
 def backup(

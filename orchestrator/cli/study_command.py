@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Json, Quiet
-from orchestrator.cli.console import INTERRUPTED, RefusalError, Refused, print_json, print_note
+from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, Refused, print_json, print_note
 from orchestrator.cli.shell_completion import files_of
 
 if TYPE_CHECKING:
+    from actors.laboratory_settings import RaySettings
     from orchestrator.study.study_plan import StudyCell, StudyPlan
-    from orchestrator.study.study_runner import CellStatus
+    from orchestrator.study.study_runner import CellStatus, CellWorkers
 
 SHOWN_FAILURES = 5
 
@@ -31,7 +32,13 @@ StudyPath = Annotated[
 def run_study(
     file: StudyPath,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="Number of parallel processes; default: one per core.", show_default=False)
+        int | None, typer.Option(min=1, help="Number of cells at a time; default: one per core.", show_default=False)
+    ] = None,
+    ray: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT", help="Run the cells on the Ray cluster with this head node.", show_default=False
+        ),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
@@ -42,12 +49,13 @@ def run_study(
     """Compare C1 to C4 and D1 to D3 with repetitions, on virtual benches that differ more or less from the simulator.
 
     Figures (PNG, SVG, CSV), tables and a page are written to runs/study-NAME/report/. Run the same command again to
-    continue a study that was stopped or killed.
+    continue a study that was stopped or killed, also on a cluster (--ray) or without it.
     """
     from orchestrator.study.study_folder import StudyError, check_settings, opened
     from orchestrator.study.study_plan import cells_of
 
     plan = read_study(file)
+    cluster = None if ray is None or dry_run else _checked_cluster(ray)
     cells = cells_of(plan)
     with Refused(StudyError):
         if dry_run:
@@ -55,7 +63,8 @@ def run_study(
             _print_remaining(plan, cells, as_json)
             return
         with opened(plan) as folder:
-            status = _run(plan, folder, jobs or os.cpu_count() or 1, file)
+            with _workers(plan, folder, jobs, cluster) as workers:
+                status = _run(plan, folder, workers, file)
             page = _report(plan, folder)
     if as_json:
         _print_result(plan, folder, page, len(cells), len(status.finished))
@@ -65,6 +74,39 @@ def run_study(
         lines += [f"  {name}: {why}" for name, why in shown]
         lines.append(f"finished cells are kept; correct that and continue with: decant study run {file}")
         raise RefusalError("\n".join(lines))
+
+
+def _checked_cluster(address: str) -> RaySettings:
+    from pydantic import ValidationError
+
+    from actors.interfaces import LaboratoryError
+    from actors.laboratory_settings import RaySettings
+    from actors.runtime.ray_cluster import check_cluster
+
+    try:
+        settings = RaySettings(address=address)
+    except ValidationError as error:
+        raise RefusalError(f"--ray: {error.errors()[0]['msg']}", BAD_INPUT) from None
+    print_note(f"looking at the Ray cluster at {address} …")
+    with Refused(LaboratoryError, at="--ray: "):
+        check_cluster(settings, need_bench=False)
+    return settings
+
+
+@contextlib.contextmanager
+def _workers(plan: StudyPlan, folder: Path, jobs: int | None, cluster: RaySettings | None) -> Iterator[CellWorkers]:
+    """The workers for the cells: child processes, or tasks on a cluster that is joined as long as this."""
+    from orchestrator.study.study_runner import LocalCells
+
+    if cluster is None:
+        yield LocalCells(plan, folder, jobs or os.cpu_count() or 1)
+        return
+    from actors.interfaces import LaboratoryError
+    from actors.runtime.ray_tasks import ClusterTasks
+    from orchestrator.study.cluster_cells import ClusterCells
+
+    with Refused(LaboratoryError), ClusterTasks(cluster) as tasks:
+        yield ClusterCells(plan, folder, tasks, jobs)
 
 
 def report_study(file: StudyPath, as_json: Json = False, quiet: Quiet = False) -> None:
@@ -139,7 +181,7 @@ def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: boo
     )
 
 
-def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
+def _run(plan: StudyPlan, folder: Path, workers: CellWorkers, path: Path) -> CellStatus:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -151,7 +193,7 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
     finished = finished_results(folder, cells)
     if len(finished) < len(cells) and (text := code_warning(finished)) is not None:
         print_note(text)
-    print_note(f"study {folder}, {jobs} at a time")
+    print_note(f"study {folder}, {workers.slots} at a time")
     columns = [TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[left]}")]
     try:
         with Progress(*columns, console=Console(stderr=True)) as bar, _ending_like_ctrl_c():
@@ -159,10 +201,10 @@ def _run(plan: StudyPlan, folder: Path, jobs: int, path: Path) -> CellStatus:
 
             def watch(status: CellStatus) -> None:
                 known = len(status.finished) + len(status.failed) + len(status.skipped)
-                text = f"about {_duration(status.seconds_left(jobs))} left" if status.running else ""
+                text = f"about {_duration(status.seconds_left(workers.slots))} left" if status.running else ""
                 bar.update(task, total=status.cells, completed=known, left=text)
 
-            return run_cells(plan, folder, jobs=jobs, watch=watch)
+            return run_cells(plan, folder, workers, watch=watch)
     except KeyboardInterrupt:
         raise RefusalError(
             f"interrupted; nothing is lost. Continue with: decant study run {path}", INTERRUPTED

@@ -16,7 +16,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from actors.laboratory_settings import LaboratorySettings
+from actors.laboratory_settings import LaboratorySettings, RayAddress, RaySettings
 from orchestrator.catalogue.run_registry import state_directory
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.config.yaml.file_access import missing_file, resolved
@@ -108,6 +108,13 @@ class RecordingsSettings(Settings):
     """Largest age of a recording; unlimited by default."""
 
 
+class ClusterSettings(Settings):
+    """A Ray cluster for the simulators. Arms, balances and benches of all rigs stay on the daemon's machine."""
+
+    address: RayAddress
+    """Address of its head node, host:port."""
+
+
 class DaemonFile(Settings):
     """Settings of a daemon."""
 
@@ -124,7 +131,10 @@ class DaemonFile(Settings):
     """Folders for campaigns that are submitted by path, with all files they refer to; none by default."""
 
     simulators: Annotated[Count, Field(le=10_000)] = 0
-    """Simulators in the pool that all campaigns share; 0: one per core."""
+    """Simulators in the pool that all campaigns share; 0: one per core of this machine or of the cluster."""
+
+    ray: ClusterSettings | None = None
+    """The Ray cluster on which the simulators run; unless given, a private Ray on this machine."""
 
     in_process: Switch = False
     """Use one simulator in the daemon's own process, without Ray; for trying Decant out."""
@@ -183,6 +193,7 @@ class DaemonSettings:
     rigs: tuple[Rig, ...] = (Rig(ANY_RIG),)
     roots: tuple[Path, ...] = ()
     simulators: int = 0
+    ray: RaySettings | None = None
     in_process: bool = False
     keep_recordings: int | None = None
     recording_age: float | None = None
@@ -260,7 +271,7 @@ def _rig(name: str, source: Path, at: Place, report: Report) -> list[Rig]:
     if not spec.pours:
         report.add(at, "has no bench; campaigns that pour nothing need no rig")
     if spec.ray is not None:
-        report.add(at, "is on a Ray cluster; a daemon's simulators are on its own machine: leave 'ray' out")
+        report.add(at, "names a Ray cluster; all rigs share the daemon's simulators: move 'ray' to the daemon's file")
     return [Rig(name, source, spec)]
 
 
@@ -321,6 +332,10 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
             report.add(place.at("madsci", "allow"), f"{error}; write addresses such as 192.0.2.10 or 192.0.2.0/28")
     if file.notify is not None:
         _check_receivers(file.notify, place.at("notify"), report)
+    if file.ray is not None and file.in_process:
+        report.add(
+            place.at("ray"), "a daemon without Ray ('in_process: true') uses no cluster; remove one of them", key=True
+        )
     state = path(file.state, place)
     if state is not None and state.exists() and not state.is_dir():
         report.add(place.at("state"), f"{state} is not a folder")
@@ -334,6 +349,7 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
         rigs=tuple(rigs) or (Rig(ANY_RIG),),
         roots=tuple(roots),
         simulators=file.simulators,
+        ray=None if file.ray is None or report.problems else RaySettings(address=file.ray.address),
         in_process=file.in_process,
         keep_recordings=file.recordings.keep,
         recording_age=file.recordings.age,

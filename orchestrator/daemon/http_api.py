@@ -7,15 +7,18 @@ No call reaches a device, except the commands that stop motion.
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI, Response
+from fastapi import FastAPI, Request, Response
+from fastapi.responses import JSONResponse
 
 from orchestrator.daemon import archive_routes, command_routes, query_routes, station_routes
 from orchestrator.daemon.access_control import Daemon, RequestGuard
 from orchestrator.daemon.access_tokens import Tokens
+from orchestrator.daemon.daemon_store import StoreError
 from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.page import page_router
 from orchestrator.daemon.schemas import HealthOut, ProblemOut
@@ -24,6 +27,8 @@ from orchestrator.strategies.stage_result import ResultPart
 from sim_engine.settings.model import meanings
 
 V1 = "/api/v1"
+
+_log = logging.getLogger(__name__)
 
 _ERRORS: dict[int | str, dict[str, Any]] = {
     code: {"model": ProblemOut, "description": text}
@@ -67,6 +72,8 @@ def create_app() -> FastAPI:
         responses={503: {"model": HealthOut, "description": "Not ready; the problems give the reasons."}},
     )
     app.include_router(page_router())
+    for kind in (StoreError, OSError):
+        app.add_exception_handler(kind, _not_stored)
     app.state.live = _nowhere
     app.state.shutdown = _nothing
     return app
@@ -123,6 +130,12 @@ async def _readiness(daemon: Daemon, response: Response) -> HealthOut:
         problems.append("ending")
     response.status_code = 503 if problems else 200
     return HealthOut(ok=not problems, problems=problems)
+
+
+async def _not_stored(request: Request, error: Exception) -> JSONResponse:
+    """Refuse a command that could not be stored; the log has the paths."""
+    _log.error("%s %s: %s", request.method, request.url.path, error)
+    return JSONResponse({"detail": "the daemon can't use its disk; is it full? Make room, then repeat the call"}, 507)
 
 
 def _nowhere(campaign: str | None) -> str | None:

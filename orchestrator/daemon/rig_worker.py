@@ -152,6 +152,7 @@ class Running:
         return RunResources(
             in_process=self._shared.settings.in_process,
             simulators=self._shared.warm.share(),
+            ray=self._shared.warm.ray,
             optimizer=self._shared.warm.optimizer(),
             operator=RemoteOperator(asking, key, rig, self._announce) if asks else None,
             ask_operator=RunQuestions(asking, self._shared.store, key, rig, load, lambda: self._look(plan)),

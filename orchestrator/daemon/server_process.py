@@ -26,6 +26,8 @@ import uvicorn
 from fastapi import FastAPI
 from pythonjsonlogger.json import JsonFormatter
 
+from actors.interfaces import LaboratoryError
+from actors.runtime.ray_cluster import check_cluster
 from orchestrator.catalogue.run_registry import make_state_directory, use_state_directory
 from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
@@ -184,11 +186,18 @@ def serve(settings: DaemonSettings, ready: Callable[[str], None] = lambda url: N
         ready: called with the URL once it is served.
 
     Raises:
-        RunError: the state directory is in use, the tokens are readable by others, or the port is taken.
+        RunError: the Ray cluster can't be used, the state directory is in use, the tokens are readable by others, or
+            the port is taken.
     """
     os.umask(0o077)
+    restart = DaemonRestart()
+    if settings.ray is not None and not settings.in_process:
+        try:
+            check_cluster(settings.ray, need_bench=False)
+        except LaboratoryError as error:
+            raise ServeError(str(error)) from None
     use_state_directory(settings.state)
-    asyncio.run(_serve(settings, ready, DaemonRestart()))
+    asyncio.run(_serve(settings, ready, restart))
 
 
 async def _serve(settings: DaemonSettings, ready: Callable[[str], None], restart: DaemonRestart) -> None:

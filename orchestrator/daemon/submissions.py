@@ -171,6 +171,8 @@ def run_request(
     theta = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
     # A daemon never repeats a pour by itself: it asks the operator, whatever the campaign says.
     plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
+    # All campaigns use the daemon's simulators. A submission must not make the daemon connect to another machine.
+    plan = replace(plan, laboratory=plan.laboratory.with_values(ray=None))
     if plan.dispense is not None and vessels:
         named = {name: vessels[name] for name in plan.dispense.sources if name in vessels}
         plan = replace(plan, dispense=replace(plan.dispense, vessels=named))

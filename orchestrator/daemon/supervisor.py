@@ -64,7 +64,9 @@ class Supervisor:
         self.store = Store(settings.state / "daemon.sqlite")
         self.feed = Feed(settings.state / "events.sqlite", settings.events, self._feed_broken)
         self.asking = Asking(self.store, self.feed.publish)
-        self.warm = WarmSimulators(settings.simulators, in_process=settings.in_process, tell=self._warn)
+        self.warm = WarmSimulators(
+            settings.simulators, in_process=settings.in_process, ray=settings.ray, tell=self._warn
+        )
         self._shared = SharedServices(settings, self.store, self.feed, self.asking, self.warm, live)
         self.workers: dict[str, RigWorker] = {
             rig.name: RigWorker(self, rig, self._shared) for rig in (*settings.rigs, Rig(NO_RIG))

@@ -71,7 +71,8 @@ class DisplayedMap(ResultPart):
     """Posterior standard deviation, in the unit of the cost."""
 
 
-_SUFFIX = {"deg/s": "deg_s", "deg/s^2": "deg_s2", "deg": "deg", "mm": "mm", "s": "s"}
+UNIT_SUFFIXES = {"deg/s": "deg_s", "deg/s^2": "deg_s2", "deg": "deg", "mm": "mm", "s": "s"}
+"""How the names of columns end, by display unit of an action dimension."""
 
 
 def displayed_action(values: Mapping[str, float | None]) -> dict[str, float | None]:
@@ -79,7 +80,7 @@ def displayed_action(values: Mapping[str, float | None]) -> dict[str, float | No
     shown: dict[str, float | None] = {}
     for name, value in values.items():
         dimension = ACTION_DIMENSIONS[name]
-        shown[f"{name}_{_SUFFIX[dimension.display_unit]}"] = None if value is None else value / dimension.factor
+        shown[f"{name}_{UNIT_SUFFIXES[dimension.display_unit]}"] = None if value is None else value / dimension.factor
     return shown
 
 

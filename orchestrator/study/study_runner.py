@@ -1,7 +1,8 @@
 """Runs the cells of a study in child processes: `python -m orchestrator.study.study_runner STUDY.yaml` is one.
 
-- `run_cells` starts each cell as soon as the cells that it needs are finished, several at a time. `CellProcess` is one
-  child process, `CellStatus` the progress.
+- `run_cells` starts each cell as soon as the cells that it needs are finished, several at a time. `CellStatus` is the
+  progress. `CellWorkers` run the cells: `LocalCells` in child processes (`CellProcess`) of this machine,
+  `cluster_cells.ClusterCells` on a Ray cluster.
 - `work` is the loop of a child process. Each line of its stdin names a cell, each line of its stdout is the JSON list
   [cell, error or null]. The process and its simulator are kept, since starting Python, Taichi and its kernels takes
   longer than a small cell.
@@ -22,6 +23,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
@@ -130,56 +132,106 @@ class CellProcess:
         self.child.release()
 
 
+class CellWorkers(Protocol):
+    """Runs cells, several at a time."""
+
+    @property
+    def slots(self) -> int:
+        """Number of cells at a time; it may change."""
+        ...
+
+    def begin(self, cell: StudyCell) -> None:
+        """Start a cell. Does not wait."""
+        ...
+
+    def ended(self) -> Iterable[tuple[StudyCell, str | None]]:
+        """The cells that have ended since the last call, with their errors. Does not wait."""
+        ...
+
+    def close(self) -> None:
+        """End the cells that run."""
+        ...
+
+
+class LocalCells:
+    """`CellWorkers` in child processes. When they are ended, the cells' journals contain their progress.
+
+    Args:
+        study: the study.
+        folder: folder of the study.
+        jobs: number of processes.
+        command: command of a process.
+    """
+
+    def __init__(
+        self,
+        study: StudyPlan,
+        folder: Path,
+        jobs: int,
+        command: Callable[[StudyPlan], list[str]] = cell_command,
+    ) -> None:
+        self._study, self._folder, self._command = study, folder, command
+        self.slots = max(jobs, 1)
+        self._processes: list[CellProcess] = []
+        self._started = 0
+
+    def begin(self, cell: StudyCell) -> None:
+        """See `CellWorkers.begin`."""
+        idle = next((process for process in self._processes if process.cell is None), None)
+        if idle is None:
+            self._started += 1
+            idle = CellProcess(self._command(self._study), self._folder / LOG.format(self._started))
+            self._processes.append(idle)
+        idle.begin(cell)
+
+    def ended(self) -> Iterator[tuple[StudyCell, str | None]]:
+        """See `CellWorkers.ended`."""
+        for process in list(self._processes):
+            if (end := process.ended()) is not None:
+                yield end
+            if process.dead:
+                process.close()
+                self._processes.remove(process)
+
+    def close(self) -> None:
+        """See `CellWorkers.close`."""
+        _end(self._processes)
+
+
 def run_cells(
-    study: StudyPlan,
-    folder: Path,
-    *,
-    jobs: int,
-    watch: Watch = lambda status: None,
-    command: Callable[[StudyPlan], list[str]] = cell_command,
+    study: StudyPlan, folder: Path, workers: CellWorkers, *, watch: Watch = lambda status: None
 ) -> CellStatus:
     """Run all cells that are not finished. A failed cell is recorded, and the others continue.
 
-    On an interrupt (KeyboardInterrupt) the cells' processes are ended first; their journals contain the progress.
+    On an interrupt (KeyboardInterrupt) the workers are closed first.
 
     Args:
         folder: folder of the study, locked by this process.
-        jobs: number of cells at a time.
+        workers: run the cells; they are closed at the end.
     """
     cells = cells_of(study)
     cost = {cell.id: estimated_seconds(study, cell) for cell in cells}
     status = CellStatus(len(cells), {cell.id for cell in cells if is_finished(folder, cell.id)})
     waiting = [cell for cell in cells if cell.id not in status.finished]
     status.cost_left = sum(cost[cell.id] for cell in waiting)
-    processes: list[CellProcess] = []
-    started = 0
     begun = time.monotonic()
     watch(status)
     try:
         while waiting or status.running:
             _skip(waiting, status)
             ready = [cell for cell in waiting if status.finished.issuperset(cell.needs)]
-            idle = [process for process in processes if process.cell is None]
-            for cell in ready[: max(jobs, 1) - len(status.running)]:
-                if not idle:
-                    started += 1
-                    processes.append(CellProcess(command(study), folder / LOG.format(started)))
-                    idle = processes[-1:]
+            for cell in ready[: max(workers.slots - len(status.running), 0)]:
                 waiting.remove(cell)
-                idle.pop().begin(cell)
+                workers.begin(cell)
                 status.running.add(cell.id)
-            for process in list(processes):
-                if (end := process.ended()) is not None:
-                    _note(*end, folder, cost, status)
-                if process.dead:
-                    process.close()
-                    processes.remove(process)
+            for cell, problem in workers.ended():
+                _note(cell, problem, folder, cost, status)
             status.seconds = time.monotonic() - begun
             watch(status)
             if status.running:
                 time.sleep(WAKE)
     finally:
-        _end(processes)
+        workers.close()
     return status
 
 

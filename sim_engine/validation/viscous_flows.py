@@ -293,8 +293,9 @@ THETA = SimulationParameters(cohesion=0.0, xsph_rate=0.0)
 
 FLOOR = (
     "Taylor and Green's vortices in a tank with slippery walls die away as exp(−2νk²t), whatever their speed. What is "
-    "found above the given viscosity is the solver's own: under pressure the packing of particles is a weak solid, and "
-    "what is taken out of its stress inside is left beside walls and the surface."
+    "found above the given viscosity is the solver's own: under pressure the packing of particles is a weak solid. What "
+    "is missing is friction near walls and the surface, where particles lack neighbours. The solver's correction was "
+    "chosen at 2,025 particles."
 )
 FILM = "A film of 10 mm, ν = 1,000 mm²/s, runs down a plane of 20°: mean velocity g sin α e²/3ν (Nusselt 1916)."
 TUBE = (

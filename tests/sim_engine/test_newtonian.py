@@ -42,7 +42,7 @@ def test_a_puddle_of_syrup_spreads_as_huppert_says(simulator: PourSimulator) -> 
 @pytest.mark.slow
 def test_the_packing_adds_little_to_a_viscosity_however_slow_the_shear(simulator: PourSimulator) -> None:
     value, _, _ = thick.own_viscosity(1_000, 1e-4, 0.05)
-    assert value < 6e-4  # it was 11e-4 before the packing's stress was taken out of the velocities
+    assert value == pytest.approx(1e-4, rel=0.5)  # 4.3e-4 if the packing keeps its resistance next to walls
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """A daemon on a toy laboratory as a process of its own, which a test kills at a chosen stage of an ordered pour.
 
-`python -m tests.support.station_process FOLDER STAGE` prints its URL. Every pour that the bench makes adds a line to
-FOLDER/poured.
+`python -m tests.support.station_process FOLDER STAGE [PORT NODE_PORT]` prints its URL and that of its MADSci node.
+Every pour that the bench makes adds a line to FOLDER/poured. In the stage 'held' a pour ends when FOLDER/go exists.
 """
 
 from __future__ import annotations
@@ -85,10 +85,12 @@ class CountingBench(HeldBench):
             os.fsync(file.fileno())
         if self._stage == "pouring":
             die()
+        while self._stage == "held" and not (self._path.parent / "go").exists():
+            await asyncio.sleep(0.02)
         return await super().pour(scene, action, **more)
 
 
-async def serve(folder: Path, stage: str) -> None:
+async def serve(folder: Path, stage: str, port: int = 0, node_port: int = 0) -> None:
     import actors.laboratory
     from orchestrator.daemon.access_control import Tokens
     from tests.support.toy_campaign import ToyOptimizer, ToySimulators
@@ -99,41 +101,53 @@ async def serve(folder: Path, stage: str) -> None:
     actors.laboratory.open_laboratory = open_laboratory  # type: ignore[assignment]
     state = folder / "state"
     state.mkdir(exist_ok=True)
-    settings = DaemonSettings(state, in_process=True, keep_free=0, quick_start=False, rigs=rigs_in(folder))
+    settings = DaemonSettings(
+        state, in_process=True, keep_free=0, quick_start=False, rigs=rigs_in(folder), roots=(folder,)
+    )
     die_at(stage)
     daemon = Supervisor(settings)
     app = serve_app(daemon, Tokens(settings.tokens), lambda: None)
-    server = uvicorn.Server(uvicorn.Config(app, log_config=None, lifespan="off", access_log=False))
-    server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign, assignment]
-    listening = socket.socket()
-    listening.bind(("127.0.0.1", 0))
+    node = create_node(daemon, app.state.ordering, MadsciSettings(allow=["127.0.0.1"]))
+    sockets = [listener(port), listener(node_port)]
     await daemon.start()
-    if stage == "node":
-        node = create_node(daemon, app.state.ordering, MadsciSettings(allow=["127.0.0.1"]))
-        server.config = uvicorn.Config(node, log_config=None, lifespan="off", access_log=False)
-    if stage in ("node", "station"):
+    if stage in ("node", "station", "held"):
         materials = Materials(daemon.store)
         materials.add_liquid("water", "", {})
-        for vessel, shape in (("beaker", BEAKER), ("vial-1", VIAL)):
+        for vessel, shape in (("beaker", BEAKER), ("vial-1", VIAL), *([("vial-2", VIAL)] if stage == "held" else [])):
             materials.add_vessel(vessel, "", shape, "", "test")
         materials.weigh("beaker", 0.1, 1e-4, "water", "test")
-    listening.listen()  # a client may connect as soon as it knows the address
-    print(f"http://127.0.0.1:{listening.getsockname()[1]}", flush=True)
-    await server.serve([listening])
+    for each in sockets:
+        each.listen()  # a client may connect as soon as it knows the address
+    print(*(f"http://127.0.0.1:{each.getsockname()[1]}" for each in sockets), flush=True)
+    await asyncio.gather(*(server_of(one).serve([each]) for one, each in zip((app, node), sockets, strict=True)))
+
+
+def listener(port: int) -> socket.socket:
+    made = socket.socket()
+    made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # a daemon that was killed had this port
+    made.bind(("127.0.0.1", port))
+    return made
+
+
+def server_of(app: Any) -> uvicorn.Server:
+    server = uvicorn.Server(uvicorn.Config(app, log_config=None, lifespan="off", access_log=False))
+    server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign, assignment]
+    return server
 
 
 @contextlib.contextmanager
-def node_process(folder: Path, served: str = "node") -> Iterator[str]:
-    """Run the daemon with a filled beaker; yields the URL of its 'node' for MADSci, or of the 'station'."""
+def station_process(folder: Path, stage: str, *ports: int) -> Iterator[tuple[str, str, subprocess.Popen[str]]]:
+    """Run the daemon; yields its URL, that of its MADSci node, and the process."""
     process = subprocess.Popen(
-        [sys.executable, "-m", __name__, str(folder), served],
+        [sys.executable, "-m", __name__, str(folder), stage, *map(str, ports)],
         stdout=subprocess.PIPE,
         text=True,
         env=child_environment(),
     )
     try:
         assert process.stdout is not None
-        yield process.stdout.readline().strip()
+        url, node = process.stdout.readline().split()
+        yield url, node, process
     finally:
         process.kill()
         process.wait()
@@ -141,5 +155,12 @@ def node_process(folder: Path, served: str = "node") -> Iterator[str]:
             process.stdout.close()
 
 
+@contextlib.contextmanager
+def node_process(folder: Path, served: str = "node") -> Iterator[str]:
+    """Run the daemon with a filled beaker; yields the URL of its 'node' for MADSci, or of the 'station'."""
+    with station_process(folder, served) as (url, node, _):
+        yield node if served == "node" else url
+
+
 if __name__ == "__main__":
-    asyncio.run(serve(Path(sys.argv[1]), sys.argv[2]))
+    asyncio.run(serve(Path(sys.argv[1]), sys.argv[2], *map(int, sys.argv[3:])))

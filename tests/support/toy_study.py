@@ -20,7 +20,7 @@ from orchestrator.run_service import RunResources
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import opened
 from orchestrator.study.study_plan import StudyPlan
-from orchestrator.study.study_runner import CellStatus, run_cells, work
+from orchestrator.study.study_runner import CellStatus, LocalCells, run_cells, work
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome, SimulatedPour
@@ -94,7 +94,7 @@ def toy_command(study: StudyPlan) -> list[str]:
 def run_toy_study(study: StudyPlan, **arguments: Any) -> CellStatus:
     """As the command does."""
     with opened(study) as folder:
-        return run_cells(study, folder, jobs=2, command=toy_command, **arguments)
+        return run_cells(study, folder, LocalCells(study, folder, 2, toy_command), **arguments)
 
 
 def main() -> int:

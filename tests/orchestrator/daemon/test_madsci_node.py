@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import subprocess
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -13,13 +11,16 @@ from typing import Any
 import httpx
 import pytest
 
-from actors.runtime.child_process import child_environment
-from orchestrator.daemon.access_tokens import Role
+from orchestrator.daemon.access_tokens import Role, token_of
+from orchestrator.daemon.daemon_client import Client
 from orchestrator.daemon.daemon_settings import MadsciSettings
 from orchestrator.daemon.madsci_node import create_node, new_ulid
 from orchestrator.daemon.ordering import Ordering
+from tests.support.other_environments import line, python_with, running, told
 from tests.support.station import order, rigs_in, set_up, until_pour
+from tests.support.station_process import node_process, station_process
 from tests.support.toy_daemon import Served, held, run, serving
+from tests.support.waiting import PATIENCE, wait_for
 
 ARGS = {
     "source": "beaker",
@@ -66,9 +67,9 @@ def test_a_started_action_is_poured_once_however_often_its_start_is_repeated(tmp
                 history = (await http.get("/action", params={"action_id": key})).json()
                 assert history[key][0]["status"] == "succeeded"
                 wrong = await created(http, source="nothing")
-                told = (await http.post(f"/action/pour/{wrong}/start")).json()
-                assert told["status"] == "failed"
-                assert "there is no vessel 'nothing'" in told["errors"][0]["message"]
+                refused = (await http.post(f"/action/pour/{wrong}/start")).json()
+                assert refused["status"] == "failed"
+                assert "there is no vessel 'nothing'" in refused["errors"][0]["message"]
         async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
             assert (await http.get("/info")).json()["node_id"] == info["node_id"]
             assert (await http.get(f"/action/{key}/result")).json()["status"] == "succeeded"
@@ -87,9 +88,9 @@ def test_admin_commands_stop_and_hold_the_node_and_only_a_person_clears_a_stop(t
 
                 assert (await admin("AdminCommands.LOCK"))["success"]
                 key = await created(http)
-                told = (await http.post(f"/action/pour/{key}/start")).json()
-                assert told["status"] == "not_ready"
-                assert told["errors"][0]["message"] == "the node is locked"
+                refused = (await http.post(f"/action/pour/{key}/start")).json()
+                assert refused["status"] == "not_ready"
+                assert refused["errors"][0]["message"] == "the node is locked"
                 assert (await admin("unlock"))["success"]
                 await http.post(f"/action/pour/{key}/start")
                 laboratory = await served.pouring()
@@ -151,28 +152,118 @@ print("TOLD " + json.dumps(told))
 @pytest.mark.slow
 def test_the_unmodified_client_of_madsci_pours(tmp_path: Path) -> None:
     """Set $DECANT_MADSCI_PYTHON to an interpreter with madsci.client 0.8.1 in an environment of its own."""
-    python = os.environ.get("DECANT_MADSCI_PYTHON")
-    if not python:
-        pytest.skip("no environment with madsci.client ($DECANT_MADSCI_PYTHON)")
-    from tests.support.station_process import node_process
-
+    python = python_with("madsci.client", "MADSCI")
     with node_process(tmp_path) as url:
-        arguments = {"source": "beaker", "receiver": "vial-1"}
-        done = subprocess.run(
-            [python, "-c", CLIENT, url, json.dumps(arguments)],
-            capture_output=True,
-            text=True,
-            timeout=600,
-            check=False,
-            env=child_environment(),
-        )
-    assert done.returncode == 0, done.stderr[-3000:]
-    told = json.loads(next(line for line in done.stdout.splitlines() if line.startswith("TOLD "))[5:])
-    assert told["predicted"] == told["poured"] == "succeeded"
-    assert told["refused"] == "failed"
-    assert told["safety_stop"]
-    assert told["stopped"]
-    assert told["history"] == 3
+        found = told(python, CLIENT, url, json.dumps({"source": "beaker", "receiver": "vial-1"}))
+    assert found["predicted"] == found["poured"] == "succeeded"
+    assert found["refused"] == "failed"
+    assert found["safety_stop"]
+    assert found["stopped"]
+    assert found["history"] == 3
+
+
+PATIENT = """
+import json, sys, time
+import httpx
+from madsci.client.node.rest_node_client import RestNodeClient
+from madsci.common.types.action_types import ActionRequest
+from madsci.common.types.node_types import AdminCommands
+client = RestNodeClient(url=sys.argv[1])
+def started(receiver="vial-1"):
+    action = {"angular_velocity": "100 deg/s", "x_offset": "70 mm"}
+    args = {"source": "beaker", "receiver": receiver, "action": action, "predict": False}
+    return client.send_action(ActionRequest(action_name="pour", args=args), await_result=False)
+def settled(key):
+    while True:
+        try:
+            return client.await_action_result(key, timeout=500)
+        except httpx.TransportError:  # the daemon is restarted, and the three repetitions of the client have failed
+            time.sleep(0.2)
+"""
+
+CANCEL = """
+pouring = started()
+waiting = started("vial-2")
+print("STARTED", flush=True)
+sys.stdin.readline()
+cancelled = client.send_admin_command(AdminCommands.CANCEL).success
+left = settled(waiting.action_id)
+print("CANCELLED", flush=True)
+found = settled(pouring.action_id)
+print("TOLD " + json.dumps({"cancelled": cancelled, "waiting": left.status.value, "pouring": found.status.value,
+    "received": found.json_result["result"]["received_g"], "busy": client.get_status().busy}), flush=True)
+"""
+
+
+@pytest.mark.slow
+def test_a_cancel_of_madsci_ends_what_waits_and_finishes_the_pour_that_has_begun(tmp_path: Path) -> None:
+    python = python_with("madsci.client", "MADSCI")
+    with station_process(tmp_path, "held") as (_, node, _), running(python, PATIENT + CANCEL, node) as client:
+        line(client, "STARTED")
+        wait_for(lambda: poured(tmp_path) == 1, "the pour begins")
+        assert client.stdin is not None
+        client.stdin.write("go on\n")
+        client.stdin.flush()
+        line(client, "CANCELLED")
+        (tmp_path / "go").touch()
+        found = json.loads(line(client, "TOLD "))
+    assert found["cancelled"]
+    assert found["waiting"] == "cancelled"
+    assert found["pouring"] == "succeeded"
+    assert found["received"] > 0.0
+    assert poured(tmp_path) == 1
+
+
+RESTART = """
+try:
+    started()
+except httpx.TransportError:
+    pass  # the daemon was killed before it had answered; the history has the action
+print("SENT", flush=True)
+while True:
+    try:
+        keys = list(client.get_action_history())
+        break
+    except httpx.TransportError:
+        time.sleep(0.2)
+results = [settled(key) for key in keys]
+print("TOLD " + json.dumps([[one.action_id, one.status.value, one.json_result["result"]["received_g"]]
+    for one in results]), flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["queued", "leased", "pouring", "poured", "weighed"])
+def test_a_daemon_that_is_killed_and_started_again_in_the_middle_pours_once_for_madsci(
+    tmp_path: Path, stage: str
+) -> None:
+    python = python_with("madsci.client", "MADSCI")
+    with station_process(tmp_path, "station"):
+        pass  # registers the vessels
+    with contextlib.ExitStack() as opened:
+        with station_process(tmp_path, stage) as (url, node, daemon):
+            client = opened.enter_context(running(python, PATIENT + RESTART, node))
+            assert daemon.wait(PATIENCE) == -9
+        ports = (int(one.rpartition(":")[2]) for one in (url, node))
+        with station_process(tmp_path, "none", *ports) as (url, node, _):
+            token = token_of(tmp_path / "state/tokens", Role.ADMIN)
+            with Client(url, tmp_path / "state", token) as own:
+                if stage == "pouring":  # only an operator can state its outcome
+                    question = wait_for(lambda: next(iter(own.get("/questions")), {}), "a question")
+                    own.post(f"/questions/{question['id']}/answer", {"answer": "weighed 2 60"})
+                found = json.loads(line(client, "TOLD "))
+                again = httpx.post(f"{node}/action/pour/{found[0][0]}/start").json()
+                assert len(own.get("/pours")) == 1
+    assert [one[1] for one in found] == ["succeeded"]
+    assert again["json_result"]["result"]["received_g"] == found[0][2]
+    if stage == "pouring":
+        assert found[0][2] == pytest.approx(38.0)
+    assert poured(tmp_path) == 1
+
+
+def poured(folder: Path) -> int:
+    path = folder / "poured"
+    return len(path.read_text().splitlines()) if path.exists() else 0
 
 
 def test_an_order_of_the_api_and_one_of_the_node_share_the_account(tmp_path: Path) -> None:
@@ -185,7 +276,7 @@ def test_an_order_of_the_api_and_one_of_the_node_share_the_account(tmp_path: Pat
                 assert (await http.get("/status")).json()["paused"]
                 await served.post("/queue/resume")
                 key = await created(http, amount="60 g", receiver="vial-2")
-                told = (await http.post(f"/action/pour/{key}/start")).json()
-                assert told["status"] == "failed"
+                refused = (await http.post(f"/action/pour/{key}/start")).json()
+                assert refused["status"] == "failed"
 
     run(work())

@@ -6,7 +6,6 @@ import contextlib
 import json
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,33 +14,19 @@ from urllib.parse import urlparse
 
 import pytest
 
-from actors.runtime.child_process import child_environment
 from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from tests.support.station import order, setting_up
-from tests.support.station_process import STAGES
+from tests.support.station_process import STAGES, station_process
 from tests.support.waiting import PATIENCE
 
 
 @contextlib.contextmanager
 def station(folder: Path, stage: str = "none") -> Iterator[tuple[Client, subprocess.Popen[str]]]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.support.station_process", str(folder), stage],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=child_environment(),
-    )
-    try:
-        assert process.stdout is not None
-        url = process.stdout.readline().strip()
+    with station_process(folder, stage) as (url, _, process):
         token = token_of(folder / "state/tokens", Role.ADMIN)
         with Client(url, folder / "state", token) as client:
             yield client, process
-    finally:
-        process.kill()
-        process.wait(PATIENCE)
-        if process.stdout is not None:
-            process.stdout.close()
 
 
 def register(client: Client) -> None:

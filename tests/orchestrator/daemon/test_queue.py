@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -276,5 +277,24 @@ def test_warnings_of_the_check_and_a_missing_recording_are_reported_as_the_run_b
                     told.append(body["text"])
             assert sum("x_offset" in text and "can a stream hit" in text for text in told) == 1
             assert sum(text.startswith("no recording: it needs Rerun") for text in told) == 1
+
+    run(work())
+
+
+def test_a_campaign_that_names_a_cluster_uses_the_daemon_s_simulators_and_connects_to_nothing(tmp_path: Path) -> None:
+    async def work() -> None:
+        with socket.socket() as cluster:
+            cluster.bind(("127.0.0.1", 0))
+            cluster.listen()
+            cluster.setblocking(False)
+            port = cluster.getsockname()[1]
+            async with serving(tmp_path) as served:
+                text = served.campaign.read_text(encoding="utf-8")
+                named = text.replace("simulators: 2", f"simulators: 2\n  ray: {{address: '127.0.0.1:{port}'}}")
+                assert named != text
+                served.campaign.write_text(named, encoding="utf-8")
+                await served.until(await served.submit(), "finished")
+            with pytest.raises(BlockingIOError):
+                cluster.accept()
 
     run(work())

@@ -9,6 +9,7 @@ import pytest
 
 from orchestrator.daemon import rig_worker as lane
 from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.daemon_store import StoreError
 from orchestrator.daemon.run_readout import prune_recordings
 from tests.support.toy_daemon import run, serving
 
@@ -34,6 +35,25 @@ def test_without_room_nothing_is_begun_and_it_is_said_until_there_is_room(
             served.daemon.wake()
             await served.until(key, "finished")
             assert (await served.get("/status"))["problems"] == []
+
+    run(work())
+
+
+def test_a_command_that_a_full_disk_can_not_keep_is_refused_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*arguments: object) -> None:
+        raise StoreError(f"{tmp_path}/daemon.sqlite: can't be written (database or disk is full)")
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            with monkeypatch.context() as disk:
+                disk.setattr(served.daemon.store, "_write", full)
+                refused = await served.post("/queue/pause", status=507)
+            assert "is it full? Make room, then repeat the call" in refused["detail"]
+            assert str(tmp_path) not in refused["detail"]
+            assert not (await served.get("/status"))["queue_paused"]
+            await served.post("/queue/pause")
 
     run(work())
 

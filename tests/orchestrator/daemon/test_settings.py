@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from orchestrator.cli.app import app
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, load_settings
 
@@ -15,6 +18,7 @@ LABORATORY = "{name: numbers, bench: {liquid: {particles: 400}}}\n"
 def load(folder: Path, text: str) -> DaemonSettings:
     (folder / "left.yaml").write_text(LABORATORY)
     (folder / "desk.yaml").write_text("{name: thinking}\n")
+    (folder / "far.yaml").write_text(LABORATORY.replace("bench", "ray: {address: 10.0.0.1:6379}, bench"))
     path = folder / "decant.yaml"
     path.write_text(text)
     return load_settings(path)
@@ -39,6 +43,19 @@ def test_a_file_says_what_is_different(tmp_path: Path) -> None:
     assert (found.keep_recordings, found.recording_age) == (3, 172_800.0)
 
 
+def test_a_cluster_where_nothing_answers_is_refused_before_anything_starts(
+    tmp_path: Path,
+) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.2", 0))
+        address = f"127.0.0.2:{free.getsockname()[1]}"
+    (tmp_path / "decant.yaml").write_text(f"state: there\nray: {{address: {address}}}\n")
+    done = CliRunner().invoke(app, ["server", "start", str(tmp_path / "decant.yaml")])
+    assert done.exit_code == 2
+    assert f"Ray cluster at {address}: nothing answers there (Connection refused)" in done.output
+    assert not (tmp_path / "there").exists()
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -48,6 +65,9 @@ def test_a_file_says_what_is_different(tmp_path: Path) -> None:
         ("rigs: {left: lefft.yaml}\n", "did you mean 'left.yaml'?"),
         ("rigs: {left: desk.yaml}\n", "has no bench; campaigns that pour nothing need no rig"),
         ("rigs: {none: left.yaml}\n", "give the rig another name"),
+        ("rigs: {far: far.yaml}\n", "move 'ray' to the daemon's file"),
+        ("ray: {address: 10.0.0.1}\n", "decant.yaml:1:16: ray.address: '10.0.0.1' should be host:port"),
+        ("in_process: true\nray: {address: 10.0.0.1:6379}\n", "decant.yaml:2:1: ray: a daemon without Ray"),
         ("roots: [nowhere]\n", "is not a folder"),
         ("recordings: {age: 30}\n", "decant.yaml:1:19: recordings.age"),
     ],
