@@ -61,7 +61,11 @@ def test_help_of_every_command_and_group_ends_with_examples_that_are_understood(
             found, rest = program, line[1:end]
             while rest and rest[0] in getattr(found, "commands", {}):
                 found = found.commands[rest.pop(0)]  # type: ignore[attr-defined]
-            found.make_context(line[0], rest).close()  # raises on an argument or option that the command lacks
+            try:
+                found.make_context(line[0], rest).close()  # raises on an argument or option that the command lacks
+            except Exception as error:
+                if not str(error).endswith("does not exist."):  # the reader's own files
+                    raise
 
 
 def test_help_of_answer_names_all_that_may_be_answered() -> None:
