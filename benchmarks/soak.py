@@ -43,6 +43,7 @@ from daemon_page import keep
 from daemon_process import PATIENCE, await_, end_in_order, started
 from ruamel.yaml import YAML
 
+from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.submissions import Files, pack
@@ -269,13 +270,14 @@ def small_disk(place: Path) -> Iterator[Path]:
         capture_output=True,
         text=True,
         check=False,
+        env=child_environment(),
     )
     if made.returncode != 0:
         raise SystemExit(f"only root may mount a small disk: {made.stderr.strip()}")
     try:
         yield place
     finally:
-        subprocess.run(["umount", "--lazy", str(place)], check=True)
+        subprocess.run(["umount", "--lazy", str(place)], check=True, env=child_environment())
 
 
 # ---- clients

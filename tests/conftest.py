@@ -21,6 +21,8 @@ from tests.support.hypothesis_examples import load_profile
 
 load_profile()
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # for children, as `orchestrator.cli` has it
+
 # Typer builds the whole tree of commands anew for each invocation, which takes longer than most commands do.
 typer.testing._get_command = functools.cache(typer.testing._get_command)
 

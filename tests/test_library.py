@@ -285,6 +285,7 @@ def test_a_campaign_that_bears_draws_of_theta_is_planned_with_those_of_a_calibra
     assert {0.1, 0.3} <= seen <= {0.1, 0.2, 0.3}
 
 
+@pytest.mark.slow
 def test_a_run_of_the_library_is_recorded_and_warns_as_one_of_the_command_line(
     tmp_path: Path, fake_simulators: None
 ) -> None:

@@ -15,8 +15,9 @@ import ast
 import dataclasses
 import functools
 import inspect
+import itertools
 import operator
-import textwrap
+import sys
 import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -429,18 +430,25 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
 
 def _texts(model: type) -> dict[str, str]:
     """The texts below the fields that a class itself declares; none if a program has made the class."""
-    try:
-        tree = ast.parse(textwrap.dedent(inspect.getsource(model)))
-    except (OSError, TypeError):
-        return {}
-    body = tree.body[0].body if isinstance(tree.body[0], ast.ClassDef) else []
+    node = _classes(model.__module__).get(model.__qualname__)
+    body = [] if node is None else node.body
     found = {}
-    for node, after in zip(body, [*body[1:], None], strict=True):
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+    for each, after in itertools.zip_longest(body, body[1:]):
+        if isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name):
             is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
             value = after.value.value if is_text else ""  # type: ignore[union-attr]
-            found[node.target.id] = value if isinstance(value, str) else ""
+            found[each.target.id] = value if isinstance(value, str) else ""
     return found
+
+
+@functools.cache
+def _classes(module: str) -> dict[str, ast.ClassDef]:
+    """The classes of a module's source; none if it has no source."""
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[module]))
+    except (KeyError, OSError, TypeError):
+        return {}
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
 class DescribedSchema(GenerateJsonSchema):

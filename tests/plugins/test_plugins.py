@@ -115,6 +115,7 @@ def test_what_is_installed_is_listed_with_its_package(decant: Decant) -> None:
     assert listed["broken"] == []
 
 
+@pytest.mark.slow
 def test_it_is_known_to_files_and_misspelt_keys_are_guessed(decant: Decant, folder: Path) -> None:
     assert decant("validate", "cone.yaml", cwd=folder).returncode == 0
     (folder / "cone.yaml").write_text(CONE.replace("bottom", "botom"))

@@ -140,6 +140,7 @@ def test_a_pour_that_is_refused_asks_nobody_and_moves_nothing(open_stage):
     assert moved == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_no_consent_no_movement(open_stage):
     async def play():

@@ -100,6 +100,7 @@ def check_amount(stage: Stage, measured: PourMeasurement, grams: float, held: fl
     assert about["left"][0] == pytest.approx(held - about["received"], abs=5e-3)
 
 
+@pytest.mark.slow
 def test_a_short_series_is_poured_over_the_wires(open_stage: OpenStage) -> None:
     async def scenario() -> None:
         planned = tuple(PlannedDose(amount, 1e-3, SCENE.receiver.name) for amount in (0.025, 0.01))

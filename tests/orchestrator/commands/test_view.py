@@ -113,6 +113,7 @@ def test_pour_of_an_arm_of_numbers_is_simulated_by_its_action(tmp_path: Path) ->
     assert task.frame_rate > 10.0
 
 
+@pytest.mark.slow
 def test_what_is_not_there_is_refused_with_what_is(recording: Path, tmp_path: Path) -> None:
     _journal(tmp_path)
     with pytest.raises(NoSuchPourError, match="no weighed pour 7; weighed were pours: 1; deployment:narrow cup: 1"):

@@ -94,6 +94,7 @@ def test_the_page_needs_nothing_beside_it(made: Made) -> None:
     assert made.page.count('src="data:image/svg+xml') == len(made.published.figures) > 3
 
 
+@pytest.mark.slow
 def test_every_figure_is_there_as_lines_for_print(made: Made) -> None:
     assert all(
         path.with_suffix(".svg").read_text("utf-8").count("<path") > 10 for path in made.published.figures.values()

@@ -171,6 +171,7 @@ def test_people_read_what_is_determined_and_what_is_not() -> None:
     ]
 
 
+@pytest.mark.slow
 def test_theta_file_carries_the_posterior_and_can_still_be_planned_with(determined: Any, tmp_path: Path) -> None:
     content = theta_file(determined.found)
     path = tmp_path / "theta.json"
