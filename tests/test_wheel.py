@@ -228,7 +228,8 @@ def test_the_wheel_works_in_a_bare_environment(wheel: Path, tmp_path: Path) -> N
     example.install_example(packages, tmp_path / "example")
     listed = json.loads(decant("plugins", "--json").stdout)
     registered = {one["name"] for one in listed["plugins"] if one["package"] == "decant-example 1.0"}
-    assert registered == {"stand", "spring", "plain", "cone", "hypercube", "gentle"}
+    declared = tomllib.loads((ROOT / "tests" / "plugins" / "pyproject.toml").read_text(encoding="utf-8"))
+    assert registered == {name for group in declared["project"]["entry-points"].values() for name in group}
     assert listed["broken"] == []
     example.write_files(tmp_path)
     wide = example.CAMPAIGN.replace("x_offset: [60 mm, 90 mm]", "x_offset: [100 mm, 130 mm]")

@@ -11,8 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.daemon_client import Client
+from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.daemon_settings import MadsciSettings
 from orchestrator.daemon.madsci_node import create_node, new_ulid
 from orchestrator.daemon.ordering import Ordering
@@ -20,7 +19,7 @@ from tests.support.other_environments import line, python_with, running, told
 from tests.support.station import order, rigs_in, set_up, until_pour
 from tests.support.station_process import node_process, station_process
 from tests.support.toy_daemon import Served, held, run, serving
-from tests.support.waiting import PATIENCE, wait_for
+from tests.support.waiting import wait_for
 
 ARGS = {
     "source": "beaker",
@@ -211,53 +210,6 @@ def test_a_cancel_of_madsci_ends_what_waits_and_finishes_the_pour_that_has_begun
     assert found["waiting"] == "cancelled"
     assert found["pouring"] == "succeeded"
     assert found["received"] > 0.0
-    assert poured(tmp_path) == 1
-
-
-RESTART = """
-try:
-    started()
-except httpx.TransportError:
-    pass  # the daemon was killed before it had answered; the history has the action
-print("SENT", flush=True)
-while True:
-    try:
-        keys = list(client.get_action_history())
-        break
-    except httpx.TransportError:
-        time.sleep(0.2)
-results = [settled(key) for key in keys]
-print("TOLD " + json.dumps([[one.action_id, one.status.value, one.json_result["result"]["received_g"]]
-    for one in results]), flush=True)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("stage", ["queued", "leased", "pouring"])
-def test_a_daemon_that_is_killed_and_started_again_in_the_middle_pours_once_for_madsci(
-    tmp_path: Path, stage: str
-) -> None:
-    python = python_with("madsci.client", "MADSCI")
-    with station_process(tmp_path, "station"):
-        pass  # registers the vessels
-    with contextlib.ExitStack() as opened:
-        with station_process(tmp_path, stage) as (url, node, daemon):
-            client = opened.enter_context(running(python, PATIENT + RESTART, node))
-            assert daemon.wait(PATIENCE) == -9
-        ports = (int(one.rpartition(":")[2]) for one in (url, node))
-        with station_process(tmp_path, "none", *ports) as (url, node, _):
-            token = token_of(tmp_path / "state/tokens", Role.ADMIN)
-            with Client(url, tmp_path / "state", token) as own:
-                if stage == "pouring":  # only an operator can state its outcome
-                    question = wait_for(lambda: next(iter(own.get("/questions")), {}), "a question")
-                    own.post(f"/questions/{question['id']}/answer", {"answer": "weighed 2 60"})
-                found = json.loads(line(client, "TOLD "))
-                again = httpx.post(f"{node}/action/pour/{found[0][0]}/start").json()
-                assert len(own.get("/pours")) == 1
-    assert [one[1] for one in found] == ["succeeded"]
-    assert again["json_result"]["result"]["received_g"] == found[0][2]
-    if stage == "pouring":
-        assert found[0][2] == pytest.approx(38.0)
     assert poured(tmp_path) == 1
 
 
