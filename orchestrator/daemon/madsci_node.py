@@ -5,9 +5,13 @@ schemas are those of madsci.client 0.8.1; its packages are not needed. Actions: 
 
 - MADSci's client repeats every POST and sends no authorization. Therefore an action is started once by its id, and only
   addresses of the settings' list may call.
-- Enabling the motion of hardware stays an operator's act: the action is 'paused' until then. An emergency stop is
-  cleared by an administrator, not by `reset`.
-- Actions and the node's lock are stored, so they outlive a restart.
+- Enabling the motion of hardware stays an operator's act. An emergency stop is cleared by an administrator, not by
+  `reset`.
+- An action that waits for a person is 'running', and the errors of its result and of the node's status state what it
+  waits for. It is never 'paused': MADSci's workcell manager stops reading a paused action, and sends it again, as
+  another pour, when its workflow is resumed.
+- Actions and the node's lock are stored, so they outlive a restart. A pour that the restart interrupted is 'unknown'
+  until an operator has stated its outcome; the workcell manager ends its workflow as failed.
 """
 
 from __future__ import annotations
@@ -26,6 +30,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ValidationError, WithJsonSchema
 
 from orchestrator.daemon.daemon_settings import MadsciSettings, networks
+from orchestrator.daemon.daemon_store import ENDED, DesiredState, QueueItem
 from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.station_schemas import PourIn
 from orchestrator.daemon.submissions import Submission, prepare
@@ -41,26 +46,25 @@ LOCKED, NODE_ID = "madsci locked", "madsci node"
 
 _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
-_STATUS = {
-    "queued": "running",
-    "running": "running",
-    "waiting for operator": "running",
-    "paused": "paused",
-    "weighed": "succeeded",
-    "failed": "failed",
-    "unknown": "unknown",
-    "cancelled": "cancelled",
-}
-"""Status words of MADSci for the states of a pour."""
+_STATUS = {"weighed": "succeeded", "failed": "failed", "unknown": "unknown", "cancelled": "cancelled"}
+"""Status words of MADSci for the states of a pour; in all others it is 'running'."""
 
 _CAMPAIGN_STATUS = {
-    "paused": "paused",
     "finished": "succeeded",
     "failed": "failed",
     "unknown": "unknown",
     "stopped": "cancelled",
     "withdrawn": "cancelled",
 }
+"""The same for a campaign."""
+
+_SELECT = """
+select node_action.id, node_action.name, args, node_action.created, coalesce(started, campaign.created) as started,
+    coalesce(node_action.campaign, pour_order.campaign) as campaign, error, json_result
+from node_action left join pour_order on pour_order.id = node_action.id
+    left join campaign on campaign.id = pour_order.campaign
+"""
+"""Actions. The order of a pour shows that its action was started: the daemon may end between the two entries."""
 
 _POUR = {
     "source": ("Vessel to pour from: id or bar code.", True),
@@ -146,12 +150,36 @@ class MadsciNode:
             "actions": {name: _definition(name, *about) for name, about in ACTIONS.items()},
         }  # fmt: skip
 
-    def status(self) -> dict[str, Any]:
-        """Return `NodeStatus`."""
+    async def status(self) -> dict[str, Any]:
+        """Return `NodeStatus`. Its errors state the problems of the daemon, and what waits for a person."""
+        daemon, flags = self._daemon, self._flags()
+        rigs = [daemon.workers[rig.name] for rig in daemon.settings.rigs]
+        running = [
+            one.id
+            for one in self.actions()
+            if one.campaign is not None and any(worker.holds(one.campaign) for worker in rigs)
+        ]
+        waiting = [
+            f"{item.id}: {text}"
+            for item in daemon.store.items()
+            if (item.by == PERSON and await self._open(item)) or any(worker.holds(item.id) for worker in rigs)
+            if (text := self._waits_for(item))
+        ]
+        return {
+            **flags,
+            "running_actions": running,
+            "errors": [_error(text) for text in (*daemon.problems.values(), *waiting)],
+            "waiting_for_config": [],
+            "config_values": {},
+            "ready": not any(flags.values()),
+            "description": "; ".join([*(name for name, holds in flags.items() if holds), *waiting]) or "Node is ready",
+        }
+
+    def _flags(self) -> dict[str, bool]:
         daemon = self._daemon
         stopped = daemon.emergency is not None or bool(daemon.emergencies)
         rigs = [daemon.workers[rig.name] for rig in daemon.settings.rigs]
-        found = {
+        return {
             "busy": all(worker.running is not None for worker in rigs),
             "paused": daemon.queue_paused,
             "locked": daemon.store.flag(LOCKED) is not None,
@@ -160,20 +188,37 @@ class MadsciNode:
             "disconnected": False,
             "initializing": not daemon.warm.ready and daemon.settings.quick_start,
         }
-        running = [
-            one.id
-            for one in self.actions()
-            if one.campaign is not None and any(worker.holds(one.campaign) for worker in rigs)
-        ]
-        return {
-            **found,
-            "running_actions": running,
-            "errors": [{"message": text} for text in daemon.problems.values()],
-            "waiting_for_config": [],
-            "config_values": {},
-            "ready": not any(found.values()),
-            "description": ", ".join(name for name, holds in found.items() if holds) or "Node is ready",
-        }
+
+    async def _open(self, item: QueueItem) -> bool:
+        """Whether an action is neither ended nor failed."""
+        if item.state in ENDED or (item.state == "failed" and item.run is None):
+            return False
+        order = self._ordering.book.of_campaign(item.id)
+        if order is None:
+            return item.state != "failed"
+        return _status_of(await self._ordering.pour_out(order["id"])) in ("running", "unknown")
+
+    def _waits_for(self, item: QueueItem) -> str:
+        """Return the person's act that a campaign waits for, with the command; '' if it needs none."""
+        daemon, worker = self._daemon, self._daemon.workers.get(item.rig)
+        if question := next(iter(daemon.store.questions(campaign=item.id)), None):
+            where = f"on the daemon's page, or with 'decant queue answer {question.id}'"
+            return f"an operator has to answer question {question.id} {where}: {question.text}"
+        if item.state in ENDED or (worker is not None and worker.holds(item.id)):
+            return ""
+        if worker is None:
+            return f"an administrator has to add rig {item.rig} to the daemon's settings again"
+        if daemon.is_stopped(item.rig):
+            return "an administrator has to clear the emergency stop: 'decant estop --clear'"
+        if item.desired_state != DesiredState.RUN:
+            return f"an operator has to resume it: 'decant queue resume {item.id}'"
+        if item.mode == "hardware" and not item.motion_enabled:
+            return f"an operator has to enable its motion: 'decant queue enable {item.id}'"
+        if item.state == "queued" and item.held:
+            return f"an operator has to release it: 'decant queue hold {item.id} --release'"
+        if item.state == "queued" and daemon.queue_paused:
+            return "the queue is paused: the command 'resume', or 'decant queue resume'"
+        return ""
 
     # ---- actions
 
@@ -188,14 +233,14 @@ class MadsciNode:
 
     def action(self, key: str) -> NodeAction:
         """Return an action. Raises KeyError."""
-        rows = self._store.rows("select * from node_action where id = ?", key)
+        rows = self._store.rows(f"{_SELECT} where node_action.id = ?", key)
         if not rows:
             raise KeyError(key)
         return _action(rows[0])
 
     def actions(self) -> list[NodeAction]:
         """Return the newest actions."""
-        return [_action(row) for row in self._store.rows("select * from node_action order by rowid desc limit 200")]
+        return [_action(row) for row in self._store.rows(f"{_SELECT} order by node_action.rowid desc limit 200")]
 
     async def start(self, key: str) -> dict[str, Any]:
         """Start an action, or return the result of the one that was started. Raises KeyError."""
@@ -211,36 +256,35 @@ class MadsciNode:
         return await self.result(key)
 
     def _not_ready(self) -> str | None:
-        status = self.status()
-        blocking = [name for name in ("locked", "stopped", "paused") if status[name]]
+        flags = self._flags()
+        blocking = [name for name in ("locked", "stopped", "paused") if flags[name]]
         return f"the node is {', '.join(blocking)}" if blocking else None
 
     async def _start(self, action: NodeAction) -> None:
         """The order has the action's id, so an interrupted start is repeated without a second pour."""
         error: str | None = None
-        campaign: str | None = None
-        found: dict[str, Any] | None = None
+        predicted: dict[str, Any] | None = None
         try:
             if action.name == "run_campaign":
-                campaign = await self._submit(action)
-            else:
-                dry = action.name == "predict_pour"
-                request = PourIn.model_validate({**action.args, "id": action.id, "dry_run": dry})
-                found = await self._ordering.pour(request, PERSON)
-                campaign = found["campaign"] or None
+                await self._submit(action)
+                return
+            dry = action.name == "predict_pour"
+            request = PourIn.model_validate({**action.args, "id": action.id, "dry_run": dry})
+            found = await self._ordering.pour(request, PERSON)
+            predicted = found if dry else None
         except ValidationError as problem:
             told = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in problem.errors())
             error = f"args: {told}"
         except RunError as problem:
             error = str(problem)
-        kept = json.dumps(found) if action.name == "predict_pour" and found is not None else None
-        if action.name != "run_campaign" or error is not None:
+        kept = None if predicted is None else json.dumps(predicted)
+        if error is not None or kept is not None:
             self._store.write(
-                "update node_action set started = ?, campaign = ?, error = ?, json_result = ? where id = ?",
-                *(time.time(), campaign, error, kept, action.id),
+                "update node_action set started = ?, error = ?, json_result = ? where id = ?",
+                *(time.time(), error, kept, action.id),
             )
 
-    async def _submit(self, action: NodeAction) -> str:
+    async def _submit(self, action: NodeAction) -> None:
         daemon = self._daemon
         path, rig = str(action.args.get("path", "")), str(action.args.get("rig", ""))
         submission = Submission(path=path, rig=rig)
@@ -251,26 +295,38 @@ class MadsciNode:
                 "update node_action set started = ?, campaign = ? where id = ?", time.time(), item.id, action.id
             )
 
-        return daemon.submit_all([item], enter)[0].id
+        daemon.submit_all([item], enter)
 
     async def result(self, key: str) -> dict[str, Any]:
         """Return `RestActionResult`. Raises KeyError."""
         action = self.action(key)
         if action.started is None:
-            return _result(action, "not_started")
+            return _result(action, "not_started", error="the action was not started, and nothing moved")
         if action.error is not None:
             return _result(action, "failed", error=action.error)
         if action.json_result is not None:
             return _result(action, "succeeded", action.json_result)
         assert action.campaign is not None
+        item = self._daemon.item(action.campaign)
         if action.name == "run_campaign":
-            item = self._daemon.item(action.campaign)
-            status = _CAMPAIGN_STATUS.get(item.state, "running")
-            about = {"campaign": item.id, "state": item.state, "run": item.run, "reason": item.reason}
-            return _result(action, status, about, item.reason if status == "failed" else "")
-        pour = await self._ordering.pour_out(action.id)
-        status = "paused" if pour["needs_enabling"] else _STATUS[pour["state"]]
-        return _result(action, status, pour, pour["reason"] if status in ("failed", "unknown") else "")
+            status, reason = _CAMPAIGN_STATUS.get(item.state, "running"), item.reason
+            about = {"campaign": item.id, "state": item.state, "run": item.run, "reason": reason}
+        else:
+            about = await self._ordering.pour_out(action.id)
+            status, reason = _status_of(about), about["reason"]
+        waits = self._waits_for(item) if status in ("running", "unknown") else ""
+        match status:
+            case "running":
+                return _result(action, status, error=waits)  # the workcell manager stores every value that it reads
+            case "unknown":
+                told = "" if reason in waits else reason  # that of a question is its text
+                return _result(action, status, about, "; ".join(filter(None, ("the outcome is unknown", told, waits))))
+            case "failed" if about["state"] == "unknown":
+                weigh = f"weigh {about['source']} and {about['receiver']}: 'decant materials weigh'"
+                return _result(action, status, about, f"the outcome is unknown ({reason}); {weigh}")
+            case "failed":
+                return _result(action, status, about, reason)
+        return _result(action, status, about)
 
     # ---- administration
 
@@ -333,7 +389,7 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
 
     @app.get("/status")
     async def status() -> Any:
-        return node.status()
+        return await node.status()
 
     @app.get("/state")
     async def state() -> Any:
@@ -398,12 +454,23 @@ def _definition(name: str, description: str, arguments: dict[str, tuple[str, boo
 def _result(action: NodeAction, status: str, value: Any = None, error: str = "") -> dict[str, Any]:
     return {
         **{"action_id": action.id, "status": status, "json_result": value, "files": None, "datapoints": None},
-        "errors": [{"message": error, "error_type": "DecantError"}] if error else [],
+        "errors": [_error(error)] if error else [],
     }
 
 
+def _error(text: str) -> dict[str, Any]:
+    return {"message": text, "error_type": "DecantError"}
+
+
 def _refused(text: str) -> dict[str, Any]:
-    return {"success": False, "errors": [{"message": text, "error_type": "DecantError"}], "data": None}
+    return {"success": False, "errors": [_error(text)], "data": None}
+
+
+def _status_of(pour: dict[str, Any]) -> str:
+    """Status word of a pour. An unknown outcome that no operator can state any more is a failure."""
+    if pour["state"] == "unknown" and pour["result"] is not None:
+        return "failed"
+    return _STATUS.get(pour["state"], "running")
 
 
 def _action(row: dict[str, Any]) -> NodeAction:

@@ -11,15 +11,17 @@ from typing import Any
 import httpx
 import pytest
 
-from orchestrator.daemon.access_tokens import Role
+from orchestrator.daemon.access_tokens import Role, token_of
+from orchestrator.daemon.daemon_client import Client
 from orchestrator.daemon.daemon_settings import MadsciSettings
-from orchestrator.daemon.madsci_node import create_node, new_ulid
+from orchestrator.daemon.madsci_node import PERSON, create_node, new_ulid
 from orchestrator.daemon.ordering import Ordering
+from orchestrator.daemon.station_schemas import PourIn
 from tests.support.other_environments import line, python_with, running, told
 from tests.support.station import order, rigs_in, set_up, until_pour
 from tests.support.station_process import node_process, station_process
 from tests.support.toy_daemon import Served, held, run, serving
-from tests.support.waiting import wait_for
+from tests.support.waiting import PATIENCE, wait_for
 
 ARGS = {
     "source": "beaker",
@@ -109,6 +111,84 @@ def test_admin_commands_stop_and_hold_the_node_and_only_a_person_clears_a_stop(t
                 await admin("lock")
         async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
             assert (await http.get("/status")).json()["locked"]
+
+    run(work())
+
+
+def messages(found: dict[str, Any]) -> str:
+    return "; ".join(one["message"] for one in found["errors"])
+
+
+def test_an_action_whose_order_was_stored_when_the_daemon_was_killed_is_started(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+            await set_up(served)
+            await served.post("/queue/pause")
+            unsent = await created(http)
+            key = await created(http)
+            await Ordering(served.daemon).pour(PourIn.model_validate({**ARGS, "id": key}), PERSON)
+        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+            found = (await http.get(f"/action/{unsent}/result")).json()
+            assert found["status"] == "not_started"
+            assert "nothing moved" in messages(found)
+            for answer in (await http.get(f"/action/{key}/result"), await http.post(f"/action/pour/{key}/start")):
+                assert answer.json()["status"] == "running"
+                assert "the queue is paused" in messages(answer.json())
+            await http.post("/admin/resume")
+            pour = await until_pour(served, key, "weighed")
+            found = (await http.get(f"/action/{key}/result")).json()
+            assert found["status"] == "succeeded"
+            assert found["json_result"]["result"]["received_g"] == pour["result"]["received_g"]
+            assert len(await served.get("/pours")) == 1
+
+    run(work())
+
+
+@pytest.mark.parametrize("answer", ["weighed 2 60", "cancel"])
+def test_a_pour_without_outcome_states_what_has_to_be_done_until_it_is_settled(tmp_path: Path, answer: str) -> None:
+    async def work() -> None:
+        async with serving(tmp_path, held, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+            await set_up(served)
+            key = await created(http)
+            await http.post(f"/action/pour/{key}/start")
+            await served.pouring()
+            campaign = (await served.get(f"/pours/{key}"))["campaign"]
+            await http.post("/admin/safety_stop")
+            await served.until(campaign, "unknown")
+        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
+
+            async def told(act: str) -> None:
+                found = (await http.get(f"/action/{key}/result")).json()
+                assert found["status"] == "unknown"
+                assert "the outcome is unknown" in messages(found)
+                assert act in messages(found)
+                assert act in messages((await http.get("/status")).json())
+
+            await told("decant estop --clear")
+            await served.post("/emergency-stop/clear", role=Role.ADMIN)
+            await told(f"decant queue resume {campaign}")
+            other = await created(http, receiver="vial-2")
+            refused = (await http.post(f"/action/pour/{other}/start")).json()
+            assert refused["status"] == "failed"
+            assert f"pour {key} has begun and has no outcome" in messages(refused)
+            await served.post(f"/campaigns/{campaign}/resume")
+            question = (await served.question())["id"]
+            await until_pour(served, key, "unknown")
+            await told(f"decant queue answer {question}")
+            if answer == "cancel":
+                await http.post("/admin/cancel")
+                await served.until(campaign, "stopped")
+                found = (await http.get(f"/action/{key}/result")).json()
+                assert found["status"] == "failed"  # final: the client waits for ever for an 'unknown' action
+                assert "weigh beaker and vial-1" in messages(found)
+            else:
+                await served.post(f"/questions/{question}/answer", {"answer": answer})
+                await until_pour(served, key, "weighed")
+                found = (await http.get(f"/action/{key}/result")).json()
+                assert found["status"] == "succeeded"
+                assert found["json_result"]["result"]["received_g"] == pytest.approx(38.0)
+            assert (await http.get("/status")).json()["errors"] == []
+            assert sum(len(one.bench.poured) for one in served.laboratories) == 0
 
     run(work())
 
@@ -210,6 +290,65 @@ def test_a_cancel_of_madsci_ends_what_waits_and_finishes_the_pour_that_has_begun
     assert found["waiting"] == "cancelled"
     assert found["pouring"] == "succeeded"
     assert found["received"] > 0.0
+    assert poured(tmp_path) == 1
+
+
+RESTART = """
+try:
+    started()
+except httpx.TransportError:
+    pass  # the daemon was killed before it had answered; the history has the action
+print("SENT", flush=True)
+while True:
+    try:
+        key, = client.get_action_history()
+        break
+    except httpx.TransportError:
+        time.sleep(0.2)
+if sys.argv[2] == "pouring":
+    while (found := client.get_action_result(key)).status.value != "unknown":
+        time.sleep(0.1)
+    again = started("vial-2")
+    status = client.get_status()
+    print("WAITS " + json.dumps({"error": found.errors[0].message, "node": [one.message for one in status.errors],
+        "ready": status.ready, "again": again.status.value, "refused": again.errors[0].message}), flush=True)
+found = settled(key)
+print("TOLD " + json.dumps([key, found.status.value, found.json_result["result"]["received_g"]]), flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["queued", "leased", "pouring"])
+def test_a_daemon_that_is_killed_and_started_again_in_the_middle_pours_once_for_madsci(
+    tmp_path: Path, stage: str
+) -> None:
+    python = python_with("madsci.client", "MADSCI")
+    with station_process(tmp_path, "held"):
+        pass  # registers the vessels
+    with contextlib.ExitStack() as opened:
+        with station_process(tmp_path, stage) as (url, node, daemon):
+            client = opened.enter_context(running(python, PATIENT + RESTART, node, stage))
+            assert daemon.wait(PATIENCE) == -9
+        ports = (int(one.rpartition(":")[2]) for one in (url, node))
+        with station_process(tmp_path, "none", *ports) as (url, node, _):
+            token = token_of(tmp_path / "state/tokens", Role.ADMIN)
+            with Client(url, tmp_path / "state", token) as own:
+                if stage == "pouring":  # only an operator can state its outcome
+                    waits = json.loads(line(client, "WAITS "))
+                    (question,) = own.get("/questions")
+                    own.post(f"/questions/{question['id']}/answer", {"answer": "weighed 2 60"})
+                    for text in (waits["error"], *waits["node"]):
+                        assert f"decant queue answer {question['id']}" in text
+                    assert not waits["ready"]
+                    assert waits["again"] == "failed"
+                    assert "has begun and has no outcome" in waits["refused"]
+                key, status, received = json.loads(line(client, "TOLD "))
+                again = httpx.post(f"{node}/action/pour/{key}/start").json()
+                assert len(own.get("/pours")) == 1
+    assert status == "succeeded"
+    assert again["json_result"]["result"]["received_g"] == received
+    if stage == "pouring":
+        assert received == pytest.approx(38.0)
     assert poured(tmp_path) == 1
 
 
