@@ -154,7 +154,7 @@ def test_a_pour_without_outcome_states_what_has_to_be_done_until_it_is_settled(t
             await served.pouring()
             campaign = (await served.get(f"/pours/{key}"))["campaign"]
             await http.post("/admin/safety_stop")
-            await served.until(campaign, "unknown")
+            await served.until(campaign, "unknown", "paused")
         async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
 
             async def told(act: str) -> None:
@@ -252,12 +252,14 @@ def started(receiver="vial-1"):
     action = {"angular_velocity": "100 deg/s", "x_offset": "70 mm"}
     args = {"source": "beaker", "receiver": receiver, "action": action, "predict": False}
     return client.send_action(ActionRequest(action_name="pour", args=args), await_result=False)
-def settled(key):
+def patiently(call):
     while True:
         try:
-            return client.await_action_result(key, timeout=500)
+            return call()
         except httpx.TransportError:  # the daemon is restarted, and the three repetitions of the client have failed
             time.sleep(0.2)
+def settled(key):
+    return patiently(lambda: client.await_action_result(key, timeout=500))
 """
 
 CANCEL = """
@@ -299,14 +301,9 @@ try:
 except httpx.TransportError:
     pass  # the daemon was killed before it had answered; the history has the action
 print("SENT", flush=True)
-while True:
-    try:
-        key, = client.get_action_history()
-        break
-    except httpx.TransportError:
-        time.sleep(0.2)
+key, = patiently(client.get_action_history)
 if sys.argv[2] == "pouring":
-    while (found := client.get_action_result(key)).status.value != "unknown":
+    while (found := patiently(lambda: client.get_action_result(key))).status.value != "unknown":
         time.sleep(0.1)
     again = started("vial-2")
     status = client.get_status()
