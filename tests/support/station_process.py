@@ -53,6 +53,10 @@ def die_at(stage: str) -> None:
             ordering.Ordering._queue = die  # type: ignore[method-assign]
         case "queued":
             ordering.Ordering._queue = _async_after(ordering.Ordering._queue)  # type: ignore[method-assign]
+        case "submitting":
+            Supervisor.submit_all = die  # type: ignore[method-assign]
+        case "submitted":
+            Supervisor.submit_all = after(Supervisor.submit_all)  # type: ignore[method-assign]
         case "leased":
             rig_worker.renew_load = after(rig_worker.renew_load)
         case "poured":

@@ -134,6 +134,12 @@ def test_an_action_whose_order_was_stored_when_the_daemon_was_killed_is_started(
             for answer in (await http.get(f"/action/{key}/result"), await http.post(f"/action/pour/{key}/start")):
                 assert answer.json()["status"] == "running"
                 assert "the queue is paused" in messages(answer.json())
+            campaign = (await served.get(f"/pours/{key}"))["campaign"]
+            served.daemon.store.change(campaign, mode="hardware")
+            found = (await http.get(f"/action/{key}/result")).json()
+            assert found["status"] == "running"
+            assert f"decant queue enable {campaign}" in messages(found)
+            served.daemon.store.change(campaign, mode="virtual")
             await http.post("/admin/resume")
             pour = await until_pour(served, key, "weighed")
             found = (await http.get(f"/action/{key}/result")).json()

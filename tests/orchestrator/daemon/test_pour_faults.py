@@ -12,13 +12,17 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
 
+import httpx
 import pytest
 
+from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
+from orchestrator.daemon.submissions import pack
 from tests.support.station import order, setting_up
 from tests.support.station_process import STAGES, station_process
-from tests.support.waiting import PATIENCE
+from tests.support.toy_daemon import campaign_in
+from tests.support.waiting import PATIENCE, wait_for
 
 
 @contextlib.contextmanager
@@ -78,6 +82,48 @@ def test_a_daemon_killed_at_any_stage_makes_the_pour_once_when_the_order_is_repe
         found = check(client, tmp_path)
     if stage == "pouring":  # nobody but an operator can state its outcome
         assert found["result"]["received_g"] == pytest.approx(38.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["submitting", "submitted"])
+def test_a_batch_whose_daemon_is_killed_before_it_answers_is_queued_once(tmp_path: Path, stage: str) -> None:
+    text, files = pack(load_campaign(campaign_in(tmp_path)))
+    items = [{"pour": order()}, {"campaign": {"text": text, "files": files, "rig": "left"}}]
+    batch = {"id": "plate-1", "items": items}
+    with station(tmp_path) as (client, _):
+        register(client)
+        client.post("/queue/pause")
+    with station(tmp_path, stage) as (client, process):
+        with pytest.raises(DaemonError):
+            client.post("/batches", batch)
+        assert process.wait(PATIENCE) == -9
+    with station(tmp_path) as (client, _):
+        assert len(client.get("/campaigns")) == (2 if stage == "submitted" else 0)
+        first, second = client.post("/batches", batch), client.post("/batches", batch)
+        assert first["items"] == second["items"]
+        assert {one["id"] for one in client.get("/campaigns")} == {one["campaign"] for one in first["items"]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["submitting", "submitted"])
+def test_a_campaign_of_madsci_whose_daemon_is_killed_before_it_answers_is_queued_once(
+    tmp_path: Path, stage: str
+) -> None:
+    path = campaign_in(tmp_path)
+    action = "/action/run_campaign"
+    with station_process(tmp_path, stage) as (_, node, process):
+        with httpx.Client(base_url=node, timeout=PATIENCE) as http:
+            key = http.post(action, json={"args": {"path": path.name, "rig": "left"}}).json()["action_id"]
+            with pytest.raises(httpx.TransportError):
+                http.post(f"{action}/{key}/start")
+        assert process.wait(PATIENCE) == -9
+    with station_process(tmp_path, "none") as (_, node, _), httpx.Client(base_url=node, timeout=PATIENCE) as http:
+        found = http.get(f"/action/{key}/status").json()
+        assert (found == "not_started") == (stage == "submitting")
+        for _ in range(2):
+            http.post(f"{action}/{key}/start")
+        wait_for(lambda: http.get(f"/action/{key}/status").json() == "succeeded", "the end of the campaign")
+    assert poured(tmp_path) == 3
 
 
 def request_bytes(client: Client, body: bytes) -> bytes:
