@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import html
 import queue
 import threading
 from collections.abc import Callable, Sequence
@@ -36,9 +35,10 @@ from actors.interfaces import (
     SimulatorPool,
     UnknownPourError,
 )
-from actors.laboratory import check_laboratory, open_laboratory
+from actors.laboratory import open_laboratory
 from actors.laboratory_settings import LaboratorySettings
-from decant.run_results import Run
+from decant.run_results import Run, html_table
+from decant.running import checked
 from orchestrator.journal.run_record import read_record
 from orchestrator.requests import Pour, Poured, Prediction
 from orchestrator.results.stage_views import receiver_names
@@ -89,10 +89,7 @@ class AskedPour:
         """The pour as a table, in notebooks."""
         shown = {"pour": f"{self.stage} {self.number}", "receiver": self.receiver, "load_g": f"{self.load_g:g}"}
         shown |= {name: "off" if value is None else f"{value:.4g}" for name, value in self.settings.items()}
-        rows = "".join(
-            f"<tr><th>{html.escape(key)}</th><td>{html.escape(text)}</td></tr>" for key, text in shown.items()
-        )
-        return f"<table>{rows}</table>" + ("<p>may have been made already</p>" if self.unknown else "")
+        return html_table(shown.items()) + ("<p>may have been made already</p>" if self.unknown else "")
 
 
 class AskTell:
@@ -126,16 +123,17 @@ class AskTell:
                 "'laboratory: {name: …, mode: external}' for pours that your program makes"
             )
         service, request = RunService(), task_request(campaign)
-        service.check(request).require()
         if not request.pours:
             raise RunTaskError(f"campaign '{campaign.name}' asks for no pours; use decant.run")
-        resources = RunResources(
-            in_process=in_process,
-            subscribers=(*watch, self._note),
-            ask_operator=self._settle,
-            laboratory=self._external_laboratory,
+        resources = checked(
+            request,
+            RunResources(
+                in_process=in_process,
+                subscribers=(*watch, self._note),
+                ask_operator=self._settle,
+                laboratory=self._external_laboratory,
+            ),
         )
-        check_laboratory(resources.settings(campaign), need_bench=False)
         if directory is not None:
             request = replace(request, folder=Path(directory).expanduser(), resume="if begun")
         self._request = request = service.with_folder(request)
@@ -146,7 +144,6 @@ class AskTell:
         self._started: RequestStarted | None = None
         self._waiting: queue.SimpleQueue[_Waiting | None] = queue.SimpleQueue()
         self._current: _Waiting | None = None
-        self._loads: dict[str, float] = {}
         self._handle: RunHandle | None = None
         self._run: Run | None = None
         self._error: BaseException | None = None
@@ -347,7 +344,7 @@ class AskTell:
             request.predicted,
             unknown,
         )
-        waiting = _Waiting(pour, asyncio.get_running_loop().create_future(), self._loop)
+        waiting = _Waiting(pour, asyncio.get_running_loop().create_future())
         self._waiting.put(waiting)
         return waiting
 
@@ -358,7 +355,6 @@ class _Waiting:
 
     pour: AskedPour
     outcome: asyncio.Future[tuple[PourMeasurement | LaboratoryError, str | None]]
-    loop: asyncio.AbstractEventLoop
 
     def reply(self, outcome: PourMeasurement | LaboratoryError, answer: str | None) -> None:
         """Give the outcome from another thread; as an object, and as an operator answers; None: no answer."""
@@ -368,7 +364,7 @@ class _Waiting:
                 self.outcome.set_result((outcome, answer))
 
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            self.loop.call_soon_threadsafe(settle)
+            self.outcome.get_loop().call_soon_threadsafe(settle)
 
 
 class _ExternalLaboratory:

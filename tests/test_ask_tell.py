@@ -15,6 +15,7 @@ from orchestrator.cli.app import main
 from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.filterwarnings("ignore:not simulated")
 
 
 def vessel(name: str, radius: float, height: float) -> dict[str, Any]:
@@ -127,11 +128,13 @@ def test_what_can_not_be_is_refused_and_nothing_is_told(tmp_path: Path) -> None:
 def test_no_other_program_pours_in_an_external_laboratory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     with (
         pytest.warns(UserWarning, match="dribbling"),
         pytest.raises(decant.LaboratoryError, match="is external: a program makes its pours"),
     ):
         decant.run(campaign())
+    assert not (tmp_path / "runs").exists()
     (tmp_path / "bench.yaml").write_text("name: bench\nmode: external\nbalance: {placement: manual}\n")
     monkeypatch.setattr("sys.argv", ["decant", "validate", str(tmp_path / "bench.yaml")])
     with pytest.raises(SystemExit) as ended:
