@@ -40,12 +40,13 @@ from actors.laboratory_settings import LaboratorySettings
 from decant.run_results import Run, html_table
 from decant.running import checked
 from orchestrator.journal.run_record import read_record
-from orchestrator.requests import Pour, Poured, Prediction
+from orchestrator.requests import Pour, Prediction
 from orchestrator.results.stage_views import receiver_names
 from orchestrator.run_service import RunHandle, RunResources, RunService, RunTaskError, task_request
+from orchestrator.runs.added_pours import weighed_by_hand
 from orchestrator.runs.events import Event, RequestStarted
 from orchestrator.runs.events import Subscriber as Watch
-from orchestrator.runs.resume import LOST, parse_answer
+from orchestrator.runs.resume import LOST
 from orchestrator.runs.stages import scenes_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.stage_result import displayed_action
@@ -219,19 +220,14 @@ class AskTell:
             InvalidArgumentError: the masses do not fit the load, or another pour is asked for.
         """
         waiting = self._asked(pour)
-        loaded = pour.load_g if loaded_g is None else loaded_g
-        if (received_g is None) == (retained_g is None):
-            raise InvalidArgumentError("give either received_g or retained_g")
-        retained = loaded - float(received_g or 0.0) - spilled_g if retained_g is None else retained_g
-        # within the balance's noise, a pourer that was emptied may seem to hold less than nothing
-        retained = 0.0 if -0.02 * loaded <= retained < 0.0 and retained_g is None else retained
-        answer = f"weighed {spilled_g!r} {retained!r} {loaded!r}"
-        try:
-            outcome = parse_answer(answer, (), 1e-3 * pour.load_g)
-        except ValueError as error:
-            raise InvalidArgumentError(str(error).removeprefix(f"'{answer}': ")) from None
-        assert isinstance(outcome, Poured)
-        measured = replace(outcome.measurement, notes={**(notes or {}), "source": SOURCE})
+        measured, answer = weighed_by_hand(
+            pour.load_g,
+            spilled_g=spilled_g,
+            received_g=received_g,
+            retained_g=retained_g,
+            loaded_g=loaded_g,
+            notes={**(notes or {}), "source": SOURCE},
+        )
         self._current = None
         waiting.reply(measured, answer)
 
