@@ -28,7 +28,7 @@ from actors.interfaces import (
     Optimizer,
     SimulatorPool,
 )
-from actors.laboratory_settings import LaboratorySettings, RaySettings
+from actors.laboratory_settings import MODE_LABELS, LaboratorySettings, RaySettings
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.ray_cluster import JoinedCluster, check_cluster, versions
 from actors.runtime.ray_runtime import forget_ray_logs, open_ray, ray_lost, stop_ray, watch_ray
@@ -52,8 +52,11 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
     Raises:
         LaboratoryError: with the problem and its remedy.
     """
-    if need_bench:
-        _check_not_external(spec)
+    if need_bench and spec.mode == "external":
+        raise LaboratoryError(
+            f"laboratory {spec.name} is external: a program makes its pours and asks for them with decant.AskTell; "
+            "'decant plan', and 'decant calibrate' on weighed pours, need no pours"
+        )
     if spec.arm is not None and need_bench and (missing := spec.arm.missing()) is not None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
@@ -68,14 +71,6 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
         )
     if spec.ray is not None and not spec.in_process:
         check_cluster(spec.ray, need_bench=need_bench)
-
-
-def _check_not_external(spec: LaboratorySettings) -> None:
-    if spec.mode == "external":
-        raise LaboratoryError(
-            f"laboratory {spec.name} is external: a program makes its pours and asks for them with decant.AskTell; "
-            "'decant plan', and 'decant calibrate' on weighed pours, need no pours"
-        )
 
 
 def check_bench_packages(spec: LaboratorySettings) -> None:
@@ -171,10 +166,9 @@ def open_laboratory(
     Raises:
         LaboratoryError: a bench is needed and there is none, or it has no operator, or the mode is unknown.
     """
-    if need_bench:
-        _check_not_external(spec)
-    if spec.mode not in ("virtual", "hardware", "external"):
-        raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not known; 'virtual' and 'hardware' are")
+    assert not (need_bench and spec.mode == "external"), "refused by check_laboratory"
+    if spec.mode not in MODE_LABELS:
+        raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not one of {', '.join(MODE_LABELS)}")
     if need_bench and not spec.pours:
         raise LaboratoryError(f"laboratory {spec.name} has no bench, but the campaign pours: add a 'bench' to it")
     if need_bench and operator is None and spec.needs_person:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import json
 import os
 import platform
@@ -23,8 +24,6 @@ ROOT = Path(__file__).resolve().parent.parent
 
 def describe() -> dict[str, Any]:
     """Machine, software and moment: without them a figure means nothing."""
-    from sim_engine.solver_fingerprint import solver_fingerprint
-
     return {
         "processor": _processor(),
         "cores": psutil.cpu_count(),
@@ -34,10 +33,17 @@ def describe() -> dict[str, Any]:
         "taichi": version("taichi"),
         "numpy": version("numpy"),
         "solver": _solver(),
-        "fingerprint": solver_fingerprint(),
+        "fingerprint": _fingerprint(),
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "load_average": [round(load, 1) for load in psutil.getloadavg()],
     }
+
+
+@functools.cache
+def _fingerprint() -> str:
+    from sim_engine.solver_fingerprint import solver_fingerprint
+
+    return solver_fingerprint()
 
 
 def pin(core: int | None) -> int | None:

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from orchestrator.run_errors import RunError
     from orchestrator.run_service import CheckReport
     from orchestrator.runs import events
+    from orchestrator.runs.added_pours import add_pour
     from orchestrator.runs.events import Event
     from orchestrator.strategies.campaign_plan import CampaignPlan
     from sim_engine.errors import DecantError, InvalidArgumentError
@@ -69,6 +70,7 @@ __all__ = [
     "VesselAccount",
     "VesselContent",
     "VesselSpec",
+    "add_pour",
     "build_campaign",
     "calibrate",
     "check",
@@ -105,6 +107,7 @@ _HOMES = {
     "orchestrator.config.yaml.yaml_errors": ("ConfigError",),
     "orchestrator.run_errors": ("RunError",),
     "orchestrator.run_service": ("CheckReport",),
+    "orchestrator.runs.added_pours": ("add_pour",),
     "orchestrator.runs.events": ("Event",),
     "orchestrator.strategies.campaign_plan": ("CampaignPlan",),
     "orchestrator.results.publishing": ("Published",),

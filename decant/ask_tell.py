@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import html
 import queue
 import threading
 from collections.abc import Callable, Sequence
@@ -36,16 +35,18 @@ from actors.interfaces import (
     SimulatorPool,
     UnknownPourError,
 )
-from actors.laboratory import check_laboratory, open_laboratory
+from actors.laboratory import open_laboratory
 from actors.laboratory_settings import LaboratorySettings
-from decant.run_results import Run
+from decant.run_results import Run, html_table
+from decant.running import checked
 from orchestrator.journal.run_record import read_record
-from orchestrator.requests import Pour, Poured, Prediction
+from orchestrator.requests import Pour, Prediction
 from orchestrator.results.stage_views import receiver_names
 from orchestrator.run_service import RunHandle, RunResources, RunService, RunTaskError, task_request
+from orchestrator.runs.added_pours import weighed_by_hand
 from orchestrator.runs.events import Event, RequestStarted
 from orchestrator.runs.events import Subscriber as Watch
-from orchestrator.runs.resume import LOST, parse_answer
+from orchestrator.runs.resume import LOST
 from orchestrator.runs.stages import scenes_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.stage_result import displayed_action
@@ -89,10 +90,7 @@ class AskedPour:
         """The pour as a table, in notebooks."""
         shown = {"pour": f"{self.stage} {self.number}", "receiver": self.receiver, "load_g": f"{self.load_g:g}"}
         shown |= {name: "off" if value is None else f"{value:.4g}" for name, value in self.settings.items()}
-        rows = "".join(
-            f"<tr><th>{html.escape(key)}</th><td>{html.escape(text)}</td></tr>" for key, text in shown.items()
-        )
-        return f"<table>{rows}</table>" + ("<p>may have been made already</p>" if self.unknown else "")
+        return html_table(shown.items()) + ("<p>may have been made already</p>" if self.unknown else "")
 
 
 class AskTell:
@@ -126,16 +124,17 @@ class AskTell:
                 "'laboratory: {name: …, mode: external}' for pours that your program makes"
             )
         service, request = RunService(), task_request(campaign)
-        service.check(request).require()
         if not request.pours:
             raise RunTaskError(f"campaign '{campaign.name}' asks for no pours; use decant.run")
-        resources = RunResources(
-            in_process=in_process,
-            subscribers=(*watch, self._note),
-            ask_operator=self._settle,
-            laboratory=self._external_laboratory,
+        resources = checked(
+            request,
+            RunResources(
+                in_process=in_process,
+                subscribers=(*watch, self._note),
+                ask_operator=self._settle,
+                laboratory=self._external_laboratory,
+            ),
         )
-        check_laboratory(resources.settings(campaign), need_bench=False)
         if directory is not None:
             request = replace(request, folder=Path(directory).expanduser(), resume="if begun")
         self._request = request = service.with_folder(request)
@@ -146,7 +145,6 @@ class AskTell:
         self._started: RequestStarted | None = None
         self._waiting: queue.SimpleQueue[_Waiting | None] = queue.SimpleQueue()
         self._current: _Waiting | None = None
-        self._loads: dict[str, float] = {}
         self._handle: RunHandle | None = None
         self._run: Run | None = None
         self._error: BaseException | None = None
@@ -222,19 +220,14 @@ class AskTell:
             InvalidArgumentError: the masses do not fit the load, or another pour is asked for.
         """
         waiting = self._asked(pour)
-        loaded = pour.load_g if loaded_g is None else loaded_g
-        if (received_g is None) == (retained_g is None):
-            raise InvalidArgumentError("give either received_g or retained_g")
-        retained = loaded - float(received_g or 0.0) - spilled_g if retained_g is None else retained_g
-        # within the balance's noise, a pourer that was emptied may seem to hold less than nothing
-        retained = 0.0 if -0.02 * loaded <= retained < 0.0 and retained_g is None else retained
-        answer = f"weighed {spilled_g!r} {retained!r} {loaded!r}"
-        try:
-            outcome = parse_answer(answer, (), 1e-3 * pour.load_g)
-        except ValueError as error:
-            raise InvalidArgumentError(str(error).removeprefix(f"'{answer}': ")) from None
-        assert isinstance(outcome, Poured)
-        measured = replace(outcome.measurement, notes={**(notes or {}), "source": SOURCE})
+        measured, answer = weighed_by_hand(
+            pour.load_g,
+            spilled_g=spilled_g,
+            received_g=received_g,
+            retained_g=retained_g,
+            loaded_g=loaded_g,
+            notes={**(notes or {}), "source": SOURCE},
+        )
         self._current = None
         waiting.reply(measured, answer)
 
@@ -347,7 +340,7 @@ class AskTell:
             request.predicted,
             unknown,
         )
-        waiting = _Waiting(pour, asyncio.get_running_loop().create_future(), self._loop)
+        waiting = _Waiting(pour, asyncio.get_running_loop().create_future())
         self._waiting.put(waiting)
         return waiting
 
@@ -358,7 +351,6 @@ class _Waiting:
 
     pour: AskedPour
     outcome: asyncio.Future[tuple[PourMeasurement | LaboratoryError, str | None]]
-    loop: asyncio.AbstractEventLoop
 
     def reply(self, outcome: PourMeasurement | LaboratoryError, answer: str | None) -> None:
         """Give the outcome from another thread; as an object, and as an operator answers; None: no answer."""
@@ -368,7 +360,7 @@ class _Waiting:
                 self.outcome.set_result((outcome, answer))
 
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            self.loop.call_soon_threadsafe(settle)
+            self.outcome.get_loop().call_soon_threadsafe(settle)
 
 
 class _ExternalLaboratory:

@@ -7,7 +7,7 @@ files. This module does not start or resume runs.
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -177,8 +177,7 @@ class Run:
         rows.append(("done", f"{self.result.pours} pours, {self.result.simulations} simulations"))
         for name, one in self.recommended.items():
             rows.append((f"recommended for {name}", described(one.action_si)))
-        cells = (f"<tr><th>{html.escape(name)}</th><td>{html.escape(text)}</td></tr>" for name, text in rows)
-        return f"<table>{''.join(cells)}</table>"
+        return html_table(rows)
 
     # -- rows --------------------------------------------------------------------------------------------------------
 
@@ -283,9 +282,13 @@ def _frame(rows: Iterator[Row]) -> pd.DataFrame:
     import pandas as pd
 
     table = pd.DataFrame(list(rows))
-    ends = {f"_{suffix}": unit for unit, suffix in UNIT_SUFFIXES.items()} | {"_g": "g"}
+    ends = {**{f"_{suffix}": unit for unit, suffix in UNIT_SUFFIXES.items()}, "_g": "g", "seconds": "s"}
     units = {name: next((unit for end, unit in ends.items() if name.endswith(end)), "") for name in table.columns}
-    table.attrs["units"] = {name: unit for name, unit in units.items() if unit} | dict.fromkeys(
-        set(table.columns) & {"seconds"}, "s"
-    )
+    table.attrs["units"] = {name: unit for name, unit in units.items() if unit}
     return table
+
+
+def html_table(rows: Iterable[tuple[str, str]]) -> str:
+    """A table of names and texts, for notebooks."""
+    cells = (f"<tr><th>{html.escape(name)}</th><td>{html.escape(text)}</td></tr>" for name, text in rows)
+    return f"<table>{''.join(cells)}</table>"

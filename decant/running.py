@@ -111,7 +111,7 @@ def run(
         RunError: the run can't begin, go on or end; the text says what is kept, and what to do.
     """
     request = task_request(campaign)
-    resources = _checked(request, watch, in_process)
+    resources = checked(request, RunResources(in_process=in_process, subscribers=watch))
     if resume is not None:
         request = replace(request, folder=Path(resume).expanduser(), resume="yes")
     return _run(request, resources)
@@ -216,7 +216,9 @@ async def start(campaign: CampaignPlan, *, watch: Sequence[Watch] = (), in_proce
     """
     progress = ProgressState(campaign)
     request = task_request(campaign)
-    resources = await asyncio.to_thread(_checked, request, (*watch, progress), in_process)
+    resources = await asyncio.to_thread(
+        checked, request, RunResources(in_process=in_process, subscribers=(*watch, progress))
+    )
     return RunningCampaign(campaign, RunService().start(request, resources), progress)
 
 
@@ -248,13 +250,13 @@ def calibrate(
         table = Path(folder) / "pours.csv"
         _write_table(table, rows)
         try:
-            checked = _calibration_of(campaign, table)
+            stage = _calibration_of(campaign, table)
         except ConfigError as error:
             shown = Path("pours.csv")
             raise ConfigError(
                 replace(one, path=shown) if one.path == table else one for one in error.problems
             ) from None
-        resources = _checked(task_request(checked, "calibrate"), watch, in_process)
+        resources = checked(task_request(stage, "calibrate"), RunResources(in_process=in_process, subscribers=watch))
     directory = create_run(campaign)
     _write_table(directory / table.name, rows)
     request = task_request(_calibration_of(campaign, directory / table.name), "calibrate")
@@ -305,7 +307,7 @@ def plan(
     vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
     given = _given(theta, campaign)
     request = task_request(campaign, "plan", given=given, receiver=vessel, iterations=iterations, seeds=seeds)
-    return _run(request, _checked(request, watch, in_process))
+    return _run(request, checked(request, RunResources(in_process=in_process, subscribers=watch)))
 
 
 def _given(theta: SimulationParameters | Run | Path | str | None, campaign: CampaignPlan) -> GivenTheta:
@@ -328,8 +330,12 @@ def _given(theta: SimulationParameters | Run | Path | str | None, campaign: Camp
     )
 
 
-def _checked(request: RunRequest, watch: Sequence[Watch], in_process: bool) -> RunResources:
-    """Refuse what can't be run, and warn of what is suspicious, before a run folder is made."""
+def checked(request: RunRequest, resources: RunResources) -> RunResources:
+    """Refuse what can't be run, and warn of what is suspicious, before a run folder is made.
+
+    Returns:
+        `resources`, with a recorder for the live view.
+    """
     campaign, service = request.campaign, RunService()
     if campaign.laboratory.mode == "hardware":
         raise InvalidArgumentError(
@@ -342,13 +348,8 @@ def _checked(request: RunRequest, watch: Sequence[Watch], in_process: bool) -> R
     found.append("\n".join(not_simulated(campaign, found.append)))
     for text in filter(None, dict.fromkeys(found)):
         _warn(text)
-    resources = RunResources(
-        in_process=in_process,
-        subscribers=watch,
-        recorder=lambda plan, run: recorder_of(plan, run, _warn),
-    )
     service.check_laboratory(request, resources)
-    return resources
+    return replace(resources, recorder=lambda plan, run: recorder_of(plan, run, _warn))
 
 
 def _warn(text: str) -> None:

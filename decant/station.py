@@ -10,7 +10,6 @@ once. It does not start a daemon and does not enable the motion of hardware.
 
 from __future__ import annotations
 
-import html
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -104,15 +103,14 @@ class StationPour:
 
     def _repr_html_(self) -> str:
         """The pour as a table, in notebooks."""
-        shown = {
-            name: value for name, value in {**self.row(), "reason": self.reason}.items() if value not in (None, "")
-        }
-        rows = "".join(
-            f"<tr><th>{html.escape(name)}</th><td>"
-            f"{html.escape(f'{value:.2f}' if isinstance(value, float) else str(value))}</td></tr>"
+        from decant.run_results import html_table
+
+        shown = {**self.row(), "reason": self.reason}
+        return html_table(
+            (name, f"{value:.2f}" if isinstance(value, float) else str(value))
             for name, value in shown.items()
+            if value not in (None, "")
         )
-        return f"<table>{rows}</table>"
 
 
 class Station:

@@ -21,6 +21,9 @@ from sim_engine.scene import PoseError
 
 _NORMAL = NormalDist()
 
+ADDED = "added"
+"""Purpose of a pour that somebody made and weighed without being asked."""
+
 WRITTEN_IF_SET = {"written": "if set"}
 """Metadata of a field that journal and events leave out while it is None."""
 
@@ -83,7 +86,7 @@ class Pour:
     """Pour once on the real (or virtual) bench. Never repeated by software.
 
     Attributes:
-        number: 1, 2, … within the stage.
+        number: 1, 2, … within the stage; 0 for an added pour.
         seed: seed of the virtual bench's hidden noise for this pour; a real bench ignores it.
         predicted: the strategy's prediction, for display.
         dose: wanted amount in the receiver; its controller then decides the tilt, and the action gives the place only.

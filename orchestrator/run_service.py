@@ -188,7 +188,8 @@ class RunService:
         """
         from actors.laboratory import check_laboratory
 
-        check_laboratory(resources.settings(request.campaign), need_bench=request.pours, brief=resources.brief)
+        need_bench = request.pours and resources.laboratory is None  # another laboratory brings its own
+        check_laboratory(resources.settings(request.campaign), need_bench=need_bench, brief=resources.brief)
 
     def with_folder(self, request: RunRequest) -> RunRequest:
         """The request with its folder, made if it names none, and with 'yes' or 'no' for `resume`.

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import ast
-import functools
 import hashlib
 from pathlib import Path
 
@@ -22,16 +21,6 @@ def solver_fingerprint(root: Path = ROOT) -> str:
     Args:
         root: folder that contains `sim_engine`.
     """
-    return _own_fingerprint() if root == ROOT else _fingerprint(root)
-
-
-@functools.cache
-def _own_fingerprint() -> str:
-    """That of this process's sources, which are loaded and don't change any more."""
-    return _fingerprint(ROOT)
-
-
-def _fingerprint(root: Path) -> str:
     digest = hashlib.sha256()
     for name, tree in sorted(_modules(root).items()):
         digest.update(f"{name}\n{ast.dump(tree)}\n".encode())

@@ -15,6 +15,7 @@ from orchestrator.cli.app import main
 from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.filterwarnings("ignore:not simulated")
 
 
 def vessel(name: str, radius: float, height: float) -> dict[str, Any]:
@@ -127,14 +128,60 @@ def test_what_can_not_be_is_refused_and_nothing_is_told(tmp_path: Path) -> None:
 def test_no_other_program_pours_in_an_external_laboratory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     with (
         pytest.warns(UserWarning, match="dribbling"),
         pytest.raises(decant.LaboratoryError, match="is external: a program makes its pours"),
     ):
         decant.run(campaign())
+    assert not (tmp_path / "runs").exists()
     (tmp_path / "bench.yaml").write_text("name: bench\nmode: external\nbalance: {placement: manual}\n")
     monkeypatch.setattr("sys.argv", ["decant", "validate", str(tmp_path / "bench.yaml")])
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 2
     assert "an external laboratory has no devices of Decant" in capsys.readouterr().err
+
+
+ACTION: dict[str, str | float] = {"angular_velocity": "40 deg/s", "x_offset": 100}
+
+
+def test_an_added_pour_is_learned_from_and_is_not_one_of_the_campaigns(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with decant.AskTell(campaign(), folder) as session:
+        first = session.ask()
+        assert first is not None
+        with pytest.raises(decant.RunError, match="is running this campaign"):
+            decant.add_pour(folder, ACTION, spilled_g=2.0, received_g=97.0)
+        session.tell(first, spilled_g=9.0, received_g=90.0)
+    decant.add_pour(folder, ACTION, spilled_g=2.0, received_g=97.0, notes={"by": "Ada"})
+    decant.add_pour(folder, ACTION | {"x_offset": "112 mm"}, spilled_g=30.0, received_g=68.0)
+    with decant.AskTell(campaign(), folder) as session:
+        predicted = []
+        while (pour := session.ask()) is not None:
+            predicted.append(pour.predicted is not None)
+            session.tell(pour, spilled_g=5.0, received_g=94.0)
+    assert predicted == [True, True, True]  # three weighed pours are enough for a surrogate, whoever made them
+    assert session.run is not None
+    pours = session.run.pours
+    assert sorted(pours["number"]) == [0, 0, 1, 2, 3, 4]
+    assert sorted(pours["spilled_g"].round(3)) == [2.0, 5.0, 5.0, 5.0, 9.0, 30.0]
+    with pytest.raises(decant.InvalidArgumentError, match="into bowl has ended"):
+        decant.add_pour(folder, ACTION, spilled_g=2.0, received_g=97.0)
+
+
+def test_an_added_pour_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with decant.AskTell(campaign(), folder) as session:
+        session.ask()
+    fine = {"spilled_g": 1.0, "received_g": 98.0}
+    refused: list[tuple[dict[str, str | float], dict[str, float], str]] = [
+        (ACTION | {"x_offset": "300 mm"}, fine, "could not have asked"),
+        ({"x_offset": 100}, fine, "lacks angular_velocity"),
+        (ACTION | {"height": "50 mm"}, fine, "height was 50 mm, here it is 115 mm"),
+        (ACTION, {"spilled_g": 80.0, "retained_g": 80.0}, "don't fit a load"),
+        (ACTION, {"spilled_g": 1.0}, "either received_g or retained_g"),
+    ]
+    for action, weighed, why in refused:
+        with pytest.raises(decant.DecantError, match=why):
+            decant.add_pour(folder, action, **weighed)  # type: ignore[arg-type]

@@ -6,6 +6,7 @@ No call reaches a device, except the commands that stop motion.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 from collections.abc import Callable
@@ -133,7 +134,9 @@ async def _readiness(daemon: Daemon, response: Response) -> HealthOut:
 
 
 async def _not_stored(request: Request, error: Exception) -> JSONResponse:
-    """Refuse a command that could not be stored; the log has the paths."""
+    """Refuse a command that could not be stored; the log has the paths. A deadline that was missed is no such error."""
+    if isinstance(error, OSError) and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO):
+        raise error
     _log.error("%s %s: %s", request.method, request.url.path, error)
     return JSONResponse({"detail": "the daemon can't use its disk; is it full? Make room, then repeat the call"}, 507)
 

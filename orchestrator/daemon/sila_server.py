@@ -34,9 +34,6 @@ from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
-PORT = 50052
-"""Usual TCP port of SiLA 2 servers."""
-
 INTERVAL = 0.5
 """Interval at which the state of the daemon is read [s]."""
 
@@ -553,7 +550,7 @@ async def serve(
     ready: Callable[[str], None],
     *,
     host: str = "127.0.0.1",
-    port: int = PORT,
+    port: int,
     certificate: Path | None = None,
     key: Path | None = None,
     clients: Path | None = None,

@@ -49,7 +49,7 @@ class AskedStep:
 
 @dataclass(frozen=True)
 class ToldStep:
-    """A call of `tell` with the outcome of a request."""
+    """A call of `tell` with the outcome of a request, or of a pour that was added by hand."""
 
     id: int
 
@@ -161,7 +161,8 @@ def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, R
     undelivered: dict[int, Request] = {}
     for step in history.steps:
         if isinstance(step, ToldStep):
-            strategy.tell(undelivered.pop(step.id), history.outcomes[step.id])
+            request = undelivered.pop(step.id, None) or history.request(step.id)
+            strategy.tell(request, history.outcomes[step.id])
             continue
         requests = strategy.ask(step.slots)
         for key, request in zip(step.ids, requests, strict=False):

@@ -96,9 +96,11 @@ async def run_campaign(
 
 
 def _default_deadlines(plan: CampaignPlan) -> Deadlines:
-    """Deadlines of a plan: with an operator who weighs, a pause waits for a pour as long as a question may take."""
+    """Deadlines of a plan: with an operator who weighs, a pause waits for a pour as long as a question may take; where
+    another program pours, a pour may take a month.
+    """
     usual, laboratory = Deadlines(), plan.laboratory
-    if laboratory.mode == "external":  # whoever pours there may do so tomorrow
+    if laboratory.mode == "external":
         return replace(usual, pour=30 * 86400.0)
     if not laboratory.needs_person:
         return usual

@@ -398,6 +398,6 @@ class StageScheduler:
             task.cancel()
         if unfinished:
             await asyncio.wait(unfinished, timeout=self._executor.deadlines.cleanup)
-        for task in (*pours, *others):
+        for task in (pending.task for pending in self._pending.values() if pending.task is not None):
             if task.done() and not task.cancelled() and (late := task.exception()) is not None and late is not error:
                 self._subscribers.log("warning", f"while winding down: {type(late).__name__}: {late}", self._stage)

@@ -254,7 +254,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
         return build
 
     stages = []
-    for name, scene in _by_receiver(deployment).items():
+    for name, scene in by_receiver(deployment).items():
         order, pours = deployment.settings.order, deployment.pours > 0
         stages.append(StageDefinition(DEPLOYMENT + name, build_for(scene), order=order, pours=pours))
         if deployment.confirm:
@@ -289,7 +289,7 @@ def prediction_stages(
         return build
 
     return [
-        StageDefinition(PREDICTION + name, build_for(name, scene)) for name, scene in _by_receiver(deployment).items()
+        StageDefinition(PREDICTION + name, build_for(name, scene)) for name, scene in by_receiver(deployment).items()
     ]
 
 
@@ -362,7 +362,7 @@ def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationPar
     return replace(deployment, bench=tuple(displacement(best, bench, deployment.actions) for bench in benches))
 
 
-def _by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
+def by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
     """Scenes by the names of their receivers, or by their own names if receivers are shared."""
     distinct = len({scene.receiver.name for scene in deployment.scenes}) == len(deployment.scenes)
     return {scene.receiver.name if distinct else scene.name: scene for scene in deployment.scenes}

@@ -415,7 +415,7 @@ PathOr = Annotated[
 
 @functools.cache
 def meanings(model: type[BaseModel]) -> dict[str, str]:
-    """The texts below the fields of a model, by field; '' for a field without one.
+    """The texts below the fields of a model at the top of a module, by field; '' for a field without one.
 
     Schemas and tables need them. Pydantic's `use_attribute_docstrings` would read and parse the source of every model
     whenever a program starts, which takes a quarter of its start.

@@ -45,13 +45,16 @@ def test_how_fast_anything_is_changes_nothing_in_logical_order(tmp_path: Path) -
         assert logical_record(directory) == undisturbed
 
 
+def finished(events: list[Event]) -> list[type[Any]]:
+    return [type(e.request) for e in events if isinstance(e, RequestFinished)]
+
+
 def test_simulations_go_on_while_the_arm_pours(tmp_path: Path) -> None:
     events: list[Event] = []
-    laboratory = ToyLaboratory(ToySimulators(lambda: 0.001), ToyBench(lambda: 0.1))
+    laboratory = ToyLaboratory(ToySimulators(lambda: 0.001), ToyBench(until=lambda: len(finished(events)) == 5))
     strategy = Script(pour(), *(simulate(seed) for seed in range(5)))
     run(tmp_path / "run", laboratory, stages=one_stage(strategy), subscribers=[events.append])
-    finished = [type(e.request) for e in events if isinstance(e, RequestFinished)]
-    assert finished == [Simulate] * 5 + [Pour]  # more simulations than slots, all beside one pour
+    assert finished(events) == [Simulate] * 5 + [Pour]  # more simulations than slots, all beside one pour
     assert [type(request) for request, _ in strategy.told] == [Simulate] * 5 + [Pour]
 
 
@@ -220,8 +223,14 @@ def test_an_optimiser_that_keeps_dying_fails_the_run_which_can_be_resumed(tmp_pa
     assert logical_record(tmp_path / "run") == logical_record(tmp_path / "undisturbed")
 
 
+def pausing(directory: Path) -> bool:
+    return states(directory)[-1] == "pausing"
+
+
 def test_a_defect_in_the_laboratory_fails_the_run_but_first_the_pour_is_finished(tmp_path: Path) -> None:
-    laboratory = ToyLaboratory(ToySimulators(fails=lambda task: ZeroDivisionError("a bug")), ToyBench(lambda: 0.05))
+    laboratory = ToyLaboratory(
+        ToySimulators(fails=lambda task: ZeroDivisionError("a bug")), ToyBench(until=lambda: pausing(tmp_path / "run"))
+    )
     with pytest.raises(ZeroDivisionError):
         run(tmp_path / "run", laboratory, stages=one_stage(Script(pour(), simulate(1))))
     assert laboratory.bench is not None
@@ -306,7 +315,7 @@ def script() -> Script:
 
 
 def test_pausing_finishes_the_pour_and_drops_simulations(tmp_path: Path) -> None:
-    laboratory = ToyLaboratory(ToySimulators(lambda: 60.0), ToyBench(lambda: 0.2))
+    laboratory = ToyLaboratory(ToySimulators(lambda: 60.0), ToyBench(until=lambda: pausing(tmp_path / "run")))
     asyncio.run(interrupt(tmp_path / "run", laboratory, script(), cancels=1))
     assert laboratory.bench is not None
     assert laboratory.bench.poured == [101]

@@ -85,9 +85,10 @@ def noise(seed: int) -> float:
 
 @dataclass
 class ToyBench:
-    """A virtual bench; `pauses` seconds before the tilt and after it."""
+    """A virtual bench; a pour takes `pauses` seconds, and goes on until `until` holds."""
 
     pauses: Callable[[], float] = lambda: 0.0
+    until: Callable[[], bool] = lambda: True
     mode: str = "virtual"
     received: list[int] = field(default_factory=list)
     poured: list[int] = field(default_factory=list)
@@ -102,6 +103,8 @@ class ToyBench:
             progress(PourProgress("tilt", 0.5))
         try:
             await asyncio.sleep(self.pauses())
+            while not self.until():
+                await asyncio.sleep(0.001)
         except asyncio.CancelledError:
             self.aborted.append(seed)
             raise

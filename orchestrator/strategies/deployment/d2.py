@@ -43,7 +43,7 @@ class RealOnly(Deployment[D2Settings]):
         self._scalarization.weigh(exploring=self._pours_left)
         if self._pours_left:
             made = [p for p in self._pours if p.status != "refused"]
-            known = [*(point for point, _ in self._prior_pours), *(p.point for p in made)]
+            known = [*(point for point, _ in self._known), *(p.point for p in made)]
             if len(known) < min(self._settings.initial_samples, self._plan.pours):
                 # one Sobol sequence, point by point, each far from the points already poured
                 self._questions.put(self._space_filling(known=tuple(known)), "start", self._start)

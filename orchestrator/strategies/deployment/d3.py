@@ -312,7 +312,7 @@ class Hybrid(Deployment[D3Settings]):
         """Acquisition of the next pour."""
         if self._settings.adaptive and not self._scalarization.exploring:
             return "least_loss"
-        return "lcb" if self._pours or self._prior_pours else "posterior_minimum"
+        return "lcb" if self._pours or self._known else "posterior_minimum"
 
     def _pour_query(self, **parts: Any) -> PourQuery:
         """A query for the next pour; with a count of 0, about the real cost only."""

@@ -15,14 +15,32 @@ from actors.optimizer.questions import (
     Suggestion,
     SurrogateQuery,
 )
-from orchestrator.requests import Decision, Failed, Outcome, Pour, Prediction, Request, Simulate, Slots, Suggest
+from orchestrator.requests import (
+    ADDED,
+    Decision,
+    Failed,
+    Outcome,
+    Pour,
+    Prediction,
+    Request,
+    Simulate,
+    Slots,
+    Suggest,
+)
 from orchestrator.strategies.calibration.calibration_base import Kappa
 from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended, RiskFound, SimulatedAction
 from orchestrator.strategies.deployment.model_monitoring import Believed
 from orchestrator.strategies.deployment.objectives import Vector
-from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck, expecting, prior_pours, trust
+from orchestrator.strategies.deployment.real_pours import (
+    PourTrial,
+    PredictionCheck,
+    expecting,
+    point_of,
+    prior_pours,
+    trust,
+)
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.deployment.scalarization import Scalarization
 from orchestrator.strategies.stage_result import displayed_map
@@ -91,6 +109,7 @@ class Deployment(ABC, Generic[S]):
         self._width_known = False
         self._pours: list[PourTrial] = []
         self._prior_pours = () if self._data is None else prior_pours(self._data, scene, plan.actions, self._costing)
+        self._added: list[PourTrial] = []
         self._queued_pour: Pour | None = None
         self._pouring: Pour | None = None
         self._final: Suggestion | None = None
@@ -145,8 +164,21 @@ class Deployment(ABC, Generic[S]):
             trial.take(outcome, self._scene, self._costing, penalised=self._settings.on_failed_pour == "penalise")
             if trial.status == "weighed" and trial.cost is not None:
                 self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
+        elif isinstance(request, Pour) and request.purpose == ADDED:
+            self._add(request.action, outcome)
         else:
             raise ValueError(f"this pour was not asked for: {request}")
+
+    def _add(self, action: Action, outcome: Outcome) -> None:
+        """Take a pour that was not asked for into the data."""
+        values = {name: float(getattr(action, name)) for name in self._plan.actions.names}
+        trial = PourTrial(0, point_of(action, self._plan.actions), values, None, 0.0)
+        trial.take(outcome, self._scene, self._costing, penalised=False)
+        if trial.cost is not None:
+            trial.status = "added"
+            self._added.append(trial)
+            text = f"a pour was added: {described(values)}  loss {trial.cost:.4g}"
+            self.decisions.append(Decision(text, {"loss": trial.cost}))
 
     @property
     def _may_think(self) -> bool:
@@ -229,7 +261,12 @@ class Deployment(ABC, Generic[S]):
 
     @property
     def _poured(self) -> list[tuple[Point, Vector]]:
-        return [*self._prior_pours, *((p.point, p.vector) for p in self._pours if p.vector is not None)]
+        return [*self._known, *((p.point, p.vector) for p in self._pours if p.vector is not None)]
+
+    @property
+    def _known(self) -> list[tuple[Point, Vector]]:
+        """Pours that the strategy did not ask for: from before the campaign, and added by hand."""
+        return [*self._prior_pours, *((p.point, p.vector) for p in self._added if p.vector is not None)]
 
     @property
     def _counted(self) -> int:
@@ -343,7 +380,9 @@ class Deployment(ABC, Generic[S]):
             simulations=self._trials.answered,
             simulations_lost=self._trials.lost,
             simulations_refused=sum(trial.refused for trial in self._trials.all),
-            pours=tuple(p.row(names, self._scene.liquid) for p in self._pours if p.status != "pouring"),
+            pours=tuple(
+                p.row(names, self._scene.liquid) for p in [*self._added, *self._pours] if p.status != "pouring"
+            ),
             simulated=tuple(
                 SimulatedAction(action_si=self._plan.actions.decode(trial.point), loss=trial.cost)
                 for trial in self._trials.all

@@ -21,6 +21,7 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.objectives import Vector
 from orchestrator.strategies.stage_result import ResultPart, displayed_action
 from orchestrator.strategies.strategy import is_sound
+from sim_engine.action import Action
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement, normalised_spillage
 from sim_engine.scene import Scene
@@ -31,17 +32,18 @@ TRUST_LIMIT = 3.0
 """Mean |z| of the first pours above which the predictions are reported as unreliable."""
 
 
-Status = Literal["pouring", "weighed", "refused", "failed"]
+Status = Literal["pouring", "weighed", "refused", "failed", "added"]
 
 
 class PourRow(ResultPart):
     """A real pour of a deployment: its action, its prediction and its outcome."""
 
     number: int
-    """Number from 1; a refused pour does not count, and the next one has the same number."""
+    """Number from 1; a refused pour does not count, and the next one has the same number. 0: added by hand."""
 
     status: Status
-    """'refused': an invalid action, nothing was poured. 'failed': an error occurred during the pour or the weighing."""
+    """'refused': an invalid action, nothing was poured. 'failed': an error occurred during the pour or the weighing.
+    'added': made and weighed without being asked for."""
 
     reason: str
     """Reason of the refusal or failure."""
@@ -102,7 +104,8 @@ class PourTrial:
 
     Attributes:
         cost, vector: value for the data, as one number and as objectives; None: the pour adds no data.
-        status: 'pouring', 'weighed', 'refused' (an invalid action: nothing was poured) or 'failed'.
+        status: 'pouring', 'weighed', 'refused' (an invalid action: nothing was poured), 'failed', or 'added' (not
+            asked for).
         mishap: whether the pour failed during its execution, for example because the vessels touched.
     """
 
@@ -189,11 +192,15 @@ def prior_pours(
     """Points and objectives of the pours from before the campaign in a scene."""
     found = []
     for pour in data.pours.get(scene.name, ()):
-        unit = actions.encode({name: getattr(pour.action, name) for name in actions.names})
-        point = tuple(min(max(float(u), 0.0), 1.0) for u in unit)
         measured = PourMeasurement(pour.poured + pour.retained, pour.spilled, pour.retained)
-        found.append((point, costing.poured(measured, pour.action)))
+        found.append((point_of(pour.action, actions), costing.poured(measured, pour.action)))
     return tuple(found)
+
+
+def point_of(action: Action, actions: Space) -> Point:
+    """An action inside the search space, up to rounding, as a point."""
+    unit = actions.encode({name: getattr(action, name) for name in actions.names})
+    return tuple(min(max(float(u), 0.0), 1.0) for u in unit)
 
 
 def trust(weighed: Sequence[PourTrial]) -> PredictionCheck:

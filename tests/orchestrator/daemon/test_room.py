@@ -6,10 +6,12 @@ import os
 from pathlib import Path
 
 import pytest
+from fastapi.testclient import TestClient
 
 from orchestrator.daemon import rig_worker as lane
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.daemon_store import StoreError
+from orchestrator.daemon.http_api import create_app
 from orchestrator.daemon.run_readout import prune_recordings
 from tests.support.toy_daemon import run, serving
 
@@ -93,3 +95,15 @@ def test_a_snapshot_that_nobody_was_told_of_is_forgotten(tmp_path: Path) -> None
             assert [path.name for path in (tmp_path / "state/campaigns").iterdir()] == [key]
 
     run(work())
+
+
+@pytest.mark.parametrize(
+    ("error", "status"), [(TimeoutError("the arm did not answer"), 500), (OSError(28, "full"), 507)]
+)
+def test_only_a_disk_that_is_full_is_called_so(error: OSError, status: int) -> None:
+    async def fails() -> None:
+        raise error
+
+    app = create_app()
+    app.add_api_route("/fails", fails)
+    assert TestClient(app, raise_server_exceptions=False).get("/fails").status_code == status
