@@ -311,14 +311,14 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
     return {**dict.fromkeys(ORDER, found["paused"]), **found, "plan": found["plain"]}
 
 
-def submitting(lab: Laboratory, rig: str, first: int, most: int) -> None:
+def submitting(lab: Laboratory, sent: dict[str, tuple[str, Files]], rig: str, first: int, most: int) -> None:
     """A client of one rig: one campaign after the other.
 
     Args:
+        sent: submissions by kind.
         first: number of its first campaign in `ORDER`.
         most: number of campaigns.
     """
-    sent = texts(lab.folder)
     chance = random.Random(f"{rig} {first}")
     for number in range(first, first + most):
         if lab.over.is_set():
@@ -571,9 +571,9 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
     with small_disk(folder / "disk") as disk, tempfile.TemporaryDirectory(prefix="k", dir="/tmp") as mark:
         lab = Laboratory(folder, disk, mark)
         lab.start()
-        begun = time.monotonic()
+        begun, sent = time.monotonic(), texts(folder)
         work: list[Callable[[], None]] = [
-            partial(submitting, lab, rig, first, campaigns) for rig in RIGS for first in (0, 5)
+            partial(submitting, lab, sent, rig, first, campaigns) for rig in RIGS for first in (0, 5)
         ]
         others: list[Callable[[], None]] = [
             partial(ordering, lab, begun),
