@@ -37,11 +37,11 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 from daemon_page import keep
 from daemon_process import PATIENCE, await_, end_in_order, started
 from ruamel.yaml import YAML
+from scipy import stats
 
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign
@@ -296,7 +296,7 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
 
     changes: dict[str, Callable[[dict[str, Any]], object]] = {
         "plain": lambda campaign: None,
-        "short": lambda campaign: short(campaign, 2),
+        "short": lambda campaign: short(campaign, 1),
         "paused": lambda campaign: short(campaign, 4),
         "recorded": lambda campaign: short(campaign, 2, {"recorded_simulations": 1}),
     }
@@ -311,14 +311,14 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
     return {**dict.fromkeys(ORDER, found["paused"]), **found, "plan": found["plain"]}
 
 
-def submitting(lab: Laboratory, rig: str, first: int, most: int) -> None:
+def submitting(lab: Laboratory, sent: dict[str, tuple[str, Files]], rig: str, first: int, most: int) -> None:
     """A client of one rig: one campaign after the other.
 
     Args:
+        sent: submissions by kind.
         first: number of its first campaign in `ORDER`.
         most: number of campaigns.
     """
-    sent = texts(lab.folder)
     chance = random.Random(f"{rig} {first}")
     for number in range(first, first + most):
         if lab.over.is_set():
@@ -480,9 +480,9 @@ def look(lab: Laboratory) -> dict[str, Any]:
         with contextlib.suppress(psutil.Error, OSError):
             with process.oneshot():
                 name = _name(process)
-                found: dict[str, Any] = {"pss": process.memory_full_info().pss / 1e6}
+                found: dict[str, Any] = {"own": _own_memory(process.pid), "pss": process.memory_full_info().pss / 1e6}
                 found |= {"threads": process.num_threads(), "handles": process.num_fds(), "processes": 1}
-            memory[name] += found["pss"]
+            memory[name] += found["own"]
             totals.update(found)
             if name == "daemon":
                 totals.update({f"daemon {k}": v for k, v in found.items() if k != "processes"})
@@ -506,6 +506,15 @@ def ours(mark: str) -> Iterator[psutil.Process]:
         with contextlib.suppress(psutil.Error, OSError):
             if process.environ().get("TMPDIR") == mark or any(mark in word for word in process.cmdline()):
                 yield process
+
+
+def _own_memory(pid: int) -> float:
+    """What a process has written to memory [MB], shared pages in equal parts; without libraries' files.
+
+    The share of those changes with every other program on the machine that uses them, by 40 MB at once.
+    """
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    return sum(int(line.split()[1]) for line in lines if line.startswith(("Pss_Anon", "Pss_Shmem"))) * 1024 / 1e6
 
 
 def _name(process: psutil.Process) -> str:
@@ -562,9 +571,9 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
     with small_disk(folder / "disk") as disk, tempfile.TemporaryDirectory(prefix="k", dir="/tmp") as mark:
         lab = Laboratory(folder, disk, mark)
         lab.start()
-        begun = time.monotonic()
+        begun, sent = time.monotonic(), texts(folder)
         work: list[Callable[[], None]] = [
-            partial(submitting, lab, rig, first, campaigns) for rig in RIGS for first in (0, 5)
+            partial(submitting, lab, sent, rig, first, campaigns) for rig in RIGS for first in (0, 5)
         ]
         others: list[Callable[[], None]] = [
             partial(ordering, lab, begun),
@@ -680,10 +689,10 @@ def draw(folder: Path) -> dict[str, Any]:
     figure, panels = style.new_figure(2, 2, size=(9.2, 6.0), sharex=True)
     memory, handles, threads, disk = panels.flat
     for starts in range(1, last + 1):
-        rows = [one for one in samples if one["starts"] == starts and "daemon pss" in one]
+        rows = [one for one in samples if one["starts"] == starts and "daemon own" in one]
         minutes = [one["minute"] for one in rows]
         for axes, curves in (
-            (memory, {"all processes": "pss", "the daemon": "daemon pss"}),
+            (memory, {"all processes": "own", "the daemon": "daemon own"}),
             (handles, {"all processes": "handles", "the daemon": "daemon handles"}),
             (threads, {"threads": "threads", "processes": "processes"}),
         ):
@@ -702,8 +711,8 @@ def draw(folder: Path) -> dict[str, Any]:
         axes.legend(fontsize=8, framealpha=0.85, edgecolor="none")
     style.save(figure, FIGURE)
     shown: dict[str, Callable[[dict[str, Any]], float]] = {
-        "memory of all processes [MB]": lambda s: float(s["pss"]),
-        "memory of the daemon itself [MB]": lambda s: float(s["daemon pss"]),
+        "memory of all processes [MB]": lambda s: float(s["own"]),
+        "memory of the daemon itself [MB]": lambda s: float(s["daemon own"]),
         "open handles": lambda s: float(s["handles"]),
         "threads": lambda s: float(s["threads"]),
         "processes": lambda s: float(s["processes"]),
@@ -754,11 +763,16 @@ def _kept(name: str, sample: dict[str, Any]) -> float:
 
 
 def _course(rows: list[dict[str, Any]], value: Callable[[dict[str, Any]], float]) -> dict[str, float]:
-    """At a third of the time, at the end, and how it went on average in the time between [1/h]."""
+    """At a third of the time, at the end, and the mean course in the time between with its standard error [1/h]."""
     begin, end = rows[0]["minute"], rows[-1]["minute"]
     late = [row for row in rows if row["minute"] >= begin + (end - begin) / 3.0]
-    slope = float(np.polyfit([row["minute"] / 60.0 for row in late], [value(row) for row in late], 1)[0])
-    return {"third": round(value(late[0]), 2), "end": round(value(late[-1]), 2), "an hour": round(slope, 2)}
+    fit = stats.linregress([row["minute"] / 60.0 for row in late], [value(row) for row in late])
+    return {
+        "third": round(value(late[0]), 2),
+        "end": round(value(late[-1]), 2),
+        "an hour": round(float(fit.slope), 2),
+        "error": round(float(fit.stderr), 2),
+    }
 
 
 def main() -> None:
@@ -767,7 +781,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=40.0)
     parser.add_argument("--into", type=Path, default=Path("soak"))
     parser.add_argument("--campaigns", type=int, default=1000, help="most of each of four clients")
-    parser.add_argument("--every", type=float, default=100.0, help="seconds between two samples")
+    parser.add_argument("--every", type=float, default=60.0, help="seconds between two samples")
     parser.add_argument("--ray", action="store_true", help="with processes of Ray: takes several times as long")
     parser.add_argument("--draw", type=Path, help="draw what was found there")
     arguments = parser.parse_args()

@@ -28,6 +28,7 @@ from pythonjsonlogger.json import JsonFormatter
 
 from actors.interfaces import LaboratoryError
 from actors.runtime.ray_cluster import check_cluster
+from actors.simulators.job_runner import few_arenas
 from orchestrator.catalogue.run_registry import make_state_directory, use_state_directory
 from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
@@ -190,6 +191,7 @@ def serve(settings: DaemonSettings, ready: Callable[[str], None] = lambda url: N
             the port is taken.
     """
     os.umask(0o077)
+    few_arenas()
     restart = DaemonRestart()
     if settings.ray is not None and not settings.in_process:
         try:
