@@ -35,7 +35,7 @@ def test_offsets_from_which_no_stream_hits_are_told_with_those_from_which_one_do
         ("1 mm, 10 mm", "from no x_offset in this range can a stream hit"),
         ("130 mm, 230 mm", "only from 21 % of this range can a stream hit"),
     ):
-        (told,) = warnings(write(tmp_path, "bad.yaml", QUICKSTART.replace("85 mm, 140 mm", ends)))
+        (told,) = warnings(write(tmp_path, "bad.yaml", QUICKSTART.replace("95 mm, 150 mm", ends)))
         assert told.startswith(INTO_NARROW + share)
         # slower pours come down nearer to the pourer
         assert told.endswith("'narrow': a free jet comes down in it from an x_offset of 56 … 150 mm")
