@@ -89,6 +89,7 @@ def day(found: Mapping[str, Any]) -> str:
     lost = [(name, count) for name, count in found["lost or doubled"].items()]
     begin, end = found["undisturbed [min]"]
     grown = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
+    memory = next(one for one in found["at rest"] if one["what"].startswith("memory of the daemon"))
     return (
         "Two rigs on simulated benches without Ray, in scaled time; in the first part a fault every 90 seconds. Each "
         "order is sent three times or more. If a pour is killed, the operator declares it lost.\n\n"
@@ -98,8 +99,9 @@ def day(found: Mapping[str, Any]) -> str:
         + f"\nBetween campaigns, from minute {begin:.0f} to {end:.0f}, when the daemon was not restarted; "
         f"{100 * found['cpu share']:.0f} % of a core on average:\n\n"
         + markdown_table(("", "after a third", "at the end", "an hour"), grown)
-        + f"\nMemory is not flat: at {60 * (found['campaigns'] + found['orders']) / found['minutes']:.0f} campaigns "
-        "and orders an hour it grows as shown, for an unknown reason.\n"
+        + f"\nAt {60 * (found['campaigns'] + found['orders']) / found['minutes']:.0f} campaigns and orders an hour the "
+        f"daemon's memory grew by {memory['an hour']:+.0f} ± {memory['error']:.0f} MB an hour (standard error); the "
+        "files of the runs grow until they are removed.\n"
     )
 
 

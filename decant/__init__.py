@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     )
     from decant.simulation import Simulation, simulate
     from decant.station import Station, StationPour
+    from orchestrator.added_pours import add_pour
     from orchestrator.bench_check import BenchReport
     from orchestrator.catalogue.vessel_account import VesselAccount, VesselContent
     from orchestrator.config.action_assignments import AssignmentError
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from orchestrator.run_errors import RunError
     from orchestrator.run_service import CheckReport
     from orchestrator.runs import events
-    from orchestrator.runs.added_pours import add_pour
     from orchestrator.runs.events import Event
     from orchestrator.strategies.campaign_plan import CampaignPlan
     from sim_engine.errors import DecantError, InvalidArgumentError
@@ -107,7 +107,7 @@ _HOMES = {
     "orchestrator.config.yaml.yaml_errors": ("ConfigError",),
     "orchestrator.run_errors": ("RunError",),
     "orchestrator.run_service": ("CheckReport",),
-    "orchestrator.runs.added_pours": ("add_pour",),
+    "orchestrator.added_pours": ("add_pour",),
     "orchestrator.runs.events": ("Event",),
     "orchestrator.strategies.campaign_plan": ("CampaignPlan",),
     "orchestrator.results.publishing": ("Published",),

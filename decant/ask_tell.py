@@ -39,11 +39,11 @@ from actors.laboratory import open_laboratory
 from actors.laboratory_settings import LaboratorySettings
 from decant.run_results import Run, html_table
 from decant.running import checked
+from orchestrator.added_pours import weighed_by_hand
 from orchestrator.journal.run_record import read_record
 from orchestrator.requests import Pour, Prediction
 from orchestrator.results.stage_views import receiver_names
 from orchestrator.run_service import RunHandle, RunResources, RunService, RunTaskError, task_request
-from orchestrator.runs.added_pours import weighed_by_hand
 from orchestrator.runs.events import Event, RequestStarted
 from orchestrator.runs.events import Subscriber as Watch
 from orchestrator.runs.resume import LOST

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/evidence/validation.md again from the curves in docs/data/validation.json, without measuring.
+"""Draw the pictures of docs/evidence/validation.md again from docs/data/validation.json, without measuring.
 
 python docs/make_validation_pictures.py
 """

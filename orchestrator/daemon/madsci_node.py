@@ -309,7 +309,7 @@ class MadsciNode:
         assert action.campaign is not None
         item = self._daemon.item(action.campaign)
         if action.name == "run_campaign":
-            status, reason = _CAMPAIGN_STATUS.get(item.state, "running"), item.reason
+            status, reason = _CAMPAIGN_STATUS.get(item.state, "running"), item.reason or ""
             about = {"campaign": item.id, "state": item.state, "run": item.run, "reason": reason}
         else:
             about = await self._ordering.pour_out(action.id)
