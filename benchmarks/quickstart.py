@@ -9,8 +9,8 @@ pour of a seed is kept under `--into`, by what was asked and the solver that ans
 their calibration and whatever else they both ask for, pour for pour the same; finished runs are kept there, too, and an
 interrupted comparison goes on. `--calibration-only` leaves the deployment out, and scores the test pours alone.
 `--random` pours so many random actions of the deployment on the bench, drawn with the seed `--first`; `--plans` pours
-so many plans of the uncalibrated simulator; with `--seeds 0` nothing else is done. `--write` makes no runs, and writes the
-tables of those that are there into docs/data/results.json, for docs/make_tables.py.
+so many plans of the uncalibrated simulator; with `--seeds 0` nothing else is done. `--write` makes no runs, and
+writes the tables of those that are there into docs/data/results.json, for docs/make_tables.py.
 
 The other arms change the program, for this benchmark only: there are no such settings.
 

@@ -310,10 +310,10 @@ class MadsciNode:
         item = self._daemon.item(action.campaign)
         if action.name == "run_campaign":
             status, reason = _CAMPAIGN_STATUS.get(item.state, "running"), item.reason or ""
-            about = {"campaign": item.id, "state": item.state, "run": item.run, "reason": reason}
+            about: dict[str, Any] = {"campaign": item.id, "state": item.state, "run": item.run, "reason": reason}
         else:
             about = await self._ordering.pour_out(action.id)
-            status, reason = _status_of(about), about["reason"]
+            status, reason = _status_of(about), str(about["reason"] or "")
         waits = self._waits_for(item) if status in ("running", "unknown") else ""
         match status:
             case "running":
