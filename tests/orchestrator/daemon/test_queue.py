@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import socket
 from pathlib import Path
@@ -18,7 +19,7 @@ from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import QueueItem
 from orchestrator.daemon.run_readout import Pours
 from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
-from orchestrator.run_service import RunRequest
+from orchestrator.run_service import RunHandle, RunRequest
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.support.small_campaign import NARROW, write_campaign
 from tests.support.toy_daemon import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
@@ -38,6 +39,22 @@ def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path
             assert before["run"] != found["run"]
 
     run(work())
+
+
+def test_nothing_of_a_campaign_stays_in_memory_when_the_next_one_has_begun(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            for key in [await served.submit() for _ in range(3)]:
+                await served.until(key, "finished")
+            # whatever its last reader still holds
+            assert sum(isinstance(one, RunHandle) for one in gc.get_objects()) <= 1
+
+    gc.collect()
+    gc.disable()  # Python itself would collect cycles much later
+    try:
+        run(work())
+    finally:
+        gc.enable()
 
 
 def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
