@@ -46,13 +46,13 @@ def predict(plan: CampaignPlan, seeds: int, label: str, *, transfer: bool) -> di
     """Calibrate on the training pours, and predict the others.
 
     Args:
-            plan: campaign with a fold as test pours.
-            seeds: simulations per prediction.
-            label: name in progress messages.
-            transfer: also predict the pours of the transfer scene.
+        plan: campaign with a fold as test pours.
+        seeds: simulations per prediction.
+        label: name in progress messages.
+        transfer: also predict the pours of the transfer scene.
 
-        Returns:
-            The residual shift, and for each unseen pour its split, measured r and simulated r.
+    Returns:
+        The residual shift, and for each unseen pour its split, measured r and simulated r.
     """
     calibration = plan.calibration
     assert calibration is not None

@@ -97,9 +97,9 @@ def searching(
     """Return the calibration that searches only these parameters.
 
     Args:
-            names: parameter names, not empty.
-            particles: N if it is neither searched nor fixed by the campaign.
-            known: values of parameters that are not searched, overriding the campaign's.
+        names: parameter names, not empty.
+        particles: N if it is neither searched nor fixed by the campaign.
+        known: values of parameters that are not searched, overriding the campaign's.
     """
     axes = {**RANGES, **{axis.name: axis for axis in plan.parameters.axes}}
     fixed = {"particles": float(particles), **plan.fixed_parameters, **(known or {})}
@@ -179,8 +179,8 @@ def calibrate(plan: CampaignPlan, seed: int, label: str, splits: Sequence[str]) 
     """Calibrate as the campaign would, and simulate θ* on the recorded pours of some splits.
 
     Args:
-            plan: the campaign; it is not calibrated if its budget is 0.
-            seed: replaces the campaign's seed.
+        plan: the campaign; it is not calibrated if its budget is 0.
+        seed: replaces the campaign's seed.
     """
     calibration = plan.calibration
     assert calibration is not None
@@ -239,7 +239,7 @@ def wanted_sets(options: argparse.Namespace) -> list[tuple[tuple[str, ...], dict
     """Return the searched parameters and the known values of each row.
 
     Raises:
-            SystemExit: `--known` has an unknown parameter or an invalid value.
+        SystemExit: `--known` has an unknown parameter or an invalid value.
     """
     if options.as_it_is:
         return [(tuple(options.searched), {})]
@@ -254,7 +254,7 @@ def known_values(texts: Sequence[str]) -> dict[str, float]:
     """Parse `--known`: values of parameters by name.
 
     Raises:
-            SystemExit: an unknown parameter or an invalid value.
+        SystemExit: an unknown parameter or an invalid value.
     """
     known: dict[str, float] = {}
     for text in texts:

@@ -66,7 +66,7 @@ class Row:
 
     Attributes:
         name: 'C1' to 'C4', or one of `NOT_CALIBRATED`.
-            budget: single simulated pours; for 'random', the number of θ.
+        budget: single simulated pours; for 'random', the number of θ.
     """
 
     name: str
@@ -95,7 +95,7 @@ def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:
     """Return the calibration by another strategy, with as many θ as the budget allows.
 
     Raises:
-            SystemExit: the budget is too small.
+        SystemExit: the budget is too small.
     """
     pours = sum(scored.pour.split == TRAINED_ON and scored.pour.spillage is not None for scored in recorded(plan))
     kind, names = calibrations()[row.name], plan.parameters.names
@@ -114,8 +114,8 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
     """Calibrate as a campaign would, and simulate the found θ on all recorded pours.
 
     Args:
-            plan: campaign whose calibration comes from `at_price`.
-            seed: replaces the campaign's seed.
+        plan: campaign whose calibration comes from `at_price`.
+        seed: replaces the campaign's seed.
     """
     calibration = plan.calibration
     assert calibration is not None
@@ -200,7 +200,7 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
     """Return the rows of the table, with the uncalibrated ones first.
 
     Raises:
-            SystemExit: `--rows` has an unknown strategy or no budget.
+        SystemExit: `--rows` has an unknown strategy or no budget.
     """
     rows = [Row(DEFAULTS)] if options.known else []
     rows += [Row(UNCALIBRATED), *([Row(RANDOM, options.random)] if options.random > 0 else [])]
@@ -233,7 +233,7 @@ def searched(plan: CampaignPlan, names: Sequence[str], known: Mapping[str, float
     """Return the campaign with only these parameters searched, and with calibration only.
 
     Raises:
-            SystemExit: the campaign has no recorded pours, or does not search these parameters.
+        SystemExit: the campaign has no recorded pours, or does not search these parameters.
     """
     calibration = plan.calibration
     if calibration is None or calibration.records is None:

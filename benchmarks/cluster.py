@@ -213,9 +213,9 @@ async def whole_run(workers: int, slots: int, mean: float) -> dict[str, Any]:
     """Run the grid of the paper's study: strategy, stage scheduler, journal, pool.
 
     Args:
-            workers: workers in the pool.
-            slots: parallel simulations in the campaign.
-            mean: mean time of a simulation [s].
+        workers: workers in the pool.
+        slots: parallel simulations in the campaign.
+        mean: mean time of a simulation [s].
     """
     idle: list[float] = []
     study = load_study(ROOT / "configs" / "studies" / "paper.yaml")
@@ -334,8 +334,8 @@ def driven(cluster: Any, kind: str, jobs: int, *, kill: int | None = None, after
 
     Args:
         cluster: `tests.support.local_cluster.LocalCluster`.
-            kill: node to kill.
-            after: time from the first job to the kill [s].
+        kill: node to kill.
+        after: time from the first job to the kill [s].
     """
     process = subprocess.Popen(
         [sys.executable, __file__, "--drive", cluster.address, kind, str(jobs)],

@@ -35,11 +35,11 @@ def run(compiler: str, particles: int) -> list[dict[str, Any]]:
     """Return nanoseconds per particle, one row per instruction set.
 
     Args:
-            compiler: path of the C compiler.
+        compiler: path of the C compiler.
         particles: N.
 
     Raises:
-            SystemExit: the program does not compile or run.
+        SystemExit: the program does not compile or run.
     """
     rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -66,7 +66,7 @@ def limits(rows: Iterable[dict[str, Any]], iterations_per_step: float) -> tuple[
 
     Args:
         rows: see `run`.
-            iterations_per_step: iterations per step of the solver to compare with.
+        iterations_per_step: iterations per step of the solver to compare with.
 
     Returns:
         With lists built in every step, and with lists kept for `KEPT` steps.

@@ -60,10 +60,10 @@ class Group:
     """A part of the benchmark.
 
     Attributes:
-            cups: names of the cups.
-            lags: range of the balance's lag [s].
-            oil: use oil instead of water.
-            final: number of series with final seeds.
+        cups: names of the cups.
+        lags: range of the balance's lag [s].
+        oil: use oil instead of water.
+        final: number of series with final seeds.
     """
 
     cups: tuple[str, ...]
@@ -123,9 +123,9 @@ class Series:
     """One source, one bench, six doses; the same for every controller.
 
     Args:
-            group: group of the benchmark.
-            seed: seed of all random choices.
-            cups: returns the flow for a cup's name and a liquid (oil or not).
+        group: group of the benchmark.
+        seed: seed of all random choices.
+        cups: returns the flow for a cup's name and a liquid (oil or not).
     """
 
     def __init__(self, group: Group, seed: int, cups: Callable[[str, bool], CupFlow]) -> None:
@@ -378,8 +378,8 @@ def picture(path: Path, seed: int = 3) -> None:
     """Draw one dose of 50 g with all its signals.
 
     Args:
-            path: path of the PNG.
-            seed: seed of a development series.
+        path: path of the PNG.
+        seed: seed of a development series.
     """
     from orchestrator.results import figure_style as style
 

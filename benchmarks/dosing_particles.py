@@ -67,12 +67,12 @@ class Comparison:
     """One dose; masses past the lip [g].
 
     Attributes:
-            wanted: target amount in the receiver.
-            load: content of the source before the dose.
-            bench: mass on the virtual bench.
-            particles: mass in the particle simulation.
-            onset: shift of the onset that explains the difference [deg]; positive if the particles flow earlier.
-            cpu_s: CPU seconds of the particle simulation.
+        wanted: target amount in the receiver.
+        load: content of the source before the dose.
+        bench: mass on the virtual bench.
+        particles: mass in the particle simulation.
+        onset: shift of the onset that explains the difference [deg]; positive if the particles flow earlier.
+        cpu_s: CPU seconds of the particle simulation.
     """
 
     seed: int

@@ -32,10 +32,10 @@ class RivalMemory:
     """State that a rival keeps from dose to dose.
 
     Attributes:
-            volume: volume in the source, from weighings [m³].
-            preact: preact [kg].
-            onset_bias: last observed bias of the onset [rad].
-            errors: errors of the last doses [kg].
+        volume: volume in the source, from weighings [m³].
+        preact: preact [kg].
+        onset_bias: last observed bias of the onset [rad].
+        errors: errors of the last doses [kg].
     """
 
     volume: float
