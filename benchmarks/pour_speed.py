@@ -109,7 +109,7 @@ def main() -> None:
         const=1,
         default=0,
         metavar="RUNS",
-        help=f"also run {peer.NAME} this number of times (default: once)",
+        help=f"also run {peer.NAME} this number of times (once without a number)",
     )
     parser.add_argument("--core", type=int, help="core to run on; default: the least busy one")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
