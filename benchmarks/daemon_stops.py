@@ -1,4 +1,4 @@
-"""Measure how soon the daemon's four ways to stop take effect, and its latency, on an idle and a saturated machine.
+"""Measure how soon the daemon's four stop commands take effect and a plan starts, on an idle and a saturated machine.
 
 The benchmark starts a daemon with a simulated bench at twice real time, and one with a bench over serial and network
 protocols. Each campaign is stopped while its arm tilts. 'pause' and 'stop' are measured until the daemon has accepted

@@ -8,8 +8,8 @@ dimension and a few coefficients. Then the particle simulator (`sim_engine.simul
 content, along the tilt that the arm executed, including the bench's grip error. The comparison is of the mass that has
 passed the lip at the end, received or spilled.
 
-The cup is the straight beaker with a round rim, because coarse particles do not resolve a spout. Amounts alternate
-between 25, 50, 100 and 200 g; the source is 30 to 95 % full. 500 particles are the coarsest resolution whose outflow is
+The cup is the straight beaker with a round rim, because coarse particles do not resolve a spout. Amounts cycle
+through 25, 50, 100 and 200 g; the source is 30 to 95 % full. 500 particles are the coarsest resolution whose outflow is
 validated (docs/evidence/validation.md: within 1 % of the load); their spacing is 8 to 10 mm. The bench retains up to
 2 mm of liquid at a dry lip; the particles have no such rule.
 """

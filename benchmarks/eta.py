@@ -1,4 +1,4 @@
-"""Measure the accuracy of 'about 4 min left in all': the predicted time left of a quickstart run and the actual time.
+"""Compare the time left that a quickstart run reports ('about 4 min left in all') with the actual time.
 
     python benchmarks/eta.py [--benches numbers,wires] [--seed 7] [--json]
 

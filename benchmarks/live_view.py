@@ -3,8 +3,8 @@
 A control loop of 100 Hz runs in this process and emits a campaign's events: a pour's progress ten times a second, a
 simulation every half second, every tenth with its particles, and a surrogate every two seconds. The benchmark measures
 the loop's lateness, the time to emit, and the CPU time of control, of the writer process and of Rerun's server. Cases:
-no monitor; a recording; the live view with 0, 1, 20 viewers; a viewer with the server stopped by SIGSTOP; the server
-killed; a full disk. Each case starts after programs are loaded and the first frames are drawn (`--warm-up`).
+no monitor; a recording; the live view with 0, 1, 20 viewers; a viewer, the server or the writer stopped by SIGSTOP; the
+server killed; a full disk. Measurements start after programs are loaded and the first frames are drawn (`--warm-up`).
 
 Viewers are Rerun's own program without a screen; they receive the stream as a browser does. On a machine with other
 load, only the ratios of the times are meaningful. When the script ends, for any reason, it ends all its processes.

@@ -1,6 +1,6 @@
 """Measure all figures of docs/evidence/performance.md, and write the page.
 
-    python benchmarks/make_page.py                      the page anew, from what was measured before
+    python benchmarks/make_page.py                      the page only, from stored measurements
     python benchmarks/make_page.py --measure            all measurements, then the page
     python benchmarks/make_page.py --measure pour-2000 start-up
 

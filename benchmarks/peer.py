@@ -50,7 +50,7 @@ BUNDLED = {
 """Libraries that the wheel bundles, with the names of the system's libraries."""
 
 WALL_DISTANCE = 1.0
-"""Distance of the peer's lattice from the walls, within which they repel liquid [spacings]."""
+"""Distance of the peer's lattice from the walls, within which the solver repels liquid [spacings]."""
 
 FRAME_EVERY = 0.02
 FREEZE_BELOW = -0.06

@@ -48,7 +48,7 @@ class Block:
     Attributes:
         wall_s: time from the first task to the last outcome.
         cpu_s: CPU seconds of the workers.
-        beside_s: CPU seconds of all other processes.
+        beside_s: CPU seconds of all other processes involved.
         busy: busy fraction of the workers, while there was work for all of them.
         between_s: the remaining time per simulation.
     """

@@ -75,7 +75,7 @@ TRUTH = ("liquid", "pose_error", "pose_noise")
 """Settings of a bench that are unknown to the simulator."""
 
 PLANNED = 12
-"""Simulations of the uncalibrated plan."""
+"""Number of simulated actions of the uncalibrated plan."""
 
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
