@@ -1,22 +1,27 @@
-"""Whether calibration pours that are chosen actively are worth twice as many, on toy benches: transfer to a new cup.
+"""Test on toy benches whether actively chosen calibration pours are worth twice as many stratified ones.
 
     python benchmarks/active_design.py [--seeds 20] [--first 1000] [--json]
 
-A bench is a jet that lands in a receiver: its reach rises with speed and height and falls with friction, its width
-rises with speed, walls that hold liquid off make the opening smaller, and the receiver stands elsewhere than it was
-put. Each seed hides another θ, other nuisances, and a wave in the reach that no θ of the simulator has. Pours scatter.
-Two receivers are poured into for calibration, a third one is to be deployed into, with other dimensions searched.
+The score is transfer to a new cup. A bench is a jet that lands in a receiver:
 
-Written down before the first run, and not changed since (seeds from 1000 on; those below were for trying the program):
+- its reach rises with speed and height and falls with friction;
+- its width rises with speed;
+- walls that repel liquid make the opening smaller;
+- the receiver is offset from its nominal position.
+
+Each seed draws a hidden θ, hidden nuisances, and a wave in the reach that no simulator θ can reproduce. Pours scatter.
+Calibration pours into two receivers. Deployment pours into a third one and searches other dimensions.
+
+Fixed before the first run and not changed since (seeds from 1000 on; lower seeds were used to develop the program):
 
     Primary question: is the transfer error of 4 active pours at most that of 8 stratified ones? The transfer error is
-    the mean |r − r̂| over 64 even actions into the third receiver, without scatter; r̂ is the mean over the posterior's
-    draws (C4, 40 simulations) of the toy simulator's spillage. Yes, if the mean over the seeds of the paired difference
-    (active less stratified) is not above 0; 95 % interval by bootstrap over seeds.
-    Second: the same of 4 active against 4 stratified pours.
+    the mean |r − r̂| over 64 evenly spread actions into the third receiver, without scatter; r̂ is the mean spillage of
+    the toy simulator over the posterior's draws (C4, 40 simulations). The answer is yes if the mean over the seeds of
+    the paired difference (active minus stratified) is not above 0; 95 % interval by bootstrap over seeds.
+    Secondary question: the same comparison of 4 active with 4 stratified pours.
 
-An active design spends 48 simulations on choosing, of which C4 learns from those in calibration's scenes (24); a
-stratified one gets all 48 for C4 in addition.
+An active design spends 48 simulations on choosing pours; C4 reuses those in calibration's scenes (24). A stratified
+design gives all 48 to C4 as additional simulations.
 """
 
 from __future__ import annotations
@@ -56,7 +61,7 @@ ACTIVE, STRATIFIED = (4,), (4, 8)
 
 
 def scene(receiver: str) -> Scene:
-    """A scene with one of the receivers."""
+    """Return a scene with one of the receivers."""
     glass = cylinder(receiver, inner_radius=RADII[receiver], inner_height=0.1)
     beaker = cylinder("beaker", inner_radius=0.04, inner_height=0.1)
     fixed: dict[str, float | None] = {"max_angle": 120 * DEG, "height": 0.08}
@@ -68,7 +73,7 @@ DEPLOYED = scene("narrow")
 
 
 def spilled(scene: Scene, action: Action, theta: SimulationParameters, wave: tuple[float, float] = (0.0, 0.0)) -> float:
-    """Share of a jet that lands beside the opening."""
+    """Return the share of a jet that lands outside the opening."""
     speed = (action.angular_velocity / DEG - 15) / 105
     fall = action.height / 0.08
     reach = 0.095 + (0.035 - 0.06 * theta.friction) * speed * np.sqrt(fall) + wave[0] * np.sin(4.0 * speed + wave[1])
@@ -79,7 +84,7 @@ def spilled(scene: Scene, action: Action, theta: SimulationParameters, wave: tup
 
 
 class Bench:
-    """A hidden bench, and the simulator beside it."""
+    """A bench with hidden ground truth, and its simulator."""
 
     def __init__(self, seed: int) -> None:
         rng = np.random.default_rng([seed, 15])
@@ -88,11 +93,11 @@ class Bench:
         self._scenes = {one.name: one for one in (*CALIBRATED, DEPLOYED)}
 
     def real(self, name: str, action: Action) -> float:
-        """What the bench spills on average."""
+        """Return the bench's mean spillage."""
         return spilled(self._scenes[name], action, self.truth, self.wave)
 
     def play(self, strategy: Strategy) -> None:
-        """From the first question to the last answer."""
+        """Run a strategy until it finishes."""
         play(strategy, self._answer, pours_last=False)
 
     def _answer(self, request: Request) -> Outcome:
@@ -107,7 +112,7 @@ class Bench:
 
 
 def plan_of(pours: int, simulations: int) -> CalibrationPlan:
-    """The calibration with so many pours."""
+    """Return a calibration plan with this number of pours."""
     return CalibrationPlan(
         settings=C4Settings(simulations=simulations),
         scene=CALIBRATED[0],
@@ -122,7 +127,7 @@ def plan_of(pours: int, simulations: int) -> CalibrationPlan:
 
 
 def transfer_error(bench: Bench, design: DesignedPours, simulations: int, seed: int) -> float:
-    """Calibrate on a design's pours; mean |r − r̂| over the deployed actions."""
+    """Calibrate on a design's pours; return mean |r − r̂| over the deployed actions."""
     plan = plan_of(len(design.measured), simulations)
     plan = replace(plan, known=known_simulations(plan, {POURS: design.result()}))
     strategy = ContinuousBayesianCalibration(plan, design.measured, seed)
@@ -143,7 +148,7 @@ DEPLOYMENT = DeploymentPlan(D2Settings(pours=1), (DEPLOYED,), Space((SPEED, OFFS
 
 
 def seed_of_all(seed: int) -> dict[str, float]:
-    """Transfer errors of all designs on one bench."""
+    """Return the transfer errors of all designs on one bench."""
     bench, found = Bench(seed), {}
     for count in ACTIVE:
         active = ActivePours(plan_of(count, CALIBRATING), DEPLOYMENT, seed)
@@ -158,7 +163,7 @@ def seed_of_all(seed: int) -> dict[str, float]:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Mean and 95 % interval by bootstrap."""
+    """Return the mean and a 95 % interval by bootstrap."""
     rng, given = np.random.default_rng(0), np.array(values)
     means = given[rng.integers(0, len(given), (4000, len(given)))].mean(axis=1)
     low, high = np.quantile(means, [0.025, 0.975])
@@ -166,7 +171,7 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=1000)

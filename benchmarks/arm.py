@@ -1,10 +1,10 @@
-"""How well the arm follows a pour, and how soon it stops: driver, client library and virtual controller together.
+"""Measure how well the arm follows a pour and how soon it stops: driver, client library and virtual controller.
 
     python benchmarks/arm.py [--speeds 10 20 40 80 120] [--stop-speeds 20 60 120] [--stops 5] [--json]
 
-In real time, each model at its own rate of cycles. A pour tilts about its lip as far as it gets in six seconds, holds
-and returns; what its joints should have done is compared with what was read back, the best constant lag taken out. A
-stop is asked for in mid-tilt; both the driver's clock and the controller's own history say when the arm stood.
+The benchmark runs in real time, each model at its own control rate. A pour tilts about its lip for up to six seconds,
+holds and returns. Planned joint positions are compared with the recorded ones after removing the best constant lag. A
+stop is requested in mid-tilt; both the driver's clock and the controller's history record when the arm stood still.
 """
 
 from __future__ import annotations
@@ -58,14 +58,15 @@ SPEC = UrArmSettings(
     upright_speed=60 * DEG,
     warning_time=0.0,
 )
-"""The gripper holds the cup from its side, so that the last joint tilts it. Un-tilting is fast: nobody stands by."""
+"""The gripper holds the cup from its side, so that the last joint tilts it. `upright_speed` is high because no operator
+is near."""
 
 HIGHEST_TILT = 110.0
-"""[deg]"""
+"""Largest tilt of a pour [deg]."""
 
 
 def pour(spec: UrArmSettings, speed: float) -> PourPath:
-    """A pour at a tilting speed [deg/s]: as far as it gets in six seconds."""
+    """Return a pour at a tilting speed [deg/s] that tilts for up to six seconds."""
     angle = min(HIGHEST_TILT, 6.0 * speed)
     action = Action(
         angular_velocity=speed * DEG,
@@ -81,7 +82,7 @@ def pour(spec: UrArmSettings, speed: float) -> PourPath:
 
 
 def follow(arm: UrArm, spec: UrArmSettings, speed: float) -> dict[str, Any]:
-    """One pour, and what it was followed with."""
+    """Run one pour and return its tracking errors."""
     path = pour(spec, speed)
     arm.release()
     arm.move_to_start(path)
@@ -101,7 +102,7 @@ def follow(arm: UrArm, spec: UrArmSettings, speed: float) -> dict[str, Any]:
 
 
 def stop(arm: UrArm, controller: VirtualController, path: PourPath, share: float) -> dict[str, float]:
-    """One stop in mid-tilt, after a share of it, with clocks on both sides [s]."""
+    """Stop once in mid-tilt, after a share of the tilt; return the delays on both clocks [s]."""
     arm.release()
     arm.move_to_start(path)
     pouring = threading.Thread(target=_stopped, args=(arm, path))
@@ -135,7 +136,7 @@ def _stopped(arm: UrArm, path: PourPath) -> None:
 
 
 def stops(arm: UrArm, controller: VirtualController, spec: UrArmSettings, speed: float, count: int) -> dict[str, Any]:
-    """Several stops at a tilting speed [deg/s]."""
+    """Stop several times at a tilting speed [deg/s]."""
     path = pour(spec, speed)
     seen = [stop(arm, controller, path, 0.35 + 0.4 * k / count) for k in range(count)]
     row: dict[str, Any] = {"speed_deg_s": speed, "stops": count}
@@ -146,7 +147,7 @@ def stops(arm: UrArm, controller: VirtualController, spec: UrArmSettings, speed:
 
 
 def measure(model: str, speeds: list[float], stop_speeds: list[float], count: int) -> dict[str, Any]:
-    """Everything about one model."""
+    """Measure one model."""
     with VirtualController.start(ADDRESS, model, 1.0, CYCLES[model], joints=SPEC.home.angles) as controller:
         spec = SPEC.with_values(model=model, address=ADDRESS)
         arm = UrArm(spec)
@@ -177,7 +178,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--speeds", type=float, nargs="*", default=[10.0, 20.0, 40.0, 80.0, 120.0], help="[deg/s]")
     parser.add_argument("--stop-speeds", type=float, nargs="*", default=[20.0, 60.0, 120.0], help="[deg/s]")
-    parser.add_argument("--stops", type=int, default=5, help="at each of these speeds")
+    parser.add_argument("--stops", type=int, default=5, help="stops at each of these speeds")
     parser.add_argument("--models", nargs="+", choices=sorted(CYCLES), default=["ur10e", "ur10"])
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()

@@ -1,14 +1,17 @@
-"""Whether the bands of predictions hold: pours that no calibration saw, by cross-validation and in another vessel.
+"""Check the coverage of prediction intervals on pours that calibration did not see.
 
     python benchmarks/bands.py [CAMPAIGN] [--folds 8] [--simulations 60] [--seeds 4] [--fresh] [--json]
 
-All recorded pours of the campaign's scene are dealt to the folds, each with slow and fast ones. Each fold is left out
-once: the campaign's strategy calibrates on the others; θ* is simulated on these, which says what it left over; then the
-fold's pours are predicted with θ of the posterior, one a seed, and those of the transfer scene by the first fold's
-calibration. A band should hold nine pours in ten. Beside the bands as they are: those of seeds and θ alone, with the
-resolution, and with what was left over.
+All recorded pours of the campaign's scene are divided into folds, each with slow and fast pours. For each fold:
 
-Every fold is a process of its own, and kept in the cache directory: what was interrupted goes on where it stopped.
+1. The campaign's strategy calibrates on the other folds.
+2. θ* is simulated on those training pours, which gives the residual shift.
+3. The fold's pours are predicted with θ from the posterior, one per seed.
+
+The first fold's calibration also predicts the pours of the transfer scene. An interval should contain nine pours in
+ten. The output compares intervals from seeds and θ alone, with the resolution, and with the residual shift as well.
+
+Each fold runs in its own process and is stored in the cache directory, so an interrupted benchmark continues.
 """
 
 from __future__ import annotations
@@ -43,13 +46,13 @@ def predict(plan: CampaignPlan, seeds: int, label: str, *, transfer: bool) -> di
     """Calibrate on the training pours, and predict the others.
 
     Args:
-        plan: with a fold as test pours.
-        seeds: simulations of each prediction.
-        label: for progress.
+        plan: campaign with a fold as test pours.
+        seeds: simulations per prediction.
+        label: name in progress messages.
         transfer: also predict the pours of the transfer scene.
 
     Returns:
-        The shift left over, and of each unseen pour: split, measured r, simulated r.
+        The residual shift, and for each unseen pour its split, measured r and simulated r.
     """
     calibration = plan.calibration
     assert calibration is not None
@@ -88,9 +91,9 @@ def _row(answers: Answers, one: ScoredPour, thetas: Sequence[SimulationParameter
 
 
 def bands_of(row: dict[str, Any], particles: int, left: float | None) -> dict[str, PredictionInterval]:
-    """A pour's band with one cause more each time."""
+    """Return a pour's interval with one more source of error each time."""
     values = row["simulated"]
-    # As many particles as leave nothing of their own error.
+    # With this many particles the resolution error vanishes.
     return {
         ROWS[0]: band(values, max(particles, 10**9)),
         ROWS[1]: band(values, particles),
@@ -99,7 +102,7 @@ def bands_of(row: dict[str, Any], particles: int, left: float | None) -> dict[st
 
 
 def summary(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Of each split, how many pours each kind of band holds, how wide it is in the mean, and how good the means are."""
+    """Return the coverage, mean width and error of the mean for each split."""
     rows = []
     for split in ("test", "transfer"):
         known = [(row, one) for one in found for row in one["pours"] if row["split"] == split and row["simulated"]]
@@ -125,13 +128,13 @@ def summary(found: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="with recorded pours")
+    parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="campaign with recorded pours")
     parser.add_argument("--folds", type=int, default=8)
-    parser.add_argument("--simulations", type=int, default=60, help="of each calibration")
-    parser.add_argument("--seeds", type=int, default=4, help="simulations of each prediction, one θ each")
-    parser.add_argument("--fresh", action="store_true", help="forget what was kept")
+    parser.add_argument("--simulations", type=int, default=60, help="simulations per calibration")
+    parser.add_argument("--seeds", type=int, default=4, help="simulations per prediction, one θ each")
+    parser.add_argument("--fresh", action="store_true", help="discard stored results")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
-    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # this is a process that makes one fold
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # runs one fold in this process
     options = parser.parse_args()
     try:
         plan = load_campaign(options.campaign)

@@ -1,9 +1,9 @@
-"""Many pours in one call: pours per minute against the number of scenes.
+"""Measure pours per minute of one batched call against its number of scenes.
 
     python benchmarks/batches.py [--particles 1000] [--scenes 1 2 4 8 16] [--backend cpu] [--core 1] [--json]
 
-Every batch pours different actions and seeds; the same tasks are also made one by one, in turns with the batch. On a
-CPU scenes of a batch follow each other, so that the ratio should be 1; on a GPU they run side by side.
+Each batch has different actions and seeds. The same tasks also run one by one, half before and half after the batch.
+A CPU processes the scenes of a batch in sequence, so the ratio should be 1; a GPU processes them in parallel.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SCENES = {"cpu": (1, 2, 4, 8, 16), "cuda": (1, 4, 16, 64, 256, 1024)}
 
 
 def tasks(particles: int, count: int) -> list[PourTask]:
-    """Different pours: speeds from 30 to 45 deg/s, a seed each."""
+    """Return different pours: speeds from 30 to 45 deg/s, one seed each."""
     pours = []
     for k in range(count):
         task = standard_task(particles, seed=k + 1)
@@ -37,7 +37,7 @@ def tasks(particles: int, count: int) -> list[PourTask]:
 
 
 def compare(simulator: PourSimulator, particles: int, count: int) -> dict[str, Any]:
-    """One batch, and the same pours one by one: half of them before it, half after."""
+    """Run one batch, and the same pours one by one: half before it, half after."""
     batch = tasks(particles, count)
     half = (count + 1) // 2
     before = clocked(lambda: [simulator.simulate(task) for task in batch[:half]])
@@ -56,7 +56,7 @@ def compare(simulator: PourSimulator, particles: int, count: int) -> dict[str, A
 
 
 def clocked(run: Callable[[], object]) -> tuple[float, float]:
-    """CPU and wall seconds of a call."""
+    """Return the CPU and wall seconds of a call."""
     cpu, wall = time.process_time(), time.perf_counter()
     run()
     return time.process_time() - cpu, time.perf_counter() - wall
@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--scenes", type=int, nargs="+", help="sizes of the batches")
     parser.add_argument("--backend", choices=BACKENDS, default="cpu")
-    parser.add_argument("--core", type=int, help="which core to run on; unless given, the one with the least to do")
+    parser.add_argument("--core", type=int, help="core to run on; default: the least busy one")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()
     particles = check_particles(options.particles)

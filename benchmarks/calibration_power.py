@@ -1,23 +1,25 @@
-"""What calibration buys: parameter by parameter on recorded pours, and by cross-validation over all of them.
+"""Measure the benefit of calibration: per parameter on recorded pours, and by cross-validation over all of them.
 
     python benchmarks/calibration_power.py [CAMPAIGN] [--seeds 11 12] [--simulations 108] [--particles 1000]
                                            [--known wall_distance=1.5 rim_correction=0] [--folds 8]
                                            [--fold-simulations 72] [--workers 1] [--fresh] [--json]
     python benchmarks/calibration_power.py --as-it-is --seeds 11 12 13 --folds 0
 
-Sets: the campaign's own calibration (C4), again and again with one more parameter to search and the same budget. What
-is not searched has the campaign's fixed value, or Decant's default; the number of particles, where the campaign doesn't
-fix it, that of `--particles`. θ* is then simulated on each recorded pour: mean |measured − simulated| of the normalised
-spillage on training, test and transfer pours; beside it the same of the mean over draws of θ's posterior. The first row
-calibrates nothing. With `--known` a last row searches all but these, which have the values given: what somebody knows
-of the walls, say. With `--as-it-is` the only row is what the campaign itself searches.
+Sets: the campaign's own calibration (C4) runs repeatedly, with one more searched parameter each time and the same
+budget. A parameter that is not searched has the campaign's fixed value or Decant's default; if the campaign does not
+fix the number of particles, `--particles` does. θ* is then simulated on each recorded pour. The score is the mean
+|measured − simulated| of the normalised spillage on training, test and transfer pours, for θ* and for the mean over
+draws from θ's posterior. The first row has no calibration. `--known` adds a last row that searches all other
+parameters, with these fixed at the given values (for example, known wall properties). With `--as-it-is` the only row
+searches what the campaign searches.
 
-Folds: all pours of the campaign's scene, by angular velocity, are dealt to the folds in turn, so that each has slow and
-fast ones. θ*, of what the campaign searches, comes of all other folds; the fold's pours judge it. Beside it what needs
-no simulator: the others' mean and a Gaussian process of them, for the same folds and leaving one out.
+Folds: all pours of the campaign's scene are sorted by angular velocity and assigned to the folds in turn, so each fold
+has slow and fast pours. θ*, over the parameters that the campaign searches, is calibrated on all other folds and scored
+on this fold's pours. Two baselines without a simulator use the same folds and leave-one-out: the mean of the other
+pours and a Gaussian process fitted to them.
 
-Every calibration is a process of its own, `--workers` of them at a time, and kept in the cache directory: what was
-interrupted goes on where it stopped. `--fresh` forgets what was kept.
+Each calibration runs in its own process, up to `--workers` at a time, and is stored in the cache directory, so an
+interrupted benchmark continues. `--fresh` discards stored results.
 """
 
 from __future__ import annotations
@@ -68,7 +70,7 @@ from sim_engine.search_space import Axis, Space
 
 CAMPAIGN = ROOT / "configs" / "campaigns" / "recorded.yaml"
 STEPS = (("xsph_rate",), ("cohesion",), ("friction",), ("wall_distance", "rim_correction"), ("smagorinsky_constant",))
-"""Which parameters join the search, one step after the other."""
+"""Parameters that each step adds to the search."""
 
 RANGES = {
     axis.name: axis
@@ -85,19 +87,19 @@ SPLITS = ("train", "test", "transfer")
 
 
 def growing_sets() -> list[tuple[str, ...]]:
-    """Names searched in each row of the first table, from none to all."""
+    """Return the parameter names searched in each row of the first table, from none to all."""
     return [tuple(name for step in STEPS[:k] for name in step) for k in range(len(STEPS) + 1)]
 
 
 def searching(
     plan: CalibrationPlan, names: Sequence[str], particles: int, known: Mapping[str, float] | None = None
 ) -> CalibrationPlan:
-    """The calibration that searches these parameters and no others.
+    """Return the calibration that searches only these parameters.
 
     Args:
-        names: not empty.
-        particles: N where it is neither searched nor fixed by the campaign.
-        known: values of parameters that are not searched, in place of the campaign's.
+        names: parameter names, not empty.
+        particles: N if it is neither searched nor fixed by the campaign.
+        known: values of parameters that are not searched, overriding the campaign's.
     """
     axes = {**RANGES, **{axis.name: axis for axis in plan.parameters.axes}}
     fixed = {"particles": float(particles), **plan.fixed_parameters, **(known or {})}
@@ -109,13 +111,13 @@ def searching(
 
 
 def dealt(pours: Sequence[RecordedPour], folds: int) -> list[list[int]]:
-    """Places of the pours in each fold: dealt in turn, in the order of their angular velocities."""
+    """Return the indices of each fold's pours, assigned in turn in the order of their angular velocities."""
     order = sorted(range(len(pours)), key=lambda i: (pours[i].action.angular_velocity, pours[i].action.max_angle))
     return [order[k::folds] for k in range(folds)]
 
 
 def without(plan: CalibrationPlan, fold: Sequence[int]) -> CalibrationPlan:
-    """The calibration on all recorded pours but a fold, whose pours are its test."""
+    """Return the calibration on all recorded pours except a fold, whose pours become its test split."""
     assert plan.records is not None
     pours = tuple(
         replace(pour, split="test" if i in set(fold) else "train") for i, pour in enumerate(plan.records.pours)
@@ -124,7 +126,7 @@ def without(plan: CalibrationPlan, fold: Sequence[int]) -> CalibrationPlan:
 
 
 def play(strategy: Strategy, answer: Callable[[Request], Outcome], slots: int, label: str) -> None:
-    """Ask, answer and tell until the strategy has finished, in the order in which a run of the campaign does."""
+    """Run the ask–tell loop until the strategy has finished, in the order of a campaign run."""
     flights: dict[int, PendingRequest] = {}
     asked, begun, told = 0, time.monotonic(), 0
     while not strategy.finished:
@@ -146,7 +148,7 @@ def play(strategy: Strategy, answer: Callable[[Request], Outcome], slots: int, l
 
 
 class Answers:
-    """Answers questions and simulates pours in this process."""
+    """Evaluates suggestion queries and simulates pours in this process."""
 
     def __init__(self, plan: CampaignPlan) -> None:
         from sim_engine.simulator import PourSimulator
@@ -155,7 +157,7 @@ class Answers:
         self._scenes = scenes_of(plan)
 
     def __call__(self, request: Request) -> Outcome:
-        """What a laboratory would say."""
+        """Return the outcome of a request."""
         from actors.optimizer.suggest import propose
 
         if isinstance(request, Suggest):
@@ -169,7 +171,7 @@ class Answers:
         return Simulated(outcome) if outcome.invalid is None else Failed("simulation", outcome.invalid)
 
     def close(self) -> None:
-        """End the simulator; compiled kernels are kept for the next process."""
+        """Close the simulator; compiled kernels remain cached for the next process."""
         self._simulator.close()
 
 
@@ -177,8 +179,8 @@ def calibrate(plan: CampaignPlan, seed: int, label: str, splits: Sequence[str]) 
     """Calibrate as the campaign would, and simulate θ* on the recorded pours of some splits.
 
     Args:
-        plan: what is searched; nothing is calibrated if its budget is 0.
-        seed: takes the place of the campaign's.
+        plan: the campaign; it is not calibrated if its budget is 0.
+        seed: replaces the campaign's seed.
     """
     calibration = plan.calibration
     assert calibration is not None
@@ -212,14 +214,14 @@ def calibrate(plan: CampaignPlan, seed: int, label: str, splits: Sequence[str]) 
 
 
 def recorded(plan: CalibrationPlan) -> list[ScoredPour]:
-    """All recorded pours, those of the other receiver last."""
+    """Return all recorded pours, with those of the other receiver last."""
     transfer = () if plan.transfer is None else plan.transfer.pours
     others = [ScoredPour(plan.transfer.scene.name, MeasuredPour.from_record(p)) for p in transfer if plan.transfer]
     return [*measured_pours(plan, {}), *others]
 
 
 def without_simulator(plan: CalibrationPlan, folds: Sequence[Sequence[int]]) -> dict[str, float]:
-    """Mean |Δ| over all pours of the mean and of a regression of the others."""
+    """Return the mean |Δ| over all pours, predicted by the mean and by a regression of the other pours."""
     totals, count = {"mean": 0.0, "regression": 0.0}, 0
     for fold in folds:
         pours = [scored.pour for scored in measured_pours(without(plan, fold), {})]
@@ -234,10 +236,10 @@ def without_simulator(plan: CalibrationPlan, folds: Sequence[Sequence[int]]) -> 
 
 
 def wanted_sets(options: argparse.Namespace) -> list[tuple[tuple[str, ...], dict[str, float]]]:
-    """What each row searches, and what it takes as known.
+    """Return the searched parameters and the known values of each row.
 
     Raises:
-        SystemExit: `--known` names no parameter, or gives no number that it may have.
+        SystemExit: `--known` has an unknown parameter or an invalid value.
     """
     if options.as_it_is:
         return [(tuple(options.searched), {})]
@@ -249,10 +251,10 @@ def wanted_sets(options: argparse.Namespace) -> list[tuple[tuple[str, ...], dict
 
 
 def known_values(texts: Sequence[str]) -> dict[str, float]:
-    """What `--known` says: values of parameters by name.
+    """Parse `--known`: values of parameters by name.
 
     Raises:
-        SystemExit: it names no parameter, or gives no number that it may have.
+        SystemExit: an unknown parameter or an invalid value.
     """
     known: dict[str, float] = {}
     for text in texts:
@@ -269,13 +271,13 @@ def known_values(texts: Sequence[str]) -> dict[str, float]:
 
 
 def set_name(names: Sequence[str], known: Mapping[str, float]) -> str:
-    """As people read it."""
+    """Return a readable name of a set."""
     told = ", ".join(f"{name} {value:g}" for name, value in known.items())
     return (" + ".join(names) or "nothing") + (f" (known: {told})" if told else "")
 
 
 def set_row(name: str, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A row of the first table: means over the seeds, and each seed's beside them."""
+    """Return a row of the first table: means over the seeds, and the value of each seed."""
     row: dict[str, Any] = {"searched": name}
     for split in SPLITS:
         values = [one["discrepancy"][split] for one in found if one["discrepancy"].get(split) is not None]
@@ -289,7 +291,7 @@ def set_row(name: str, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def fold_summary(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Mean |Δ| over all pours, each judged by a θ* that never saw it, with its standard error."""
+    """Return mean |Δ| over all pours, each scored by a θ* not trained on it, with its standard error."""
     errors = [error for one in found for error in one["errors"]]
     spread = statistics.stdev(errors) / len(errors) ** 0.5 if len(errors) > 1 else None
     return {
@@ -306,7 +308,7 @@ def _rounded(theta: Mapping[str, float]) -> dict[str, float]:
 
 
 class Kept:
-    """Calibrations that have been made, by everything that decides them; one file for each."""
+    """Store of finished calibrations, keyed by everything that determines them; one file each."""
 
     def __init__(self, folder: str = "calibration-power", *, fresh: bool) -> None:
         self._folder = cache_directory() / folder
@@ -316,12 +318,12 @@ class Kept:
                 path.unlink()
 
     def find(self, key: Any) -> dict[str, Any] | None:
-        """What was kept; None if nothing was."""
+        """Return the stored result, or None."""
         path = self._path(key)
         return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
 
     def get(self, key: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """What was kept, or what is made now."""
+        """Return the stored result, or compute and store it."""
         found = self.find(key)
         if found is not None:
             return found
@@ -337,26 +339,26 @@ class Kept:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="with recorded pours")
-    parser.add_argument("--seeds", type=int, nargs="*", default=(11, 12), help="of the sets; none leaves them out")
-    parser.add_argument("--simulations", type=int, help="budget of each set; the campaign's unless given")
-    parser.add_argument("--particles", type=int, default=1_000, metavar="N", help="where the campaign doesn't fix them")
+    parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="campaign with recorded pours")
+    parser.add_argument("--seeds", type=int, nargs="*", default=(11, 12), help="seeds of the sets; none skips the sets")
+    parser.add_argument("--simulations", type=int, help="budget per set; default: the campaign's")
+    parser.add_argument("--particles", type=int, default=1_000, metavar="N", help="if the campaign does not fix it")
     parser.add_argument(
-        "--known", nargs="*", default=[], metavar="NAME=VALUE", help="for a last row that searches the rest"
+        "--known", nargs="*", default=[], metavar="NAME=VALUE", help="add a last row that searches the others"
     )
-    parser.add_argument("--as-it-is", action="store_true", help="only what the campaign itself searches")
-    parser.add_argument("--folds", type=int, default=8, help="0 leaves the cross-validation out")
-    parser.add_argument("--fold-simulations", type=int, default=72, help="budget of each fold")
+    parser.add_argument("--as-it-is", action="store_true", help="only the campaign's own search")
+    parser.add_argument("--folds", type=int, default=8, help="0 skips the cross-validation")
+    parser.add_argument("--fold-simulations", type=int, default=72, help="budget per fold")
     parser.add_argument("--workers", type=int, default=1, help="calibrations at a time")
-    parser.add_argument("--fresh", action="store_true", help="forget what was kept")
+    parser.add_argument("--fresh", action="store_true", help="discard stored results")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
-    parser.add_argument("--one", help=argparse.SUPPRESS)  # this is a process that makes one calibration
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # runs one calibration in this process
     return parser.parse_args()
 
 
 @dataclass(frozen=True)
 class Job:
-    """One calibration and its judges."""
+    """One calibration, its seed and the splits that score it."""
 
     calibration: CalibrationPlan
     seed: int
@@ -365,7 +367,7 @@ class Job:
 
 
 def job(calibration: CalibrationPlan, options: argparse.Namespace, which: str) -> Job:
-    """What is meant by 'set 3 11', row 3 of the sets with seed 11, or 'fold 3 11', the fourth fold."""
+    """Parse a job name: 'set 3 11' is row 3 of the sets with seed 11, 'fold 3 11' the fourth fold."""
     kind, number, seed = which.split()
     if kind == "fold":
         fold = dealt(calibration.records.pours if calibration.records else (), options.folds)[int(number)]

@@ -1,4 +1,4 @@
-"""C1, C2, C3, C4 and no calibration at all: discrepancy of θ* on recorded pours that it never saw, and the price.
+"""Compare C1, C2, C3, C4 and no calibration: discrepancy of θ* on unseen recorded pours, and cost.
 
     python benchmarks/calibration_strategies.py [CAMPAIGN] [--search wall_distance rim_correction]
                                                 [--rows C1=2800 C2=504 C3=1652 C4=108] [--seeds 11 12 13]
@@ -6,22 +6,24 @@
                                                 [--random 8] [--once C1 random] [--workers 1] [--fresh] [--kept]
                                                 [--json]
 
-Each row is a strategy with a budget of single simulated pours, the paper's unless given; `--rows C1=504 C2=504 C3=504
-C4=504` compares them at one price. All search the same parameters, two as in the paper; what is not searched has the
-value given with `--known`, the campaign's fixed one, or Decant's default. θ* is then simulated on each recorded pour:
-mean |measured − simulated| of the normalised spillage on training, test and transfer pours, each with a 95 % interval,
-and the quartiles over all pours that were not trained on (test and transfer, all seeds). An interval is a bootstrap
-over the pours, each with its mean over the seeds: how much hangs on which pours there are. Seeds change the random
-choices and the initial positions; C1 and θ that nobody searched have no random choices, and what `--once` names is made
-with the first seed only.
+Each row is a strategy with a budget of single simulated pours; the default budgets are the paper's. `--rows C1=504
+C2=504 C3=504 C4=504` compares the strategies at equal cost. All rows search the same parameters, two as in the paper.
+A parameter that is not searched has the value given with `--known`, the campaign's fixed value, or Decant's default.
 
-'uncalibrated' has the values that are known, and Decant's defaults of what is searched; 'defaults', where anything is
-told to be known, has nothing but defaults; 'random' is the median over θ drawn from the searched box, on pours that
-were not trained on.
+θ* is then simulated on each recorded pour. The score is the mean |measured − simulated| of the normalised spillage on
+training, test and transfer pours, each with a 95 % interval, and the quartiles over all pours outside the training set
+(test and transfer, all seeds). An interval is a bootstrap over the pours, each averaged over the seeds; it shows the
+effect of the choice of pours. Seeds change the random choices and the initial positions. C1 and rows without a search
+have no random choices. Rows named in `--once` run with the first seed only.
 
-Every calibration is a process of its own, `--workers` of them at a time, and kept in the cache directory: what was
-interrupted goes on where it stopped, and `--kept` makes nothing and shows what there is so far. `--fresh` forgets what
-was kept.
+Rows without calibration:
+
+- 'uncalibrated' has the known values, and Decant's defaults for the searched parameters.
+- 'defaults', present if `--known` is given, has only defaults.
+- 'random' is the median over θ drawn from the search space, on pours outside the training set.
+
+Each calibration runs in its own process, up to `--workers` at a time, and is stored in the cache directory, so an
+interrupted benchmark continues. `--kept` computes nothing and shows the stored results. `--fresh` discards them.
 """
 
 from __future__ import annotations
@@ -60,11 +62,11 @@ TRAINED_ON = "train"
 
 @dataclass(frozen=True)
 class Row:
-    """A strategy and what it may spend.
+    """A strategy and its budget.
 
     Attributes:
         name: 'C1' to 'C4', or one of `NOT_CALIBRATED`.
-        budget: single simulated pours; of random θ their number.
+        budget: single simulated pours; for 'random', the number of θ.
     """
 
     name: str
@@ -72,28 +74,28 @@ class Row:
 
 
 class Complaints:
-    """Notes that something is wrong."""
+    """Records whether the settings have a problem."""
 
     any = False
 
     def add(self, text: str, *at: str | int, key: bool = False, of: str = "", more: bool = False) -> None:
-        """Something is."""
+        """Record a problem."""
         self.any = True
 
     def valid(self, *keys: str) -> bool:
-        """All are."""
+        """Return True: all keys are valid."""
         return True
 
     def within(self, *at: str | int) -> Problems:
-        """The same notes."""
+        """Return this object."""
         return self
 
 
 def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:
-    """The calibration by another strategy: as many θ as the budget allows.
+    """Return the calibration by another strategy, with as many θ as the budget allows.
 
     Raises:
-        SystemExit: it allows none.
+        SystemExit: the budget is too small.
     """
     pours = sum(scored.pour.split == TRAINED_ON and scored.pour.spillage is not None for scored in recorded(plan))
     kind, names = calibrations()[row.name], plan.parameters.names
@@ -109,11 +111,11 @@ def at_price(plan: CalibrationPlan, row: Row) -> CalibrationPlan:
 
 
 def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
-    """Calibrate as a campaign would, and simulate what was found on all recorded pours.
+    """Calibrate as a campaign would, and simulate the found θ on all recorded pours.
 
     Args:
-        plan: its calibration is `at_price`.
-        seed: takes the place of the campaign's.
+        plan: campaign whose calibration comes from `at_price`.
+        seed: replaces the campaign's seed.
     """
     calibration = plan.calibration
     assert calibration is not None
@@ -122,7 +124,7 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
     if row.name == DEFAULTS:
         thetas = {"theta": SimulationParameters()}
     elif row.name == UNCALIBRATED:
-        # fixed values are what anybody would take; those that are searched have their defaults
+        # fixed values apply to every user; searched parameters have their defaults
         thetas = {"theta": SimulationParameters.from_values(calibration.fixed_parameters)}
     elif row.name == RANDOM:
         thetas = random_parameters(calibration.parameters, calibration.fixed_parameters, row.budget, seed)
@@ -134,7 +136,7 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
         thetas = {"theta": calibrated_theta({CALIBRATION: found}).theta}
     pours = recorded(calibration)
     unseen = [scored for scored in pours if scored.pour.split != TRAINED_ON]
-    # the unseen come first, so that all θ meet the same initial positions there
+    # unseen pours come first, so that all θ have the same initial positions there
     trained = [] if row.name == RANDOM else [scored for scored in pours if scored.pour.split == TRAINED_ON]
     judge = Evaluation(thetas, [*unseen, *trained], stage_seed(seed, "evaluation"))
     play(judge, answers, plan.parallel_simulations, f"{label}, judged")
@@ -158,7 +160,7 @@ def measure(plan: CampaignPlan, row: Row, seed: int) -> dict[str, Any]:
 
 
 def table_row(row: Row, calibration: CalibrationPlan | None, found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Means over the seeds with intervals over the pours, each seed beside them, and quartiles of the unseen."""
+    """Return means over the seeds, intervals over the pours, each seed's value, and quartiles of unseen pours."""
     shown: dict[str, Any] = {"strategy": row.name, "simulations": max(one["simulations"] for one in found)}
     if calibration is not None and row.name in ("C1", "C2", "C3"):
         assert isinstance(calibration.settings, DesignSettings)
@@ -189,16 +191,16 @@ def table_row(row: Row, calibration: CalibrationPlan | None, found: Sequence[Map
 
 
 def over_seeds(found: Sequence[Sequence[float | None]]) -> list[float]:
-    """Mean error of each pour over the seeds that have one, from a list of each seed's; empty if there are none."""
+    """Return each pour's mean error over the seeds that have one; empty if there are none."""
     known = [[error for error in errors if error is not None] for errors in zip(*found, strict=True)]
     return [statistics.mean(errors) for errors in known if errors]
 
 
 def rows_of(options: argparse.Namespace) -> list[Row]:
-    """The rows of the table, the uncalibrated first.
+    """Return the rows of the table, with the uncalibrated ones first.
 
     Raises:
-        SystemExit: `--rows` names no strategy, or no budget.
+        SystemExit: `--rows` has an unknown strategy or no budget.
     """
     rows = [Row(DEFAULTS)] if options.known else []
     rows += [Row(UNCALIBRATED), *([Row(RANDOM, options.random)] if options.random > 0 else [])]
@@ -212,26 +214,26 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
 
 def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="with recorded pours")
+    parser.add_argument("campaign", type=Path, nargs="?", default=CAMPAIGN, help="campaign with recorded pours")
     parser.add_argument("--search", nargs="+", default=("wall_distance", "rim_correction"), metavar="PARAMETER")
-    parser.add_argument("--known", nargs="*", default=[], metavar="NAME=VALUE", help="of what is not searched")
+    parser.add_argument("--known", nargs="*", default=[], metavar="NAME=VALUE", help="values of other parameters")
     parser.add_argument("--rows", nargs="+", default=PAPER, metavar="STRATEGY=SIMULATIONS")
     parser.add_argument("--seeds", type=int, nargs="+", default=(11, 12, 13))
-    parser.add_argument("--random", type=int, default=8, help="random θ to compare with, each seed; 0 for none")
-    parser.add_argument("--once", nargs="*", default=[], metavar="ROW", help="rows made with the first seed only")
+    parser.add_argument("--random", type=int, default=8, help="random θ per seed to compare with; 0 for none")
+    parser.add_argument("--once", nargs="*", default=[], metavar="ROW", help="rows that run with the first seed only")
     parser.add_argument("--workers", type=int, default=1, help="calibrations at a time")
-    parser.add_argument("--fresh", action="store_true", help="forget what was kept")
-    parser.add_argument("--kept", action="store_true", help="make nothing, show what was kept so far")
+    parser.add_argument("--fresh", action="store_true", help="discard stored results")
+    parser.add_argument("--kept", action="store_true", help="compute nothing, show stored results")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
-    parser.add_argument("--one", help=argparse.SUPPRESS)  # this is a process that makes one calibration
+    parser.add_argument("--one", help=argparse.SUPPRESS)  # runs one calibration in this process
     return parser.parse_args()
 
 
 def searched(plan: CampaignPlan, names: Sequence[str], known: Mapping[str, float]) -> CampaignPlan:
-    """The campaign with only these parameters searched, and nothing but its calibration.
+    """Return the campaign with only these parameters searched, and with calibration only.
 
     Raises:
-        SystemExit: it has no recorded pours, or doesn't search these.
+        SystemExit: the campaign has no recorded pours, or does not search these parameters.
     """
     calibration = plan.calibration
     if calibration is None or calibration.records is None:

@@ -1,17 +1,17 @@
-"""Simulations on several machines: speed-up, a lost node, memory of the driver, and the limits of the scheduler.
+"""Measure simulations on several machines: speed-up, a lost node, memory of the driver, scheduler limits.
 
     python benchmarks/cluster.py scheduler      1,000 workers that answer after a drawn time; needs no Ray
     python benchmarks/cluster.py nodes          Ray clusters of 1 to 3 nodes of one core, on loopback addresses
     python benchmarks/cluster.py page           the tables of docs/laboratory/cluster.md from the figures
 
-Scheduler: the real pool, and a whole run with its journal, on an event loop whose time is the CPU time of its thread
-plus skipped waits (`skipping_clock`). The figures are therefore those of a core with nothing else to do. A worker has
-one job in advance, as a Ray actor has. 'Idle' is the time that workers wait for their next job while jobs are queued.
+Scheduler: the real pool, and a complete run with its journal, execute on an event loop whose time is the CPU time of
+its thread plus skipped waits (`skipping_clock`). The figures therefore hold for an otherwise idle core. A worker
+prefetches one job, as a Ray actor does. 'Idle' is the time that a worker waits for its next job while jobs are queued.
 
-Nodes: jobs that wait for a second and need no core show what scheduling costs. Real simulations share the cores of this
-machine. For a lost node, the node and all processes on it are killed (SIGKILL) in the middle.
+Nodes: jobs that wait for a second and use no core show the cost of scheduling. Real simulations share the cores of this
+machine. For a lost node, the node and all its processes are killed (SIGKILL) in mid-run.
 
-Figures are kept in docs/data/cluster.json.
+Figures are stored in docs/data/cluster.json.
 """
 
 from __future__ import annotations
@@ -61,17 +61,17 @@ SHORTER = (3.0, 1.0, 0.3)
 QUEUED = 10_000
 
 RUNS = ((16, 16), (16, 32), (16, 64), (64, 256), (128, 256), (256, 256))
-"""Workers and `parallel_simulations` of whole runs; 256 is the largest."""
+"""Workers and `parallel_simulations` of complete runs; 256 is the largest."""
 
 WAIT = 1.0
-"""Time of a waiting job [s]."""
+"""Duration of a waiting job [s]."""
 
 PARTICLES, POURS = 500, 12
-"""Of the real simulations, and their number."""
+"""Particles of the real simulations, and their number."""
 
 
 def outcome(seed: int = 0) -> SimulatedPour:
-    """An outcome of the usual size."""
+    """Return an outcome of typical size."""
     curve = tuple(0.02 * k for k in range(200))
     return SimulatedPour(
         PourOutcome(
@@ -85,12 +85,12 @@ def outcome(seed: int = 0) -> SimulatedPour:
 
 
 class VirtualWorker:
-    """A `Worker` that answers after a drawn time, one job after the other.
+    """A `Worker` that answers after a drawn time, one job at a time.
 
     Args:
-        mean: time of a job [s].
-        seed: of the drawn times.
-        idle: receives the times between two jobs [s].
+        mean: mean time of a job [s].
+        seed: seed of the drawn times.
+        idle: list that receives the times between two jobs [s].
     """
 
     def __init__(self, mean: float, seed: int, idle: list[float]) -> None:
@@ -100,7 +100,7 @@ class VirtualWorker:
         self._answer = outcome()
 
     def busy(self, now: float) -> float:
-        """Time spent on jobs until now [s]."""
+        """Return the time spent on jobs until now [s]."""
         return self._busy + (now - self._begun if self._works else 0.0)
 
     async def start(self) -> Greeting:
@@ -128,7 +128,7 @@ class VirtualWorker:
 
 
 def virtual_pool(workers: int, mean: float, idle: list[float]) -> tuple[WorkerPool, list[VirtualWorker]]:
-    """A pool of virtual workers, and the workers."""
+    """Return a pool of virtual workers, and the workers."""
     made: list[VirtualWorker] = []
 
     def make() -> VirtualWorker:
@@ -145,7 +145,7 @@ def skipping(work: Callable[[], Any]) -> Any:
 
 
 async def queue_of(workers: int, mean: float, jobs: int) -> dict[str, Any]:
-    """All jobs queued at once: efficiency of the workers while jobs wait, and cost of the decisions."""
+    """Queue all jobs at once; measure worker efficiency while jobs wait, and scheduling cost."""
     idle: list[float] = []
     pool, made = virtual_pool(workers, mean, idle)
     await pool.pids()
@@ -177,7 +177,7 @@ async def queue_of(workers: int, mean: float, jobs: int) -> dict[str, Any]:
 
 
 async def fairness(workers: int, mean: float) -> dict[str, Any]:
-    """Two users of one pool, of whom one has queued ten times as much: when the small one has all its answers."""
+    """Time the smaller of two users of a pool until it has all its answers; the other queues ten times as many jobs."""
     pool, _ = virtual_pool(workers, mean, [])
     many, few = pool.share(), pool.share()
     task = standard_task(2000, 1)
@@ -195,7 +195,7 @@ async def fairness(workers: int, mean: float) -> dict[str, Any]:
 
 
 class VirtualLaboratory:
-    """A laboratory of a virtual pool."""
+    """A laboratory with a virtual pool."""
 
     bench = optimizer = None
 
@@ -210,12 +210,12 @@ class VirtualLaboratory:
 
 
 async def whole_run(workers: int, slots: int, mean: float) -> dict[str, Any]:
-    """The grid of the paper's study as a run: strategy, stage scheduler, journal, pool.
+    """Run the grid of the paper's study: strategy, stage scheduler, journal, pool.
 
     Args:
-        workers: of the pool.
-        slots: simulations in parallel, as the campaign states them.
-        mean: time of a simulation [s].
+        workers: workers in the pool.
+        slots: parallel simulations in the campaign.
+        mean: mean time of a simulation [s].
     """
     idle: list[float] = []
     study = load_study(ROOT / "configs" / "studies" / "paper.yaml")
@@ -249,7 +249,7 @@ async def whole_run(workers: int, slots: int, mean: float) -> dict[str, Any]:
 
 
 def scheduler() -> dict[str, Any]:
-    """All measurements without Ray."""
+    """Run all measurements without Ray."""
     pools, runs = [], []
     for workers in WORKERS:
         say(f"pool of {workers}")
@@ -273,26 +273,26 @@ def scheduler() -> dict[str, Any]:
 
 
 class Waiting:
-    """A simulator that waits.
+    """A simulator that only waits.
 
     Args:
-        seconds: for so long.
+        seconds: duration [s].
     """
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
 
     def simulate(self, task: PourTask, *, cancelled: Any = None) -> SimulatedPour:
-        """Wait, then answer."""
+        """Wait, then return an outcome."""
         time.sleep(self._seconds)
         return outcome(task.seed)
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing; there is nothing to close."""
 
 
 async def drive(address: str, kind: str, jobs: int) -> None:
-    """The program that uses a cluster; prints one line of JSON per event."""
+    """Use a cluster as a client program; print one line of JSON per event."""
     import ray
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -330,12 +330,12 @@ async def drive(address: str, kind: str, jobs: int) -> None:
 
 
 def driven(cluster: Any, kind: str, jobs: int, *, kill: int | None = None, after: float = 0.0) -> dict[str, Any]:
-    """Run `drive` on a cluster; its last line, with what happened on the way.
+    """Run `drive` on a cluster; return its last line and, for a killed node, the time until the loss was reported.
 
     Args:
         cluster: `tests.support.local_cluster.LocalCluster`.
-        kill: node that is killed.
-        after: time from the first job until then [s].
+        kill: node to kill.
+        after: time from the first job to the kill [s].
     """
     process = subprocess.Popen(
         [sys.executable, __file__, "--drive", cluster.address, kind, str(jobs)],
@@ -365,7 +365,7 @@ def driven(cluster: Any, kind: str, jobs: int, *, kill: int | None = None, after
 
 
 def nodes(real: bool) -> dict[str, Any]:
-    """All measurements on Ray clusters of this machine."""
+    """Run all measurements on Ray clusters of this machine."""
     sys.path.insert(0, str(ROOT))
     from tests.support.local_cluster import LocalCluster
 
@@ -395,7 +395,7 @@ def nodes(real: bool) -> dict[str, Any]:
         say("a lost node")
         jobs, after = 60, 8.0
         lost = driven(cluster, "wait", jobs, kill=3, after=after)
-        # the node's work until it was killed, and that of the two others
+        # the node's work until it was killed, plus that of the two others
         ideal = after + (jobs * WAIT - 3 * after) / 2.0
         found["lost"] = {
             "jobs": jobs,
@@ -412,7 +412,7 @@ def nodes(real: bool) -> dict[str, Any]:
 
 
 def row(kind: str, count: int, jobs: int, found: dict[str, Any], each: float) -> dict[str, Any]:
-    """One row of speed-ups."""
+    """Return one row of speed-ups."""
     return {
         "kind": kind,
         "nodes": count,
@@ -427,14 +427,14 @@ def row(kind: str, count: int, jobs: int, found: dict[str, Any], each: float) ->
 
 
 def keep(name: str, found: dict[str, Any]) -> None:
-    """Write down what was measured, and bring the page up to date."""
+    """Store the measured figures."""
     figures = json.loads(DATA.read_text(encoding="utf-8")) if DATA.is_file() else {}
     figures[name] = {**found, "machine": describe(), "command": f"python benchmarks/cluster.py {name}"}
     DATA.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
 def render(page: str, figures: dict[str, Any]) -> str:
-    """A page with its tables as they should be; those that were not measured stay as they are."""
+    """Return the page with updated tables; tables without figures stay unchanged."""
 
     def shown(match: Any) -> str:
         found = figures.get(match[2].removeprefix("cluster-"))
@@ -444,7 +444,7 @@ def render(page: str, figures: dict[str, Any]) -> str:
 
 
 def nodes_table(found: dict[str, Any]) -> str:
-    """Speed-up and efficiency by number of nodes."""
+    """Return the table of speed-up and efficiency by number of nodes."""
     rows = [
         (
             *(one[key] for key in ("kind", "nodes", "jobs", "each_s", "wall_s", "speed_up")),
@@ -478,7 +478,7 @@ def nodes_table(found: dict[str, Any]) -> str:
 
 
 def scheduler_table(found: dict[str, Any]) -> str:
-    """Speed of the scheduler, by workers and duration."""
+    """Return the tables of scheduler speed, by workers and duration."""
     rows = [
         (
             f"{one['workers']:,}",
@@ -524,13 +524,13 @@ TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
 
 
 def write_page() -> None:
-    """Bring the page up to date."""
+    """Update the tables of the page."""
     figures = json.loads(DATA.read_text(encoding="utf-8"))
     PAGE.write_text(render(PAGE.read_text(encoding="utf-8"), figures), encoding="utf-8")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """See the module."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("scheduler", "nodes", "page"), nargs="?", default="scheduler")
     parser.add_argument("--no-simulations", action="store_true", help="only jobs that wait")

@@ -1,11 +1,11 @@
-"""How evenly the virtual controller's clock runs next to busy simulators that share its cores.
+"""Measure the jitter of the virtual controller's clock while busy simulators share its cores.
 
     python benchmarks/control_period.py [--seconds 30] [--runs 3] [--cores 2] [--simulators 2] [--json]
 
-A UR10e in real time at 500 Hz moves to and fro while a client reads it at 500 Hz; simulators pour again and again on
-the same cores, each in a session of its own and as nice as those of a campaign. The controller reports its latest
-wake-up itself, so that a client's own delays are left out. Both settings alternate, so that other work on the machine
-meets both. `stolen_ms` is what a hypervisor kept from all cores meanwhile, against which no priority helps.
+A UR10e in real time at 500 Hz moves back and forth while a client reads it at 500 Hz. Simulators pour continuously on
+the same cores, each in its own session and with the niceness of a campaign's simulators. The controller reports its
+latest wake-up itself, which excludes the client's delays. Both priority settings alternate, so that other load on the
+machine affects both. `stolen_ms` is the time the hypervisor took from all cores meanwhile; no priority prevents it.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ while True:
 
 @contextlib.contextmanager
 def simulators(count: int, niceness: int) -> Iterator[None]:
-    """So many of them, each with its first pour done; they end with the block."""
+    """Run this number of simulators during the block; each has finished its first pour."""
     started = [
         subprocess.Popen(
             [sys.executable, "-c", SIMULATE, str(niceness)],
@@ -81,7 +81,7 @@ def simulators(count: int, niceness: int) -> Iterator[None]:
 
 
 def measure(seconds: float, *, prioritised: bool) -> dict[str, Any]:
-    """One controller, started, moved, read and ended."""
+    """Start, move, read and end one controller."""
     with VirtualController.start(ADDRESS, "ur10e", prioritised=prioritised) as controller:
         with socket.create_connection((ADDRESS, 30003)) as port:
             port.sendall(PROGRAM)
@@ -107,11 +107,11 @@ def measure(seconds: float, *, prioritised: bool) -> dict[str, Any]:
 def main() -> None:
     """Measure, and print a table or JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=30.0, help="length of one run")
-    parser.add_argument("--runs", type=int, default=3, help="runs of each setting")
+    parser.add_argument("--seconds", type=float, default=30.0, help="duration of one run [s]")
+    parser.add_argument("--runs", type=int, default=3, help="runs per setting")
     parser.add_argument("--cores", type=int, default=2, help="cores that all processes share")
     parser.add_argument("--simulators", type=int, default=2)
-    parser.add_argument("--niceness", type=int, default=NICENESS, help="of the simulators")
+    parser.add_argument("--niceness", type=int, default=NICENESS, help="niceness of the simulators")
     parser.add_argument("--json", action="store_true")
     chosen = parser.parse_args()
     allowed = sorted(os.sched_getaffinity(0))

@@ -1,11 +1,11 @@
-"""How far the answer depends on the number of particles, and what an answer near the limit costs.
+"""Measure how the outcome depends on the number of particles, and the cost of an outcome near the limit.
 
     python benchmarks/convergence.py --store FILE [--particles 500 1000 2000] [--seeds 3] [--finest 5000 10000 20000]
     python benchmarks/convergence.py --store FILE --table [--before FILE] [--json]
 
 Nineteen pours (`sim_engine.validation.convergence`) are simulated at each number of particles: the coarse ones with
-several seeds, the finest once. What is done is in the store, so that a measurement that was broken off goes on where it
-was. The limit of each pour is the value at zero spacing of a straight line through the finest, fitted with weights 1/d.
+several seeds, the finest once. Finished simulations are in the store, so an interrupted measurement continues. The
+limit of each pour is the value at zero spacing of a straight line through the finest, fitted with weights 1/d.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ VOLUME = 200e-6
 
 @dataclass
 class Store:
-    """Spillage and CPU seconds by pour, number of particles and seed, on disk after every pour."""
+    """Spillage and CPU seconds by pour, number of particles and seed, written to disk after every pour."""
 
     path: Path
     known: dict[str, list[float]] = field(default_factory=dict)
@@ -38,28 +38,28 @@ class Store:
 
     @staticmethod
     def key(pour: str, particles: int, seed: int) -> str:
-        """Key of one simulation."""
+        """Return the key of one simulation."""
         return f"{pour} | {particles} | {seed}"
 
     def put(self, key: str, values: tuple[float, float]) -> None:
-        """Keep one simulation's spillage and CPU seconds."""
+        """Store one simulation's spillage and CPU seconds."""
         self.known[key] = [round(v, 5) for v in values]
         part = self.path.with_suffix(".part")
         part.write_text(json.dumps(self.known, indent=0), encoding="utf-8")
         part.replace(self.path)
 
     def of(self, pour: str, particles: int) -> list[list[float]]:
-        """All seeds of a pour: spillage, CPU seconds."""
+        """Return the spillage and CPU seconds of a pour for all seeds."""
         begin = f"{pour} | {particles} | "
         return [values for key, values in self.known.items() if key.startswith(begin)]
 
     def numbers(self) -> list[int]:
-        """Numbers of particles that there are, increasing."""
+        """Return the stored numbers of particles in increasing order."""
         return sorted({int(key.split(" | ")[1]) for key in self.known})
 
 
 def limit(store: Store, pour: str, finest: list[int]) -> float | None:
-    """Spillage at zero spacing, from a line through the finest; None if fewer than two of them are known."""
+    """Return the spillage at zero spacing from a line through the finest; None if fewer than two are stored."""
     values = [(spacing(VOLUME, n), np.mean([v for v, _ in found])) for n in finest if (found := store.of(pour, n))]
     if len(values) < 2:
         return None
@@ -68,7 +68,7 @@ def limit(store: Store, pour: str, finest: list[int]) -> float | None:
 
 
 def table(store: Store, finest: list[int], limits: dict[str, float] | None = None) -> dict[str, Any]:
-    """Everything that is known: rows of pours, columns of numbers of particles; how far each is from the limit."""
+    """Return all results: pours by number of particles, and the distance of each number from the limit."""
     numbers = store.numbers()
     rows: list[dict[str, Any]] = []
     for pour in POURS:
@@ -91,7 +91,7 @@ def table(store: Store, finest: list[int], limits: dict[str, float] | None = Non
 
 
 def markdown(found: dict[str, Any]) -> str:
-    """The table as docs have it."""
+    """Return the table in the Markdown of the docs."""
     numbers = sorted({n for row in found["rows"] for n in row["spilled"]})
     lines = [
         "| pour | " + " | ".join(f"{n:,}" for n in numbers) + " | limit |",
@@ -109,15 +109,15 @@ def markdown(found: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Simulate what the store lacks, or print its table."""
+    """Run the missing simulations, or print the table of the store."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--store", type=Path, required=True)
     parser.add_argument("--particles", type=int, nargs="*", default=[500, 1_000, 2_000])
-    parser.add_argument("--seeds", type=int, default=3, help="of the coarse ones")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds of the coarse simulations")
     parser.add_argument("--finest", type=int, nargs="*", default=[5_000, 10_000, 20_000])
-    parser.add_argument("--pours", type=int, default=len(POURS), help="only the first so many")
-    parser.add_argument("--table", action="store_true", help="simulate nothing")
-    parser.add_argument("--before", type=Path, help="another store, held against the same limits")
+    parser.add_argument("--pours", type=int, default=len(POURS), help="number of pours, from the first")
+    parser.add_argument("--table", action="store_true", help="only print the table")
+    parser.add_argument("--before", type=Path, help="another store, compared with the same limits")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     store = Store(options.store)

@@ -1,10 +1,10 @@
-/* How fast one core can be at the density constraint: the two passes over neighbour lists and the building of the
- * lists, on a jittered lattice at rest, sorted by cell; no walls, no forces, no sweeps, no integration.
+/* Speed limit of one core for the density constraint: two passes over neighbour lists, and building the lists, on a
+ * jittered lattice at rest, sorted by cell; no walls, no forces, no sweeps, no integration.
  *
  * cc -O3 -march=native -ffast-math core_limit.c -lm -o core_limit && ./core_limit 10000
  *
- * Prints nanoseconds of the process for all particles: building full lists, one density iteration over them, building
- * half lists (every pair once), one iteration over those.
+ * Prints nanoseconds of process time for all particles: building full lists, one density iteration with them, building
+ * half lists (each pair once), one density iteration with them.
  */
 #define _POSIX_C_SOURCE 199309L
 #include <math.h>
@@ -14,11 +14,11 @@
 #include <time.h>
 
 #define REPEATS 21
-#define MOST 64 /* neighbours of a particle; there are about 50 */
+#define MOST 64 /* capacity of a neighbour list; a particle has about 50 neighbours */
 
 static int n, cells, *cell, *start, *list, *count;
 static float *x, *y, *z, *multiplier, *density, *dx, *dy, *dz;
-static const float reach = 2.3f, support = 2.0f; /* spacings: kernel and skin */
+static const float reach = 2.3f, support = 2.0f; /* [spacings]: kernel plus skin, kernel */
 
 static double now(void) {
     struct timespec t;

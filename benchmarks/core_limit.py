@@ -1,10 +1,10 @@
-"""How fast one core can be at the density constraint, in plain C: what the solver's speed is held against.
+"""Measure how fast one core can evaluate the density constraint in plain C, as a reference for the solver's speed.
 
     python benchmarks/core_limit.py [--particles 2000] [--core 1] [--json]
 
-Compiles and runs core_limit.c: lists and density iterations on a jittered lattice at rest, without walls, forces,
-sweeps and everything else that makes a pour. Nanoseconds a particle, for two instruction sets, medians of 21
-repetitions.
+Compiles and runs core_limit.c: neighbour lists and density iterations on a jittered lattice at rest, without walls,
+forces, sweeps and the other parts of a pour. Reports nanoseconds per particle for two instruction sets, as medians of
+21 repetitions.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from actors.runtime.child_process import child_environment
 
 SOURCE = Path(__file__).with_name("core_limit.c")
 MACHINES = {"x86_64": ("x86-64-v3", "native"), "AMD64": ("x86-64-v3", "native")}
-"""What `-march` to try; short loops are often faster with narrower vectors than the processor has."""
+"""`-march` options to try; short loops are often faster with vectors narrower than the processor's."""
 
 KEPT = 8
-"""Steps that a neighbour list may last, at best."""
+"""Largest number of steps for which a neighbour list stays valid."""
 
 
 def run(compiler: str, particles: int) -> list[dict[str, Any]]:
-    """Nanoseconds a particle, a row for each instruction set.
+    """Return nanoseconds per particle, one row per instruction set.
 
     Args:
-        compiler: path.
+        compiler: path of the C compiler.
         particles: N.
 
     Raises:
-        SystemExit: it does not compile or run.
+        SystemExit: the program does not compile or run.
     """
     rows = []
     with tempfile.TemporaryDirectory() as folder:
@@ -62,11 +62,11 @@ def run(compiler: str, particles: int) -> list[dict[str, Any]]:
 
 
 def limits(rows: Iterable[dict[str, Any]], iterations_per_step: float) -> tuple[float, float]:
-    """Particle-iterations/s that the best of these would make in steps of so many iterations.
+    """Return the particle-iterations/s that the best of these rows would reach.
 
     Args:
         rows: see `run`.
-        iterations_per_step: of the solver that is held against them.
+        iterations_per_step: iterations per step of the solver to compare with.
 
     Returns:
         With lists built in every step, and with lists kept for `KEPT` steps.
@@ -88,7 +88,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--particles", type=int, default=2000)
-    parser.add_argument("--core", type=int, help="which core to run on; unless given, the one with the least to do")
+    parser.add_argument("--core", type=int, help="core to run on; default: the least busy one")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()
     particles = check_particles(options.particles)

@@ -1,6 +1,6 @@
-"""Writes what was measured of the daemon into docs/evidence/reliability.md: `python benchmarks/daemon_page.py`.
+"""Write the daemon's measurements into docs/evidence/reliability.md: `python benchmarks/daemon_page.py`.
 
-What was measured stands in docs/data/daemon.json; `daemon_stops`, `soak` and `idle_time` put it there and call this.
+The figures are in docs/data/daemon.json. `daemon_stops`, `soak` and `idle_time` store them there and call this script.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ BENCHES = {"numbers": "", "wires": " over wires"}
 
 
 def keep(name: str, found: Mapping[str, Any]) -> None:
-    """Write down what was measured, and bring the page up to date."""
+    """Store a measurement and update the page."""
     figures = measured()
     figures[name] = dict(found)
     FIGURES.write_text(json.dumps(figures, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -33,13 +33,13 @@ def keep(name: str, found: Mapping[str, Any]) -> None:
 
 
 def measured() -> dict[str, Any]:
-    """All that was."""
+    """Return all stored measurements."""
     found: dict[str, Any] = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.is_file() else {}
     return found
 
 
 def render(page: str, figures: Mapping[str, Any]) -> str:
-    """A page with its tables as they should be; those that nobody has measured stay as they are."""
+    """Return the page with updated tables; tables without measurements stay unchanged."""
 
     def table(match: re.Match[str]) -> str:
         found = figures.get(match[2])
@@ -49,7 +49,7 @@ def render(page: str, figures: Mapping[str, Any]) -> str:
 
 
 def stops(found: Mapping[str, Any]) -> str:
-    """Median and worst of each grade, by load [ms]."""
+    """Return the table of the median and worst stop time of each grade, by load [ms]."""
     loads = {"idle": "idle", "readers": "200 readers of events", "saturated": "saturated"}
     rows = []
     for bench, words in BENCHES.items():
@@ -70,7 +70,7 @@ def stops(found: Mapping[str, Any]) -> str:
 
 
 def day(found: Mapping[str, Any]) -> str:
-    """A day in scaled time: what was done to the daemon, what was lost, and what has grown."""
+    """Return the tables of a day in scaled time: load and faults, losses, and growth."""
     counts = found["counts"]
     states = ", ".join(f"{name} {count}" for name, count in sorted(_by_state(found["states"]).items()))
     ended = ", ".join(f"{name} {count}" for name, count in sorted(found["orders ended"].items()))
@@ -106,7 +106,7 @@ def day(found: Mapping[str, Any]) -> str:
 
 
 def _by_state(states: Mapping[str, int]) -> dict[str, int]:
-    """Numbers by the last word of their names."""
+    """Return the counts by the last word of their names."""
     found: dict[str, int] = {}
     for name, count in states.items():
         state = name.rpartition(" ")[2]
@@ -115,7 +115,7 @@ def _by_state(states: Mapping[str, int]) -> dict[str, int]:
 
 
 def idle_time(found: Mapping[str, Any]) -> str:
-    """Wall time with and without simulations ahead."""
+    """Return the table of wall times with and without speculative simulations."""
     rows = []
     times = "once" if found["times"] == 1 else f"the median of {found['times']}"
     for run in found["runs"]:
@@ -138,13 +138,13 @@ TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "".join(f"| {' | '.join(map(str, line))} |\n" for line in lines)
 
 
 def main() -> None:
-    """Bring the page up to date."""
+    """Update the page."""
     PAGE.write_text(render(PAGE.read_text(encoding="utf-8"), measured()), encoding="utf-8")
 
 

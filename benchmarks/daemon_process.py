@@ -1,4 +1,4 @@
-"""A `decant server start` of a benchmark's own, that ends with the benchmark, however that ends."""
+"""Start `decant server start` for a benchmark; the daemon ends with the benchmark, even if that is killed (Linux)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from typing import Any
 from orchestrator.daemon.daemon_client import Client
 
 PATIENCE = 120.0
-"""Longest time that anything is waited for [s]."""
+"""Longest time to wait for any event [s]."""
 
 _PR_SET_PDEATHSIG = 1
 
 
 def started(command: Sequence[str | Path], **options: Any) -> subprocess.Popen[bytes]:
-    """A process that is told to end (SIGTERM) when this one is gone, also where this one was killed (Linux)."""
+    """Start a process that receives SIGTERM when this one ends, even if this one is killed (Linux)."""
 
     def follow() -> None:
         if sys.platform == "linux":
@@ -32,7 +32,7 @@ def started(command: Sequence[str | Path], **options: Any) -> subprocess.Popen[b
 
 
 def end_in_order() -> None:
-    """A time limit's SIGTERM ends this process as Ctrl-C does: what it has started is ended first."""
+    """Handle SIGTERM like Ctrl-C, so that child processes are ended first."""
 
     def leave(number: int, frame: object) -> None:
         sys.exit(128 + number)
@@ -42,12 +42,12 @@ def end_in_order() -> None:
 
 @contextlib.contextmanager
 def serving(folder: Path, *options: str, environment: Mapping[str, str] | None = None) -> Iterator[Client]:
-    """A daemon with its state and its log in a folder.
+    """Run a daemon with its state and its log in a folder.
 
     Args:
-        folder: is there.
-        options: of `decant server start`, a settings file among them.
-        environment: beside this process's own.
+        folder: an existing folder.
+        options: arguments of `decant server start`, including a settings file.
+        environment: variables added to this process's own.
     """
     with (folder / "log").open("a") as log:
         command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "server", "start", *options]
@@ -72,7 +72,7 @@ def serving(folder: Path, *options: str, environment: Mapping[str, str] | None =
 
 
 def await_(happened: Callable[[], Any], patience: float = PATIENCE) -> Any:
-    """What it says, once that is true. Raises TimeoutError."""
+    """Wait until a function returns a true value, and return it. Raises TimeoutError."""
     end = time.monotonic() + patience
     while time.monotonic() < end:
         with contextlib.suppress(Exception):

@@ -1,9 +1,11 @@
-"""How soon the daemon's four ways to stop take effect, and how warm it is: with an idle and with a saturated machine.
+"""Measure how soon the daemon's four stop commands take effect and a plan starts, on an idle and a saturated machine.
 
-A daemon of its own, on a bench of numbers at twice real time and on one over wires. Each time a campaign is stopped
-while its arm tilts: 'pause' and 'stop' are measured until the daemon has taken note (they wait for the pour by
-intention), 'abort' and the emergency stop until the arm has confirmed that it stands. Idle: nothing else. Readers: 200
-of all events. Saturated: the readers, and a busy process for each core. Run from the project's root:
+The benchmark starts a daemon with a simulated bench at twice real time, and one with a bench over serial and network
+protocols. Each campaign is stopped while its arm tilts. 'pause' and 'stop' are measured until the daemon has accepted
+them (by design they wait for the pour). 'abort' and the emergency stop are measured until the arm confirms standstill.
+
+Loads: 'idle' has nothing else; 'readers' has 200 readers of all events; 'saturated' has the readers and one busy
+process per core. Run from the project's root:
 
     python benchmarks/daemon_stops.py --times 10    # into docs/data/daemon.json and docs/evidence/reliability.md
 """
@@ -75,7 +77,7 @@ asyncio.run(main(sys.argv[1], sys.argv[2], int(sys.argv[3])))
 
 
 def campaigns(folder: Path) -> dict[str, tuple[str, Files]]:
-    """What is stopped: on a bench of numbers, and over wires in real time."""
+    """Return the campaigns to stop: on a simulated bench, and over device protocols in real time."""
     yaml = YAML()
     table = yaml.load(CAMPAIGN)
     yaml.dump(table, folder / "numbers.yaml")
@@ -94,7 +96,7 @@ def campaigns(folder: Path) -> dict[str, tuple[str, Files]]:
 
 @contextlib.contextmanager
 def beside(client: Client, token: str, *, readers: int, busy: int) -> Iterator[None]:
-    """Others at work meanwhile: readers of all events, and processes that take a core each."""
+    """Run a load during the block: readers of all events, and processes that occupy a core each."""
     others = [started([sys.executable, "-c", "while True: pass"]) for _ in range(busy)]
     if readers:
         others.append(
@@ -115,7 +117,7 @@ def _readers(client: Client) -> float:
 
 
 def once(client: Client, sent: tuple[str, Files], grade: str) -> float:
-    """Stop a campaign whose arm tilts; how long that takes [s]."""
+    """Stop a campaign while its arm tilts; return the time until the stop took effect [s]."""
     key = client.post("/campaigns", {"text": sent[0], "files": sent[1]})["id"]
     await_(lambda: _at_bench(client) == key and client.get("/rigs")[0]["checkpoint"] in MOVING)
     begin = time.perf_counter()
@@ -125,7 +127,7 @@ def once(client: Client, sent: tuple[str, Files], grade: str) -> float:
         client.post("/emergency-stop/clear")
     else:
         for _ in range(2):
-            with contextlib.suppress(Exception):  # it rests already
+            with contextlib.suppress(Exception):  # the campaign has already stopped
                 client.post(f"/campaigns/{key}/abort")
     await_(lambda: _at_bench(client) is None)
     client.post(f"/campaigns/{key}/stop")
@@ -137,7 +139,7 @@ def _at_bench(client: Client) -> Any:
 
 
 def warm(client: Client, sent: tuple[str, Files]) -> float:
-    """From the submission of a plan to the beginning of its first simulation [s]."""
+    """Return the time from the submission of a plan to the start of its first simulation [s]."""
     begin = time.time()
     last = client.get("/status")["last_event"]
     key = client.post("/campaigns", {"text": sent[0], "files": sent[1], "task": "plan"})["id"]
@@ -152,7 +154,7 @@ def warm(client: Client, sent: tuple[str, Files]) -> float:
 
 
 def measured(folder: Path, times: int, chosen: Sequence[str]) -> dict[str, Any]:
-    """Everything [ms], with the machine's load before [processes that want a core]."""
+    """Run all measurements [ms]; include the machine's load average before them."""
     found: dict[str, Any] = {
         "cores": os.cpu_count(),
         "times": times,
@@ -181,7 +183,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=10)
     parser.add_argument("--loads", nargs="+", choices=list(LOADS), default=list(LOADS))
-    parser.add_argument("--to", type=Path, help="in place of the page")
+    parser.add_argument("--to", type=Path, help="write to this file instead of the page")
     arguments = parser.parse_args()
     end_in_order()
     with tempfile.TemporaryDirectory() as name:

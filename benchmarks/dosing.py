@@ -1,15 +1,14 @@
-"""Doses of wanted amounts on the virtual bench: the dose controller and its rivals, on the same seeds.
+"""Compare the dose controller with its rivals on the virtual bench, with the same target amounts and seeds.
 
     python benchmarks/dosing.py --final --json      # the figures of the evidence page: docs/data/dosing.json
     python benchmarks/dosing.py --series 20         # development seeds, for tuning
 
-A series is six doses of 10, 25, 50, 100, 200 g and one more of these, in a random order, from one source vessel. The
-seed draws cup, filling, balance and their errors; the bench draws the rest. The source is filled again and weighed when
-it holds too little. Development uses the seeds 0 to 99. The final seeds begin at 9000. Earlier final runs were at 5000
-to 5059, 6000 to 6059 and 7000 to 7049; what they showed led to changes, which were made on development seeds.
+A series is six doses from one source vessel, in random order: 10, 25, 50, 100, 200 g and one more of these. The seed
+draws cup, filling, balance and their errors; the bench draws the rest. If the source holds too little, it is refilled
+and weighed. Development uses the seeds 0 to 99. The final seeds begin at 9000. Earlier final runs were at 5000 to 5059,
+6000 to 6059 and 7000 to 7049; their results led to changes, which were made on development seeds.
 
-With `--dump FILE` every series is written as soon as it is complete, and a run that was interrupted continues after the
-last one.
+With `--dump FILE` each series is written when it is complete, and an interrupted run continues after the last one.
 """
 
 from __future__ import annotations
@@ -61,10 +60,10 @@ class Group:
     """A part of the benchmark.
 
     Attributes:
-        cups: names.
+        cups: names of the cups.
         lags: range of the balance's lag [s].
-        oil: instead of water.
-        final: series of the final seeds.
+        oil: use oil instead of water.
+        final: number of series with final seeds.
     """
 
     cups: tuple[str, ...]
@@ -83,7 +82,7 @@ GROUPS = {
 
 
 def spouted_vessel(cup: TrueCup) -> Vessel:
-    """The vessel that the controllers know: a mesh with the spout's outline, another one than the bench's."""
+    """Return the vessel model of the controllers: a mesh with the spout's outline, not the bench's model."""
     if cup.spout_length == 0.0:
         return build_vessel(cylinder("beaker", inner_radius=cup.radius, inner_height=cup.height))
     import trimesh
@@ -104,7 +103,7 @@ def spouted_vessel(cup: TrueCup) -> Vessel:
 
 @dataclass(frozen=True)
 class Dose:
-    """One dose of the table; masses [g], times [s]."""
+    """One row of the table; masses [g], times [s]."""
 
     seed: int
     place: int
@@ -124,9 +123,9 @@ class Series:
     """One source, one bench, six doses; the same for every controller.
 
     Args:
-        group: of the benchmark.
-        seed: of everything.
-        cups: flows by name of cup and liquid.
+        group: group of the benchmark.
+        seed: seed of all random choices.
+        cups: returns the flow for a cup's name and a liquid (oil or not).
     """
 
     def __init__(self, group: Group, seed: int, cups: Callable[[str, bool], CupFlow]) -> None:
@@ -158,11 +157,11 @@ class Series:
         self._weighing = rng.normal(0.0, 0.3e-3, 12).tolist()
 
     def weighed_content(self) -> float:
-        """Content of the source as weighed [kg]."""
+        """Return the weighed content of the source [kg]."""
         return self.bench.content + float(self._weighing.pop())
 
     def refill_for(self, amount: float) -> bool:
-        """Fill the source if it holds less than the amount and a tenth of its capacity."""
+        """Refill the source if it holds less than the amount plus a tenth of its capacity; return whether it did."""
         capacity = self.bench.cup.capacity * self.density
         if self.bench.content > amount + 0.1 * capacity:
             return False
@@ -170,7 +169,7 @@ class Series:
         return True
 
     def doses(self, pour: Callable[[float, bool], tuple[Any, str]]) -> Iterator[Dose]:
-        """All doses; `pour` receives the amount and whether the source was filled; it returns record and end."""
+        """Yield all doses; `pour` takes the amount and whether the source was refilled, and returns record and end."""
         for place, amount in enumerate(self.amounts):
             filled = self.refill_for(amount)
             fill = self.bench.content / (self.bench.cup.capacity * self.density)
@@ -192,7 +191,7 @@ class Series:
 
 
 def with_particles(series: Series) -> list[Dose]:
-    """The dose controller."""
+    """Pour a series with the dose controller."""
     rng = np.random.default_rng((series.seed, 3))
     started: list[DoseSeries] = []
 
@@ -218,7 +217,7 @@ def with_particles(series: Series) -> list[Dose]:
 
 
 def with_rival(rival: type[Rival]) -> Callable[[Series], list[Dose]]:
-    """A rival over a series."""
+    """Return a function that pours a series with a rival."""
 
     def run(series: Series) -> list[Dose]:
         memory: list[RivalMemory] = []
@@ -251,7 +250,7 @@ CONTROLLERS: dict[str, Callable[[Series], list[Dose]]] = {
 
 
 def figures(doses: Sequence[Dose]) -> dict[str, Any]:
-    """Mean |error|, bias, 95 %, worst, excess, spill and times of some doses."""
+    """Return mean |error|, bias, 95 %, worst, excess, spill and times of some doses."""
     errors = np.array([d.error for d in doses])
     sizes = np.abs(errors)
     firsts = np.array([abs(d.error) for d in doses if d.place == 0])
@@ -276,7 +275,7 @@ def figures(doses: Sequence[Dose]) -> dict[str, Any]:
 
 
 def paired(doses: Sequence[Dose], rival: Sequence[Dose], seed: int = 0) -> tuple[float, float, float]:
-    """Mean |error| of a rival minus ours, with its 95 % interval over series (bootstrap) [g]."""
+    """Return the mean |error| of a rival minus ours, with its 95 % interval over series (bootstrap) [g]."""
     own = {(d.seed, d.place): abs(d.error) for d in doses}
     by_series: dict[int, list[float]] = {}
     for d in rival:
@@ -288,7 +287,7 @@ def paired(doses: Sequence[Dose], rival: Sequence[Dose], seed: int = 0) -> tuple
 
 
 def cup_flows() -> Callable[[str, bool], CupFlow]:
-    """Flows by cup and liquid, each built once."""
+    """Return a function that gives the flow by cup and liquid, building each once."""
     vessels: dict[str, Vessel] = {}
     flows: dict[tuple[str, bool], CupFlow] = {}
 
@@ -312,14 +311,14 @@ def measure(
     dump: Path | None = None,
     pour: bool = True,
 ) -> dict[str, dict[str, list[Dose]]]:
-    """All doses by group and controller; every controller pours a series before the next series begins.
+    """Pour all doses by group and controller; every controller pours a series before the next series begins.
 
     Args:
         groups, controllers: names.
-        seeds: of a group's series.
+        seeds: returns the seeds of a group's series.
         say: receives the progress.
-        dump: file of all doses, one JSON line for each series and controller; what it has is not poured again.
-        pour: pour what the file lacks; otherwise the result has what is in the file.
+        dump: file of all doses, one JSON line per series and controller; its doses are not poured again.
+        pour: pour the doses that the file lacks; otherwise return only those in the file.
     """
     flow = cup_flows()
     known: dict[tuple[str, str, int], list[Dose]] = {}
@@ -363,7 +362,7 @@ HEAD = (
 
 
 def row(name: str, f: dict[str, Any]) -> str:
-    """One row of the table [g], [s]."""
+    """Return one row of the table [g], [s]."""
     keys = ("mean", "bias", "p95", "worst", "over_1g", "first_mean", "first_p95", "spill_mean", "spill_p95")
     times = ("time_50_p95", "time_200_p95", "time_median")
     values = [f"{f[k]:6.1%}" if k == "over_1g" else f"{_or_nan(f[k]):6.2f}" for k in keys]
@@ -379,8 +378,8 @@ def picture(path: Path, seed: int = 3) -> None:
     """Draw one dose of 50 g with all its signals.
 
     Args:
-        path: of the PNG.
-        seed: of a development series.
+        path: path of the PNG.
+        seed: seed of a development series.
     """
     from orchestrator.results import figure_style as style
 
@@ -393,7 +392,7 @@ def picture(path: Path, seed: int = 3) -> None:
     seen: list[tuple[float, str, float, float]] = []
 
     class Recorder:
-        """Notes what the controller believes at every step."""
+        """Records the controller's estimate at every step."""
 
         def step(self, time: float, tilt: float, readings: Any) -> Any:
             """See `actors.dosing.virtual_dosing_bench.Doser`."""
@@ -440,7 +439,7 @@ FAULTS = {
 
 
 def faults(count: int = 10) -> list[dict[str, Any]]:
-    """First doses of 100 g from the group 'round rim', each with one fault; one row per fault."""
+    """Pour first doses of 100 g of the group 'round rim' with one fault each; return one row per fault."""
     cups, rows = cup_flows(), []
     for name, fault in FAULTS.items():
         ends, above, misreported, spilled, upright = Counter[str](), [0.0], [0.0], [], []
@@ -483,7 +482,7 @@ def faults(count: int = 10) -> list[dict[str, Any]]:
 
 
 def write(update: dict[str, Any]) -> None:
-    """Replace a part of docs/data/dosing.json."""
+    """Update a part of docs/data/dosing.json."""
     data = json.loads(DATA.read_text(encoding="utf-8")) if DATA.exists() else {"groups": {}}
     DATA.write_text(json.dumps(data | update, indent=1) + "\n", encoding="utf-8")
 
@@ -491,16 +490,16 @@ def write(update: dict[str, Any]) -> None:
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--final", action="store_true", help="the final seeds instead of the development seeds")
-    parser.add_argument("--series", type=int, help="series; by default 20, or all of the final seeds")
+    parser.add_argument("--final", action="store_true", help="use the final seeds instead of the development seeds")
+    parser.add_argument("--series", type=int, help="number of series; default: 20, or all final seeds")
     parser.add_argument("--first", type=int, default=0, help="first development seed")
     parser.add_argument("--groups", type=int, nargs="*", help="numbers of groups, from 0")
     parser.add_argument("--controllers", nargs="*", choices=list(CONTROLLERS), default=list(CONTROLLERS))
     parser.add_argument("--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}")
     parser.add_argument("--dump", type=Path, help="file of all doses; continue if it exists")
-    parser.add_argument("--as-dumped", action="store_true", help="pour nothing: the figures of the doses in --dump")
-    parser.add_argument("--picture", type=Path, help="draw one dose, and nothing else")
-    parser.add_argument("--faults", action="store_true", help="doses with a fault each, and nothing else")
+    parser.add_argument("--as-dumped", action="store_true", help="pour nothing; use the doses in --dump")
+    parser.add_argument("--picture", type=Path, help="only draw one dose")
+    parser.add_argument("--faults", action="store_true", help="only pour doses with one fault each")
     options = parser.parse_args()
     if options.picture:
         return picture(options.picture)

@@ -1,17 +1,17 @@
-"""Doses of the virtual bench, repeated with particles: the amount past the lip under the same executed tilt.
+"""Repeat doses of the virtual bench with particles, and compare the amount past the lip for the same executed tilt.
 
     python benchmarks/dosing_particles.py --json    # into docs/data/dosing.json
     python benchmarks/dosing_particles.py --first 40 --doses 2
 
-The dose controller pours on the virtual dosing bench (`actors.dosing.virtual_dosing_bench`), whose liquid is one
+The dose controller pours on the virtual dosing bench (`actors.dosing.virtual_dosing_bench`), whose liquid has one
 dimension and a few coefficients. Then the particle simulator (`sim_engine.simulator`) moves the same cup, with the same
-content, along the tilt that the arm executed, the bench's error of the grip included. Compared is the mass that has
+content, along the tilt that the arm executed, including the bench's grip error. The comparison is of the mass that has
 passed the lip at the end, received or spilled.
 
-The cup is the straight beaker with a round rim, because coarse particles do not resolve a spout. Amounts of 25, 50, 100
-and 200 g in turn, the source between 30 and 95 % full. 500 particles are the coarsest resolution whose outflow is
-validated (docs/evidence/validation.md: within 1 % of the load); their spacing is 8 to 10 mm. The bench holds up to 2 mm
-of liquid back at a dry lip; the particles have no such rule.
+The cup is the straight beaker with a round rim, because coarse particles do not resolve a spout. Amounts cycle
+through 25, 50, 100 and 200 g; the source is 30 to 95 % full. 500 particles are the coarsest resolution whose outflow is
+validated (docs/evidence/validation.md: within 1 % of the load); their spacing is 8 to 10 mm. The bench retains up to
+2 mm of liquid at a dry lip; the particles have no such rule.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from dosing import AMOUNTS, CUPS, DATA, GROUPS, PARTICLES, Series, cup_flows
 
 FIRST_SEED = 7100
 RESOLUTION = 500
-"""Particles of a simulation."""
+"""Particles per simulation."""
 
 GROUP = "round rim"
 CUP = CUPS["round beaker"]
@@ -67,12 +67,12 @@ class Comparison:
     """One dose; masses past the lip [g].
 
     Attributes:
-        wanted: amount in the receiver.
-        load: content of the source before.
-        bench: of the virtual bench.
-        particles: of the particle simulation.
-        onset: shift of the onset that explains the difference [deg]; positive: the particles flow earlier.
-        cpu_s: of the particle simulation.
+        wanted: target amount in the receiver.
+        load: content of the source before the dose.
+        bench: mass on the virtual bench.
+        particles: mass in the particle simulation.
+        onset: shift of the onset that explains the difference [deg]; positive if the particles flow earlier.
+        cpu_s: CPU seconds of the particle simulation.
     """
 
     seed: int
@@ -85,7 +85,7 @@ class Comparison:
 
 
 def executed(scene: Scene, record: DoseRecord, grip: float) -> SampledMotion:
-    """The motion of the cup about its lip with the tilt that the arm executed."""
+    """Return the motion of the cup about its lip with the executed tilt."""
     planned = plan_motion(scene, ACTION, build_vessel(scene.pourer), build_vessel(scene.receiver))
     times, tilts = record.times, record.tilts
     speeds = np.diff(tilts) / np.diff(times)
@@ -129,7 +129,7 @@ def compare(simulator: PourSimulator, flow: CupFlow, seed: int, amount: float) -
 
 
 def summary(found: list[Comparison]) -> dict[str, Any]:
-    """Differences of particles − bench."""
+    """Return the differences particles − bench."""
     difference = np.array([one.particles - one.bench for one in found])
     shift = np.array([one.onset for one in found])
     return {
@@ -146,7 +146,7 @@ def summary(found: list[Comparison]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Compare and print."""
+    """Run the comparison and print it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--doses", type=int, default=20)
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="first seed")

@@ -1,11 +1,11 @@
 """Rivals of the dose controller: open loop, fixed and learned preact, and PID, on the same bench with the same cup.
 
-All of them know the geometry of the cup, the weighed content of the source, and the zero of the balance. They begin
-alike: fast to the earliest plausible onset, then slowly until two readings have risen.
+All rivals know the geometry of the cup, the weighed content of the source, and the zero of the balance. All begin in
+the same way: fast to the earliest plausible onset, then slowly until two readings have risen.
 
 - `OpenLoop` pours along the cup's equation and ignores the balance.
-- `Preact` ends at target − preact. With `gain` 0 the preact is fixed; otherwise `gain` × the
-  mean error of the last four doses is added after every dose, as in A.S.T. A810; outliers are ignored.
+- `Preact` ends at target − preact. With `gain` 0 the preact is fixed; otherwise `gain` × the mean error of the last
+  four doses is added after every dose, as in A.S.T. A810; outliers are ignored.
 - `Pid` turns with Kp·(target − reading) − Kd·flow, and ends when the reading is within its tolerance.
 """
 
@@ -29,13 +29,13 @@ EARLY = math.radians(3.0)
 
 @dataclass
 class RivalMemory:
-    """What a rival carries from dose to dose.
+    """State that a rival keeps from dose to dose.
 
     Attributes:
-        volume: of the source, from weighings [m³].
-        preact: [kg].
-        onset_bias: as last seen [rad].
-        errors: of the last doses [kg].
+        volume: volume in the source, from weighings [m³].
+        preact: preact [kg].
+        onset_bias: last observed bias of the onset [rad].
+        errors: errors of the last doses [kg].
     """
 
     volume: float
@@ -45,10 +45,10 @@ class RivalMemory:
 
 
 class Rival:
-    """The common part: zero, approach, flow control on the cup's equation, return, weighing."""
+    """Common part of all rivals: zero, approach, flow control on the cup's equation, return, weighing."""
 
     first_preact = 4.2e-3
-    """0.7 s of fine flow: the best of four on development seeds [kg]."""
+    """Equals 0.7 s of fine flow: the best of four values on development seeds [kg]."""
 
     def __init__(self, cup: CupFlow, amount: float, memory: RivalMemory, fine_flow: float) -> None:
         self.cup, self.amount, self.memory, self.fine_flow = cup, amount, memory, fine_flow
@@ -61,12 +61,12 @@ class Rival:
 
     @property
     def reading(self) -> float:
-        """Last reading net of the receiver [kg]."""
+        """Return the last reading net of the receiver [kg]."""
         return self._readings[-1].mass - self._zero if self._readings else 0.0
 
     @property
     def measured_flow(self) -> float:
-        """Slope of the readings of the last 0.4 s [kg/s]."""
+        """Return the slope of the readings of the last 0.4 s [kg/s]."""
         last = [r for r in self._readings if r.time > self._now - 0.45]
         if len(last) < 2 or last[-1].time <= last[0].time:
             return 0.0
@@ -105,14 +105,14 @@ class Rival:
         return search if self._tilt < math.radians(120.0) else 0.0
 
     def _seen(self) -> None:
-        """The stream was seen about half a second after it began."""
+        """Set the onset; the stream is detected about half a second after it began."""
         self._onset = self._tilt - 0.5 * self._speed - self._equilibrium(self.memory.volume, 0.0)
 
     def _pour(self, step: float) -> float:
         raise NotImplementedError
 
     def _follow(self, flow: float, step: float) -> float:
-        """Speed of the tilt for a flow: the cup's equation, corrected by the measured flow."""
+        """Return the tilt speed for a flow: the cup's equation, corrected by the measured flow."""
         self._onset += math.radians(0.06) * step * (flow - self.measured_flow) / 1e-3
         volume = self.memory.volume - self.reading / self.cup.density
         head = float(self.cup.head_for(np.array([flow / self.cup.density]), self._tilt)[0])
@@ -151,7 +151,7 @@ class Rival:
         return self._equilibrium(self.memory.volume, head) + self.memory.onset_bias
 
     def learn(self) -> None:
-        """Carry over to the next dose."""
+        """Update the memory for the next dose."""
         if self.weighed is not None:
             self.memory.volume = max(self.memory.volume - self.weighed / self.cup.density, 0.0)
             self.memory.onset_bias = self._onset
@@ -197,7 +197,7 @@ class OpenLoop(Rival):
 
 
 class Preact(Rival):
-    """Coarse and fine flow, and a preact."""
+    """Pours with coarse and fine flow, and a preact."""
 
     gain = 0.0
 
@@ -221,13 +221,13 @@ class Preact(Rival):
 
 
 class LearnedPreact(Preact):
-    """The preact learns from fill to fill."""
+    """Updates the preact after every dose."""
 
     gain = 0.5
 
 
 class Pid(Rival):
-    """PID on the amount, with the tilt's speed as output; the gains with the least error on development seeds."""
+    """PID on the amount with the tilt's speed as output; its gains have the least error on development seeds."""
 
     gains = (0.15, 0.3, 0.8e-3)
     """Kp [deg/s per g], Kd [deg/s per g/s], tolerance [kg]."""

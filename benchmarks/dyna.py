@@ -1,18 +1,18 @@
-"""What simulating beside pours buys, how busy it keeps the pool, and whether the arm ever waits for a decision.
+"""Measure the benefit of simulations during pours, the pool's load, and the arm's waiting time for decisions.
 
     python benchmarks/dyna.py [--worlds right half ...] [--problem spill2] [--arms fixed priced ...] [--seeds 30]
                               [--first 0] [--simulation 1.5] [--slots 2] [--pour 90] [--pours 15] [--prior 37]
                               [--model adaptive] [--json]
 
-Toy worlds (`optimiser_problems.py`, and simulators that know them more or less as in `hybrid_models.py`) behind the
-real strategy, scheduler, journal and optimiser, in one process, on a clock that leaves waiting out
-(`skipping_clock.py`). A simulation takes `--simulation` seconds, give or take a fifth, one at a time on each of
-`--slots` simulators; a pour takes `--pour`; an answer of the optimiser what it takes in CPU time.
+Toy worlds (`optimiser_problems.py`, with simulators of varying accuracy as in `hybrid_models.py`) run with the real
+strategy, scheduler, journal and optimiser, in one process, on a clock that skips waits (`skipping_clock.py`). A
+simulation takes `--simulation` seconds ± 20 %, one at a time on each of `--slots` simulators. A pour takes `--pour`
+seconds. An optimiser query takes its CPU time.
 
-    D2      pours alone
-    fixed   D3 with 37 simulations and 2 beside each pour (the paper's form)
-    priced  D3 with `simulations_per_pour: free`: simulations by what they are worth, before the first pour at most 37
-    longer  the same, with at most 200 before the first pour
+    D2      pours only
+    fixed   D3 with 37 simulations and 2 during each pour (the paper's form)
+    priced  D3 with `simulations_per_pour: free`: simulations by their value; at most 37 before the first pour
+    longer  as priced, with at most 200 before the first pour
     tireless  as priced, but the pool never rests
 """
 
@@ -59,7 +59,7 @@ SIMULATORS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
 
 
 def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
-    """What is compared."""
+    """Return the compared deployments by name."""
     settings = D3Settings(
         pours=asked.pours,
         prior_simulations=asked.prior,
@@ -77,7 +77,7 @@ def arms(asked: argparse.Namespace, space: Space) -> dict[str, DeploymentPlan]:
 
 
 class Bench:
-    """A laboratory of numbers: simulators, arm and optimiser, with costs, and a record of who was busy when."""
+    """A simulated laboratory: simulators, arm and optimiser with costs, and a record of their occupancy."""
 
     mode = "virtual"
 
@@ -108,12 +108,12 @@ class Bench:
         return loop
 
     def watch(self, event: Event) -> None:
-        """The strategy says when the pool may rest."""
+        """Record when the strategy lets the pool rest."""
         if isinstance(event, DecisionMade) and POOL_RESTS in event.decision.values:
             self.occupancy.rests(self._clock.time())
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
-        """One of the pool's members takes its time."""
+        """Simulate on a free worker for the set time."""
         rng = np.random.default_rng(task.seed)
         cost = self._simulated(self._world, unit(self._space, task.action), self._sign)
         cost, seconds = cost + SCATTER * float(rng.standard_normal()), self._asked.simulation * rng.uniform(0.8, 1.2)
@@ -133,7 +133,7 @@ class Bench:
         progress: ProgressCallback | None = None,
         dose: DoseTarget | None = None,
     ) -> PourMeasurement:
-        """The arm pours, the operator mops."""
+        """Pour for the set time, including the operator's cleaning."""
         self.before_first = self.before_first if self.poured else self.simulations
         self.occupancy.pour_started(self._clock.time())
         await asyncio.sleep(self._asked.pour)
@@ -144,7 +144,7 @@ class Bench:
         return PourMeasurement(scene.liquid.mass, scene.liquid.mass * min(max(cost + noise, 0.0), 1.0), 0.0)
 
     async def suggest(self, query: SuggestionQuery) -> Suggestion:
-        """The real optimiser; in a laboratory it is a process of its own."""
+        """Query the real optimiser; in a laboratory it has its own process."""
         begun = time.thread_time()
         suggestion = propose(query)
         seconds = time.thread_time() - begun
@@ -153,12 +153,12 @@ class Bench:
         return suggestion
 
     def true(self, values: dict[str, float]) -> float:
-        """Spillage of an action without noise."""
+        """Return the spillage of an action without noise."""
         return self._world.true(self._space.encode(values))
 
 
 def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespace) -> dict[str, Any]:
-    """One campaign, and what it came to."""
+    """Run one campaign and return its figures."""
     problem = BY_NAME[asked.problem]
     bench = Bench(problem, world, seed, arm.actions, asked)
     with tempfile.TemporaryDirectory() as folder:
@@ -198,12 +198,12 @@ def campaign(arm: DeploymentPlan, world: str, seed: int, asked: argparse.Namespa
 
 
 def rounded(values: list[float]) -> list[float]:
-    """Mean and interval as they are printed."""
+    """Return mean and interval, rounded for printing."""
     return [round(v, 4) for v in interval(values)]
 
 
 def rows_of(asked: argparse.Namespace) -> list[dict[str, Any]]:
-    """Every world with every arm."""
+    """Run all worlds with all arms."""
     space = Space(AXES[: BY_NAME[asked.problem].dimension])
     rows = []
     for world in asked.worlds:
@@ -225,7 +225,7 @@ def rows_of(asked: argparse.Namespace) -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = ["D2", "fixed", "priced", "longer", "tireless"]
     parser.add_argument("--worlds", nargs="+", choices=list(SIMULATORS), default=["right", "shifted by 0.08"])

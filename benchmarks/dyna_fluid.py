@@ -1,13 +1,13 @@
-"""The Dyna loop with liquid in it: real simulations beside pours of the virtual bench's own liquid, at 90 s a pour.
+"""Run the Dyna loop with simulated liquid: real simulations during pours of the virtual bench, at 90 s per pour.
 
     python benchmarks/dyna_fluid.py [--level moderate] [--receiver narrow] [--arms D2 fixed priced tireless]
                                     [--seeds 3] [--particles 500] [--slots 2] [--pour 90] [--pours 15] [--json]
 
-Simulator, strategy, scheduler, journal and optimiser are the real ones, in one process, on a clock that leaves waiting
-out (`skipping_clock.py`): a simulation takes its own CPU time on one of `--slots` simulators, a pour takes `--pour`.
-The bench's own liquid is accounted apart: it takes no time on that clock. Bench, scenes and actions are those of
-`configs/studies/paper.yaml`; θ is not calibrated. Arms are those of `dyna.py`; `tireless` simulates for as long as a
-pour takes, some 900 times.
+Simulator, strategy, scheduler, journal and optimiser are the real ones, in one process, on a clock that skips waits
+(`skipping_clock.py`). A simulation takes its own CPU time on one of `--slots` simulators; a pour takes `--pour`
+seconds. The bench's own liquid is counted separately and takes no time on that clock. Bench, scenes and actions are
+those of `configs/studies/paper.yaml`; θ is not calibrated. Arms are those of `dyna.py`; `tireless` simulates
+throughout each pour, about 900 times.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ Row = dict[str, Any]
 
 
 class Fluid(Bench):
-    """A laboratory whose numbers are simulated: the pool's by the strategy's θ, the bench's by the hidden one."""
+    """A laboratory with simulated liquid: the pool uses the strategy's θ, the bench the hidden ground truth."""
 
     def __init__(self, study: StudyPlan, level: str, simulator: PourSimulator, asked: argparse.Namespace) -> None:
         self._asked, self._simulator = asked, simulator
@@ -64,7 +64,7 @@ class Fluid(Bench):
         self._hidden, self._beside = study.level(level).bench, _Apart(self)
 
     def _run(self, task: PourTask) -> tuple[SimulatedPour, float]:
-        """A simulation, and the CPU time that this thread spent on it."""
+        """Run a simulation; return it with the CPU time that this thread spent on it."""
         begun = time.thread_time()
         try:
             found = self._simulator.simulate(task)
@@ -73,7 +73,7 @@ class Fluid(Bench):
         return SimulatedPour(found.outcome), time.thread_time() - begun
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
-        """One of the pool's members takes the CPU time that the simulation takes."""
+        """Simulate on a free worker for the CPU time of the simulation."""
         async with self._free:
             self.occupancy.simulation_started(self._clock.time())
             try:
@@ -86,7 +86,7 @@ class Fluid(Bench):
         return result
 
     async def simulate_apart(self, task: PourTask) -> SimulatedPour:
-        """A simulation of the bench's own liquid: it takes none of the campaign's time."""
+        """Simulate the bench's own liquid, which takes none of the campaign's time."""
         result, used = self._run(task)
         self.apart += result.outcome.cpu_s
         await self._clock.spend(0.0, used)
@@ -101,7 +101,7 @@ class Fluid(Bench):
         progress: ProgressCallback | None = None,
         dose: DoseTarget | None = None,
     ) -> PourMeasurement:
-        """The arm pours, the operator mops."""
+        """Pour for the set time, including the operator's cleaning."""
         self.before_first = self.before_first if self.poured else self.simulations
         self.occupancy.pour_started(self._clock.time())
         try:
@@ -115,7 +115,7 @@ class Fluid(Bench):
 
 
 class _Apart:
-    """The bench's simulator."""
+    """The simulator of the bench."""
 
     size = 1
     separate = False
@@ -128,7 +128,7 @@ class _Apart:
 
 
 def arms(asked: argparse.Namespace, base: DeploymentPlan) -> dict[str, DeploymentPlan]:
-    """What is compared; see `dyna.py`."""
+    """Return the compared deployments by name; see `dyna.py`."""
     free = replace(base, settings=D3Settings.like(base.settings, pours=asked.pours, simulations_per_pour="free"))
     costs = CostSettings(pour=asked.pour)
     return {
@@ -140,7 +140,7 @@ def arms(asked: argparse.Namespace, base: DeploymentPlan) -> dict[str, Deploymen
 
 
 def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, asked: argparse.Namespace) -> Row:
-    """One campaign, and what it came to."""
+    """Run one campaign and return its figures."""
     with tempfile.TemporaryDirectory() as folder:
         plan = replace(
             study.base,
@@ -176,12 +176,12 @@ def campaign(study: StudyPlan, arm: DeploymentPlan, seed: int, fluid: Fluid, ask
 
 
 def replace_particles(study: StudyPlan, particles: int) -> SimulationParameters:
-    """The study's θ at another resolution."""
+    """Return the study's θ at another resolution."""
     return study.base.parameters.model_copy(update={"particles": particles})
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = ["D2", "fixed", "priced", "tireless"]
     parser.add_argument("--level", default="moderate")

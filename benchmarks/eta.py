@@ -1,13 +1,13 @@
-"""Whether 'about 4 min left in all' comes true: what a run of the quickstart says, beside what it then takes.
+"""Compare the time left that a quickstart run reports ('about 4 min left in all') with the actual time.
 
     python benchmarks/eta.py [--benches numbers,wires] [--seed 7] [--json]
 
-Runs the shipped quickstart as a person would, on the bench of numbers (`twin.yaml`) and over wires, reads every line of
-its plain progress, and compares the time left that it tells with the moment at which the campaign was over. The error
-is a share of the whole run: (told − true) / whole. Required: every one within 20 %, from the first line on.
+Runs the shipped quickstart like a user, on the simulated bench (`twin.yaml`) and over device protocols. Reads each line
+of its plain progress, and compares the reported time left with the end of the campaign. The error is a share of the
+whole run: (told − true) / whole. Required: every error within 20 %, from the first line on.
 
-Other work on the machine spoils what this is about: run it on an idle one. A deployment that ends before its last pour,
-because no further one is worth it, ends sooner than it was told; how many pours were made stands beside the result.
+Run it on an idle machine, because other load distorts the result. A deployment that ends before its last pour, because
+no further pour has enough value, ends earlier than predicted; the result includes the number of pours.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from machine import ROOT, describe, say, show
 from actors.runtime.child_process import child_environment
 
 LIMIT = 0.2
-"""Largest error of a time that is told, as a share of the whole run."""
+"""Largest error of a reported time, as a share of the whole run."""
 
 LABORATORIES = {"numbers": "twin.yaml", "wires": "virtual.yaml"}
 
 LONGEST = 3600.0
-"""A run that takes longer is ended [s]."""
+"""Time limit of a run [s]."""
 
 TOLD = re.compile(r"about (?:(?P<hours>\d+) h )?(?:(?P<minutes>\d+) min ?)?(?:(?P<seconds>\d+) s )?left in all")
 
 
 def told(line: str) -> float | None:
-    """The time left that a line of progress tells [s]; None where it tells none."""
+    """Return the time left that a line of progress reports [s], or None."""
     found = TOLD.search(line)
     if found is None:
         return None
@@ -46,11 +46,11 @@ def told(line: str) -> float | None:
 
 
 def score(lines: list[tuple[float, str]], whole: float) -> list[dict[str, Any]]:
-    """Every time that was told beside the truth.
+    """Compare each reported time with the actual one.
 
     Args:
-        lines: moments since the campaign began [s], and what was printed.
-        whole: when it was over [s].
+        lines: times since the campaign began [s], and the printed lines.
+        whole: duration of the campaign [s].
     """
     rows = []
     for at, line in lines:
@@ -70,10 +70,10 @@ def score(lines: list[tuple[float, str]], whole: float) -> list[dict[str, Any]]:
 
 
 def run(bench: str, seed: int) -> dict[str, Any]:
-    """One quickstart, with what it told.
+    """Run one quickstart; return its reported times and their errors.
 
     Raises:
-        SystemExit: it did not come to its end.
+        SystemExit: the run failed.
     """
     program = "from orchestrator.cli.app import main; main()"
     configs = ROOT / "configs"
@@ -125,7 +125,7 @@ def run(bench: str, seed: int) -> dict[str, Any]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--benches", default="numbers,wires", help=f"which, of {', '.join(LABORATORIES)}")
+    parser.add_argument("--benches", default="numbers,wires", help=f"comma-separated, of {', '.join(LABORATORIES)}")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()

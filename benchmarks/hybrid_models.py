@@ -1,12 +1,12 @@
-"""Which surrogate makes the most of simulations that are right, off, scaled, shifted or wrong.
+"""Compare surrogates for use with simulations that are right, off, scaled, shifted or wrong.
 
 Toy pours after toy simulations:
 
     python benchmarks/hybrid_models.py [--worlds right far ...] [--models residual constant] [--seeds 8]
                                        [--simulations 37] [--pours 15] [--json]
 
-A world is `spill2` of `optimiser_problems.py`, and a simulator that knows it more or less. The optimiser chooses the
-simulations, as D3's first stage does, then the pours; `constant` sees no simulations. All of it in this process.
+A world is `spill2` of `optimiser_problems.py` with a simulator of some accuracy. The optimiser chooses the simulations,
+like D3's first stage, then the pours; `constant` uses no simulations. Everything runs in this process.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sim_engine.search_space import Axis, Space
 
 SPACE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))
 SCATTER = 0.02
-"""Scatter of a simulation."""
+"""Standard deviation of a simulation's noise."""
 
 WORLDS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
     "right": lambda world, u, _: world.true(u),
@@ -40,7 +40,7 @@ WORLDS: dict[str, Callable[[Instance, Floats, Floats], float]] = {
 
 
 def simulations(name: str, world: Instance, count: int) -> Data:
-    """The first stage: five Sobol points, then as the optimiser chooses."""
+    """Run the first stage: five Sobol points, then points chosen by the optimiser."""
     rng = np.random.default_rng([world.seed, 999])
     sign = rng.choice([-1.0, 1.0], 2)
     data = Data()
@@ -58,7 +58,7 @@ def simulations(name: str, world: Instance, count: int) -> Data:
 
 
 def campaign(model: str, world: Instance, simulated: Data, pours: int) -> dict[str, float]:
-    """The pours, and what they come to without noise."""
+    """Run the pours; return their noise-free results."""
     informed = model != "constant"
     query = PourQuery(SPACE, Data(), simulated=simulated) if informed else MinimumQuery(SPACE, Data())
     visited = []
@@ -77,7 +77,7 @@ def campaign(model: str, world: Instance, simulated: Data, pours: int) -> dict[s
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     models = ["residual", "constant"]
     parser.add_argument("--worlds", nargs="+", choices=list(WORLDS), default=list(WORLDS))

@@ -1,8 +1,8 @@
-"""Wall time of whole campaigns over wires, with the simulations that are made while the arm pours, and without them.
+"""Measure the wall time of complete campaigns over device protocols, with and without speculative simulations.
 
-Each campaign is run by `decant run` as people run it, with and without in turn, in one go on one machine; its decisions
-have to be the same. 'Without', what is foreseen is thrown away, for this benchmark only: there is no such setting. Run
-from the project's root, on a machine that does nothing else:
+`decant run` runs each campaign as for a user, alternately with and without speculative execution, in one session on one
+machine. The decisions must be identical. 'Without' discards the predicted requests, for this benchmark only; there is
+no such setting. Run from the project's root, on an idle machine:
 
     python benchmarks/idle_time.py                                    # the quickstart; into docs/data/daemon.json
     python benchmarks/idle_time.py --campaigns quickstart paper --times 1
@@ -33,7 +33,7 @@ WITHOUT = f"from orchestrator.runs.request_executor import SpeculativeExecution;
 
 
 def run_once(campaign: str, program: str) -> dict[str, Any]:
-    """A run from the start of the program to its end, on the campaign's own virtual bench."""
+    """Run a campaign from program start to end, on its own virtual bench."""
     path = ROOT / "configs" / "campaigns" / f"{campaign}.yaml"
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
@@ -69,7 +69,7 @@ def run_once(campaign: str, program: str) -> dict[str, Any]:
 
 
 def compared(campaign: str, times: int) -> list[dict[str, Any]]:
-    """Rows of the table: medians with and without, and whether both decided the same."""
+    """Return the rows of the table: medians with and without, and whether the decisions agree."""
     found: dict[str, list[dict[str, Any]]] = {"yes": [], "no": []}
     for _ in range(times):
         for ahead, program in (("no", WITHOUT), ("yes", WITH)):
@@ -93,7 +93,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--campaigns", nargs="+", default=["quickstart"], help="names in configs/campaigns")
     parser.add_argument("--times", type=int, default=1)
-    parser.add_argument("--to", type=Path, help="in place of the page")
+    parser.add_argument("--to", type=Path, help="write to this file instead of the page")
     arguments = parser.parse_args()
     end_in_order()
     found: dict[str, Any] = {"cores": os.cpu_count(), "times": arguments.times}

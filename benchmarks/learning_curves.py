@@ -1,20 +1,20 @@
-"""Loss against pours: D1, D2, D3, and what they compete with, on the same benches.
+"""Compare loss against number of pours for D1, D2, D3 and competing methods, on the same benches.
 
     python benchmarks/learning_curves.py [--arms D1 D2 ...] [--seeds 20] [--first 3000] [--pours 15] [--kept FILE]
                                          [--rivals PYTHON] [--write]
 
-Benches are numbers: the valleys with steep walls of `mismatch_worlds.py`, with a simulator of moderate error. Nobody
-knows a bench before; D1 and D3 have its simulator. A loss is counted without scatter. Each run is added to
-docs/data/learning-curves.json and not made again; `--kept` takes the runs of D3 from a file of `mismatch.py`. `--write`
-puts the table into docs/data/results.json; docs/make_learning_picture.py draws the curves.
+Benches are simulated: the valleys with steep walls of `mismatch_worlds.py`, with a simulator of moderate error. No
+method has prior data of a bench; D1 and D3 have its simulator. Losses are without scatter. Each run is stored in
+docs/data/learning-curves.json and not repeated; `--kept` takes the runs of D3 from a file of `mismatch.py`. `--write`
+writes the table to docs/data/results.json; docs/make_learning_picture.py draws the curves.
 
-    random, Sobol   points that nothing chooses
-    rule of thumb   a slow tilt over the middle, every time: a fifth of the range of speeds, the middle of all others
+    random, Sobol   points without any choice by results
+    rule of thumb   the same slow tilt over the middle each time: a fifth of the range of speeds, the middle of others
     BoTorch qNEI    four Sobol points, then noisy expected improvement: `qLogNoisyExpectedImprovement` with a
                     `SingleTaskGP`, defaults of BoTorch, in the environment of `optimisers.py` (or that of `--rivals`)
     D1              30 simulations; the planned action is poured every time
-    D2              pours alone
-    D3              37 simulations, and two next to each pour
+    D2              pours only
+    D3              37 simulations, and two during each pour
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ Ask = Callable[[int, list[Floats], list[float]], Floats]
 
 
 def asked_by(arm: str, valley: Valley, seed: int, rival: Ask | None) -> list[float]:
-    """Losses of pours at the points of an arm that knows no simulator, without end."""
+    """Return losses of pours at the points of an arm without a simulator; the run does not stop early."""
     dimension = len(valley.space.axes)
     start = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng(seed)).random(64)
     rng = np.random.default_rng([seed, 1])
@@ -74,7 +74,7 @@ def asked_by(arm: str, valley: Valley, seed: int, rival: Ask | None) -> list[flo
 
 
 def planned(valley: Valley, seed: int) -> list[float]:
-    """D1: the same action every time."""
+    """Return the losses of D1, which pours the same action every time."""
     poured: list[float] = []
 
     def simulated(action: Action, theta: SimulationParameters, rng: np.random.Generator) -> float:
@@ -92,7 +92,7 @@ def planned(valley: Valley, seed: int) -> list[float]:
 
 @contextmanager
 def rival(python: Path) -> Iterator[Ask]:
-    """BoTorch in a child process."""
+    """Run BoTorch in a child process."""
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     child = subprocess.Popen([str(python), str(RIVALS_FILE), "BoTorch qLogNEI"], env=single_threaded(), **pipes)
     assert child.stdin is not None
@@ -112,7 +112,7 @@ def rival(python: Path) -> Iterator[Ask]:
 
 
 def run(arm: str, seed: int, ask: Ask | None) -> list[float]:
-    """Losses of the pours of an arm on the bench of a seed."""
+    """Return the losses of an arm's pours on the bench of a seed."""
     valley = Valley(LEVEL, seed)
     if arm == "D1":
         return planned(valley, seed)
@@ -126,7 +126,7 @@ SIMULATED = {"D1": "30", "D3": f"{PRIOR}, and {BESIDE} a pour"}
 
 
 def rows(kept: dict[str, Any], seeds: list[str]) -> list[list[str]]:
-    """A row for each arm."""
+    """Return one row per arm."""
     found = []
     for arm in (arm for arm in ARMS if arm in kept["runs"]):
         losses = np.array([kept["runs"][arm][seed] for seed in seeds])
@@ -139,7 +139,7 @@ def rows(kept: dict[str, Any], seeds: list[str]) -> list[list[str]]:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
     parser.add_argument("--seeds", type=int, default=20)

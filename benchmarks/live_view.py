@@ -1,14 +1,13 @@
-"""What watching costs control: `python benchmarks/live_view.py` writes docs/data/live-view-timing.json, and a table.
+"""Measure the cost of monitoring: `python benchmarks/live_view.py` writes docs/data/live-view-timing.json, and a table.
 
-A control loop of 100 Hz runs in this process and emits what a campaign emits: a pour's progress ten times a second, a
-simulation every half second, every tenth with its particles, and a surrogate every two seconds. Measured is how late
-the loop wakes, how long emitting takes, and CPU time of control, of the process that writes and of Rerun's server: with
-no monitor, with a recording, with the live view and 0, 1, 20 viewers, with a viewer and with the server stopped by
-SIGSTOP, with the server killed, and with a full disk. All of it from when programs are loaded and the first pictures
-drawn (`--warm-up`).
+A control loop of 100 Hz runs in this process and emits a campaign's events: a pour's progress ten times a second, a
+simulation every half second, every tenth with its particles, and a surrogate every two seconds. The benchmark measures
+the loop's lateness, the time to emit, and the CPU time of control, of the writer process and of Rerun's server. Cases:
+no monitor; a recording; the live view with 0, 1, 20 viewers; a viewer, the server or the writer stopped by SIGSTOP; the
+server killed; a full disk. Measurements start after programs are loaded and the first frames are drawn (`--warm-up`).
 
-Viewers are Rerun's own program without a screen: they take the stream as a browser does. Times on a machine that does
-something else as well are worth their ratios, no more. However the script ends, nothing that it started stays.
+Viewers are Rerun's own program without a screen; they receive the stream as a browser does. On a machine with other
+load, only the ratios of the times are meaningful. When the script ends, for any reason, it ends all its processes.
 """
 
 from __future__ import annotations
@@ -51,23 +50,23 @@ PAGE = ROOT / "docs" / "evidence" / "reliability.md"
 BEGIN, END = "<!-- timing of control, by benchmarks/live_view.py -->", "<!-- end of timing -->"
 
 RATE = 100.0
-"""Of the control loop [Hz]."""
+"""Frequency of the control loop [Hz]."""
 
 PARTICLES = 2000
 
 PATIENCE = 120.0
-"""With a writer that starts or ends on a busy machine [s]."""
+"""Longest time for a writer to start or end on a busy machine [s]."""
 
 
 def main() -> None:
     """Measure all cases."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seconds", type=float, default=40.0, help="measured, per case")
-    parser.add_argument("--warm-up", type=float, default=15.0, help="before that [s]")
-    parser.add_argument("--only", default="", help="cases whose names begin so; the page is left alone then")
+    parser.add_argument("--seconds", type=float, default=40.0, help="measured time per case [s]")
+    parser.add_argument("--warm-up", type=float, default=15.0, help="time before the measurement [s]")
+    parser.add_argument("--only", default="", help="only cases with this prefix; keeps the page")
     parser.add_argument("--to", type=Path, default=ROOT / "docs" / "data" / "live-view-timing.json")
     arguments = parser.parse_args()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # what is open is closed
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # closes what is open
     plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml")
     rows = []
     for name, case in cases(plan):
@@ -106,7 +105,7 @@ COLUMNS = {
 
 
 def table(told: Mapping[str, Any]) -> list[str]:
-    """The table and the line below it, as on the page."""
+    """Return the table and the line below it, as on the page."""
     lines = [f"| {' | '.join(COLUMNS.values())} |", f"|---|{'--:|' * (len(COLUMNS) - 1)}"]
     lines += [f"| {' | '.join(str(row[name]) for name in COLUMNS)} |" for row in told["rows"]]
     load = told["load"][0]
@@ -119,7 +118,7 @@ def table(told: Mapping[str, Any]) -> list[str]:
 
 
 def fill(page: Path, told: Mapping[str, Any]) -> None:
-    """Put the table between its marks on the page."""
+    """Insert the table between its markers on the page."""
     before, mark, rest = page.read_text(encoding="utf-8").partition(BEGIN)
     _, end, after = rest.partition(END)
     if not mark or not end:
@@ -129,12 +128,12 @@ def fill(page: Path, told: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class Watching:
-    """Who watches.
+    """A monitor and its processes.
 
     Attributes:
-        monitor: that events go to.
-        processes: that do it, by what they are.
-        recording: that is written.
+        monitor: monitor that receives the events.
+        processes: the monitor's processes, by role.
+        recording: file that is written.
     """
 
     monitor: RerunMonitor | None = None
@@ -146,7 +145,7 @@ Case = Callable[[Path], contextlib.AbstractContextManager[Watching]]
 
 
 def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
-    """By name, in the order of the table."""
+    """Return the cases by name, in the order of the table."""
 
     @contextlib.contextmanager
     def nobody(folder: Path) -> Iterator[Watching]:
@@ -216,7 +215,7 @@ def cases(plan: CampaignPlan) -> list[tuple[str, Case]]:
 
 @contextlib.contextmanager
 def viewer(view: LiveView, kept: Path) -> Iterator[int]:
-    """One who watches; gives its process id."""
+    """Start a viewer; yield its process id."""
     command = [rerun_program(), "--save", str(kept), "--connect", view.stream, "--port", "auto"]
     process = subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=child_environment(environment())
@@ -234,7 +233,7 @@ _GUARD = "import os, sys; sys.stdin.read(); os.kill(int(sys.argv[1]), 9)"
 
 @contextlib.contextmanager
 def guarded(pid: int) -> Iterator[None]:
-    """A process that would stay, stopped perhaps, if this script were killed, is ended then."""
+    """End a process, even a stopped one, if this script is killed."""
     guard = subprocess.Popen(
         [sys.executable, "-c", _GUARD, str(pid)], stdin=subprocess.PIPE, start_new_session=True, env=child_environment()
     )
@@ -246,7 +245,7 @@ def guarded(pid: int) -> Iterator[None]:
 
 
 async def controlled(plan: CampaignPlan, watching: Watching, seconds: float, warm_up: float) -> dict[str, Any]:
-    """Run the loop, and say how it went once programs are loaded."""
+    """Run the control loop; return its figures after the warm-up."""
     watcher = watching.monitor
     late, emitting, count = [], [], 0
     events = _events(plan)
@@ -337,7 +336,7 @@ def _events(plan: CampaignPlan) -> Callable[[int], list[Event]]:
 
 
 def _cpu(watching: Watching) -> dict[str, float]:
-    """CPU seconds of each process; 0 for one that is gone."""
+    """Return the CPU seconds of each process; 0 for one that has ended."""
     spent = dict.fromkeys(watching.processes, 0.0)
     for name, process in watching.processes.items():
         with contextlib.suppress(psutil.Error):
@@ -347,7 +346,7 @@ def _cpu(watching: Watching) -> dict[str, float]:
 
 
 async def _begun(watching: Watching) -> None:
-    """Until the writer has loaded its programs and written its first rows."""
+    """Wait until the writer has loaded its programs and written its first rows."""
     end = time.monotonic() + PATIENCE
     while watching.recording is not None and not _size(watching):
         if time.monotonic() > end:

@@ -1,4 +1,4 @@
-"""Where and when something was measured, and on which core."""
+"""Description of the machine and time of a measurement, and helpers to run it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def describe() -> dict[str, Any]:
-    """Machine, software and moment: without them a figure means nothing."""
+    """Return machine, software and time of a measurement."""
     return {
         "processor": _processor(),
         "cores": psutil.cpu_count(),
@@ -47,16 +47,16 @@ def _fingerprint() -> str:
 
 
 def pin(core: int | None) -> int | None:
-    """Keep this process and its children on one core, so that all that is compared runs on the same.
+    """Pin this process and its children to one core, so that all compared programs use the same core.
 
     Args:
-        core: its number; None takes the one with the least to do now.
+        core: its number; None takes the least busy one.
 
     Returns:
-        The core, or None where the system can't pin (macOS).
+        The core, or None if the system cannot pin processes (macOS).
 
     Raises:
-        SystemExit: there is no such core, with those that there are.
+        SystemExit: the core does not exist; the message lists the available ones.
     """
     process = psutil.Process()
     if not hasattr(process, "cpu_affinity"):
@@ -74,12 +74,12 @@ def pin(core: int | None) -> int | None:
 
 
 def say(text: str) -> None:
-    """Progress, on stderr: stdout is for the result alone."""
+    """Print progress to stderr; stdout is for the result only."""
     print(text, file=sys.stderr, flush=True)
 
 
 def show(result: dict[str, Any], as_json: bool) -> None:
-    """The result on stdout: one line of JSON, or a line a value."""
+    """Print the result to stdout: one line of JSON, or one line per value."""
     print(json.dumps(result) if as_json else "\n".join(_lines(result)))
 
 
@@ -97,15 +97,15 @@ def _lines(result: dict[str, Any], indent: str = "") -> Iterator[str]:
 
 
 def run_self(script: str, *arguments: str, cache: Path | None = None) -> dict[str, Any]:
-    """Run one of these scripts in a fresh process, single-threaded, and read the JSON it prints last.
+    """Run one of these scripts in a new single-threaded process, and parse the JSON of its last line.
 
     Args:
         script: its `__file__`.
-        arguments: for it.
-        cache: takes the place of the user's cache directory.
+        arguments: its arguments.
+        cache: replaces the user's cache directory.
 
     Raises:
-        SystemExit: it failed; what it had to say went to stderr.
+        SystemExit: it failed; its messages are on stderr.
     """
     environment = single_threaded()
     if cache is not None:
@@ -119,15 +119,15 @@ def run_self(script: str, *arguments: str, cache: Path | None = None) -> dict[st
 
 
 def single_threaded() -> dict[str, str]:
-    """Environment for children: one thread for every library that would take more."""
+    """Return an environment for child processes with one thread for each multi-threaded library."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     return {**os.environ, **dict.fromkeys(names, "1")}
 
 
 def as_a_second_time(kept: Path) -> dict[str, str]:
-    """Environment for processes that find in a folder what the first of them left: bytecode, kernels, grids.
+    """Return an environment for processes that share a cache folder for bytecode, kernels and grids.
 
-    Bytecode is kept also where the environment says otherwise: a user's second run finds it.
+    Bytecode is cached even if the current environment disables it, because a user's second run has it.
     """
     environment = {**os.environ, "PYTHONPYCACHEPREFIX": str(kept), ENVIRONMENT_VARIABLE: str(kept)}
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -135,7 +135,7 @@ def as_a_second_time(kept: Path) -> dict[str, str]:
 
 
 def _processor() -> str:
-    """Model name as the system tells it."""
+    """Return the processor's model name as the system reports it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -147,7 +147,7 @@ def _processor() -> str:
 
 
 def _solver() -> str:
-    """The last commit that changed the simulator, with a mark if the files differ from it."""
+    """Return the last commit that changed the simulator, with a mark if the files differ from it."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(ROOT), *arguments, "--", "sim_engine"]

@@ -1,11 +1,11 @@
 """Measure all figures of docs/evidence/performance.md, and write the page.
 
-    python benchmarks/make_page.py                      the page anew, from what was measured before
+    python benchmarks/make_page.py                      the page only, from stored measurements
     python benchmarks/make_page.py --measure            all measurements, then the page
     python benchmarks/make_page.py --measure pour-2000 start-up
 
-Measurements are kept in docs/data/performance.json, each with its command, machine and moment. Those that are
-not made now stay as they are.
+Measurements are stored in docs/data/performance.json, each with its command, machine and time. Measurements that are
+not repeated stay unchanged.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def page_text(records: dict[str, Any]) -> str:
-    """The page.
+    """Return the text of the page.
 
     Args:
-        records: measurements by name, as `measure` returns them.
+        records: measurements by name, as returned by `measure`.
     """
     pours = pour_records(records)
     scaling = records.get("scaling")
@@ -82,16 +82,16 @@ def page_text(records: dict[str, Any]) -> str:
 
 
 def pour_records(records: dict[str, Any]) -> list[dict[str, Any]]:
-    """Those of the standard pour, by number of particles."""
+    """Return the records of the standard pour, by number of particles."""
     pours = [record for name, record in records.items() if name.startswith("pour-")]
     return sorted(pours, key=lambda record: int(record["result"]["particles"]))
 
 
 def stale(records: dict[str, Any]) -> list[str]:
-    """A warning if some measurements were made with another solver than the others."""
+    """Return a warning if measurements were made with different solvers."""
     prints: dict[str, list[str]] = {}
     for name, record in records.items():
-        if name == "core-limit":  # has no solver in it
+        if name == "core-limit":  # does not use the solver
             continue
         prints.setdefault(record["result"]["machine"].get("fingerprint", "?"), []).append(name)
     if len(prints) < 2:
@@ -101,7 +101,7 @@ def stale(records: dict[str, Any]) -> list[str]:
 
 
 def draw(records: dict[str, Any], images: Path) -> None:
-    """The figures for which there are measurements."""
+    """Draw the figures that have measurements."""
     pours = pour_records(records)
     ours = {r["result"]["particles"]: r["result"]["cpu_s"] for r in pours}
     if "scaling" in records:
@@ -117,7 +117,7 @@ def write(folder: Path) -> Path:
     """Write page and figures from the measurements in a folder.
 
     Raises:
-        SystemExit: there are none, or they can't be read.
+        SystemExit: the measurements are missing or unreadable.
     """
     try:
         records = json.loads((folder / DATA).read_text(encoding="utf-8"))
@@ -133,7 +133,7 @@ def write(folder: Path) -> Path:
 
 
 def keep(folder: Path, name: str, record: dict[str, Any]) -> None:
-    """Put a measurement beside those made before; a later failure then loses nothing."""
+    """Store a measurement at once, so that a later failure does not lose it."""
     path = folder / DATA
     records = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     records[name] = record
@@ -144,10 +144,10 @@ def keep(folder: Path, name: str, record: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Measure what was asked for, write the page."""
+    """Run the requested measurements and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--measure", nargs="*", metavar="NAME", help=f"which: {', '.join(PLAN)}; all if none is named")
-    parser.add_argument("--folder", type=Path, default=ROOT / "docs", help="where page, data and images are")
+    parser.add_argument("--measure", nargs="*", metavar="NAME", help=f"measurements: {', '.join(PLAN)}; default: all")
+    parser.add_argument("--folder", type=Path, default=ROOT / "docs", help="folder of page, data and images")
     options = parser.parse_args()
     names = [] if options.measure is None else options.measure or list(PLAN)
     for name in names:

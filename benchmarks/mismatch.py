@@ -1,29 +1,29 @@
-"""What a wrong simulator costs: D2, D3 as in the paper, and D3 that averages over mistakes.
+"""Measure the cost of a wrong simulator: D2, D3 as in the paper, and D3 that averages over simulator errors.
 
     python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--settled 0.005] [--out FILE]
                                   [--receivers] [--write] [--write-steep]
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
-the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are kept in FILE, so that an
-interrupted comparison goes on; `--write` makes none, and puts the rows of FILE into docs/evidence/results.md.
+the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are stored in FILE, so an
+interrupted comparison continues. `--write` makes no runs; it writes the rows of FILE to docs/evidence/results.md.
 
-Primary questions, written before any of it was run. Seeds below 1000 are for tuning, those from 1000 on for answers:
-1000 to 1019, and 2000, 3000 and 7000 to 7019 for what was changed after the answers of those before were known (5000 to
-5019 were tuned on, too). What is lost is without scatter, means over at least 20 seeds with 95 % bootstrap intervals:
+Primary questions, fixed before the first run. Seeds below 1000 are for tuning. Seeds from 1000 on are for answers: 1000
+to 1019; and 2000, 3000 and 7000 to 7019 for changes made after the previous answers were known (5000 to 5019 were also
+used for tuning). Losses are without scatter, means over at least 20 seeds with 95 % bootstrap intervals:
 
 1. Mean of 15 pours of `adaptive` at no, small, moderate and large mismatch: at most 0.05, 0.08, 0.10, 0.25?
-2. Its pours that lose more than 10 % after the first that lost less than 1 %: at most 0.2 a campaign?
-3. The action it recommends in the end: never more than 0.01 worse than that of D2?
+2. Its pours that lose more than 10 % after the first that lost less than 1 %: at most 0.2 per campaign?
+3. The action that it recommends at the end: never more than 0.01 worse than that of D2?
 4. With an anti-correlated simulator: its pours from the fourth on no worse than D2's; best of the first three at most
    0.4?
-5. (`--receivers`, six pours each.) With what was learnt of the bench before: fewer pours into receiver 3 until one
-   loses less than 1 % than afresh?
+5. (`--receivers`, six pours each.) With data from earlier receivers on the bench: fewer pours into receiver 3 until one
+   loses less than 1 % than without?
 
-Questions on the levels `cliff, …`, written before seeds 3000 to 3019 were used, which is done once (`--settled 0.005`;
-seeds 1000 to 1031 are for tuning). The same questions were asked again with seeds from 8120, once, after simulated
-valleys became oblique and space was filled until one was found; for this, seeds 5000 to 5019 and 8100 to 8102 are for
-tuning.
+Questions on the levels `cliff, …`, fixed before seeds 3000 to 3019 were used; these seeds are used once (`--settled
+0.005`; seeds 1000 to 1031 are for tuning). The same questions were repeated once with seeds from 8120, after simulated
+valleys became oblique and space-filling continued until it found a valley; for this, seeds 5000 to 5019 and 8100 to
+8102 are for tuning.
 
 6. First pour at no mismatch: at most 0.05? Mean of 15 pours at none, small, moderate, large and contrary: at most 0.02,
    0.03, 0.06, 0.12, 0.15? Mean of pours 9 to 15 of `changed`: at most 0.30?
@@ -73,25 +73,25 @@ SHARES = (0.5, 0.9, 0.99)
 """Probabilities of the intervals that are compared with the pours."""
 PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "results.md"
 FEWEST = 20
-"""Seeds of a row on the page."""
+"""Minimum number of seeds of a row on the page."""
 
 
 def numbers(valley: Valley) -> Numbers:
-    """What answers in that world."""
+    """Return the simulated bench and simulator of a world."""
     world = Numbers(valley.space, valley.true, valley.observe, valley.simulated, valley.scatter)
     world.true = lambda unit: valley.true(unit, len(world.poured))
     return world
 
 
 class _SettledError(Exception):
-    """Three pours in a row lost almost nothing."""
+    """Three consecutive pours lost almost nothing."""
 
 
 def campaign(arm: str, level: str, seed: int, pours: int, simulations: int, settled: float = 0.0) -> dict[str, Any]:
-    """One campaign; losses without scatter.
+    """Run one campaign; losses are without scatter.
 
-    After three pours in a row that lost less than `settled`, it ends, and the other pours count as their mean. On a
-    bench that changes, the three must be after the change.
+    The campaign ends after three consecutive pours that lost less than `settled`; the remaining pours count as
+    their mean. On a bench that changes, the three pours must be after the change.
     """
     valley = Valley(level, seed)
     settings = ARMS[arm](pours, simulations)
@@ -133,7 +133,7 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int, sett
 
 
 def receivers(level: str, bench: int, carried: bool, pours: int, simulations: int) -> list[dict[str, float]]:
-    """Three receivers one after the other on one bench: what each loses, with what was learnt before or without."""
+    """Return the losses of three receivers in sequence on one bench, with or without data from earlier receivers."""
     results: dict[str, StageResult] = {}
     found = []
     for number in range(3):
@@ -156,7 +156,7 @@ def receivers(level: str, bench: int, carried: bool, pours: int, simulations: in
 
 
 def receivers_table(levels: list[str], benches: range, pours: int, simulations: int) -> str:
-    """Markdown: a row for each receiver, with what was learnt before and without."""
+    """Return Markdown: one row per receiver, with and without data from earlier receivers."""
     lines = ["| simulator | receiver | | first pour | mean | pours until below 1 % |", "|---|---|---|---|---|---|"]
     for level in levels:
         for carried in (False, True):
@@ -173,7 +173,7 @@ def receivers_table(levels: list[str], benches: range, pours: int, simulations: 
 
 
 def figures(run: dict[str, Any]) -> dict[str, float]:
-    """What is asked of a campaign."""
+    """Return the summary figures of a campaign."""
     poured = np.array(run["poured"])
     good = np.flatnonzero(poured < GOOD)
     return {
@@ -186,7 +186,7 @@ def figures(run: dict[str, Any]) -> dict[str, float]:
 
 
 def held(runs: list[dict[str, Any]]) -> str:
-    """Of the pours of runs, how many lie in their bands, the first ones apart; nothing where there are no bands."""
+    """Return how many pours lie in their intervals, first pours separately; empty if there are no intervals."""
     first = [run["bands"][0] for run in runs if run.get("bands")]
     later = [band for run in runs for band in run.get("bands", [])[1:]]
     inside = [sum(low <= lost <= high for low, high, lost in bands) for bands in (first, later)]
@@ -194,7 +194,7 @@ def held(runs: list[dict[str, Any]]) -> str:
 
 
 def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
-    """Markdown: a row for each level and arm with that many seeds; D2 knows no simulator and has one row."""
+    """Return Markdown: one row per level and arm with enough seeds; D2 uses no simulator and has one row."""
     lines = [
         "| simulator | | mean of 15 pours | pours above 10 % after the first below 1 % | best of 3 | pours 4 to 15 "
         "| action in the end | in their 90 % bands, the first pours and all others |",
@@ -221,12 +221,12 @@ BEFORE = {
     "anti-correlated": ("–", "0.074", "–"),
     "changed": ("0.198", "0.156", "0.306"),
 }
-"""First pour, mean of 15 pours, and pours 9 to 15, of seeds from 3000 (anti-correlated: 2000 to 2008), before simulated
-valleys were oblique."""
+"""First pour, mean of 15 pours, and pours 9 to 15, of seeds from 3000 (anti-correlated: 2000 to 2008), from before
+simulated valleys became oblique."""
 
 
 def steep_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
-    """A row for each level with steep walls: figures before (other seeds) and now, with standard errors."""
+    """Return a row per level with steep walls: earlier figures (other seeds) and current ones, with standard errors."""
     found = []
     for level, earlier in BEFORE.items():
         poured = np.array([run["poured"] for run in runs if run["level"] == f"cliff, {level}"])
@@ -243,7 +243,7 @@ def steep_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def interval_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
-    """A row for first pours and for all others: how many lie in their intervals, and the mean interval score.
+    """Return rows for first pours and for all others: the number in their intervals, and the mean interval score.
 
     Source: interval score, Gneiting & Raftery, JASA 2007.
     """
@@ -263,7 +263,7 @@ def interval_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
 
 
 def write_steep(runs: list[dict[str, Any]]) -> None:
-    """Keep the runs in docs/data/steep-walls.json, and their tables in docs/data/results.json."""
+    """Store the runs in docs/data/steep-walls.json, and their tables in docs/data/results.json."""
     data, machine = PAGE.parents[1] / "data", describe()
     (data / "steep-walls.json").write_text(json.dumps({"machine": machine, "runs": rounded(runs)}) + "\n")
     results = json.loads((data / "results.json").read_text(encoding="utf-8"))
@@ -287,7 +287,7 @@ def write_steep(runs: list[dict[str, Any]]) -> None:
 
 
 def rounded(value: Any) -> Any:
-    """Numbers with five decimals."""
+    """Round numbers to five decimals, recursively."""
     if isinstance(value, list):
         return [rounded(one) for one in value]
     if isinstance(value, dict):
@@ -296,7 +296,7 @@ def rounded(value: Any) -> Any:
 
 
 def write(text: str) -> None:
-    """Put a table into the page; rows that it lacks stay as they are there."""
+    """Put a table into the page; rows of the page without a new value stay unchanged."""
     begin, end = "<!-- measured: mismatch -->\n", "<!-- end of measured -->"
     before, rest = PAGE.read_text().split(begin)
     shown, after = rest.split(end, 1)
@@ -306,12 +306,12 @@ def write(text: str) -> None:
 
 
 def _row(line: str) -> tuple[str, ...]:
-    """What a line of the table is about: its simulator and its arm."""
+    """Return the key of a table line: its simulator and its arm."""
     return tuple(cell.strip() for cell in line.split("|")[1:3])
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--levels", nargs="+", choices=[*LEVELS, *CLIFFS], default=list(LEVELS))
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
@@ -319,11 +319,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--pours", type=int, default=15)
     parser.add_argument("--simulations", type=int, default=37)
-    parser.add_argument("--settled", type=float, default=0.0, help="ends after three pours in a row below this loss")
+    parser.add_argument("--settled", type=float, default=0.0, help="end after three consecutive pours below this loss")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/evidence/results.md")
     parser.add_argument("--write-steep", action="store_true", help="write the tables of the levels with steep walls")
-    parser.add_argument("--receivers", action="store_true", help="three receivers one after the other on one bench")
+    parser.add_argument("--receivers", action="store_true", help="three receivers in sequence on one bench")
     asked = parser.parse_args()
     if asked.receivers:
         benches = range(asked.first, asked.first + asked.seeds)

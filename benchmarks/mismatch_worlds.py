@@ -1,11 +1,11 @@
-"""Spill-like valleys, and simulators of them that are displaced, scaled, narrowed, or the wrong way round.
+"""Spill-like valleys, and simulators of them that are displaced, scaled, narrowed or inverted.
 
-Four shapes, in the units of a robot's actions, so that an error has a size in millimetres and per cent. What is lost is
-0 inside a valley, rises around it as 1 − exp(−r^1.5) and levels off at 1; see `Valley`. A seed draws place and size of
-the valley, what is wrong with the simulator, and the scatter of every pour. Written before anything was tuned on them.
+Four shapes have the units of a robot's actions, so that errors are in millimetres and per cent. The loss is 0 inside a
+valley, rises around it as 1 − exp(−r^1.5) and saturates at 1; see `Valley`. A seed draws position and size of the
+valley, the simulator's errors, and the scatter of every pour. The worlds were defined before any tuning on them.
 
-`CLIFFS` are the same valleys with steep walls and little scatter: everything is lost on most of the actions. On one of
-them the bench changes after pour `CHANGED_AFTER`.
+`CLIFFS` are the same valleys with steep walls and little scatter: most actions lose everything. On one of them the
+bench changes after pour `CHANGED_AFTER`.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ SHAPES: dict[str, Space] = {
     "edge": Space((SPEED, OFFSET)),
     "jet3": Space((SPEED, OFFSET, HEIGHT)),
 }
-"""A jet that reaches farther when it is fast; a tilted ellipse; a valley beside a cliff; a jet that falls from higher,
-too."""
+"""A jet that reaches farther at higher speed; a tilted ellipse; a valley next to a cliff; a jet whose fall height also
+varies."""
 
 FOUR_AXES = Space((SPEED, OFFSET, HEIGHT, ANGLE))
-"""The space of the level `FOUR`: the jet from higher, and less is poured at another angle than the best one."""
+"""Space of the level `FOUR`: the jet with variable height; any angle other than the best one pours less."""
 
 SIMULATED_SCATTER = 0.02
 CHANGED_AFTER = 8
@@ -45,15 +45,15 @@ CHANGED_AFTER = 8
 
 @dataclass(frozen=True)
 class Wrong:
-    """What is wrong with a simulator, as the size of each error; its sign is the seed's.
+    """Errors of a simulator; each value is a magnitude, and the seed draws its sign.
 
     Attributes:
-        offset: the receiver stands elsewhere [m].
+        offset: offset of the receiver [m].
         speed: relative error of the speed.
-        gain: natural logarithm of the factor on what is lost.
+        gain: natural logarithm of the factor on the loss.
         width: natural logarithm of the factor on the valley's width.
-        bump: height of a smooth error that nothing of the above explains.
-        inverted: it says 1 − 0.8 times the truth.
+        bump: height of a smooth error that none of the above explains.
+        inverted: the simulated loss is 1 − 0.8 × the true loss.
     """
 
     offset: float = 0.0
@@ -77,19 +77,19 @@ CLIFFS: dict[str, Wrong] = {
     "cliff, four axes": LEVELS["small"],
 }
 CHANGE = Wrong(offset=0.010, speed=0.05)
-"""How the bench differs from itself after the change."""
+"""Difference of the bench after the change from the bench before."""
 
 
 class Valley:
-    """One seed's world: what is lost on the bench, and what its simulator says."""
+    """The world of one seed: losses on the bench and in its simulator."""
 
     def __init__(self, level: str, seed: int, bench: int | None = None) -> None:
-        """Draw.
+        """Draw the world.
 
         Args:
-            level: of `LEVELS` or `CLIFFS`.
-            seed: its remainder by four is the shape.
-            bench: seed of the errors' signs, the same for all receivers on a bench; None: the seed's own.
+            level: name in `LEVELS` or `CLIFFS`.
+            seed: seed; its remainder by four selects the shape.
+            bench: seed of the errors' signs, equal for all receivers on a bench; None: `seed`.
         """
         self.cliff, self.changes = level in CLIFFS, level == "cliff, changed"
         self.shape = "jet4" if level == "cliff, four axes" else list(SHAPES)[seed % len(SHAPES)]
@@ -106,17 +106,17 @@ class Valley:
             self._signs = np.random.default_rng([bench, 20261122]).choice([-1.0, 1.0], 4)
 
     def true(self, unit: Floats, index: int = 0) -> float:
-        """What the `index`-th pour, from 0, loses at a point of the unit cube (dimension,), without scatter."""
+        """Return the loss of pour `index`, from 0, at a point of the unit cube (dimension,), without scatter."""
         u = np.clip(np.asarray(unit, dtype=float), 0.0, 1.0)
         return self._lost(self._moved(u, CHANGE, -1.0) if self.changes and index >= CHANGED_AFTER else u, 1.0)
 
     def observe(self, unit: Floats, index: int) -> float:
-        """The same as that pour shows it."""
+        """Return the loss of that pour with scatter."""
         lost, (least, growth) = self.true(unit, index), (0.003, 0.03) if self.cliff else (0.01, 0.12)
         return min(max(lost + (least + growth * lost) * float(self._noise[index]), 0.0), 1.0)
 
     def simulated(self, unit: Floats) -> float:
-        """What the simulator says at a point of the unit cube (dimension,), without scatter."""
+        """Return the simulated loss at a point of the unit cube (dimension,), without scatter."""
         wrong, signs = self._wrong, self._signs
         u = np.clip(np.asarray(unit, dtype=float), 0.0, 1.0)
         if wrong.inverted:
@@ -127,7 +127,7 @@ class Valley:
         return float(np.clip(lost + wrong.bump * float(np.sin(waves).mean()) * 6**0.5, 0.0, 1.0))
 
     def _moved(self, u: Floats, wrong: Wrong, sign: float) -> Floats:
-        """The action with the errors of speed and offset."""
+        """Return the action with the errors of speed and offset."""
         moved, factor = u.copy(), 1.0 + sign * self._signs[0] * wrong.speed
         moved[0] = factor * u[0] + (factor - 1.0) * SPEED.lower / (SPEED.upper - SPEED.lower)
         moved[1] += sign * self._signs[1] * wrong.offset / (OFFSET.upper - OFFSET.lower)
@@ -144,7 +144,7 @@ class Valley:
             if self.shape in ("jet3", "jet4"):
                 across -= 0.5 * (math.sqrt(0.3 + u[2]) - math.sqrt(0.3 + self._height))
             slow = max(-speed, 0.0) / (widened * self._length) + max(speed, 0.0) / (3.0 * widened * self._length)
-            if self.shape == "edge":  # beyond it the jet misses altogether; before it, it is lost bit by bit
+            if self.shape == "edge":  # beyond it the jet misses completely; before it, the loss grows gradually
                 across = across if across > 0.0 else 0.4 * across
             distance = math.hypot(slow, across / width)
             if self.shape == "jet4":

@@ -1,6 +1,6 @@
-"""Costs to try optimisers on: two standard functions, and four that look like spillage over actions.
+"""Test costs for optimisers: two standard functions, and four that resemble spillage over actions.
 
-Also imported where only numpy and scipy are installed (`optimiser_rivals.py`), so it imports nothing of Decant.
+`optimiser_rivals.py` imports this module with only numpy and scipy installed, so it imports nothing of Decant.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from scipy.stats import qmc
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
 INITIAL = 5
-"""Evaluations at scrambled Sobol points before an optimiser is asked; the same points for all."""
+"""Evaluations at scrambled Sobol points before an optimiser is queried; the same points for all optimisers."""
 
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One axis as optimisers are told of it: bounds, scale, whole numbers or not."""
+    """One axis of a problem: bounds, scale, integer or not."""
 
     lower: float
     upper: float
@@ -28,7 +28,7 @@ class Coordinate:
     integer: bool = False
 
     def value(self, unit: float) -> float:
-        """At a place in the unit interval."""
+        """Return the value at a position in the unit interval."""
         u = min(max(float(unit), 0.0), 1.0)
         value = self.lower * (self.upper / self.lower) ** u if self.log else self.lower + u * (self.upper - self.lower)
         return float(round(value)) if self.integer else min(max(value, self.lower), self.upper)
@@ -45,13 +45,13 @@ REAL = Coordinate(0.0, 1.0)
 
 @dataclass(frozen=True)
 class Problem:
-    """A cost, how noisy it is, and how often it may be evaluated.
+    """A cost function, its noise, and its budget of evaluations.
 
     Attributes:
         coordinates: the axes.
-        budget: evaluations in all.
-        width: half axes of the valley in which nothing is spilled, in units of the cube; 0: a standard function.
-        about: for the page.
+        budget: total evaluations.
+        width: half axes of the valley without spillage, in units of the cube; 0: a standard function.
+        about: description for the page.
     """
 
     name: str
@@ -96,11 +96,11 @@ _P = 1e-4 * np.array(
 
 
 class Instance:
-    """One instance of a problem: of a seed come the valley's place and shape, the first points and the noise.
+    """One instance of a problem: the seed draws the valley's position and shape, the first points and the noise.
 
-    Spillage-like costs are 0 in an ellipsoid, rise steeply around it and level off at 1: 1 − exp(−(8 w (r − 1))^1.5),
+    Spillage-like costs are 0 in an ellipsoid, rise steeply around it and saturate at 1: 1 − exp(−(8 w (r − 1))^1.5),
     where w is the valley's width and r = 1 on its edge. An observation scatters by 0.01 + 0.12 of its cost, and is
-    clipped into [0, 1].
+    clipped to [0, 1].
 
     Source: Branin and Hartmann as in Surjanovic & Bingham, Virtual Library of Simulation Experiments.
     """
@@ -117,7 +117,7 @@ class Instance:
         self._noise = rng.standard_normal(problem.budget)
 
     def true(self, unit: Floats) -> float:
-        """Noise-free regret at a point of the unit cube (dimension,): 0 at best."""
+        """Return noise-free regret at a point of the unit cube (dimension,): 0 at best."""
         coordinates = self.problem.coordinates
         u = np.clip(np.asarray(unit, dtype=float), 0.0, 1.0)
         if self.problem.name == "branin":
@@ -132,7 +132,7 @@ class Instance:
         return 1.0 - math.exp(-((8.0 * self.problem.width * max(radius - 1.0, 0.0)) ** 1.5))
 
     def observe(self, unit: Floats, index: int) -> float:
-        """What the `index`-th evaluation would show at a point of the unit cube (dimension,)."""
+        """Return the observation of evaluation `index` at a point of the unit cube (dimension,)."""
         cost = self.true(unit)
         if not self.problem.width:
             return cost

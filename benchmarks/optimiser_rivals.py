@@ -1,9 +1,9 @@
-"""Other optimisers on the problems of `optimiser_problems.py`; runs in their own environment, see `optimisers.py`.
+"""Run other optimisers on the problems of `optimiser_problems.py`, in their own environment (see `optimisers.py`).
 
     python optimiser_rivals.py OPTIMISER < jobs.jsonl
 
-Each line of the input is {"problem": name, "seed": number}; each line of the output a result. With {"points": [...],
-"costs": [...], "seed": number} one of BoTorch's answers with a point.
+Each line of the input is {"problem": name, "seed": number}; each line of the output is a result. For {"points": [...],
+"costs": [...], "seed": number} a BoTorch optimiser returns a point.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Report = Callable[[Points, Costs], Floats]
 
 
 def luckiest(points: Points, costs: Costs) -> Floats:
-    """What most libraries report: the lowest observation."""
+    """Return the point with the lowest observation, as most libraries report it."""
     return points[int(np.argmin(costs))]
 
 
 def scikit_optimize(world: Instance) -> tuple[Ask, Report]:
-    """`Optimizer` with its defaults: GP, gp_hedge; integer and log axes as its own."""
+    """Use `Optimizer` with its defaults: GP, gp_hedge; native integer and log axes."""
     from skopt import Optimizer
     from skopt.space import Integer, Real
 
@@ -47,7 +47,7 @@ def scikit_optimize(world: Instance) -> tuple[Ask, Report]:
     def ask(points: Points, costs: Costs) -> Floats:
         for point, cost in list(zip(points, costs, strict=True))[len(optimizer.Xi) :]:
             values = [c.value(u) for c, u in zip(coordinates, point, strict=True)]
-            # while only the first points are told, a fit would be wasted
+            # fitting while the first points are registered would be wasted
             fit = len(optimizer.Xi) + 1 == len(points)
             optimizer.tell(
                 [int(v) if c.integer else v for c, v in zip(coordinates, values, strict=True)], cost, fit=fit
@@ -58,7 +58,7 @@ def scikit_optimize(world: Instance) -> tuple[Ask, Report]:
 
 
 def bayesian_optimization(world: Instance) -> tuple[Ask, Report]:
-    """`BayesianOptimization` with its defaults: GP, UCB; integers as its own, log axes by their logarithm."""
+    """Use `BayesianOptimization` with its defaults: GP, UCB; native integers, log axes by their logarithm."""
     from bayes_opt import BayesianOptimization
 
     coordinates = world.problem.coordinates
@@ -93,7 +93,7 @@ def bayesian_optimization(world: Instance) -> tuple[Ask, Report]:
 
 
 def botorch(world: Instance, acquisition: str) -> tuple[Ask, Report]:
-    """`SingleTaskGP` with standardised outcomes and its default priors; integer axes rounded by the problem."""
+    """Use `SingleTaskGP` with standardised outcomes and default priors; the problem rounds integer axes."""
     import torch
     from botorch.acquisition import UpperConfidenceBound, qLogNoisyExpectedImprovement
     from botorch.fit import fit_gpytorch_mll
@@ -139,7 +139,7 @@ RIVALS: dict[str, Callable[[Instance], tuple[Ask, Report]]] = {
 
 
 def play(world: Instance, ask: Ask, report: Report) -> dict[str, Any]:
-    """One whole optimisation: the first points, then as proposed until the budget is spent."""
+    """Run one optimisation: the first points, then proposals until the budget is spent."""
     points: Points = list(world.initial)
     costs: Costs = [world.observe(point, i) for i, point in enumerate(points)]
     started = time.process_time()
@@ -159,12 +159,12 @@ def play(world: Instance, ask: Ask, report: Report) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Answer job after job."""
+    """Process one job after the other."""
     warnings.simplefilter("ignore")
     name = sys.argv[1]
     for line in sys.stdin:
         job = json.loads(line)
-        if "points" in job:  # one proposal instead of a whole optimisation
+        if "points" in job:  # one proposal instead of an optimisation
             points = [np.array(point) for point in job["points"]]
             about = SimpleNamespace(seed=job["seed"], problem=SimpleNamespace(dimension=len(points[0])))
             proposed = RIVALS[name](about)[0](points, job["costs"])  # type: ignore[arg-type]

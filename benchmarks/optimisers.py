@@ -1,16 +1,16 @@
-"""Decant's optimiser beside others on the same problems: regret of what each reports at the end.
+"""Compare Decant's optimiser with others on the same problems: regret of the reported result.
 
     python benchmarks/optimisers.py [--problems spill2 narrow2 ...] [--optimisers Decant "BoTorch UCB" ...] [--seeds 30]
                                     [--budget SECONDS] [--fresh NAME ...] [--speed] [--json]
 
-All start at the same points, see the same noise and may evaluate as often (`optimiser_problems.py`). Reported: what an
-optimiser would hand to its user, judged without noise: by posterior mean for ours and BoTorch, else the lowest
-observation. Visited: the best of what it tried, whatever it reports. Means with 95 % bootstrap intervals over seeds.
+All optimisers have the same initial points, noise and number of evaluations (`optimiser_problems.py`). 'Reported' is
+the result an optimiser returns to its user, evaluated without noise: the best posterior mean for Decant and BoTorch,
+otherwise the lowest observation. 'Visited' is the best evaluated point. Means have 95 % bootstrap intervals over seeds.
 
-The others live in an environment of their own in the cache directory, made when it is first needed (about 1 GB); they
-are not a dependency of Decant. Every run of (problem, optimiser, seed) is kept there too: what was interrupted goes on.
-`--budget` ends each optimiser after so many CPU seconds; `--fresh` forgets what was kept of some. `--speed` measures
-what a fit and a suggestion cost instead.
+The other optimisers are not dependencies of Decant. They run in their own environment in the cache directory, created
+on first use (about 1 GB). Each run of (problem, optimiser, seed) is stored there too, so an interrupted comparison
+continues. `--budget` limits each optimiser's CPU seconds; `--fresh` discards stored runs of the named optimisers.
+`--speed` measures the cost of a fit and a suggestion instead.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ RESAMPLES = 4000
 
 
 def environment() -> Path:
-    """The Python of the others' environment, made if there is none.
+    """Return the Python of the other optimisers' environment, creating it if needed.
 
     Raises:
-        SystemExit: it can't be made, with what pip said.
+        SystemExit: the environment cannot be created; the message has pip's output.
     """
     folder = cache_directory() / f"rivals-1-py{sys.version_info[0]}.{sys.version_info[1]}"
     python = folder / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
@@ -69,7 +69,7 @@ def environment() -> Path:
 
 
 class Kept:
-    """Results in the cache, one line of JSON each, appended as they come."""
+    """Results in the cache, one line of JSON each, appended when they arrive."""
 
     def __init__(self) -> None:
         self._path = cache_directory() / "optimisers.jsonl"
@@ -80,14 +80,14 @@ class Kept:
             self.rows[row["optimiser"], row["problem"], row["seed"]] = row
 
     def add(self, optimiser: str, row: dict[str, Any]) -> None:
-        """Keep one more."""
+        """Store one more result."""
         row = {"optimiser": optimiser, **row}
         self.rows[optimiser, row["problem"], row["seed"]] = row
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
 
     def forget(self, optimisers: Sequence[str]) -> None:
-        """Drop what was kept of some optimisers."""
+        """Discard the stored results of some optimisers."""
         self.rows = {key: row for key, row in self.rows.items() if key[0] not in optimisers}
         lines = [json.dumps(row) + "\n" for row in self.rows.values()]
         beside = self._path.with_suffix(".new")
@@ -96,7 +96,7 @@ class Kept:
 
 
 def ours(name: str, world: Instance) -> dict[str, Any]:
-    """One run of Decant's optimiser as a campaign uses it, or of blind search."""
+    """Run Decant's optimiser as a campaign uses it, or random search, once."""
     axes = [
         Axis(f"x{i}", c.lower, c.upper, "log" if c.log else "linear", c.integer)
         for i, c in enumerate(world.problem.coordinates)
@@ -123,10 +123,10 @@ def ours(name: str, world: Instance) -> dict[str, Any]:
 
 
 def rival(name: str, jobs: Sequence[tuple[str, int]], seconds: float) -> Iterator[dict[str, Any]]:
-    """Results of one of the others, as they come, from a child that ends when no more jobs can come.
+    """Yield results of another optimiser as they arrive from a child process, which ends when no jobs can follow.
 
     Raises:
-        SystemExit: it failed, with the end of what it said.
+        SystemExit: it failed; the message has the end of its output.
     """
     command = [str(environment()), str(RIVALS_FILE), name]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
@@ -150,7 +150,7 @@ def rival(name: str, jobs: Sequence[tuple[str, int]], seconds: float) -> Iterato
 
 
 def run(optimisers: Sequence[str], problems: Sequence[str], seeds: int, seconds: float, kept: Kept) -> None:
-    """Run what is missing; seeds outermost, so that what time allows is spread over all problems."""
+    """Run missing jobs; seeds are the outer loop, so that a limited budget covers all problems."""
     for name in optimisers:
         jobs = [(p, seed) for seed in range(seeds) for p in problems if (name, p, seed) not in kept.rows]
         if not jobs:
@@ -168,7 +168,7 @@ def run(optimisers: Sequence[str], problems: Sequence[str], seeds: int, seconds:
 
 
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Mean and its 95 % bootstrap interval (percentiles)."""
+    """Return the mean and its 95 % bootstrap interval (percentiles)."""
     array = np.array(values)
     means = array[np.random.default_rng(0).integers(0, len(array), (RESAMPLES, len(array)))].mean(axis=1)
     low, high = np.percentile(means, (2.5, 97.5))
@@ -176,7 +176,7 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def table(optimisers: Sequence[str], problems: Sequence[str], seeds: int, kept: Kept) -> list[dict[str, Any]]:
-    """A row for each problem and optimiser."""
+    """Return one row per problem and optimiser."""
     rows = []
     for problem in problems:
         for name in optimisers:
@@ -201,7 +201,7 @@ def table(optimisers: Sequence[str], problems: Sequence[str], seeds: int, kept: 
 
 
 def speed() -> list[dict[str, Any]]:
-    """CPU time of a fit, and of a fit with a proposal, at 100 observations: the quickest of five."""
+    """Return the CPU time of a fit, and of a fit with a proposal, at 100 observations: the fastest of five."""
     rows = []
     for dimension in (2, 4, 6):
         space = Space(tuple(Axis(f"x{i}", 0.0, 1.0) for i in range(dimension)))
@@ -228,7 +228,7 @@ def speed() -> list[dict[str, Any]]:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     names = [*OURS, *RIVALS]
     parser.add_argument("--problems", nargs="+", choices=list(BY_NAME), default=[p.name for p in PROBLEMS])

@@ -1,4 +1,4 @@
-"""Figures of docs/evidence/performance.md, in the look of a campaign's report."""
+"""Figures of docs/evidence/performance.md, in the style of a campaign's report."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PASS_COLOURS = (
     *("#f0e442", "#555555", style.GREY, style.PALE),
 )
 LEAST_SHARE = 0.03
-"""Passes with a smaller share of the whole pour are drawn as one."""
+"""Passes with a smaller share of the pour are combined."""
 
 
 def cost_figure(
@@ -24,12 +24,12 @@ def cost_figure(
     theirs: Sequence[tuple[int, float]],
     targets: Mapping[int, tuple[float, float]],
 ) -> Path:
-    """CPU seconds against the number of particles, both on logarithmic axes.
+    """Draw CPU seconds against the number of particles, both on logarithmic axes.
 
     Args:
-        path: of the PNG.
+        path: path of the PNG.
         ours, theirs: (particles, CPU seconds).
-        targets: required and aimed-at CPU seconds by particles.
+        targets: required and target CPU seconds by particles.
     """
     figure, axes = style.new_figure(size=(6.4, 4.2))
     for points, colour, name in ((theirs, style.GREY, "SPlisHSPlasH, DFSPH"), (ours, style.MEASURED, "Decant")):
@@ -53,10 +53,10 @@ def cost_figure(
 
 
 def passes_figure(path: Path, profile: Mapping[str, Any]) -> Path:
-    """Shares of the solver's passes as stacked bars, for the whole pour and its moment.
+    """Draw the shares of the solver's passes as stacked bars, for the complete pour and for full flow.
 
     Args:
-        path: of the PNG.
+        path: path of the PNG.
         profile: result of `profile_passes.py`.
     """
     whole = profile[MOMENTS[0]]["share"]

@@ -6,7 +6,7 @@ from page_sections import Record, facts, missing, prose, seconds, settings, tabl
 
 
 def scenes(record: Record | None) -> str:
-    """Pours per minute against the number of scenes in one call."""
+    """Return the section on pours per minute against the number of scenes in one call."""
     title = "Number of scenes"
     if record is None:
         return missing(title, "batches.py")
@@ -31,7 +31,7 @@ def scenes(record: Record | None) -> str:
 
 
 def plan(record: Record | None) -> str:
-    """How long a plan for a new cup takes."""
+    """Return the section on the duration of a plan for a new cup."""
     title = "Planning"
     if record is None:
         return missing(title, "plan_speed.py")
@@ -56,7 +56,7 @@ def plan(record: Record | None) -> str:
 
 
 def validate(record: Record | None) -> str:
-    """What the check of every shipped file costs."""
+    """Return the section on the cost of checking every shipped file."""
     title = "Checking a file"
     if record is None:
         return missing(title, "validate_cost.py")
@@ -70,7 +70,7 @@ def validate(record: Record | None) -> str:
 
 
 def pool(record: Record | None) -> str:
-    """What `pool_speed.py` found."""
+    """Return the section on `pool_speed.py`."""
     title = "Pool and cluster"
     if record is None:
         return missing(title, "pool_speed.py")
@@ -102,7 +102,7 @@ def pool(record: Record | None) -> str:
 
 
 def gpu(record: Record | None) -> str:
-    """What a GPU does with batches."""
+    """Return the section on batches on a GPU."""
     title = "GPU"
     if record is None:
         return f"## {title}\n\nNot measured: no GPU was available.\n"

@@ -1,4 +1,4 @@
-"""The sections of docs/evidence/performance.md, each from the JSON of one benchmark."""
+"""Sections of docs/evidence/performance.md, each from the JSON of one benchmark."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ import page_figures
 from standard_pour import LEFT, LEFT_LIMIT
 
 TARGETS = {2_000: (1.5, 0.6), 5_000: (5.0, 2.0), 10_000: (12.0, 5.0)}
-"""Required and aimed-at CPU seconds of the standard pour, by particles."""
+"""Required and target CPU seconds of the standard pour, by particles."""
 
 PHYSICS = ("left at 2.3 s", "2.7 s", "3.1 s", "", "delivered", "density inside")
 
 Record = Mapping[str, Any]
-"""`command`, and the `result` that it printed."""
+"""A measurement: its `command` and printed `result`."""
 
 
 def introduction() -> str:
-    """What the page is and how it is made anew."""
+    """Return the introduction: purpose of the page and how to update it."""
     return """# Performance
 
 <!-- written by benchmarks/make_page.py from docs/data/performance.json -->
@@ -39,7 +39,7 @@ The standard pour: 200 mL in a straight cup (R 40 mm, H 100 mm), turned about it
 
 
 def targets(pours: Sequence[Record]) -> str:
-    """Speed against what was asked for, physics beside it."""
+    """Return the section that compares speed with its targets, together with physical results."""
     if not pours:
         return missing("Against the targets", "pour_speed.py --particles 2000")
     rows, physics = [], []
@@ -90,7 +90,7 @@ def targets(pours: Sequence[Record]) -> str:
 
 
 def beside_the_peer(pours: Sequence[Record]) -> str:
-    """The peer's figures, measured in the same go."""
+    """Return the section on the peer's figures, measured in the same session."""
     both = [record for record in pours if "peer" in record["result"]]
     if not both:
         return missing("Compared with the fastest peer", "pour_speed.py --particles 2000 --peer")
@@ -132,7 +132,7 @@ Its physics, measured as ours:
 
 
 def passes(record: Record | None, limit: Record | None) -> str:
-    """The profile, and how far from the core's limit that is."""
+    """Return the section on the profile and its distance from the core's limit."""
     title = "Where the time goes"
     if record is None:
         return missing(title, "profile_passes.py")
@@ -165,7 +165,7 @@ def passes(record: Record | None, limit: Record | None) -> str:
 
 
 def _limit(profile: Record, limit: Record | None) -> str:
-    """Distance to what plain C makes of the core."""
+    """Return the paragraph on the distance to plain C on the same core."""
     if limit is None:
         return ""
     rate, rows = profile["particle_iterations_per_s"], limit["result"]["rows"]
@@ -179,7 +179,7 @@ def _limit(profile: Record, limit: Record | None) -> str:
 
 
 def cost(record: Record | None) -> str:
-    """CPU seconds against N."""
+    """Return the section on CPU seconds against N."""
     title = "Cost against the number of particles"
     if record is None:
         return missing(title, "scaling.py")
@@ -210,7 +210,7 @@ def cost(record: Record | None) -> str:
 
 
 def memory(record: Record | None) -> str:
-    """Resident memory."""
+    """Return the section on resident memory."""
     title = "Memory"
     if record is None or not record["result"]["memory"]:
         return missing(title, "scaling.py")
@@ -226,7 +226,7 @@ Resident memory of a process with one simulator, early in a pour, by its use [MB
 
 
 def start_up(record: Record | None) -> str:
-    """First answer of a fresh process."""
+    """Return the section on the first outcome of a new process."""
     title = "Start-up"
     if record is None:
         return missing(title, "start_up.py")
@@ -256,12 +256,12 @@ def start_up(record: Record | None) -> str:
 
 
 def missing(title: str, command: str) -> str:
-    """A section whose benchmark has not been run."""
+    """Return the section for a benchmark without results."""
     return f"## {title}\n\nNot measured yet: `python benchmarks/{command} --json`\n"
 
 
 def facts(result: Record) -> str:
-    """Tables of a result of any shape: one of the plain values, one of each list of rows."""
+    """Return tables of a result of any shape: one for plain values, and one per list of rows."""
     plain = {key: value for key, value in result.items() if isinstance(value, str | int | float)}
     parts = [table(("", ""), [(_words(key), _value(value)) for key, value in plain.items()], "lr")] if plain else []
     for key, value in result.items():
@@ -275,7 +275,7 @@ def facts(result: Record) -> str:
 
 
 def settings(records: Sequence[Record]) -> str:
-    """Machine, software, commands, and the moment of each of one or several measurements, small."""
+    """Return machine, software, commands and time of one or several measurements, in small print."""
     machines: dict[str, list[str]] = {}
     for record in records:
         m, core = record["result"]["machine"], record["result"].get("core")
@@ -287,26 +287,26 @@ def settings(records: Sequence[Record]) -> str:
 
 
 def prose(text: str) -> str:
-    """A paragraph in lines of the pages' length."""
+    """Wrap a paragraph to the pages' line length."""
     return textwrap.fill(" ".join(text.split()), 120, break_long_words=False, break_on_hyphens=False)
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], align: str) -> str:
-    """Markdown; `align` has an l or r for each column."""
+    """Return a Markdown table; `align` has an l or r for each column."""
     marks = {"l": "---", "r": "---:"}
     lines = ["| " + " | ".join(head) + " |", "|" + "|".join(marks[a] for a in align) + "|"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)]) + "\n"
 
 
 def seconds(value: float | None) -> str:
-    """CPU seconds as people read them: '0.61', '5.3', '176'."""
+    """Format CPU seconds: '0.61', '5.3', '176'."""
     if value is None:
         return ""
     return f"{value:.2f}" if value < 10 else f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
 
 def verdict(cpu_s: float, required: float | None, aim: float | None) -> str:
-    """How a time stands to its targets."""
+    """Compare a time with its targets."""
     if required is None or aim is None:
         return ""
     if cpu_s <= aim:

@@ -1,7 +1,7 @@
-"""The peer to measure beside: SPlisHSPlasH 2.19 in an environment of its own, on the same scene.
+"""Run the peer solver for comparison: SPlisHSPlasH 2.19 in its own environment, on the same scene.
 
-It is not a dependency of Decant: `environment()` makes a virtual environment in the user's cache directory when it is
-first asked for (about 250 MB), and `pour()` starts the solver there as a child of this process, on the same core.
+It is not a dependency of Decant. `environment()` creates a virtual environment in the user's cache directory on first
+use (about 250 MB); `pour()` starts the solver there as a child of this process, on the same core.
 """
 
 from __future__ import annotations
@@ -47,24 +47,24 @@ BUNDLED = {
     "libGLdispatch": "libGLdispatch.so.0",
     "libOpenGL": "libOpenGL.so.0",
 }
-"""Libraries that the wheel brings along, by the name under which a system has its own."""
+"""Libraries that the wheel bundles, with the names of the system's libraries."""
 
 WALL_DISTANCE = 1.0
-"""Its lattice keeps that many spacings from the walls: it repels liquid up to there."""
+"""Distance of the peer's lattice from the walls, within which the solver repels liquid [spacings]."""
 
 FRAME_EVERY = 0.02
 FREEZE_BELOW = -0.06
-"""Nothing that has fallen below this height comes back [m]."""
+"""Particles below this height do not return [m]."""
 
 PATIENCE = 3600.0
-"""A run that takes longer has gone wrong [s]."""
+"""Time limit of a run [s]."""
 
 
 @dataclass(frozen=True)
 class PeerRun:
     """One standard pour by the peer; attributes as in `standard_pour.Measured`.
 
-    `course`: times [s] and the fraction left in the pourer, of the whole pour; where a viscosity was asked for.
+    `course`: times [s] and the fraction left in the pourer, for the complete pour; only with a viscosity.
     """
 
     cpu_s: float
@@ -77,7 +77,7 @@ class PeerRun:
 
 
 def check_particles(particles: int) -> None:
-    """The peer's liquid starts as a block of two by two columns.
+    """Check that N is a multiple of four: the peer's liquid starts as a block of two by two columns.
 
     Raises:
         SystemExit: N is not a multiple of four.
@@ -87,10 +87,10 @@ def check_particles(particles: int) -> None:
 
 
 def environment() -> Path:
-    """The Python of the peer's environment, made if there is none.
+    """Return the Python of the peer's environment, creating it if needed.
 
     Raises:
-        SystemExit: it can't be made, or the peer can't be imported there, with what to do.
+        SystemExit: the environment or the import of the peer failed; the message has instructions.
     """
     folder = cache_directory() / f"peer-{NAME.lower()}-{VERSION}-py{sys.version_info[0]}.{sys.version_info[1]}"
     python = folder / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
@@ -130,7 +130,7 @@ def _install(python: Path) -> None:
 
 
 def _import_trouble(python: Path) -> str | None:
-    """Why the peer can't be imported; None if it can. A segmentation fault is the usual way to fail."""
+    """Return why the peer cannot be imported, or None; a segmentation fault is the usual failure."""
     done = subprocess.run(
         [str(python), "-c", f"import {MODULE}"], check=False, capture_output=True, text=True, env=child_environment()
     )
@@ -140,7 +140,7 @@ def _import_trouble(python: Path) -> str | None:
 
 
 def _use_libraries_of_the_system(folder: Path) -> None:
-    """Put links to the system's OpenGL libraries where the wheel's own are."""
+    """Replace the wheel's OpenGL libraries by links to the system's."""
     if not sys.platform.startswith("linux"):
         return
     told = subprocess.run(
@@ -156,17 +156,17 @@ def _use_libraries_of_the_system(folder: Path) -> None:
 
 
 def pour(python: Path, particles: int, seed: int, viscosity: float = 0.0, end: float = END) -> PeerRun:
-    """The standard pour by the peer, in a process of its own.
+    """Run the standard pour with the peer in a child process.
 
     Args:
-        python: of its environment.
+        python: Python of the peer's environment.
         particles: N, a multiple of four.
-        seed: of the initial positions.
+        seed: seed of the initial positions.
         viscosity: kinematic, implicit (Weiler et al. 2018), in the liquid and on walls [m²/s]; 0: water's, explicit.
-        end: of the pour [s].
+        end: duration of the pour [s].
 
     Raises:
-        SystemExit: the run failed, with the end of what it said.
+        SystemExit: the run failed; the message has the end of its output.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -212,13 +212,13 @@ def pour(python: Path, particles: int, seed: int, viscosity: float = 0.0, end: f
 
 
 def _job(folder: Path, particles: int, seed: int) -> dict[str, object]:
-    """What the child needs: files in `folder`, and numbers [m, s, rad/s] in the simulator's world frame."""
+    """Return the job for the child: files in `folder`, and numbers [m, s, rad/s] in the simulator's world frame."""
     pourer, receiver = vessels()
     pose = motion().sample(np.array([0.0]))
     (rotation,) = rotations(pose)
     lattice = fill(pourer, SCENE.liquid.volume, particles, seed, WALL_DISTANCE)
     np.save(folder / "positions.npy", (lattice @ rotation.T + pose[0, :3]).astype(np.float32))
-    # A body turns about its mesh's origin, so that of the pourer is laid on the pivot.
+    # A body rotates about its mesh's origin, so the pourer's origin is placed at the pivot.
     _write_obj(folder / "pourer.obj", pourer.solid_vertices - np.array(motion().pivot_vessel), pourer.solid_faces)
     _write_obj(folder / "receiver.obj", receiver.solid_vertices, receiver.solid_faces)
     return {

@@ -2,11 +2,11 @@
 
     python benchmarks/peer_splishsplash.py JOB.json RESULT.npz
 
-Runs in the peer's own environment (`peer.py` makes it and writes the job), so it imports numpy and the peer alone.
+Runs in the peer's own environment (`peer.py` creates it and writes the job), so it imports only numpy and the peer.
 Settings: support 2d, CFL factor 1 (0.4 d per step), steps up to 4 ms, density error 0.1 %, viscosity 1e-6 m²/s, no
-surface tension; what has spilled is frozen, since its speed would otherwise rule the time step.
+surface tension. Spilled particles are frozen, because their speed would otherwise determine the time step.
 
-A job may name another viscosity, which is then implicit and acts on walls as well.
+A job may specify another viscosity, which is then implicit and also acts on walls.
 
 Source: Bender & Koschier 2015 (DFSPH); Bender et al. 2019 (volume maps).
 """
@@ -27,13 +27,13 @@ DFSPH, VOLUME_MAPS = 4, 2
 FIRST_STEP, LONGEST_STEP = 5e-4, 4e-3
 MAP_RESOLUTION = [40, 40, 40]
 WEILER = 6
-"""Implicit viscosity of Weiler et al. 2018, for jobs that name a kinematic viscosity [m²/s]."""
+"""Implicit viscosity of Weiler et al. 2018, for jobs with a kinematic viscosity [m²/s]."""
 FIXED = sph.ParticleState(2)
-"""The binding names only two of the states; this one stays where it is."""
+"""State of a particle that stays in place; the binding names only two of the states."""
 
 
 def scene(job: dict[str, Any]) -> dict[str, Any]:
-    """The scene file's content. The liquid is a block of 2 × 2 × N/4, moved to the job's positions afterwards."""
+    """Return the scene file's content. The liquid is a block of 2 × 2 × N/4, then moved to the job's positions."""
     d = 2.0 * job["radius"]
 
     def body(mesh: str, at: list[float], moves: bool) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def scene(job: dict[str, Any]) -> dict[str, Any]:
 
 
 class Run:
-    """The peer's simulation, with what is looked at between its steps. Looking is not counted."""
+    """The peer's simulation with observations between its steps; their time is not counted."""
 
     def __init__(self, job: dict[str, Any], folder: Path) -> None:
         self.job = job
@@ -121,12 +121,12 @@ class Run:
         self.frames: list[Any] = []
 
     def positions(self) -> Any:
-        """(N, 3), in whatever order they are sorted now [m]."""
+        """Return the positions (N, 3) in the solver's current order [m]."""
         count = self.liquid.numActiveParticles()
         return np.array(self.liquid.getFieldBuffer("position"), copy=False)[:count, :3]
 
     def look(self) -> None:
-        """After every step: turn the pourer, freeze what has spilled, keep frames."""
+        """Turn the pourer, freeze spilled particles and store frames, after every step."""
         entered = time.process_time()
         now = self.clock.getTime()
         if self.pourer is None:  # the first step is set-up: volume maps and first neighbour lists
@@ -153,7 +153,7 @@ class Run:
         self.looked += time.process_time() - entered
 
     def to_the_end(self) -> float:
-        """CPU seconds of all steps but the first."""
+        """Run to the end; return the CPU seconds of all steps except the first."""
         self.base.setTimeStepCB(self.look)
         self.base.setValueFloat(self.base.STOP_AT, self.job["end_time"])
         self.base.runSimulation()

@@ -1,10 +1,10 @@
-"""How long `decant plan` takes for a cup that it never saw: seconds and CPU seconds of fresh processes.
+"""Measure how long `decant plan` takes for a new cup: wall and CPU seconds of new processes.
 
     python benchmarks/plan_speed.py [--receivers cone narrow bowl mug] [--json]
 
-The quickstart's pour, with Decant's defaults for θ, start, imports, figures and report included. Bytecode and kernels
-are there: a plan for the tumbler, not counted, sees to that. Each receiver is planned for once: a second time its grid
-would be there, too.
+Plans the quickstart's pour with Decant's default θ; the time includes start, imports, figures and report. Bytecode and
+kernels are cached by an initial plan for the tumbler, which is not counted. Each receiver is planned once, because a
+second plan would also find its grid in the cache.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from typing import Any
 from machine import ROOT, as_a_second_time, describe, say, show
 
 LIMIT = 15.0
-"""A plan for a new cup shall take no longer on two cores [s]."""
+"""Required time of a plan for a new cup on two cores [s]."""
 
 RECEIVERS = ("cone", "narrow", "bowl", "mug")
 
 
 def plan(configs: Path, receiver: str, environment: dict[str, str]) -> dict[str, Any]:
-    """One plan in a fresh process.
+    """Run one plan in a new process.
 
     Raises:
         SystemExit: it failed.
@@ -60,7 +60,7 @@ def plan(configs: Path, receiver: str, environment: dict[str, str]) -> dict[str,
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--receivers", nargs="+", default=RECEIVERS, metavar="NAME", help="of configs/vessels")
+    parser.add_argument("--receivers", nargs="+", default=RECEIVERS, metavar="NAME", help="names in configs/vessels")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []

@@ -1,4 +1,4 @@
-"""What benchmarks that play strategies on numbers share: a scene, answers to a strategy, means with intervals."""
+"""Shared parts of benchmarks that play strategies on toy problems: scene, outcomes, means with intervals."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ SCENE = Scene(
 
 
 def play(strategy: Strategy, answer: Callable[[Request], Outcome], *, pours_last: bool = True) -> None:
-    """From the first question to the last answer; the optimiser answers its own.
+    """Run a strategy until it finishes; optimiser queries are answered here.
 
     Args:
-        strategy: to be played.
-        answer: what comes of a simulation or a pour.
-        pours_last: a pour takes longest; else all is answered in the order of asking.
+        strategy: strategy to run.
+        answer: returns the outcome of a simulation or a pour.
+        pours_last: finish pours after other requests; otherwise all requests finish in order.
     """
     waiting: list[Request] = []
     while not strategy.finished:
@@ -54,7 +54,7 @@ def play(strategy: Strategy, answer: Callable[[Request], Outcome], *, pours_last
         if isinstance(request, Suggest):
             query = request.query
             if not isinstance(query, SpaceFillingQuery):
-                query = replace(query, map_resolution=0)  # maps are for pictures, and decide nothing
+                query = replace(query, map_resolution=0)  # maps are only for figures and do not affect decisions
             outcome: Outcome = Suggested(propose(query))
         else:
             outcome = answer(request)
@@ -62,27 +62,27 @@ def play(strategy: Strategy, answer: Callable[[Request], Outcome], *, pours_last
 
 
 def simulated(spilled: float, seed: int, cpu_s: float = 1.0) -> PourOutcome:
-    """A simulated pour that spills so much of the load (within 0 … 1), and leaves nothing behind."""
+    """Return a simulated pour that spills this share of the load (0 … 1) and retains nothing."""
     spilled = min(max(spilled, 0.0), 1.0)
     return PourOutcome(1 - spilled, spilled, 0.0, 0.0, 0.0, 500, 0.007, 0.01, 2.0, 400, cpu_s, seed)
 
 
 def unit(space: Space, action: Any) -> Floats:
-    """The point of the unit cube that an action is."""
+    """Return the point of the unit cube for an action."""
     return space.encode({name: getattr(action, name) for name in space.names})
 
 
 @dataclass
 class Numbers:
-    """A world of numbers that answers simulations and pours, at points of the unit cube.
+    """A toy world that evaluates simulations and pours at points of the unit cube.
 
     Attributes:
-        true: what a pour loses.
-        observed: the same as weighed, of the pour with that number.
-        simulated: what the simulator says in the mean.
-        scatter: its scatter from seed to seed.
-        poured: what the pours have lost, without scatter.
-        places: where they were.
+        true: loss of a pour without scatter.
+        observed: weighed loss of the pour with this number.
+        simulated: mean simulated loss.
+        scatter: standard deviation of simulations over seeds.
+        poured: losses of the pours, without scatter.
+        places: points of the pours.
     """
 
     space: Space
@@ -94,7 +94,7 @@ class Numbers:
     places: list[Floats] = field(default_factory=list)
 
     def answer(self, request: Request) -> Outcome:
-        """What comes of a simulation or a pour."""
+        """Return the outcome of a simulation or a pour."""
         assert isinstance(request, Simulate | Pour)
         at = unit(self.space, request.action)
         if isinstance(request, Pour):
@@ -107,7 +107,7 @@ class Numbers:
 
 
 def interval(values: list[float]) -> tuple[float, float, float]:
-    """Mean, and its 95 % bootstrap interval."""
+    """Return the mean and its 95 % bootstrap interval."""
     draws = random.Random(0)
     means = sorted(float(np.mean(draws.choices(values, k=len(values)))) for _ in range(2000))
     return float(np.mean(values)), means[50], means[1949]

@@ -1,14 +1,14 @@
-"""What the pool of actors costs beside plain processes, how busy it keeps its workers, and how soon it answers first.
+"""Measure the worker pool's overhead against plain processes, its load, and the time to the first outcome.
 
     python benchmarks/pool_speed.py [--workers 2] [--particles 2000] [--pours 8] [--rounds 3] [--json]
 
-Throughput: the same pours by the pool and by as many plain processes without Ray, in turns, in one go; medians over the
-rounds. Overhead of a simulation: with pours so small that little else is left, and with a simulator that does nothing:
-wall time × workers − what the workers say they worked, by the number of simulations. Busy fraction: what the workers
-say they worked over wall time × workers; both while there was work for all of them, until the first one ran out of it.
-Start: fresh processes with a warm kernel cache, from the opening of the laboratory to the first answer.
+Throughput: the pool and an equal number of plain processes without Ray make the same pours alternately in one session;
+medians over the rounds. Overhead per simulation: (wall time × workers − time reported by the workers) / simulations,
+with very small pours and with a simulator that does nothing. Busy fraction: time reported by the workers / (wall time ×
+workers). Both end when the first worker runs out of work. Start: new processes with a warm kernel cache, from opening
+the laboratory to the first outcome.
 
-Use it on a machine with nothing else to do: plain processes and pool take turns, but other work does not.
+Run it on an idle machine: plain processes and pool alternate, but other load does not.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask
 
 TINY = 200
-"""Particles of a pour that is nearly nothing."""
+"""Particles of a very small pour."""
 
 THROUGHPUT_LIMIT, OVERHEAD_LIMIT_MS = 0.95, 10.0
-"""What is required: pool over plain processes; per simulation."""
+"""Required throughput of the pool relative to plain processes, and largest overhead per simulation."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Some pours, made together.
+    """A set of pours made together.
 
     Attributes:
-        wall_s: from the first task to the last answer.
-        cpu_s: of the workers.
-        beside_s: CPU seconds of everything else that was needed for it.
-        busy: fraction of the workers' time in which they worked, while there was work for all of them.
-        between_s: the rest of that time, by the number of simulations.
+        wall_s: time from the first task to the last outcome.
+        cpu_s: CPU seconds of the workers.
+        beside_s: CPU seconds of all other processes involved.
+        busy: busy fraction of the workers, while there was work for all of them.
+        between_s: the remaining time per simulation.
     """
 
     wall_s: float
@@ -61,10 +61,10 @@ class Block:
 
 
 class Nothing:
-    """A simulator that answers at once."""
+    """A simulator that returns at once."""
 
     def simulate(self, task: PourTask, *, cancelled: Any = None) -> SimulatedPour:
-        """An outcome of the usual size."""
+        """Return an outcome of typical size."""
         curve = tuple(0.02 * k for k in range(200))
         outcome = PourOutcome(
             1.0, 0.0, 0.0, 0.0, 0.0, 1, 0.01, 0.0, 4.0, 1, 0.0, task.seed, curve_times=curve, curve_poured=curve,
@@ -73,11 +73,11 @@ class Nothing:
         return SimulatedPour(outcome)
 
     def close(self) -> None:
-        """Nothing to end."""
+        """Do nothing; there is nothing to close."""
 
 
 class Plain:
-    """Processes without Ray that pour what they are told, each its share."""
+    """Processes without Ray that share the requested pours."""
 
     def __init__(self, workers: int) -> None:
         command = [sys.executable, __file__, "--plain"]
@@ -88,7 +88,7 @@ class Plain:
         self.pour(TINY, workers)
 
     def pour(self, particles: int, pours: int) -> Block:
-        """Make so many pours, shared out evenly."""
+        """Make this number of pours, distributed evenly."""
         begun = time.perf_counter()
         cpu = 0.0
         try:
@@ -106,13 +106,13 @@ class Plain:
         return Block(time.perf_counter() - begun, cpu)
 
     def close(self) -> None:
-        """End them."""
+        """End the processes."""
         for process in self._processes:
             process.communicate(timeout=60)
 
 
 def plain_worker() -> None:
-    """What runs in a plain process: orders come line by line, CPU seconds go back."""
+    """Run in a plain process: read orders line by line, return CPU seconds."""
     from sim_engine.simulator import PourSimulator
 
     simulator = PourSimulator()
@@ -127,12 +127,12 @@ def plain_worker() -> None:
 
 
 async def pour_in_pool(pool: WorkerPool, particles: int, pours: int) -> Block:
-    """Make so many pours, all queued at once."""
+    """Make this number of pours, all queued at once."""
     workers, others = await _processes(pool)
     before = [_cpu(workers), _cpu(others) + time.process_time()]
     worked, begun = pool.statistics().busy_s, time.perf_counter()
     jobs = [asyncio.ensure_future(pool.simulate(standard_task(particles, seed))) for seed in range(pours)]
-    full = pours - pool.size + 1  # with that answer the first worker runs out of work
+    full = pours - pool.size + 1  # after this outcome the first worker runs out of work
     for answered, job in enumerate(asyncio.as_completed(jobs), start=1):
         await job
         if answered == full:
@@ -145,11 +145,11 @@ async def pour_in_pool(pool: WorkerPool, particles: int, pours: int) -> Block:
 
 
 async def _processes(pool: WorkerPool) -> tuple[list[psutil.Process], list[psutil.Process]]:
-    """The pool's members, and what else Ray runs."""
+    """Return the pool's worker processes and Ray's other processes."""
     members = [psutil.Process(pid) for pid in await pool.pids()]
     others = []
     for process in psutil.Process().children(recursive=True):
-        with contextlib.suppress(psutil.Error):  # gone in between
+        with contextlib.suppress(psutil.Error):  # ended meanwhile
             if process not in members and "pool_speed" not in " ".join(process.cmdline()):
                 others.append(process)
     return members, others
@@ -165,7 +165,7 @@ def _cpu(processes: list[psutil.Process]) -> float:
 
 
 async def throughput(options: argparse.Namespace) -> dict[str, Any]:
-    """Pool and plain processes in turns, and the pool's overhead with tiny pours."""
+    """Measure pool and plain processes alternately, and the pool's overhead with very small pours."""
     plain = Plain(options.workers)
     spec = LaboratorySettings(name="benchmark", simulators=options.workers)
     async with RayLaboratory(spec) as laboratory:
@@ -207,7 +207,7 @@ async def throughput(options: argparse.Namespace) -> dict[str, Any]:
 
 
 async def nothing(options: argparse.Namespace) -> dict[str, Any]:
-    """The pool with a simulator that does nothing: many at once, and one after the other."""
+    """Measure the pool with a simulator that does nothing: many jobs at once, and one after the other."""
     import ray
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -229,11 +229,11 @@ async def nothing(options: argparse.Namespace) -> dict[str, Any]:
 
 
 async def first_answer(particles: int, begun: float) -> dict[str, float]:
-    """What a fresh process spends its time on until the first answer of a laboratory [s].
+    """Return the time of each phase of a new process up to a laboratory's first outcome [s].
 
     Args:
         particles: N.
-        begun: `time.monotonic()` when the process was started, by its parent's clock.
+        begun: `time.monotonic()` at the process's start, by its parent's clock.
     """
     marks = {"program": time.monotonic()}
     async with RayLaboratory(LaboratorySettings(name="benchmark", simulators=1)) as laboratory:
@@ -256,7 +256,7 @@ async def first_answer(particles: int, begun: float) -> dict[str, float]:
 
 
 def start(options: argparse.Namespace) -> dict[str, Any]:
-    """Fresh processes, one after the other; medians. The kernel cache is warm: the pools before have filled it."""
+    """Run new processes one after the other; return medians. The previous pools have filled the kernel cache."""
     runs = []
     for number in range(options.rounds):
         say(f"start {number + 1} of {options.rounds}")
@@ -270,9 +270,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--particles", type=int, default=2000)
-    parser.add_argument("--pours", type=int, default=8, help="of a round, on each side")
+    parser.add_argument("--pours", type=int, default=8, help="pours per round, on each side")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--tiny", type=int, default=60, help="tiny pours of a round")
+    parser.add_argument("--tiny", type=int, default=60, help="very small pours per round")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     parser.add_argument("--plain", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--first-answer", type=float, help=argparse.SUPPRESS)

@@ -1,13 +1,13 @@
-"""CPU seconds of the standard pour, alone or beside the fastest peer.
+"""Measure CPU seconds of the standard pour, alone or compared with the fastest peer.
 
     python benchmarks/pour_speed.py --particles 2000 [--repeats 3] [--core 1] [--json]
     python benchmarks/pour_speed.py --particles 2000 --peer [RUNS]
 
-One thread on one core. Set-up is not counted for either: kernels are compiled (or loaded from the cache) by a short
-pour before anything is measured, and the peer's first step, which samples its walls, is left out. Ours is over when
-nothing can change any more, at most 6 s; the peer always runs for 6 s, so the ratio is given per simulated second as
-well. Runs of both take turns. Outflow, delivery and density of both are measured in the same way. The peer has no
-surface tension, and so has the standard pour; what Decant's default cohesion costs is measured beside it.
+Both use one thread on one core and alternate. Set-up is excluded: a short pour compiles kernels (or loads them from the
+cache) before the measurement, and the peer's first step, which samples its walls, is not counted. Decant's pour ends
+when nothing can change any more, after at most 6 s. The peer always simulates 6 s, so the ratio is also given per
+simulated second. Outflow, delivery and density are measured in the same way. The peer and the standard pour have no
+surface tension; the cost of Decant's default cohesion is measured as well.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = ["SCENE", "main", "standard_action"]
 
 
 def turns(ours: int, theirs: int) -> Iterator[str]:
-    """Who is next, 'ours' or 'theirs': as evenly mixed as can be."""
+    """Yield 'ours' and 'theirs', alternating as evenly as possible."""
     done = {"ours": 0, "theirs": 0}
     total = {"ours": ours, "theirs": theirs}
     while done != total:
@@ -49,7 +49,7 @@ def turns(ours: int, theirs: int) -> Iterator[str]:
 
 
 def of_ours(particles: int, runs: list[Measured]) -> dict[str, Any]:
-    """What came of our runs: medians over the seeds."""
+    """Return the figures of our runs: medians over the seeds."""
     middle = sorted(runs, key=lambda run: run.cpu_s)[len(runs) // 2]
     cpu_s = statistics.median(run.cpu_s for run in runs)
     rates = [particles * run.iterations / run.cpu_s for run in runs]
@@ -70,7 +70,7 @@ def of_ours(particles: int, runs: list[Measured]) -> dict[str, Any]:
 
 
 def of_theirs(particles: int, runs: list[PeerRun]) -> dict[str, Any]:
-    """What came of the peer's runs: medians over the seeds."""
+    """Return the figures of the peer's runs: medians over the seeds."""
     middle = sorted(runs, key=lambda run: run.cpu_s)[len(runs) // 2]
     left = [statistics.mean(values) for values in zip(*(run.left for run in runs), strict=True)]
     cpu_s = statistics.median(run.cpu_s for run in runs)
@@ -101,7 +101,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--particles", type=int, default=2000)
-    parser.add_argument("--repeats", type=_at_least_one, default=3, help="our pours, each with another seed")
+    parser.add_argument("--repeats", type=_at_least_one, default=3, help="number of our pours, each with another seed")
     parser.add_argument(
         "--peer",
         type=_at_least_one,
@@ -109,9 +109,9 @@ def main() -> None:
         const=1,
         default=0,
         metavar="RUNS",
-        help=f"also run {peer.NAME} so many times (once if no number follows)",
+        help=f"also run {peer.NAME} this number of times (once without a number)",
     )
-    parser.add_argument("--core", type=int, help="which core to run on; unless given, the one with the least to do")
+    parser.add_argument("--core", type=int, help="core to run on; default: the least busy one")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()
     particles = check_particles(options.particles)

@@ -1,15 +1,14 @@
-"""Where a pour's CPU time goes, pass by pass.
+"""Profile a pour's CPU time by pass.
 
     python benchmarks/profile_passes.py [--particles 2000] [--core 1] [--json]
 
-The solver runs whole slices of a pour in one compiled kernel, which no profiler looks into. So the kernel itself notes
-the time: before it is compiled, each pass is wrapped in two calls of the C library's clock, and one standard pour is
-made as users make it. A pass that calls another is charged for the rest only. What the clock itself takes is told
-(`slower`: CPU seconds of this pour over those of the same pour without clocks).
+The solver runs complete slices of a pour in one compiled kernel, which profilers cannot inspect. Therefore the kernel
+records the time itself: before compilation, each pass is wrapped in two calls of the C library's clock. Then one
+standard pour runs as usual. A pass that calls another one is charged only for its own part. `slower` reports the clock
+overhead: CPU seconds of this pour divided by those of the same pour without clocks.
 
-Shares are given for the whole pour and around a moment in full flow (2.7 s). (Before liquid can leave nothing is
-simulated, so there is no moment at rest.)
-Linux only; kernels are compiled anew, which takes a quarter of a minute.
+Shares are for the complete pour and around a time in full flow (2.7 s). Nothing is simulated before liquid can leave,
+so there is no profile at rest. Linux only; compiling the kernels takes a quarter of a minute.
 """
 
 from __future__ import annotations
@@ -47,26 +46,26 @@ PASSES = {
     "sim_engine.fluid.step.Stepper.classify": "classify",
     "sim_engine.fluid.step.Stepper.conclude": "the end of a step",
 }
-"""Functions of the solver by the name under which a step finds them, and what people read."""
+"""Functions of the solver by their name in a step, with readable names."""
 
 WHOLE = "sim_engine.fluid.step.Stepper.step"
 
 MOMENTS = {"in full flow": 2.7}
 WINDOW = 0.15
-"""A moment lasts from so long before to so long after [s]."""
+"""Half length of the time window around a profile time [s]."""
 
 ENTRIES = 1 << 20
 PROCESS_CPU_CLOCK = 2
-"""CLOCK_PROCESS_CPUTIME_ID of Linux: other work on the machine does not count."""
+"""CLOCK_PROCESS_CPUTIME_ID of Linux, which excludes other processes."""
 
 
 class Clock:
-    """A log that a compiled kernel writes to: which pass began (k ≥ 0) or ended (−1), when, at which simulated time."""
+    """A log written by a compiled kernel: which pass began (k ≥ 0) or ended (−1), CPU time and simulated time."""
 
     def __init__(self) -> None:
         from sim_engine.fluid.engine import engine
 
-        # After the solver, which keeps Taichi quiet.
+        # After the solver, which sets Taichi's log level.
         import taichi as ti  # isort: skip
         from taichi.lang.source_builder import SourceBuilder  # isort: skip
 
@@ -74,7 +73,7 @@ class Clock:
         self.instants = np.zeros((ENTRIES, 2), np.int64)  # the C library's struct timespec
         self.passes = ti.field(ti.i32, shape=ENTRIES)
         self.simulated = ti.field(ti.f32, shape=ENTRIES)
-        self.used = ti.field(ti.i64, shape=2)  # entries so far; where `instants` begins
+        self.used = ti.field(ti.i64, shape=2)  # number of entries; start of `instants`
         self.clear()
         library = SourceBuilder()
         library.so, library.mode = ctypes.CDLL(None), "so"
@@ -92,11 +91,11 @@ class Clock:
         self.note = note
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Clear the log."""
         self.used[0], self.used[1] = 0, self.instants.ctypes.data
 
     def around(self, function: Callable[..., Any], k: int) -> Callable[..., Any]:
-        """A pass that notes when it begins and ends. Called while Taichi compiles, as the pass itself is."""
+        """Wrap a pass so that it logs its begin and end. Called while Taichi compiles, like the pass itself."""
 
         def timed(*arguments: Any) -> Any:
             self.note(k)
@@ -110,17 +109,17 @@ class Clock:
         return timed
 
     def wrap_all(self) -> None:
-        """Put the clock around every pass.
+        """Wrap every pass.
 
         Raises:
-            SystemExit: the solver has no such pass any more.
+            SystemExit: the solver no longer has a pass.
         """
         for k, path in enumerate(PASSES):
             place, name = _find(path)
             setattr(place, name, self.around(getattr(place, name), k))
 
     def log(self) -> list[tuple[int, float, float]]:
-        """(pass or −1, CPU time [s], simulated time [s]) in order.
+        """Return (pass or −1, CPU time [s], simulated time [s]) in order.
 
         Raises:
             SystemExit: the log was too short for the pour.
@@ -134,7 +133,7 @@ class Clock:
 
 
 def _find(path: str) -> tuple[Any, str]:
-    """Where a pass is kept (module or class), and its name there."""
+    """Return the module or class of a pass, and its name there."""
     *parts, name = path.split(".")
     for depth in range(len(parts), 0, -1):
         try:
@@ -149,10 +148,10 @@ def _find(path: str) -> tuple[Any, str]:
 
 
 def own_times(log: list[tuple[int, float, float]]) -> list[tuple[int, float, float]]:
-    """(pass, CPU seconds of its own without the passes that it calls, simulated time) for every call.
+    """Return (pass, own CPU seconds without called passes, simulated time) for every call.
 
     Args:
-        log: well nested beginnings and ends.
+        log: properly nested begins and ends.
     """
     open_calls: list[list[float]] = []  # pass, begun, inner
     calls = []
@@ -168,7 +167,7 @@ def own_times(log: list[tuple[int, float, float]]) -> list[tuple[int, float, flo
 
 
 def shares(calls: list[tuple[int, float, float]]) -> dict[str, Any]:
-    """Share of each pass, largest first, calls per step, and CPU milliseconds a step."""
+    """Return the share of each pass, largest first, calls per step, and CPU milliseconds per step."""
     names, whole = list(PASSES.values()), list(PASSES).index(WHOLE)
     seconds: dict[int, float] = defaultdict(float)
     counts: dict[int, int] = defaultdict(int)
@@ -187,11 +186,11 @@ def shares(calls: list[tuple[int, float, float]]) -> dict[str, Any]:
 
 
 def profile(particles: int, plain_cpu_s: float) -> dict[str, Any]:
-    """Make the pour with clocks in it.
+    """Run the pour with clocks.
 
     Args:
         particles: N.
-        plain_cpu_s: what the same pour takes without.
+        plain_cpu_s: CPU seconds of the same pour without clocks.
     """
     from sim_engine.simulator import PourSimulator
 
@@ -222,7 +221,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--particles", type=int, default=2000)
-    parser.add_argument("--core", type=int, help="which core to run on; unless given, the one with the least to do")
+    parser.add_argument("--core", type=int, help="core to run on; default: the least busy one")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()
     particles = check_particles(options.particles)
@@ -232,7 +231,7 @@ def main() -> None:
     plain = run_self(
         str(Path(__file__).with_name("scaling.py")), f"--particles={particles}", "--one=cost", "--repeats=1"
     )
-    # Kernels that carry an address of this process must not be kept for another.
+    # Kernels that contain an address of this process must not be cached.
     with tempfile.TemporaryDirectory() as cache:
         os.environ[ENVIRONMENT_VARIABLE] = cache
         result = {**profile(particles, plain["cpu_s"]), "core": core, "machine": describe()}

@@ -1,25 +1,28 @@
-"""What the quickstart's calibration is worth, what it loses on its way, and after how many pours it stops.
+"""Measure the quickstart: benefit of its calibration, losses of its pours, and number of pours until it stops.
 
     python benchmarks/quickstart.py [--seeds 10] [--first 401] [--arms shipped ...] [--calibration-only] [--random 256]
                                     [--plans 4] [--laboratory FILE] [--into build/quickstart] [--write]
 
-The shipped campaign as it is, on a bench of numbers with the ground truth of its own laboratory; only random θ are not
-scored, which the deployment does not depend on. A seed is a process of its own that ends with this one. Every simulated
-pour of a seed is kept under `--into`, by what was asked and the solver that answered, so that the arms of a seed share
-their calibration and whatever else they both ask for, pour for pour the same; finished runs are kept there, too, and an
-interrupted comparison goes on. `--calibration-only` leaves the deployment out, and scores the test pours alone.
-`--random` pours so many random actions of the deployment on the bench, drawn with the seed `--first`; `--plans` pours
-so many plans of the uncalibrated simulator; with `--seeds 0` nothing else is done. `--write` makes no runs, and
-writes the tables of those that are there into docs/data/results.json, for docs/make_tables.py.
+The benchmark runs the shipped campaign unchanged, on a simulated bench with the ground truth of its own laboratory. It
+only skips the scores of random θ, on which the deployment does not depend. Each seed runs in its own process, which
+ends with this one. Every simulated pour of a seed is stored under `--into`, keyed by request and solver. The arms of a
+seed thus share their calibration and all other identical pours. Finished runs are stored there too, so an interrupted
+comparison continues.
+
+- `--calibration-only` skips the deployment, and scores only the test pours.
+- `--random` pours this number of random actions of the deployment on the bench, drawn with the seed `--first`.
+- `--plans` pours this number of plans of the uncalibrated simulator.
+- With `--seeds 0` only `--random` and `--plans` are done.
+- `--write` makes no runs; it writes the tables of stored runs to docs/data/results.json, for docs/make_tables.py.
 
 The other arms change the program, for this benchmark only: there are no such settings.
 
-Questions, written before it was run on seeds from 401 on; seeds below 400 are for tuning or were used before:
+Questions, fixed before the first run on seeds from 401 on; seeds below 400 are for tuning or were used before:
 
 1. Do fewer than 10 % of random actions lose less than 1 %?
-2. Does the action that the uncalibrated simulator plans lose more than 5 % on the bench?
+2. Does the action planned by the uncalibrated simulator lose more than 5 % on the bench?
 3. Does calibration halve the mean error on the test pours, on at least 9 of 10 seeds?
-4. No pour above 10 % after the first below 1 %? Four pours or fewer until it stops, in the median?
+4. Is no pour above 10 % after the first below 1 %? Is the median number of pours until it stops four or fewer?
 """
 
 from __future__ import annotations
@@ -69,10 +72,10 @@ from sim_engine.scene import PourTask
 GOOD, BAD = 0.01, 0.10
 DATA = ROOT / "docs" / "data" / "results.json"
 TRUTH = ("liquid", "pose_error", "pose_noise")
-"""Settings of a bench that the simulator does not know."""
+"""Settings of a bench that are unknown to the simulator."""
 
 PLANNED = 12
-"""Simulated actions of the uncalibrated plan."""
+"""Number of simulated actions of the uncalibrated plan."""
 
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
@@ -91,7 +94,7 @@ ARMS: dict[str, Callable[[], None]] = {
 
 
 class KeptPours(WorkerPool):
-    """A pool that answers from a file what it has simulated before; the file's name tells the solver."""
+    """A pool that returns stored outcomes of repeated simulations; the file's name has the solver's fingerprint."""
 
     def __init__(self, file: Path, *, make: Callable[[], Simulator] = pour_simulator) -> None:
         super().__init__(1, partial(ThreadWorker, make), separate=False)
@@ -114,7 +117,7 @@ class KeptPours(WorkerPool):
 
 
 def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: bool = False) -> dict[str, Any]:
-    """One campaign: the error of its calibration on the test pours, and every pour with its prediction."""
+    """Run one campaign; return its calibration's error on the test pours, and every pour with its prediction."""
     from decant.running import build_campaign
     from orchestrator.results.stage_views import deployments_of, evaluation_of, theta_of
     from orchestrator.run_service import RunRequest, RunResources, RunService, task_request
@@ -161,7 +164,7 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
 
 
 def calibration_and_test(plan: CalibrationPlan) -> tuple[StageDefinition, ...]:
-    """The calibration's stages, with an evaluation on the test pours alone."""
+    """Return the calibration's stages, with an evaluation on the test pours only."""
     *stages, _ = calibration_stages(plan)
 
     def evaluation(results: Any, seed: int) -> CalibrationEvaluation:
@@ -174,7 +177,7 @@ def calibration_and_test(plan: CalibrationPlan) -> tuple[StageDefinition, ...]:
 
 
 def uncalibrated_plan(seed: int, laboratory: Path, into: Path) -> dict[str, float]:
-    """What the plan of the uncalibrated simulator is expected to lose, and its loss on the bench."""
+    """Return the predicted loss of the uncalibrated simulator's plan, and its loss on the bench."""
     from decant.running import build_campaign
     from orchestrator.results.stage_views import deployments_of
     from orchestrator.run_service import RunResources, RunService, task_request
@@ -194,14 +197,14 @@ def uncalibrated_plan(seed: int, laboratory: Path, into: Path) -> dict[str, floa
 
 
 def kept_pours(seed: int | str, into: Path) -> KeptPours:
-    """The pool of a seed."""
+    """Return the pool of a seed."""
     from sim_engine.solver_fingerprint import solver_fingerprint
 
     return KeptPours(into / f"pours-{solver_fingerprint()}-{seed}.jsonl")
 
 
 def on_numbers(seed: int, laboratory: Path, folder: str) -> dict[str, Any]:
-    """The shipped campaign on a laboratory of numbers, with the ground truth of the campaign's own laboratory."""
+    """Return the shipped campaign on a simulated laboratory, with the ground truth of the campaign's own laboratory."""
     from decant.running import load_campaign
 
     truth = load_campaign(CAMPAIGN).resolved["laboratory"]["bench"]
@@ -212,13 +215,13 @@ def on_numbers(seed: int, laboratory: Path, folder: str) -> dict[str, Any]:
     }
     bench = {key: value for key, value in content["laboratory"]["bench"].items() if key not in TRUTH}
     bench |= {key: truth[key] for key in TRUTH if key in truth}
-    content["laboratory"]["bench"] = bench | {"time_scale": 3000}  # nobody watches; the numbers are the same
+    content["laboratory"]["bench"] = bench | {"time_scale": 3000}  # only speeds the bench up; the results are the same
     content["calibration"]["random_baseline"] = 0
     return content
 
 
 async def lost(campaign: CampaignPlan, action: Action, seed: int, pool: KeptPours) -> float:
-    """The true loss of an action on the bench; 1 if the cups touch."""
+    """Return the true loss of an action on the bench; 1 if the cups touch."""
     assert campaign.deployment is not None
     scene, bench = campaign.deployment.scenes[0], campaign.laboratory.bench
     assert bench is not None
@@ -229,10 +232,10 @@ async def lost(campaign: CampaignPlan, action: Action, seed: int, pool: KeptPour
 
 
 def random_losses(count: int, seed: int, laboratory: Path, into: Path) -> list[float]:
-    """True losses of random actions of the deployment on the bench, from a scrambled Sobol sequence.
+    """Return true losses of random actions of the deployment on the bench, from a scrambled Sobol sequence.
 
     Args:
-        seed: of the scrambling and, times 1000, of the first pour.
+        seed: seed of the scrambling and, times 1000, of the first pour.
     """
     from scipy.stats import qmc
 
@@ -254,10 +257,10 @@ def random_losses(count: int, seed: int, laboratory: Path, into: Path) -> list[f
 
 
 def figures(run: dict[str, Any]) -> dict[str, float]:
-    """What is asked of a run; shares of a load.
+    """Return the summary figures of a run; shares of a load.
 
-    'final' is the mean of the pours of the recommended action; where no pour goes below 1 %, 'good' is the number of
-    pours and one more.
+    'final' is the mean of the pours of the recommended action. 'good' is the number of pours until one is below 1 %;
+    if no pour is, it is the number of pours plus one.
     """
     losses = [pour["loss"] for pour in run["pours"]]
     good = next((i for i, loss in enumerate(losses) if loss < GOOD), len(losses))
@@ -276,20 +279,20 @@ def figures(run: dict[str, Any]) -> dict[str, float]:
 
 
 def held(pour: dict[str, Any]) -> bool:
-    """Whether a pour lies in its 90 % band."""
+    """Return whether a pour lies in its 90 % interval."""
     low, high = pour["band"]
     return bool(low <= pour["loss"] <= high)
 
 
 def table(runs: list[dict[str, Any]]) -> str:
-    """Markdown: a row for every seed, and what was asked."""
+    """Return Markdown: one row per seed, and the summary."""
     shown = pours_table(runs)
     lines = [shown["head"], ["---"] * len(shown["head"]), *shown["rows"]]
     return "\n".join([*(f"| {' | '.join(cells)} |" for cells in lines), "", summary(runs)])
 
 
 def pours_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Head and rows: a row for every seed."""
+    """Return head and rows: one row per seed."""
     rows = []
     found = [figures(run) for run in runs]
     for run, one in zip(runs, found, strict=True):
@@ -304,7 +307,7 @@ def pours_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def summary(runs: list[dict[str, Any]]) -> str:
-    """What was asked, over all seeds."""
+    """Return the summary over all seeds."""
     found = [figures(run) for run in runs]
     pours = [pour for run in runs for pour in run["pours"]]
     inside = sum(map(held, pours))
@@ -328,7 +331,7 @@ def summary(runs: list[dict[str, Any]]) -> str:
 
 
 def calibration_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Head and rows: errors on the test pours, and the parameters found."""
+    """Return head and rows: errors on the test pours, and the parameters found."""
     rows = []
     for run in runs:
         calibrated, plain, theta = run["test"]["theta"], run["test"]["uncalibrated"], run["theta"]
@@ -363,7 +366,7 @@ def write(name: str, content: dict[str, Any], command: str, settings: str) -> No
 
 
 def _end_with_parent() -> None:
-    """End this process when the one that started it is gone, whatever ended that."""
+    """End this process when its parent has ended for any reason."""
     parent = os.getppid()
 
     def watch() -> None:
@@ -375,7 +378,7 @@ def _end_with_parent() -> None:
 
 
 def _run_missing(asked: argparse.Namespace, runs: list[dict[str, Any]], file: Path) -> None:
-    """Make the runs that are not there yet, one process each."""
+    """Make the missing runs, one process each."""
     places = [f"--{name}={path.resolve()}" for name, path in vars(asked).items() if isinstance(path, Path)]
     places += ["--calibration-only"] if asked.calibration_only else []
     for seed in range(asked.first, asked.first + asked.seeds):
@@ -400,18 +403,18 @@ def _run_missing(asked: argparse.Namespace, runs: list[dict[str, Any]], file: Pa
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=401)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["shipped"])
-    parser.add_argument("--calibration-only", action="store_true", help="leave the deployment out")
+    parser.add_argument("--calibration-only", action="store_true", help="skip the deployment")
     parser.add_argument("--random", type=int, default=0, help="number of random actions to pour on the bench")
     parser.add_argument("--plans", type=int, default=0, help="number of uncalibrated plans to pour on the bench")
     parser.add_argument("--laboratory", type=Path, default=ROOT / "configs" / "laboratories" / "twin.yaml")
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "quickstart")
     parser.add_argument("--write", action="store_true", help="write the tables into docs/data/results.json")
-    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # this is a process that makes one seed
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # runs one seed in this process
     asked = parser.parse_args()
     asked.into.mkdir(parents=True, exist_ok=True)
     if asked.one is not None:

@@ -1,19 +1,18 @@
-"""Predictions of recorded pours that no calibration saw, seed by seed, and again after a change as small as rounding.
+"""Test predictions of unseen recorded pours seed by seed, and after perturbations on the order of rounding errors.
 
     python benchmarks/recorded_predictions.py [--seeds 11 12 ...] [--perturbed 10] [--simulations 108] [--draws 5]
                                               [--write]
 
 For each seed the shipped campaign configs/campaigns/recorded.yaml is calibrated. Each test pour and each pour into the
-other receiver is then simulated with draws of the posterior, with one seed each: their mean and their 90 % interval are
-the prediction. Its error is the mean |recorded − predicted|; the goals are 0.02 on both.
+other receiver is then simulated with draws of the posterior, one seed each. The prediction is their mean and their 90 %
+interval. Its error is the mean |recorded − predicted|; the goals are 0.02 on both.
 
-`--perturbed` calibrates with the first seed again, each time with all recorded masses changed by 1e-7, relative, up or
-down. Rounding on another processor changes results by less. How much θ* and the predictions then differ is reported,
-and how many of the predictions lie in each other's intervals.
+`--perturbed` repeats the calibration with the first seed, each time with all recorded masses changed by a relative 1e-7
+up or down. Rounding on another processor changes results by less. The output reports how much θ* and the predictions
+differ, and how many predictions lie in each other's intervals.
 
-Every calibration is a process of its own and kept in the cache directory; an interrupted comparison goes on where it
-stopped.
-`--write` makes no calibrations, and writes those that are there into docs/data.
+Each calibration runs in its own process and is stored in the cache directory, so an interrupted comparison continues.
+`--write` makes no calibrations; it writes the stored ones to docs/data.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ GOAL = 0.02
 
 
 def perturbed(plan: CampaignPlan, number: int) -> CampaignPlan:
-    """The campaign with all recorded masses changed by ± 1e-7; unchanged for 0."""
+    """Return the campaign with all recorded masses changed by ± 1e-7; unchanged for 0."""
     calibration = plan.calibration
     assert calibration is not None
     assert calibration.records is not None
@@ -71,10 +70,10 @@ def perturbed(plan: CampaignPlan, number: int) -> CampaignPlan:
 
 
 def predictions(plan: CampaignPlan, seed: int, draws: int, label: str) -> dict[str, Any]:
-    """Calibrate, and predict the pours that were not used.
+    """Calibrate, and predict the unseen pours.
 
     Returns:
-        θ*, and of each pour its split, the recorded r, the mean of the simulated ones and the ends of their interval.
+        θ*, and for each pour its split, the recorded r, the mean of the simulated r and the ends of their interval.
     """
     calibration = plan.calibration
     assert calibration is not None
@@ -104,12 +103,12 @@ def predictions(plan: CampaignPlan, seed: int, draws: int, label: str) -> dict[s
 
 
 def error(found: dict[str, Any], split: str) -> float:
-    """Mean |recorded − predicted| over the pours of a split."""
+    """Return the mean |recorded − predicted| over the pours of a split."""
     return fmean(abs(one["recorded"] - one["predicted"]) for one in found["pours"] if one["split"] == split)
 
 
 def seed_rows(found: dict[int, dict[str, Any]]) -> list[list[str]]:
-    """A row per seed: errors, and how many pours lie in their intervals."""
+    """Return one row per seed: errors, and number of pours in their intervals."""
     rows = []
     for seed, one in sorted(found.items()):
         held = sum(pour["low"] <= pour["recorded"] <= pour["high"] for pour in one["pours"])
@@ -119,7 +118,7 @@ def seed_rows(found: dict[int, dict[str, Any]]) -> list[list[str]]:
 
 
 def rounding_rows(found: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """How much the calibrations of almost equal pours differ."""
+    """Return rows with the differences between calibrations of almost equal pours."""
     rows = []
     for name in found[0]["theta"]:
         values = [one["theta"][name] for one in found]
@@ -139,7 +138,7 @@ def rounding_rows(found: Sequence[dict[str, Any]]) -> list[list[str]]:
 
 
 def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]], again: Sequence[dict[str, Any]]) -> None:
-    """Put predictions and tables into docs/data."""
+    """Write predictions and tables to docs/data."""
     machine = describe()
     where = f"{machine['processor'].split(' (')[0]}, {machine['cores']} shared cores, {machine['system']}"
     common = {
@@ -164,15 +163,15 @@ def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]], again: 
 
 
 def main() -> None:
-    """Measure, print and keep."""
+    """Measure, print and store."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(11, 21)))
     parser.add_argument("--perturbed", type=int, default=0, help="calibrations of slightly changed pours")
-    parser.add_argument("--simulations", type=int, default=108, help="budget of each calibration")
-    parser.add_argument("--draws", type=int, default=5, help="posterior draws for each prediction")
-    parser.add_argument("--fresh", action="store_true", help="forget what was kept")
-    parser.add_argument("--write", action="store_true", help="make no calibrations; write those that are there")
-    parser.add_argument("--one", type=int, nargs=2, help=argparse.SUPPRESS)  # this is a process that makes one
+    parser.add_argument("--simulations", type=int, default=108, help="budget per calibration")
+    parser.add_argument("--draws", type=int, default=5, help="posterior draws per prediction")
+    parser.add_argument("--fresh", action="store_true", help="discard stored results")
+    parser.add_argument("--write", action="store_true", help="make no calibrations; write the stored ones")
+    parser.add_argument("--one", type=int, nargs=2, help=argparse.SUPPRESS)  # runs one calibration in this process
     options = parser.parse_args()
     plan = load_campaign(CAMPAIGN)
     assert plan.calibration is not None

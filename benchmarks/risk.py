@@ -1,13 +1,13 @@
-"""What planning for errors of execution buys: plain D1 beside D1 under risk, judged under errors that neither has seen.
+"""Measure the benefit of planning for execution errors: plain D1 and D1 under risk, evaluated under unseen errors.
 
 Real simulations, few particles, one process:
 
     python benchmarks/risk.py [--plans 3] [--evaluations 40] [--iterations 12] [--per-iteration 4] [--particles 500]
                               [--receiver configs/vessels/narrow.yaml] [--json]
 
-Each way plans `--plans` times with the same number of simulations; each planned action is then simulated
-`--evaluations` times, every time with a fresh seed and fresh errors, the same for all ways. Intervals are 95 %,
-by resampling the plans, and the evaluations of each.
+Each method plans `--plans` times with the same number of simulations. Each planned action is then simulated
+`--evaluations` times with new seeds and new errors, which are the same for all methods. Intervals are 95 %, from
+resampling the plans and the evaluations of each plan.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ RESAMPLED = 4000
 
 
 class Bench:
-    """One scene, answered by the simulator of this process."""
+    """One scene, evaluated by the simulator of this process."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._simulator = scene, PourSimulator()
@@ -57,7 +57,7 @@ class Bench:
         self.seconds = 0.0
 
     def answer(self, request: Request) -> Outcome:
-        """What comes of a question or a simulation."""
+        """Return the outcome of a suggestion query or a simulation."""
         if isinstance(request, Suggest):
             suggestion = propose(request.query)
             self.seconds += suggestion.seconds
@@ -76,7 +76,7 @@ class Bench:
         return Simulated(outcome)
 
     def plan(self, strategy: OneShotPlanning) -> Recommended:
-        """Play a strategy to its end; what it recommends."""
+        """Run a strategy until it finishes; return its recommendation."""
         waiting: list[Request] = []
         while not strategy.finished:
             waiting += strategy.ask(Slots(1 - sum(isinstance(one, Simulate) for one in waiting), 0))
@@ -88,7 +88,7 @@ class Bench:
 
 
 def fresh_errors(count: int, seed: int) -> list[tuple[int, PoseError]]:
-    """Seeds and errors of the evaluations."""
+    """Return seeds and errors of the evaluations."""
     rng = np.random.default_rng([seed, 77])
     found = []
     for _ in range(count):
@@ -103,7 +103,7 @@ def fresh_errors(count: int, seed: int) -> list[tuple[int, PoseError]]:
 def evaluated(
     bench: Bench, costing: Costing, values: dict[str, float], errors: Sequence[tuple[int, PoseError]]
 ) -> Floats:
-    """Losses of an action under errors, (count,); a simulation that failed is left out."""
+    """Return losses of an action under errors, (count,), without failed simulations."""
     action, losses = costing.scene.action(dict(values)), []
     for seed, error in errors:
         outcome = bench.answer(Simulate(costing.scene.name, action, costing.parameters, seed, "judge", error))
@@ -114,7 +114,7 @@ def evaluated(
 
 
 def resampled(losses: Sequence[Floats], quantile: float | None, rng: np.random.Generator) -> Floats:
-    """Mean or quantile of plans and evaluations drawn again, (RESAMPLED,)."""
+    """Return the mean or quantile of resampled plans and evaluations, (RESAMPLED,)."""
     found = []
     for _ in range(RESAMPLED):
         plans = rng.integers(0, len(losses), len(losses))
@@ -124,7 +124,7 @@ def resampled(losses: Sequence[Floats], quantile: float | None, rng: np.random.G
 
 
 def row_of(way: str, losses: Sequence[Floats]) -> dict[str, Any]:
-    """Mean, 90 % quantile and CVaR of all evaluations, in per cent, with intervals."""
+    """Return mean, 90 % quantile and CVaR of all evaluations, in per cent, with intervals."""
     row: dict[str, Any] = {"way": way}
     every = np.concatenate(losses)
     for name, quantile in (("mean", None), ("q90", 0.9)):
@@ -137,7 +137,7 @@ def row_of(way: str, losses: Sequence[Floats]) -> dict[str, Any]:
 
 
 def deployment(receiver: Path, particles: int) -> tuple[DeploymentPlan, Scene, SimulationParameters]:
-    """The quickstart's deployment, into another receiver if one is given, as a D1 without pours."""
+    """Return the quickstart's deployment, with another receiver if given, as D1 without pours."""
     plan = load_campaign(ROOT / "configs/campaigns/quickstart.yaml")
     assert plan.deployment is not None
     vessel = load_vessel(receiver)
@@ -148,7 +148,7 @@ def deployment(receiver: Path, particles: int) -> tuple[DeploymentPlan, Scene, S
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plans", type=int, default=3)
     parser.add_argument("--evaluations", type=int, default=40)

@@ -1,12 +1,12 @@
-"""How to estimate a risk from few simulations: a surrogate over what was executed, or raw measures of m1 draws.
+"""Compare risk estimates from few simulations: a surrogate over executed actions, or raw measures of m1 draws.
 
-Toy losses, cheap and known exactly, at the same number of simulations:
+Toy losses, cheap and with known exact risk, at the same number of simulations:
 
     python benchmarks/risk_measures.py [--seeds 5] [--simulations 48] [--toys cup cliff valleys] [--json]
 
-`joint` is `orchestrator.strategies.deployment.d1`; `raw` forms the mean or CVaR of the m1 losses of each action,
-under the same m1 draws for all of them, and regresses that over actions; `plain` is D1, which knows of no errors.
-Regret: the true measure of the recommended action, less the least there is.
+`joint` is `orchestrator.strategies.deployment.d1`. `raw` computes the mean or CVaR of the m1 losses of each action,
+under the same m1 draws for all actions, and regresses it over actions. `plain` is D1, which has no model of errors.
+Regret: the true measure of the recommended action, minus the smallest possible value.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ DEVIATIONS = PoseNoise(**asdict(ERRORS))
 
 
 def cup(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
-    """A valley; missing sideways and tilting more only harm."""
+    """A valley in which lateral errors and additional tilt only increase the loss."""
     depth = ((x - 0.62 - 0.15 * (v - 0.3)) / 0.16) ** 2 + ((v - 0.3) / 0.35) ** 2 + (y / 8e-3) ** 2
     return np.clip(1.0 - np.exp(-0.5 * depth) + 2.0 * np.maximum(tilt, 0.0), 0.0, 1.0)
 
 
 def cliff(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
-    """Best right beside a wall."""
+    """A loss with its optimum directly next to a wall."""
     d = x - 0.45 - 0.2 * (v - 0.5)
     far = 0.02 + 0.25 * d + 0.3 * (v - 0.5) ** 2
     return np.clip(np.where(d < 0.0, 0.9, far) + np.abs(tilt) + 4.0 * np.abs(y), 0.0, 1.0)
 
 
 def valleys(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
-    """A narrow valley that spills nothing, and a broad one that always spills a little."""
+    """A narrow valley without spillage, and a broad one that always spills a little."""
     speed = ((v - 0.5) / 0.8) ** 2
     narrow = 1.0 - np.exp(-0.5 * (((x - 0.25) / 0.06) ** 2 + speed))
     broad = 1.0 - 0.95 * np.exp(-0.5 * (((x - 0.7) / 0.2) ** 2 + speed))
@@ -71,7 +71,7 @@ TOYS: dict[str, Callable[[Floats, Floats, Floats, Floats], Floats]] = {"cup": cu
 
 
 class RawMeasure(RobustPlanning):
-    """The measure of the m1 losses of an action, as an observation of that action."""
+    """Observes, for each action, the measure of its m1 losses."""
 
     def _repeated(self, action: Action, purpose: str, repeats: int) -> tuple[Simulate, ...]:
         return self._under(action, purpose, self._disturbances.draws(repeats))
@@ -96,11 +96,11 @@ WAYS: dict[str, tuple[type[OneShotPlanning], int]] = {
     "raw, 4 each": (RawMeasure, 4),
     "plain, 2 each": (OneShotPlanning, 2),
 }
-"""Strategy, and simulations of each action."""
+"""Strategy, and simulations per action."""
 
 
 def answer(request: Request, toy: Callable[..., Floats]) -> Outcome:
-    """What comes of a request; simulations scatter by 1 % of the load and 5 % of the loss."""
+    """Return the outcome of a request; simulations scatter by 1 % of the load and 5 % of the loss."""
     if isinstance(request, Suggest):
         return Suggested(propose(request.query))
     assert isinstance(request, Simulate)
@@ -116,7 +116,7 @@ def answer(request: Request, toy: Callable[..., Floats]) -> Outcome:
 
 
 def play(strategy: OneShotPlanning, toy: Callable[..., Floats]) -> Recommended:
-    """A campaign to its end; what it recommends."""
+    """Run a campaign until it finishes; return its recommendation."""
     waiting: list[Request] = []
     while not strategy.finished:
         waiting += strategy.ask(Slots(1 - sum(isinstance(one, Simulate) for one in waiting), 0))
@@ -128,7 +128,7 @@ def play(strategy: OneShotPlanning, toy: Callable[..., Floats]) -> Recommended:
 
 
 def truth(toy: Callable[..., Floats], level: float, places: Floats) -> Floats:
-    """The measure at points (m, 2) of the unit cube, over 2048 draws: (m,)."""
+    """Return the measure at points (m, 2) of the unit cube, over 2048 draws: (m,)."""
     x, y, tilt, speed = np.clip(ndtri(qmc.Sobol(4, rng=np.random.default_rng(0)).random(2048)), -3.5, 3.5).T
     velocity = (15.0 + 105.0 * places[:, :1]) * (1.0 + ERRORS.speed_factor * speed)
     offset = places[:, 1:] + ERRORS.x * x / 0.07
@@ -137,7 +137,7 @@ def truth(toy: Callable[..., Floats], level: float, places: Floats) -> Floats:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--simulations", type=int, default=48)

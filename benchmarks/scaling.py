@@ -1,11 +1,11 @@
-"""What a pour costs against the number of particles: CPU seconds and memory.
+"""Measure a pour's CPU seconds and memory against the number of particles.
 
     python benchmarks/scaling.py [--particles 1000 2000 5000 10000 20000] [--memory 1000 2000 5000 10000 20000 50000]
                                  [--repeats 3] [--core 1] [--json]
 
-A process for each number, so that memory is its own. Memory is the resident set early in the pour, and by how
-much it grew with each step on the way there: packages, Taichi, the solver's arrays, kernels and vessels (by a pour of
-200 particles), the pour of N itself. The exponent is that of a power law through all CPU seconds.
+Each number has its own process, so that memory is measured separately. Memory is the resident set early in the pour,
+and its growth with each step before that: packages, Taichi, the solver's arrays, kernels and vessels (by a pour of 200
+particles), the pour of N itself. The exponent is that of a power law fitted to all CPU seconds.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from sim_engine.simulator import SETTLING, SLICE, PourSimulator
 PARTICLES = (1_000, 2_000, 5_000, 10_000, 20_000)
 MEMORY = (1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
 EARLY = round((0.1 + SETTLING) / SLICE)
-"""Slices after which all memory that a pour needs is in use."""
+"""Slices after which a pour uses all its memory."""
 
 
 def resident() -> int:
-    """Memory of this process that is in RAM [bytes]."""
+    """Return the memory of this process that is in RAM [bytes]."""
     return int(psutil.Process().memory_info().rss)
 
 
 def cost(particles: int, repeats: int) -> dict[str, Any]:
-    """CPU seconds and what they were spent on, median over seeds."""
+    """Return CPU seconds by phase, median over seeds."""
     simulator = PourSimulator()
     simulator.simulate(short_task(FEWEST))
     runs = [measure(simulator, particles, seed) for seed in range(1, repeats + 1)]
@@ -53,7 +53,7 @@ def cost(particles: int, repeats: int) -> dict[str, Any]:
 
 
 def memory(particles: int) -> dict[str, Any]:
-    """Resident memory of a process within a pour, and what it went to."""
+    """Return the resident memory of a process during a pour, by use."""
     imports = resident()
     from sim_engine.fluid.engine import engine
 
@@ -89,7 +89,7 @@ def memory(particles: int) -> dict[str, Any]:
 
 
 def exponent(rows: list[dict[str, Any]]) -> float | None:
-    """p of cpu_s ∝ N^p by least squares of the logarithms; None for fewer than two numbers."""
+    """Return p of cpu_s ∝ N^p by least squares of the logarithms; None for fewer than two numbers."""
     if len(rows) < 2:
         return None
     n, cpu = (np.log([row[key] for row in rows]) for key in ("particles", "cpu_s"))
@@ -99,12 +99,12 @@ def exponent(rows: list[dict[str, Any]]) -> float | None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--particles", type=int, nargs="*", default=PARTICLES, metavar="N", help="for CPU seconds")
-    parser.add_argument("--memory", type=int, nargs="*", default=MEMORY, metavar="N", help="for memory")
-    parser.add_argument("--repeats", type=int, default=3, help="pours for each N, each with another seed")
-    parser.add_argument("--core", type=int, help="which core to run on; unless given, the one with the least to do")
+    parser.add_argument("--particles", type=int, nargs="*", default=PARTICLES, metavar="N", help="N for CPU seconds")
+    parser.add_argument("--memory", type=int, nargs="*", default=MEMORY, metavar="N", help="N for memory")
+    parser.add_argument("--repeats", type=int, default=3, help="pours per N, each with another seed")
+    parser.add_argument("--core", type=int, help="core to run on; default: the least busy one")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
-    parser.add_argument("--one", choices=("cost", "memory"), help=argparse.SUPPRESS)  # this is a process measured
+    parser.add_argument("--one", choices=("cost", "memory"), help=argparse.SUPPRESS)  # measures in this process
     options = parser.parse_args()
     numbers = [check_particles(n) for n in options.particles]
     if options.one is not None:

@@ -1,7 +1,7 @@
-"""An event loop whose clock leaves waiting out: a campaign of 15 pours at 90 s each passes in seconds.
+"""An event loop whose clock skips waits: a campaign of 15 pours at 90 s each takes seconds.
 
-Its time is the CPU time of this thread, all of it, plus every wait, which is skipped. So scheduler, journal and
-strategy take as long as they do, also on a machine that is busy with other work, and 90 s of sleep take no time.
+The loop's time is the CPU time of this thread plus all waits, which are skipped. Scheduler, journal and strategy thus
+take their own CPU time, even on a machine with other load, and 90 s of sleep take no real time.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class _Skipping(selectors.DefaultSelector):
-    """Never waits for a timer."""
+    """A selector that never waits for a timer."""
 
     skipped = 0.0
 
@@ -28,7 +28,7 @@ class _Skipping(selectors.DefaultSelector):
 
 
 class SkippingLoop(asyncio.SelectorEventLoop):
-    """See the module."""
+    """An event loop with the clock described in the module's docstring."""
 
     def __init__(self) -> None:
         self._waits = _Skipping()
@@ -36,16 +36,16 @@ class SkippingLoop(asyncio.SelectorEventLoop):
         super().__init__(self._waits)
 
     def time(self) -> float:
-        """Seconds since the loop was made."""
+        """Return the seconds since the loop was created."""
         return time.thread_time() - self._started + self._waits.skipped
 
     async def spend(self, seconds: float, computed: float) -> None:
-        """Let `seconds` pass in place of `computed` CPU seconds that another process would have spent."""
+        """Advance the clock by `seconds` instead of the `computed` CPU seconds, for work of another process."""
         self._started += computed
         await asyncio.sleep(seconds)
 
 
 def run(work: Coroutine[Any, Any, T]) -> T:
-    """`asyncio.run` on such a loop."""
+    """Run a coroutine like `asyncio.run`, on a `SkippingLoop`."""
     with asyncio.Runner(loop_factory=SkippingLoop) as runner:
         return runner.run(work)

@@ -1,14 +1,18 @@
-"""A day of a laboratory in scaled time: a daemon with two rigs, campaigns, ordered pours, faults, and clients.
+"""Run a laboratory for a day of scaled time: a daemon with two rigs, campaigns, ordered pours, faults, and clients.
 
-Two rigs of simulated benches get campaigns over HTTP from two clients each: plans, calibrations with deployments, and
-deployments alone, with and without a recording, some paused, stopped or aborted and resumed. On the right rig an
-operator answers questions. Another client orders pours and repeats every order with the same id. Other clients read,
-follow events and leave, some in the middle of a request. In the first part the daemon is killed (SIGKILL) or ended
-again and again, and its disk is filled up; the second part is undisturbed but for one full disk, so that growth of
-memory can be seen. From time to time the clients wait until nothing runs, and all processes and files are measured.
+- Two clients per rig submit campaigns to simulated benches over HTTP: plans, calibrations with deployments, and
+  deployments alone, with and without a recording; some are paused, stopped or aborted and resumed. On the right rig an
+  operator answers questions.
+- Another client orders pours and repeats every order with the same id.
+- Other clients read, follow events and disconnect, some in the middle of a request.
 
-At the end every journal, the queue and the account of materials are compared with the answers to the clients.
-The state directory is a small file system in memory, so that it can be full: root is needed. From the project's root:
+In the first part the daemon is repeatedly killed (SIGKILL) or ended, and its disk is filled. The second part has only
+one full disk, so that growth of memory is visible. At intervals the clients pause until nothing runs, and all processes
+and files are measured.
+
+At the end every journal, the queue and the account of materials are compared with the responses to the clients.
+The state directory is a small file system in memory, so that it can be full; this requires root. From the project's
+root:
 
     python benchmarks/soak.py --minutes 40 --into soak     # writes soak/samples.jsonl, items.jsonl, result.json
     python benchmarks/soak.py --draw soak                  # the picture, and its table in docs/evidence/reliability.md
@@ -54,7 +58,7 @@ from orchestrator.results import figure_style as style
 ROOT = Path(__file__).parents[1]
 
 TIME_SCALE = 60
-"""Bench seconds per second: 24 minutes are a day."""
+"""Bench seconds per second: a day takes 24 minutes."""
 
 DISK = 900
 """Size of the file system of the state directory [MB]."""
@@ -67,7 +71,7 @@ keep_free: 40 MB
 events: 2000
 recordings: {keep: 3}
 """
-"""Bounds that are reached within minutes, as days reach the usual ones."""
+"""Limits that are reached within minutes, as the usual ones are within days."""
 
 BENCH = f"bench: {{liquid: {{particles: 200}}, time_scale: {TIME_SCALE}}}"
 RIGS = {
@@ -120,13 +124,13 @@ ORDER = (
     "recorded",
     "short",
 )
-"""Kinds of campaigns, again and again. Plain ones and plans calibrate and deploy; the others only pour."""
+"""Kinds of campaigns, in repeating order. Plain ones and plans calibrate and deploy; the others only pour."""
 
 FULL_FOR = 30.0
-"""Time for which the disk is full [s]."""
+"""Duration of a full disk [s]."""
 
 ENDS_WITHIN = 60.0
-"""Longest time for the daemon to end by itself [s]."""
+"""Longest time for the daemon to end after a signal [s]."""
 
 ENDED = ("finished", "stopped", "withdrawn")
 RESTS = ("paused", "failed", "unknown")
@@ -136,12 +140,12 @@ RESTS = ("paused", "failed", "unknown")
 
 
 class Laboratory:
-    """A daemon on a small disk, and what its clients share.
+    """A daemon on a small disk, and the state that its clients share.
 
     Args:
-        folder: for settings, log and results.
-        disk: of the state directory.
-        mark: folder for temporary files, by which its processes are found.
+        folder: folder for settings, log and results.
+        disk: file system of the state directory.
+        mark: folder for temporary files, which identifies the daemon's processes.
     """
 
     def __init__(self, folder: Path, disk: Path, mark: str) -> None:
@@ -163,7 +167,7 @@ class Laboratory:
         return self.disk / "state"
 
     def start(self) -> None:
-        """Start the daemon and wait until it serves."""
+        """Start the daemon and wait until it serves requests."""
         begun = time.monotonic()
         with (self.folder / "log").open("a") as log:
             command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "server", "start"]
@@ -184,7 +188,7 @@ class Laboratory:
         self.restarts.append(time.monotonic() - begun)
 
     def end(self, number: int = signal.SIGTERM) -> None:
-        """End the daemon by a signal."""
+        """End the daemon with a signal."""
         self.spent += _cpu(self.mark)
         process, self._process = self._process, None
         if process is not None:
@@ -196,14 +200,14 @@ class Laboratory:
                 process.wait()
 
     def client(self) -> Client:
-        """A client; it may meet a daemon that does not run."""
+        """Return a client; the daemon may not be running."""
         return Client(f"http://127.0.0.1:{self._port}", self.state)
 
     def call(self, method: str, path: str, body: Any = None, *, repeat: bool = True, **query: Any) -> Any:
-        """A request, repeated until a daemon answers.
+        """Send a request, and repeat it until the daemon responds.
 
         Raises:
-            DaemonError: it was refused, or no answer came and it may not be repeated.
+            DaemonError: it was refused, or there was no response and it may not be repeated.
         """
         while True:
             try:
@@ -219,7 +223,7 @@ class Laboratory:
 
     @contextlib.contextmanager
     def item(self) -> Iterator[None]:
-        """An item of a client: it begins when nothing has to be calm."""
+        """Run an item of a client; wait first if the clients are paused."""
         while not self.go.wait(0.2):
             if self.over.is_set():
                 break
@@ -232,7 +236,7 @@ class Laboratory:
                 self._active -= 1
 
     def calm(self, patience: float) -> bool:
-        """Let clients begin nothing, and wait until nothing runs. Returns whether that was so in time."""
+        """Pause the clients, and wait until nothing runs; return whether this succeeded in time."""
         self.go.clear()
         end = time.monotonic() + patience
         while time.monotonic() < end and self._active:
@@ -240,7 +244,7 @@ class Laboratory:
         return not self._active
 
     def fill(self) -> None:
-        """Leave no byte on the disk."""
+        """Fill the disk completely."""
         with (self.disk / "filler").open("ab", buffering=0) as file:
             for size in (1 << 20, 4096, 1):
                 with contextlib.suppress(OSError):
@@ -252,14 +256,14 @@ class Laboratory:
         (self.disk / "filler").unlink(missing_ok=True)
 
     def note(self, **row: Any) -> None:
-        """Append to the items."""
+        """Append a row to the items."""
         with self._lock:
             _append(self.folder / "items.jsonl", row)
 
 
 @contextlib.contextmanager
 def small_disk(place: Path) -> Iterator[Path]:
-    """A file system in memory.
+    """Mount a file system in memory.
 
     Raises:
         SystemExit: this user may not mount one.
@@ -284,7 +288,7 @@ def small_disk(place: Path) -> Iterator[Path]:
 
 
 def texts(folder: Path) -> dict[str, tuple[str, Files]]:
-    """Submissions by kind."""
+    """Return the submissions by kind."""
     yaml = YAML()
 
     def short(campaign: dict[str, Any], pours: int, outputs: dict[str, Any] | None = None) -> None:
@@ -312,11 +316,11 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
 
 
 def submitting(lab: Laboratory, sent: dict[str, tuple[str, Files]], rig: str, first: int, most: int) -> None:
-    """A client of one rig: one campaign after the other.
+    """Run a client of one rig that submits one campaign after the other.
 
     Args:
         sent: submissions by kind.
-        first: number of its first campaign in `ORDER`.
+        first: index of its first campaign in `ORDER`.
         most: number of campaigns.
     """
     chance = random.Random(f"{rig} {first}")
@@ -342,7 +346,7 @@ def submitting(lab: Laboratory, sent: dict[str, tuple[str, Files]], rig: str, fi
 
 
 def followed(lab: Laboratory, key: str, kind: str, chance: random.Random) -> str:
-    """Have a campaign run to its end, whatever happens on the way; the state that it ends in."""
+    """Follow a campaign to its end, resuming it if needed; return its final state."""
     verb = {"paused": "pause", "stopped": "stop", "aborted": "abort"}.get(kind, "")
     when = time.monotonic() + chance.uniform(1.0, 6.0)
     while True:
@@ -361,7 +365,7 @@ def followed(lab: Laboratory, key: str, kind: str, chance: random.Random) -> str
 
 
 def ordering(lab: Laboratory, begun: float) -> None:
-    """A client that orders pours on both rigs by turns, and sends every order three times or more."""
+    """Run a client that orders pours on both rigs alternately, and sends every order three times or more."""
     setting_up = [
         ("/materials/liquids", {"id": "water", "properties": {"name": "water"}}),
         *[("/materials/vessels", {"id": f"beaker-{rig}", "shape": BEAKER}) for rig in RIGS],
@@ -407,7 +411,7 @@ def ordering(lab: Laboratory, begun: float) -> None:
 
 
 def answering(lab: Laboratory) -> None:
-    """The operator of the right rig, who is also asked about pours that a kill has left unknown."""
+    """Run the operator of the right rig, who also decides about pours with unknown outcome after a kill."""
     while not lab.over.is_set():
         with contextlib.suppress(DaemonError):
             for question in lab.call("get", "/questions"):
@@ -418,7 +422,7 @@ def answering(lab: Laboratory) -> None:
 
 
 def visiting(lab: Laboratory, number: int) -> None:
-    """A client that comes and goes: it reads, follows events for a while, or leaves in the middle of a request."""
+    """Run a client that connects repeatedly: it reads, follows events, or disconnects in the middle of a request."""
     chance = random.Random(number)
     while not lab.over.wait(chance.uniform(1.0, 6.0)):
         lab.counts["visits"] += 1
@@ -442,7 +446,7 @@ def visiting(lab: Laboratory, number: int) -> None:
 
 
 def striking(lab: Laboratory, begun: float, disturbed: float) -> None:
-    """Kill or end the daemon every minute and a half, and fill its disk, until `disturbed` [s]; later fill it once."""
+    """Kill or end the daemon every 90 s, and fill its disk, until `disturbed` [s]; later fill it once."""
     for number in range(100_000):
         if lab.over.wait(90.0):
             return
@@ -462,7 +466,7 @@ def striking(lab: Laboratory, begun: float, disturbed: float) -> None:
 
 
 def sampling(lab: Laboratory, every: float, begun: float) -> None:
-    """Measure every so often, between items if they end in time."""
+    """Take a sample at regular intervals, between items if they end in time."""
     while not lab.over.wait(every):
         calm = lab.calm(60.0)
         try:
@@ -473,7 +477,7 @@ def sampling(lab: Laboratory, every: float, begun: float) -> None:
 
 
 def look(lab: Laboratory) -> dict[str, Any]:
-    """Everything that might grow, now: memory [MB], counts, sizes on disk [MB]."""
+    """Return everything that may grow: memory [MB], counts, sizes on disk [MB]."""
     memory: collections.Counter[str] = collections.Counter()
     totals: collections.Counter[str] = collections.Counter()
     for process in ours(lab.mark):
@@ -501,7 +505,7 @@ def look(lab: Laboratory) -> dict[str, Any]:
 
 
 def ours(mark: str) -> Iterator[psutil.Process]:
-    """The daemon and all that it has started, those included that have left its tree."""
+    """Yield the daemon and all processes it has started, including those that have left its process tree."""
     for process in psutil.process_iter():
         with contextlib.suppress(psutil.Error, OSError):
             if process.environ().get("TMPDIR") == mark or any(mark in word for word in process.cmdline()):
@@ -509,9 +513,9 @@ def ours(mark: str) -> Iterator[psutil.Process]:
 
 
 def _own_memory(pid: int) -> float:
-    """What a process has written to memory [MB], shared pages in equal parts; without libraries' files.
+    """Return the memory that a process has written [MB], with equal parts of shared pages and without library files.
 
-    The share of those changes with every other program on the machine that uses them, by 40 MB at once.
+    The share of library files changes by up to 40 MB whenever another program uses them.
     """
     lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
     return sum(int(line.split()[1]) for line in lines if line.startswith(("Pss_Anon", "Pss_Shmem"))) * 1024 / 1e6
@@ -537,7 +541,7 @@ def _size(folder: Path) -> int:
 
 
 def _cpu(mark: str) -> float:
-    """CPU time of the daemon and all that it has started [s], with those that have ended and were waited for."""
+    """Return the CPU time of the daemon and its processes [s], including those that have ended and been waited for."""
     spent = 0.0
     for process in ours(mark):
         with contextlib.suppress(psutil.Error, OSError):
@@ -550,18 +554,18 @@ def _append(path: Path, row: dict[str, Any]) -> None:
         file.write(json.dumps(row) + "\n")
 
 
-# ---- the whole
+# ---- the complete soak
 
 
 def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) -> None:
-    """Keep a daemon busy, then check what it has kept.
+    """Keep a daemon busy, then check its records.
 
     Args:
-        folder: where it is done; samples.jsonl, items.jsonl and result.json are written there.
-        minutes: for so long.
-        campaigns: largest number of each of the four clients.
-        every: between two samples [s].
-        ray: whether simulator, arm and balance are processes of Ray; else they are threads of the daemon.
+        folder: working folder; receives samples.jsonl, items.jsonl and result.json.
+        minutes: duration [min].
+        campaigns: largest number of campaigns of each of the four clients.
+        every: time between two samples [s].
+        ray: run simulator, arm and balance as processes of Ray instead of threads of the daemon.
     """
     folder.mkdir(parents=True, exist_ok=True)
     settings = SETTINGS.replace("in_process: true\n", "") if ray else SETTINGS
@@ -619,10 +623,10 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
 
 
 def checked(lab: Laboratory, campaigns: list[Any], pours: list[Any], account: list[Any]) -> dict[str, Any]:
-    """Compare what the daemon has kept with what its clients were promised.
+    """Compare the daemon's records with its responses to the clients.
 
     Args:
-        campaigns, pours, account: as the daemon listed them at the end.
+        campaigns, pours, account: lists from the daemon at the end.
     """
     items = [json.loads(line) for line in (lab.folder / "items.jsonl").read_text().splitlines()]
     acknowledged = [one["id"] for one in items if one["what"] == "campaign"]
@@ -681,7 +685,7 @@ FIGURE = ROOT / "docs" / "images" / "daemon" / "day.png"
 
 
 def draw(folder: Path) -> dict[str, Any]:
-    """Draw a soak; what its table says."""
+    """Draw a soak; return the contents of its table."""
     samples = [json.loads(line) for line in (folder / "samples.jsonl").read_text().splitlines()]
     result: dict[str, Any] = json.loads((folder / "result.json").read_text())
     last = max(one["starts"] for one in samples)
@@ -763,7 +767,7 @@ def _kept(name: str, sample: dict[str, Any]) -> float:
 
 
 def _course(rows: list[dict[str, Any]], value: Callable[[dict[str, Any]], float]) -> dict[str, float]:
-    """At a third of the time, at the end, and the mean course in the time between with its standard error [1/h]."""
+    """Return the value at a third of the time and at the end, and the slope between with its standard error [1/h]."""
     begin, end = rows[0]["minute"], rows[-1]["minute"]
     late = [row for row in rows if row["minute"] >= begin + (end - begin) / 3.0]
     fit = stats.linregress([row["minute"] / 60.0 for row in late], [value(row) for row in late])
@@ -776,14 +780,14 @@ def _course(rows: list[dict[str, Any]], value: Callable[[dict[str, Any]], float]
 
 
 def main() -> None:
-    """See the module."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=40.0)
     parser.add_argument("--into", type=Path, default=Path("soak"))
-    parser.add_argument("--campaigns", type=int, default=1000, help="most of each of four clients")
+    parser.add_argument("--campaigns", type=int, default=1000, help="campaigns per client, at most (four clients)")
     parser.add_argument("--every", type=float, default=60.0, help="seconds between two samples")
-    parser.add_argument("--ray", action="store_true", help="with processes of Ray: takes several times as long")
-    parser.add_argument("--draw", type=Path, help="draw what was found there")
+    parser.add_argument("--ray", action="store_true", help="use processes of Ray; takes several times as long")
+    parser.add_argument("--draw", type=Path, help="draw the results in this folder")
     arguments = parser.parse_args()
     if arguments.draw is not None:
         keep("day", draw(arguments.draw))

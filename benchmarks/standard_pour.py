@@ -1,8 +1,8 @@
-"""The standard pour, and how everything here measures one.
+"""The standard pour, and its measurements.
 
-200 mL in a straight cup (R 40 mm, H 100 mm) turned about its inner lip at 30 °/s, from a step, to 120°, over a straight
-receiver (R 45 mm, H 90 mm) whose floor lies 200 mm under the lip and whose axis stands 40 mm in front of it; 6 s. Other
-solvers were run on the same scene, which is why it is not one of ours.
+200 mL in a straight cup (R 40 mm, H 100 mm) are turned about its inner lip at 30 °/s, from a step, to 120°, over a
+straight receiver (R 45 mm, H 90 mm). The receiver's floor is 200 mm below the lip and its axis 40 mm in front of it.
+The pour lasts 6 s. The scene was chosen because other solvers have been run on it.
 """
 
 from __future__ import annotations
@@ -34,22 +34,23 @@ SCENE = Scene(
     Liquid(mass=0.1996),
 )
 END = 6.0
-"""The standard pour lasts so long [s]."""
+"""Duration of the standard pour [s]."""
 
 TIMES = (2.3, 2.7, 3.1)
 LEFT = (0.945, 0.675, 0.31)
-"""What infinitely fine particles have left in the pourer at `TIMES`: several solvers extrapolate to it within .003 …"""
+"""Fractions left in the pourer at `TIMES` in the limit of infinitely fine particles; several solvers extrapolate to
+them within 0.003."""
 LEFT_LIMIT = 0.01
-"""… and what is off by more than this is called so, ours as theirs."""
+"""Largest deviation from `LEFT` that is not reported, for Decant and the peer."""
 
 REST = 1.0
-"""When the density is looked at: the cup is tilted by 30° and nothing flows yet [s]."""
+"""Time at which the density is measured: the cup is tilted by 30° and nothing flows yet [s]."""
 
 FEWEST, MOST = 200, 50_000
 
 
 def standard_action(angular_velocity: float = 30 * DEG, hold_time: float = 2.0) -> Action:
-    """The lip is 110 mm above the receiver's rim and 40 mm behind its axis; no ramp, no return."""
+    """Return the action: the lip is 110 mm above the receiver's rim and 40 mm behind its axis; no ramp, no return."""
     return Action(
         angular_velocity=angular_velocity,
         x_offset=0.080,
@@ -62,42 +63,42 @@ def standard_action(angular_velocity: float = 30 * DEG, hold_time: float = 2.0) 
 
 
 def standard_task(particles: int, seed: int, *, frame_rate: float = 0.0, cohesion: float = 0.0) -> PourTask:
-    """The standard pour at the default θ but for N, and without surface tension, which the peer hasn't either."""
+    """Return the standard pour at the default θ except N, and without surface tension, which the peer lacks."""
     theta = SimulationParameters(particles=particles, cohesion=cohesion)
     return PourTask(SCENE, standard_action(), theta, seed, frame_rate=frame_rate)
 
 
 def short_task(particles: int) -> PourTask:
-    """The fastest pour there is: it compiles every kernel that a long one uses."""
+    """Return the fastest possible pour, which compiles every kernel that a long one uses."""
     theta = SimulationParameters(particles=particles)
     return PourTask(SCENE, standard_action(180 * DEG, 0.0), theta, 0, frame_rate=1.0)
 
 
 @cache
 def vessels() -> tuple[Vessel, Vessel]:
-    """Pourer and receiver."""
+    """Return pourer and receiver."""
     return build_vessel(SCENE.pourer), build_vessel(SCENE.receiver)
 
 
 @cache
 def motion() -> PourMotion:
-    """Motion of the pourer."""
+    """Return the motion of the pourer."""
     return plan_motion(SCENE, standard_action(), *vessels())
 
 
 def particle_spacing(particles: int) -> float:
-    """d = (V/N)^(1/3) [m]."""
+    """Return d = (V/N)^(1/3) [m]."""
     return spacing(SCENE.liquid.volume, particles)
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One standard pour and what it took.
+    """Figures of one standard pour.
 
     Attributes:
         cpu_s: CPU seconds of the steps, without set-up (vessels, lattice, kernels).
-        wall_s: from the task to the answer, set-up included [s].
-        iterations: passes over the density constraint, all steps together.
+        wall_s: time from the task to the outcome, including set-up [s].
+        iterations: passes over the density constraint, over all steps.
         left: fraction in the pourer at `TIMES`.
         density: ρ/ρ₀ well inside the liquid at `REST`, by Voronoi cells.
     """
@@ -114,13 +115,13 @@ def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float
     """Pour once.
 
     Args:
-        simulator: of this process.
+        simulator: simulator of this process.
         particles: N.
-        seed: of the initial positions.
+        seed: seed of the initial positions.
         cohesion: surface tension [N/m].
 
     Raises:
-        SystemExit: the outcome is invalid, so that its time means nothing.
+        SystemExit: the outcome is invalid, so its time is meaningless.
     """
     begun = time.perf_counter()
     run = simulator.simulate(standard_task(particles, seed, frame_rate=10.0, cohesion=cohesion))
@@ -130,7 +131,7 @@ def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float
         raise SystemExit(f"the standard pour with {particles} particles, seed {seed}, is invalid: {outcome.invalid}")
     frames = run.frames
     assert frames is not None
-    # The first frame that was simulated; before it the liquid is laid out level, and settles for a moment.
+    # The first simulated frame; before it the liquid is placed level, and settles briefly.
     first = int(np.argmax(frames.times >= max(REST, outcome.curve_times[1])))
     at_rest = frames.positions[first]
     left = 1.0 - np.interp(TIMES, outcome.curve_times, outcome.curve_poured)
@@ -145,7 +146,7 @@ def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float
 
 
 def iterations_of(outcome: PourOutcome) -> int:
-    """Density iterations of the pour just made: of the outcome, or of the engine where the outcome does not tell."""
+    """Return the density iterations of the last pour, from the outcome or, if it lacks them, from the engine."""
     told = getattr(outcome, "iterations", None)
     if told is not None:
         return int(told)
@@ -155,11 +156,11 @@ def iterations_of(outcome: PourOutcome) -> int:
 
 
 def in_frame(points: Floats, time_: float) -> Floats:
-    """World → frame of the pourer at a time [m].
+    """Transform points from the world to the frame of the pourer at a time [m].
 
     Args:
-        points: (N, 3).
-        time_: [s].
+        points: (N, 3), world [m].
+        time_: time [s].
     """
     from sim_engine.collision import rotations
 
@@ -169,15 +170,15 @@ def in_frame(points: Floats, time_: float) -> Floats:
 
 
 def density_inside(points: Floats, time_: float, particles: int) -> float:
-    """ρ/ρ₀ of the particles two spacings and more from the pourer's walls and from the surface.
+    """Return ρ/ρ₀ of the particles at least two spacings from the pourer's walls and from the surface.
 
     Args:
-        points: of all particles, (N, 3), world [m].
-        time_: before the outflow begins [s].
-        particles: N, which sets what each stands for.
+        points: all particles, (N, 3), world [m].
+        time_: time before the outflow begins [s].
+        particles: N, which sets the volume per particle.
 
     Returns:
-        Mean volume that a particle stands for over that of its Voronoi cell; nan if nobody is that far inside.
+        Mean volume per particle divided by that of its Voronoi cell; nan if no particle is that far inside.
     """
     from sim_engine.validation.hydrostatic_cases import INNER, mean_density
 
@@ -190,23 +191,23 @@ def density_inside(points: Floats, time_: float, particles: int) -> float:
 
 
 def left_in_pourer(points: Floats, time_: float, slack: float) -> float:
-    """Fraction of the particles within the pourer's cavity, up to its rim.
+    """Return the fraction of the particles within the pourer's cavity, up to its rim.
 
     Args:
         points: (N, 3), world [m].
-        time_: [s].
-        slack: that far into the wall counts as well [m].
+        time_: time [s].
+        slack: depth in the wall that counts as inside [m].
     """
     pourer = vessels()[0]
     return float(np.mean(_in_cup(in_frame(points, time_), pourer, POURER_RADIUS, slack)))
 
 
 def delivered(points: Floats, slack: float) -> float:
-    """Fraction of the particles within the receiver, half a spacing above its rim included.
+    """Return the fraction of the particles within the receiver or up to `slack` above its rim.
 
     Args:
         points: (N, 3), world [m].
-        slack: that far into the wall, and above the rim, counts as well [m].
+        slack: depth in the wall, and height above the rim, that count as inside [m].
     """
     receiver = vessels()[1]
     inside = _in_cup(points, receiver, RECEIVER_RADIUS, slack) | _in_cup(
@@ -222,10 +223,10 @@ def _in_cup(points: Floats, vessel: Vessel, radius: float, slack: float) -> NDAr
 
 
 def check_particles(particles: int) -> int:
-    """N if it can be simulated.
+    """Return N if it can be simulated.
 
     Raises:
-        SystemExit: with the bounds.
+        SystemExit: it cannot; the message has the limits.
     """
     if not FEWEST <= particles <= MOST:
         raise SystemExit(f"--particles {particles}: {FEWEST} to {MOST} can be simulated")

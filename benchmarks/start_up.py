@@ -1,10 +1,10 @@
-"""How long a fresh process takes to answer its first pour, and what it spends that on.
+"""Measure how long a new process takes to finish its first pour, by phase.
 
     python benchmarks/start_up.py [--particles 2000] [--repeats 3] [--core 1] [--json]
 
-The first process starts with an empty cache: it builds the vessels' grids and compiles the kernels. The others find
-what it left. Seconds of wall time from the start of the process to the answer; CPU seconds beside them, which other
-work on the machine can't spoil. Kernels: what the first pour took longer than the same pour made again.
+The first process starts with an empty cache: it builds the vessels' grids and compiles the kernels. The others use its
+cache. Figures are wall time in seconds from the start of the process to the outcome, and CPU seconds, which other load
+does not affect. Kernels: the first pour's time minus that of the same pour repeated.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 PHASES = ("interpreter", "imports", "engine", "vessels", "kernels", "pour")
-"""In the order of time: Python itself, packages, Taichi's start and the arrays, geometry and its checks, compiling or
-loading kernels, the pour."""
+"""Phases in order of time: Python itself, packages, Taichi's start and the arrays, geometry and its checks, compiling
+or loading kernels, the pour."""
 
 LIMIT, COLD_LIMIT = 3.0, 12.0
-"""A process shall answer within this, with a warm cache and with an empty one [s]."""
+"""Required time to the first outcome with a warm cache and with an empty one [s]."""
 
 
 def answer(particles: int, begun: float) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def answer(particles: int, begun: float) -> dict[str, Any]:
 
     Args:
         particles: N.
-        begun: `time.monotonic()` when the process was started, by its parent's clock [s].
+        begun: `time.monotonic()` at the process's start, by its parent's clock [s].
     """
     marks = [begun, time.monotonic()]
     from standard_pour import standard_task
@@ -62,7 +62,7 @@ def answer(particles: int, begun: float) -> dict[str, Any]:
 
 
 def summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Medians over some processes."""
+    """Return medians over some processes."""
     return {
         "answered_s": round(statistics.median(run["answered_s"] for run in runs), 2),
         "cpu_s": round(statistics.median(run["cpu_s"] for run in runs), 2),
@@ -75,10 +75,10 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--particles", type=int, default=2000)
-    parser.add_argument("--repeats", type=int, default=3, help="processes with a warm cache")
-    parser.add_argument("--core", type=int, help="which core to run on; unless given, the one with the least to do")
+    parser.add_argument("--repeats", type=int, default=3, help="number of processes with a warm cache")
+    parser.add_argument("--core", type=int, help="core to run on; default: the least busy one")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
-    parser.add_argument("--begun", type=float, help=argparse.SUPPRESS)  # this is a process that is measured
+    parser.add_argument("--begun", type=float, help=argparse.SUPPRESS)  # measured process
     options = parser.parse_args()
     if options.begun is not None:
         print(json.dumps(answer(options.particles, options.begun)))

@@ -1,9 +1,9 @@
-"""Answer the six questions of the study of hidden benches (docs/evidence/study-questions.md) by its finished cells.
+"""Answer the six questions of the study of hidden benches (docs/evidence/study-questions.md) from its finished cells.
 
     python benchmarks/study_questions.py [runs/study-benches] [--write]
 
-Every number is a bench's: the mean over its repetitions (and receivers) of differences paired by repetition. Their mean
-has a 95 % t interval over the benches. `--write` puts the table into docs/evidence/results.md.
+Each value belongs to a bench: the mean over its repetitions (and receivers) of differences paired by repetition. The
+mean over the benches has a 95 % t interval. `--write` puts the table into docs/evidence/results.md.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ PAGE = ROOT / "docs" / "evidence" / "results.md"
 BEGIN, END = "<!-- measured: hidden benches -->\n", "<!-- end of measured -->"
 STUDY = ROOT / "configs" / "studies" / "benches.yaml"
 NEAR = 0.005
-"""'Within half a point'; and by how much six active pours may be worse than twelve."""
+"""'Within half a point', and the largest excess error allowed for six active pours compared with twelve."""
 
 ByBench = dict[str, float]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """One question."""
+    """One question with its answer."""
 
     question: str
     by_bench: ByBench
@@ -52,7 +52,7 @@ class Answer:
     unit: str = "points"
 
     def row(self) -> str:
-        """Of the table."""
+        """Return the row of the table."""
         found = estimate(list(self.by_bench.values()))
         factor = 100.0 if self.unit == "points" else 1.0
         better = sum(value < 0.0 for value in self.by_bench.values())
@@ -62,7 +62,7 @@ class Answer:
 
 
 def calibrated(found: Gathered, levels: list[str], first: str, second: str) -> ByBench:
-    """Test discrepancy of one less that of another."""
+    """Return the test discrepancy of one calibration minus that of another."""
     a, b = tests_of(found, first), tests_of(found, second)
     return _by_bench(levels, {number: a[number] - b[number] for number in a.keys() & b.keys()})
 
@@ -75,7 +75,7 @@ def _by_bench(levels: list[str], differences: Mapping[int, float]) -> ByBench:
 def deployed(
     found: Gathered, levels: list[str], receivers: list[str], value: Callable[[Key], dict[int, float]]
 ) -> ByBench:
-    """A deployment's value for D3 less that for D2, by bench."""
+    """Return a deployment's value for D3 minus that for D2, by bench."""
     by_bench: ByBench = {}
     for level in levels:
         differences = []
@@ -88,7 +88,7 @@ def deployed(
 
 
 def answers(found: Gathered, levels: list[str], receivers: list[str]) -> list[Answer]:
-    """All six."""
+    """Return the answers to all six questions."""
 
     def below_zero(one: Estimate, _: ByBench) -> bool:
         return one.high < 0.0
@@ -130,7 +130,7 @@ def answers(found: Gathered, levels: list[str], receivers: list[str]) -> list[An
 
 
 def table(found: Gathered, levels: list[str], receivers: list[str]) -> str:
-    """Markdown: a row for every question, and what was run."""
+    """Return Markdown: one row per question, and the description of the runs."""
     rows = ["| question | difference, 95 % interval over benches | first better on | |", "|---|---|---|---|"]
     rows += [one.row() for one in answers(found, levels, receivers)]
     shares = {name: 100.0 * mean(list(tests_of(found, name).values())) for name in found.calibrated}
@@ -151,7 +151,7 @@ def table(found: Gathered, levels: list[str], receivers: list[str]) -> str:
 
 
 def main() -> None:
-    """Command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "runs" / "study-benches")
     parser.add_argument("--study", type=Path, default=STUDY)

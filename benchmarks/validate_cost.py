@@ -1,9 +1,9 @@
-"""What `decant validate` costs for every shipped file, in CPU seconds of fresh processes.
+"""Measure the CPU seconds of `decant validate` for every shipped file in new processes.
 
     python benchmarks/validate_cost.py [--repeats 5] [--json]
 
-User plus system time of the whole process, start and imports included: other work on the machine hardly spoils it.
-Bytecode and the grids of meshes are there: one run of each file before, not counted, sees to that.
+User plus system time of the complete process, including start and imports; other load hardly affects it. Bytecode and
+the grids of meshes are cached by one initial run per file, which is not counted.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from typing import Any
 from machine import ROOT, as_a_second_time, describe, say, show, single_threaded
 
 LIMIT = 2.0
-"""What the check of a shipped file may take [CPU s]."""
+"""Required time for the check of a shipped file [CPU s]."""
 
 FOLDERS = ("campaigns", "studies", "laboratories", "vessels")
 
 
 def cost(file: Path, environment: dict[str, str]) -> float:
-    """CPU seconds of one check.
+    """Return the CPU seconds of one check.
 
     Raises:
         SystemExit: the file was refused.
@@ -43,7 +43,7 @@ def cost(file: Path, environment: dict[str, str]) -> float:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--repeats", type=int, default=5, help="processes for each file")
+    parser.add_argument("--repeats", type=int, default=5, help="processes per file")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()
     if options.repeats < 1:

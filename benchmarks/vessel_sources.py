@@ -1,6 +1,6 @@
-"""How well `decant vessel` does: shipped vessels through each of its doors, with the errors of real tools.
+"""Measure the accuracy of `decant vessel`: shipped vessels from each vessel source, with the errors of real tools.
 
-Writes the table of docs/evidence/results.md. Run from the project's root: python benchmarks/vessel_doors.py
+Writes the table of docs/evidence/results.md. Run from the project's root: python benchmarks/vessel_sources.py
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ OFFSETS = {
     "bowl": (0.160, 0.083),
     "narrow": (0.095, 0.125),
 }
-"""x_offset [m] of a pour into each vessel from the beaker, and of one from it into the tumbler, at 60 deg/s: where the
-true vessel spills between a twentieth and two fifths, at the edge of missing, so that a wrong shape shows."""
+"""x_offset [m] of a pour into each vessel from the beaker, and of one from it into the tumbler, at 60 deg/s. The true
+vessel spills between a twentieth and two fifths there, close to missing, so a wrong shape changes the spillage."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One vessel through one door."""
+    """One vessel from one source."""
 
     vessel: str
-    door: str
+    source: str
     profile: float
     largest: float
     capacity: float
     spillage: tuple[float, float]
 
 
-def doors(of: Bench, folder: Path) -> dict[str, dict[str, Any]]:
-    """What is given for each."""
+def vessel_sources(of: Bench, folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the arguments of `decant vessel` by source."""
     tall, wall, floor = f"{of.height} m", f"{of.shape.wall} m", f"{of.shape.floor} m"
     outside = f"{of.height + of.shape.floor} m"
     diameters = of.diameters(6)
@@ -80,7 +80,7 @@ def doors(of: Bench, folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def profile_of(built: Vessel, z: np.ndarray) -> np.ndarray:
-    """Inner radius at heights above the inner floor, mean over the directions [m]."""
+    """Return the inner radius at heights above the inner floor, mean over the directions [m]."""
     found = [
         np.interp(z, curve[1:, 2] - built.inner_floor, np.hypot(curve[1:, 0], curve[1:, 1]))
         for curve in built.meridians[::12]
@@ -89,7 +89,7 @@ def profile_of(built: Vessel, z: np.ndarray) -> np.ndarray:
 
 
 def spillages(of: VesselSpec, name: str, simulator: PourSimulator, seeds: range) -> tuple[float, float]:
-    """Spilled share of the two pours with a vessel in place of the shipped one, mean over the seeds."""
+    """Return the spilled shares of the two pours with a replacement of the shipped vessel, mean over the seeds."""
     beaker, tumbler = (load_vessel(Path(f"configs/vessels/{other}.yaml")) for other in ("beaker", "tumbler"))
     found = []
     theta = SimulationParameters(particles=PARTICLES)
@@ -102,7 +102,7 @@ def spillages(of: VesselSpec, name: str, simulator: PourSimulator, seeds: range)
 
 
 def measure(seeds: int) -> list[Row]:
-    """All vessels through all doors."""
+    """Measure all vessels from all sources."""
     rows, simulator = [], PourSimulator()
     for name in OFFSETS:
         of = Bench(load_vessel(Path(f"configs/vessels/{name}.yaml")))
@@ -114,9 +114,9 @@ def measure(seeds: int) -> list[Row]:
         rows.append(Row(name, itself, 0.0, 0.0, 0.0, (again[0] - right[0], again[1] - right[1])))
         print(rows[-1], flush=True)
         with tempfile.TemporaryDirectory() as scratch:
-            for number, (door, sources) in enumerate(doors(of, Path(scratch)).items()):
+            for number, (source, arguments) in enumerate(vessel_sources(of, Path(scratch)).items()):
                 out = Path(scratch) / f"{number}.yaml"
-                vessel(out, **sources)
+                vessel(out, **arguments)
                 spec = load_vessel(out)
                 built = build_vessel(spec, use_cache=False)
                 off = np.abs(profile_of(built, z) - true)
@@ -124,7 +124,7 @@ def measure(seeds: int) -> list[Row]:
                 rows.append(
                     Row(
                         name,
-                        door,
+                        source,
                         float(off.mean()),
                         float(off.max()),
                         built.capacity / of.vessel.capacity - 1.0,
@@ -138,7 +138,7 @@ def measure(seeds: int) -> list[Row]:
 def main() -> None:
     """Measure, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=4, help="of each simulated pour")
+    parser.add_argument("--seeds", type=int, default=4, help="seeds per simulated pour")
     asked = parser.parse_args()
     lines = [
         "| vessel | source | profile, mean / largest [mm] | capacity [%] | spillage of two pours |",
@@ -146,14 +146,13 @@ def main() -> None:
     ]
     for row in measure(asked.seeds):
         lines.append(
-            f"| {row.vessel} | {row.door} | {1e3 * row.profile:.2f} / {1e3 * row.largest:.2f} | "
+            f"| {row.vessel} | {row.source} | {1e3 * row.profile:.2f} / {1e3 * row.largest:.2f} | "
             f"{100 * row.capacity:+.1f} | {row.spillage[0]:+.3f}, {row.spillage[1]:+.3f} |"
         )
     text = "\n".join(lines)
     page = PAGE.read_text()
-    PAGE.write_text(
-        re.sub(r"(<!-- doors -->\n).*?(<!-- end of doors -->)", lambda m: f"{m[1]}{text}\n{m[2]}", page, flags=re.S)
-    )
+    marked = r"(<!-- vessel sources -->\n).*?(<!-- end of vessel sources -->)"
+    PAGE.write_text(re.sub(marked, lambda m: f"{m[1]}{text}\n{m[2]}", page, flags=re.S))
 
 
 if __name__ == "__main__":
