@@ -25,6 +25,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +184,7 @@ def main() -> None:
             "settings": f"'{LEVEL}'; mean loss without scatter, 95 % bootstrap intervals over {asked.seeds} benches; "
             f"seeds from {asked.first}, not used for tuning",
             "date": machine["date"][:10],
+            "version": version("decant-pouring"),
         }
         RESULTS.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
 

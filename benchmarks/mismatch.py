@@ -2,7 +2,7 @@
 
     python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--settled 0.005] [--out FILE]
-                                  [--receivers] [--write] [--write-steep]
+                                  [--receivers] [--write] [--write-steep] [--budgets N=FILE ...]
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are stored in FILE, so an
@@ -28,6 +28,13 @@ valleys became oblique and space-filling continued until it found a valley; for 
 6. First pour at no mismatch: at most 0.05? Mean of 15 pours at none, small, moderate, large and contrary: at most 0.02,
    0.03, 0.06, 0.12, 0.15? Mean of pours 9 to 15 of `changed`: at most 0.30?
 7. Share of the pours inside their intervals of 50, 90 and 99 %: within 45 to 60, 85 to 95, and above 97?
+
+Questions on a learned emulator of the simulator, written before its runs. It cannot do better than unlimited exact
+simulations, so D3 runs with 9, 18, 37, 111 and 222 `--simulations` (levels `cliff, small`, `moderate` and `large`, seeds
+8120 to 8139; `--budgets` writes the table). An emulator is left out if both answers are no.
+
+8. Does the mean loss of 15 pours fall by more than 0.02 from 37 to 222? Yes if the paired 95 % interval is below -0.02.
+9. Do 37 simulations on two cores take more than 10 % of a campaign with pours of 60 s?
 """
 
 from __future__ import annotations
@@ -37,6 +44,7 @@ import json
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -72,6 +80,8 @@ GOOD, BAD = 0.01, 0.10
 SHARES = (0.5, 0.9, 0.99)
 """Probabilities of the intervals that are compared with the pours."""
 PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "results.md"
+BUDGET_LEVELS = ("cliff, small", "cliff, moderate", "cliff, large")
+"""Levels that are compared with other numbers of simulations."""
 FEWEST = 20
 """Minimum number of seeds of a row on the page."""
 
@@ -220,6 +230,7 @@ BEFORE = {
     "large": ("0.995", "0.339", "0.127"),
     "anti-correlated": ("–", "0.074", "–"),
     "changed": ("0.198", "0.156", "0.306"),
+    "four axes": ("–", "–", "–"),
 }
 """First pour, mean of 15 pours, and pours 9 to 15, of seeds from 3000 (anti-correlated: 2000 to 2008), from before
 simulated valleys became oblique."""
@@ -262,6 +273,45 @@ def interval_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
     return found
 
 
+def budget_rows(runs: list[dict[str, Any]], others: dict[int, list[dict[str, Any]]]) -> list[list[str]]:
+    """Return a row per number of simulations: mean loss of 15 pours by level, and the paired difference from `runs`.
+
+    A level is left out of a row unless all seeds of `runs` were run with that number.
+    """
+    usual = {(run["level"], run["seed"]): float(np.mean(run["poured"])) for run in runs}
+    found = []
+    for number, made in sorted(others.items()):
+        row = [str(number)]
+        for level in BUDGET_LEVELS:
+            lost = {run["seed"]: float(np.mean(run["poured"])) for run in made if run["level"] == level}
+            seeds = [seed for other, seed in usual if other == level]
+            if not set(seeds) <= set(lost):
+                row.append("–")
+                continue
+            differences = [lost[seed] - usual[level, seed] for seed in seeds]
+            mean, low, high = interval(differences)
+            compared = f" ({mean:+.3f}, {low:+.3f} … {high:+.3f})" if any(differences) else ""
+            row.append(f"{np.mean([lost[seed] for seed in seeds]):.3f}{compared}")
+        found.append(row)
+    return found
+
+
+def write_budgets(runs: list[dict[str, Any]], others: dict[int, list[dict[str, Any]]], seeds: int) -> None:
+    """Keep the table of runs with other numbers of simulations in docs/data/results.json."""
+    path, machine = PAGE.parents[1] / "data" / "results.json", describe()
+    results = json.loads(path.read_text(encoding="utf-8"))
+    results["budgets"] = results["cliffs"] | {
+        "head": ["simulations before the first pour", *(level.removeprefix("cliff, ") for level in BUDGET_LEVELS)],
+        "rows": budget_rows(runs, others),
+        "command": "python benchmarks/mismatch.py --out FILE --budgets 9=FILE … --first 8120 --seeds 20",
+        "settings": "mean loss of 15 pours; in brackets the difference from 37 simulations on the same benches, with "
+        f"its 95 % bootstrap interval over {seeds} seeds",
+        "date": machine["date"][:10],
+        "version": version("decant-pouring"),
+    }
+    path.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
 def write_steep(runs: list[dict[str, Any]]) -> None:
     """Store the runs in docs/data/steep-walls.json, and their tables in docs/data/results.json."""
     data, machine = PAGE.parents[1] / "data", describe()
@@ -271,6 +321,7 @@ def write_steep(runs: list[dict[str, Any]]) -> None:
         "command": "python benchmarks/mismatch.py --levels 'cliff, none' … --arms adaptive --first 8120 --seeds 20 "
         "--settled 0.005 --out FILE --write-steep",
         "date": machine["date"][:10],
+        "version": version("decant-pouring"),
     }
     sought = ["first pour", "mean of 15 pours", "pours 9 to 15"]
     head = ["simulator", "seeds", *(cell for one in sought for cell in (f"{one}, before", "now ± standard error"))]
@@ -323,6 +374,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/evidence/results.md")
     parser.add_argument("--write-steep", action="store_true", help="write the tables of the levels with steep walls")
+    parser.add_argument("--budgets", nargs="+", metavar="N=FILE", help="write the table of runs with N simulations")
     parser.add_argument("--receivers", action="store_true", help="three receivers in sequence on one bench")
     asked = parser.parse_args()
     if asked.receivers:
@@ -333,6 +385,11 @@ def main() -> None:
     if asked.out is not None and asked.out.exists():
         runs = [json.loads(line) for line in asked.out.read_text().splitlines()]
     known = {(run["arm"], run["level"], run["seed"]) for run in runs}
+    if asked.budgets:
+        pairs = [one.split("=", 1) for one in asked.budgets]
+        others = {int(n): [json.loads(line) for line in Path(path).read_text().splitlines()] for n, path in pairs}
+        write_budgets(runs, others, asked.seeds)
+        return
     if asked.write_steep:
         seeds = range(asked.first, asked.first + asked.seeds)
         write_steep([run for run in runs if run["level"] in CLIFFS and run["seed"] in seeds])

@@ -39,7 +39,7 @@ def main() -> None:
         axes.fill_between(pours, low, high, color=colour, alpha=0.2, linewidth=0.0)
         axes.plot(pours, losses.mean(axis=0), color=colour, label=name)
     axes.set_ylim(0.0, 1.0)
-    axes.legend(frameon=False, ncols=2)
+    axes.legend(frameon=False, ncols=len(SHOWN), loc="upper center", bbox_to_anchor=(0.5, -0.18))
     style.dress(axes, title=f"Loss against pours, {len(benches)} benches", x="pour", y="mean loss of the pour")
     style.save(figure, DOCS / "images" / "learning-curves.png")
 
