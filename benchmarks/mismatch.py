@@ -30,7 +30,7 @@ valleys became oblique and space-filling continued until it found a valley; for 
 7. Share of the pours inside their intervals of 50, 90 and 99 %: within 45 to 60, 85 to 95, and above 97?
 
 Questions on a learned emulator of the simulator, written before its runs. It cannot do better than unlimited exact
-simulations, so D3 runs with 9, 18, 37, 111 and 222 `--simulations` (levels `cliff, small`, `moderate` and `large`, seeds
+simulations, so D3 runs with 9, 18, 37, 111 and 222 `--simulations` (levels `cliff, small`, `moderate`, `large`; seeds
 8120 to 8139; `--budgets` writes the table). An emulator is left out if both answers are no.
 
 8. Does the mean loss of 15 pours fall by more than 0.02 from 37 to 222? Yes if the paired 95 % interval is below -0.02.
