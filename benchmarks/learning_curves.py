@@ -25,12 +25,11 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import describe, say, single_threaded
+from machine import TABLES, say, single_threaded, write_table
 from mismatch import campaign
 from mismatch_worlds import Valley
 from optimiser_problems import Floats
@@ -46,8 +45,7 @@ from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 
-DATA = Path(__file__).resolve().parents[1] / "docs" / "data"
-CURVES, RESULTS = DATA / "learning-curves.json", DATA / "results.json"
+CURVES = TABLES.with_name("learning-curves.json")
 LEVEL, PRIOR, BESIDE, SLOW, INITIAL = "cliff, moderate", 37, 2, 0.2, 4
 ARMS = ("rule of thumb", "random", "Sobol", "BoTorch qNEI", "D1", "D2", "D3")
 Ask = Callable[[int, list[Floats], list[float]], Floats]
@@ -174,19 +172,14 @@ def main() -> None:
     table = rows(kept, seeds)
     print("\n".join(" | ".join(row) for row in table))
     if asked.write:
-        machine = describe()
-        results = json.loads(RESULTS.read_text())
         head = ["", "simulations", "first pour", "mean of 15 pours", "pours 11 to 15", "best of 15"]
-        results["learning"] = results["cliffs"] | {
-            "head": head,
-            "rows": table,
-            "command": f"python benchmarks/learning_curves.py --seeds {asked.seeds} --write",
-            "settings": f"'{LEVEL}'; mean loss without scatter, 95 % bootstrap intervals over {asked.seeds} benches; "
-            f"seeds from {asked.first}, not used for tuning",
-            "date": machine["date"][:10],
-            "version": version("decant-pouring"),
-        }
-        RESULTS.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+        kept_runs = " --kept FILE" if asked.kept else ""
+        command = f"python benchmarks/learning_curves.py --first {asked.first} --seeds {asked.seeds}{kept_runs} --write"
+        settings = (
+            f"'{LEVEL}'; mean loss without scatter, 95 % bootstrap intervals over {asked.seeds} benches; seeds from "
+            f"{asked.first}, not used for tuning"
+        )
+        write_table("learning", head, table, command, settings)
 
 
 if __name__ == "__main__":

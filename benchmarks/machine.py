@@ -20,6 +20,8 @@ from actors.runtime.child_process import child_environment
 from sim_engine.resources import ENVIRONMENT_VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent
+TABLES = ROOT / "docs" / "data" / "results.json"
+"""Tables of the evidence pages; `docs/make_tables.py` puts them into the pages."""
 
 
 def describe() -> dict[str, Any]:
@@ -37,6 +39,30 @@ def describe() -> dict[str, Any]:
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "load_average": [round(load, 1) for load in psutil.getloadavg()],
     }
+
+
+def provenance(settings: str) -> dict[str, str]:
+    """Return settings, date, version and machine of a measurement, as they stand below a table."""
+    machine = describe()
+    where = f"{machine['processor'].split(' (')[0]}, {machine['cores']} shared cores, {machine['system']}"
+    return {
+        "settings": settings,
+        "date": machine["date"].split()[0],
+        "version": version("decant-pouring"),
+        "machine": f"{where}, Python {'.'.join(machine['python'].split('.')[:2])}",
+    }
+
+
+def write_table(name: str, head: list[str], rows: list[list[str]], command: str, settings: str) -> None:
+    """Store a table of the evidence pages, with the command, settings, date, version and machine of its figures.
+
+    Args:
+        name: its key; the page names it in `<!-- table: result-NAME -->`.
+        command: the command that repeats the measurement.
+    """
+    tables = json.loads(TABLES.read_text(encoding="utf-8"))
+    tables[name] = {"head": head, "rows": rows, "command": command, **provenance(settings)}
+    TABLES.write_text(json.dumps(tables, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 @functools.cache

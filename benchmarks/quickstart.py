@@ -38,13 +38,12 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-from machine import ROOT, describe, run_self, say
+from machine import ROOT, run_self, say, write_table
 from players import interval
 
 from actors.bench.ground_truth import draw_pose_error
@@ -70,7 +69,6 @@ from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask
 
 GOOD, BAD = 0.01, 0.10
-DATA = ROOT / "docs" / "data" / "results.json"
 TRUTH = ("liquid", "pose_error", "pose_noise")
 """Settings of a bench that are unknown to the simulator."""
 
@@ -349,22 +347,6 @@ def calibration_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return {"head": [*head, "receiver found at"], "rows": rows}
 
 
-def write(name: str, content: dict[str, Any], command: str, settings: str) -> None:
-    """Put a table into the data of the evidence pages."""
-    machine = describe()
-    data = json.loads(DATA.read_text(encoding="utf-8"))
-    where = f"{machine['processor'].split(' (')[0]}, {machine['cores']} shared cores, {machine['system']}"
-    data[name] = {
-        **content,
-        "command": command,
-        "settings": settings,
-        "date": machine["date"].split()[0],
-        "version": version("decant-pouring"),
-        "machine": f"{where}, Python {'.'.join(machine['python'].split('.')[:2])}",
-    }
-    DATA.write_text(json.dumps(data, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
 def _end_with_parent() -> None:
     """End this process when its parent has ended for any reason."""
     parent = os.getppid()
@@ -447,9 +429,11 @@ def main() -> None:
             seeds = f"--seeds {asked.seeds} --first {asked.first}"
             bench = "quickstart.yaml on a simulated bench with the ground truth of virtual.yaml"
             command = f"python benchmarks/quickstart.py {seeds}"
-            write("quickstart-calibration", calibration_table(chosen), f"{command} --calibration-only", bench)
+            shown = f"{command} --calibration-only"
+            write_table("quickstart-calibration", **calibration_table(chosen), command=shown, settings=bench)
             if poured:
-                write("quickstart", pours_table(poured), command, f"{bench}. {summary(poured)}")
+                settings = f"{bench}. {summary(poured)}"
+                write_table("quickstart", **pours_table(poured), command=command, settings=settings)
 
 
 if __name__ == "__main__":

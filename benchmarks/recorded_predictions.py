@@ -22,14 +22,13 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from itertools import permutations
 from statistics import fmean
 from typing import Any
 
 import numpy as np
 from calibration_power import CAMPAIGN, Answers, Kept, play, recorded
-from machine import ROOT, describe, run_self, say
+from machine import TABLES, describe, provenance, run_self, say, write_table
 
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.requests import Simulate, Simulated
@@ -42,8 +41,7 @@ from sim_engine.prediction_band import band
 PERTURBATION = 1e-7
 """Relative change of every recorded mass."""
 
-DATA = ROOT / "docs" / "data"
-PREDICTIONS = DATA / "recorded-predictions.json"
+PREDICTIONS = TABLES.with_name("recorded-predictions.json")
 GOAL = 0.02
 
 
@@ -139,26 +137,19 @@ def rounding_rows(found: Sequence[dict[str, Any]]) -> list[list[str]]:
 
 def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]], again: Sequence[dict[str, Any]]) -> None:
     """Write predictions and tables to docs/data."""
-    machine = describe()
-    where = f"{machine['processor'].split(' (')[0]}, {machine['cores']} shared cores, {machine['system']}"
-    common = {
-        "settings": f"recorded.yaml with the set of 5,000 particles, C4, {options.simulations} simulations of 1,000 "
-        f"particles, {options.draws} draws of the posterior for each prediction",
-        "date": machine["date"].split()[0],
-        "version": version("decant-pouring"),
-        "machine": f"{where}, Python {'.'.join(machine['python'].split('.')[:2])}",
-    }
+    settings = (
+        f"recorded.yaml with the set of 5,000 particles, C4, {options.simulations} simulations of 1,000 particles, "
+        f"{options.draws} draws of the posterior for each prediction"
+    )
     command = f"python benchmarks/recorded_predictions.py --simulations {options.simulations} --draws {options.draws}"
-    tables = json.loads((DATA / "results.json").read_text(encoding="utf-8"))
     head = ["seed", "test, 4 pours", "another receiver, 16 pours", "pours inside their 90 % intervals"]
     named = " ".join(map(str, sorted(seeds)))
-    tables["recorded"] = {"head": head, "rows": seed_rows(seeds), "command": f"{command} --seeds {named}", **common}
+    write_table("recorded", head, seed_rows(seeds), f"{command} --seeds {named}", settings)
     if len(again) > 1:
-        rows = rounding_rows(again)
         shown = f"{command} --seeds {options.seeds[0]} --perturbed {len(again) - 1}"
-        tables["rounding"] = {"head": ["", f"{len(again)} calibrations"], "rows": rows, "command": shown, **common}
-    (DATA / "results.json").write_text(json.dumps(tables, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    kept = {"command": command, **common, "seeds": {str(seed): one["pours"] for seed, one in sorted(seeds.items())}}
+        write_table("rounding", ["", f"{len(again)} calibrations"], rounding_rows(again), shown, settings)
+    predicted = {str(seed): one["pours"] for seed, one in sorted(seeds.items())}
+    kept = {"command": command, **provenance(settings), "seeds": predicted}
     PREDICTIONS.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

@@ -192,7 +192,7 @@ class ArmContract:
     def test_the_poses_it_reports_are_measured(self, bench: ArmBench) -> None:
         """A pour that is executed differently from the command is reported as executed."""
         if bench.disturb is None:
-            pytest.skip("ArmBench.disturb is missing: not checked is whether reported poses are measured or commanded")
+            pytest.skip("ArmBench.disturb is missing; not checked: whether reported poses are measured or commanded")
         before = self._poured(bench)
         self._to_start(bench)
         bench.disturb()
@@ -327,7 +327,7 @@ class ArmContract:
     def test_a_connection_lost_during_a_pour_is_an_error_and_the_arm_stands(self, bench: ArmBench) -> None:
         """The running call ends within the stated time; consent ends; after a new connection the arm returns home."""
         if bench.cut is None:
-            pytest.skip("ArmBench.cut is missing: not checked is what happens when the connection is lost")
+            pytest.skip("ArmBench.cut is missing; not checked: what happens when the connection is lost")
         home = self._home(bench)
         pouring = self._tilting(bench)
         bench.cut()
@@ -351,7 +351,7 @@ class ArmContract:
     def test_a_connection_lost_at_rest_is_an_error_of_the_next_call(self, bench: ArmBench) -> None:
         """No call reports success over a cut connection."""
         if bench.cut is None:
-            pytest.skip("ArmBench.cut is missing: not checked is what happens when the connection is lost")
+            pytest.skip("ArmBench.cut is missing; not checked: what happens when the connection is lost")
         bench.arm.connect()
         bench.arm.hands_in()
         bench.cut()
@@ -507,7 +507,7 @@ class ArmContract:
     @staticmethod
     def _needs_witness(bench: ArmBench, unchecked: str) -> None:
         if bench.true_poses is None:
-            pytest.skip(f"ArmBench.true_poses is missing: not checked is {unchecked}")
+            pytest.skip(f"ArmBench.true_poses is missing; not checked: {unchecked}")
 
     def _home(self, bench: ArmBench) -> FloatArray | None:
         """True pose of the pourer before the first motion, shape (7,); None without a witness."""

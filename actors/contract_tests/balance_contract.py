@@ -126,7 +126,7 @@ class BalanceContract:
     def test_a_tare_without_effect_is_an_error(self, bench: BalanceBench) -> None:
         """Balances may acknowledge commands without executing them; a pour would start from a wrong zero."""
         if bench.ignore_tare is None:
-            pytest.skip("BalanceBench.ignore_tare is missing: not checked is whether a tare without effect is an error")
+            pytest.skip("BalanceBench.ignore_tare is missing; not checked: whether a tare without effect is an error")
         bench.put(bench.load)
         bench.driver.weigh()
         bench.ignore_tare(True)
@@ -138,7 +138,7 @@ class BalanceContract:
     def test_a_tare_waits_for_rest(self, bench: BalanceBench) -> None:
         """A moving value is never taken for zero."""
         if bench.restless is None:
-            pytest.skip("BalanceBench.restless is missing: not checked is whether tare waits for rest")
+            pytest.skip("BalanceBench.restless is missing; not checked: whether tare waits for rest")
         bench.driver.weigh()
         bench.restless(True)
         try:
@@ -149,7 +149,7 @@ class BalanceContract:
     def test_a_moving_display_is_not_called_stable(self, bench: BalanceBench) -> None:
         """The operator reads the display during a pour, and records keep it."""
         if bench.restless is None:
-            pytest.skip("BalanceBench.restless is missing: not checked is whether a moving display is called stable")
+            pytest.skip("BalanceBench.restless is missing; not checked: whether a moving display is called stable")
         bench.driver.weigh()
         bench.restless(True)
         try:
@@ -247,7 +247,7 @@ class BalanceContract:
     def test_a_lost_connection_is_an_error_and_no_weight(self, bench: BalanceBench) -> None:
         """Calls end within the stated time, including the running one; the display does not keep the last weight."""
         if bench.unplug is None or bench.plug is None:
-            pytest.skip("BalanceBench.unplug or plug is missing: not checked is what a lost connection comes to")
+            pytest.skip("BalanceBench.unplug or plug is missing; not checked: what happens when the connection is lost")
         bench.driver.tare()
         bench.put(bench.load)
         bench.driver.weigh()

@@ -281,10 +281,10 @@ def test_an_arm_that_does_not_do_what_it_reports_is_found(
 def test_without_a_witness_the_contract_names_what_it_does_not_check() -> None:
     bench = replace(bench_of(Stand, witness=False), disturb=None, cut=None)
     for name, unchecked in [
-        (AS_REPORTED, "true_poses is missing: not checked is whether the arm moves as it reports"),
-        (MEASURED, "disturb is missing: not checked is whether reported poses are measured"),
-        (LOST, "cut is missing: not checked is what happens when the connection is lost"),
-        (LOST_AT_REST, "cut is missing: not checked is what happens when the connection is lost"),
+        (AS_REPORTED, "true_poses is missing; not checked: whether the arm moves as it reports"),
+        (MEASURED, "disturb is missing; not checked: whether reported poses are measured"),
+        (LOST, "cut is missing; not checked: what happens when the connection is lost"),
+        (LOST_AT_REST, "cut is missing; not checked: what happens when the connection is lost"),
     ]:
         with pytest.raises(pytest.skip.Exception, match=unchecked):
             getattr(ArmContract(), name)(bench)
