@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -111,3 +111,18 @@ def interval(values: list[float]) -> tuple[float, float, float]:
     draws = random.Random(0)
     means = sorted(float(np.mean(draws.choices(values, k=len(values)))) for _ in range(2000))
     return float(np.mean(values)), means[50], means[1949]
+
+
+def coverage(intervals: Sequence[Sequence[float]], share: float) -> tuple[float, float]:
+    """Return the share of losses inside their intervals, and the mean interval score (smaller is better).
+
+    Source: interval score, Gneiting & Raftery, JASA 2007, equation 43.
+
+    Args:
+        intervals: low end, high end and loss of each pour.
+        share: probability of the intervals.
+    """
+    low, high, lost = np.array(intervals).T
+    missed = np.maximum(low - lost, 0.0) + np.maximum(lost - high, 0.0)
+    score = high - low + 2.0 / (1.0 - share) * missed
+    return float(np.mean((low <= lost) & (lost <= high))), float(np.mean(score))

@@ -23,9 +23,11 @@ from orchestrator.results.summarise import summarise
 from orchestrator.run_service import planned
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
 from orchestrator.runs.stages import deployment_stages, prediction_stages
+from orchestrator.strategies.deployment import deployment_base
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
 from orchestrator.strategies.single_action import RepeatedSimulation
 from orchestrator.strategies.strategy import Progress, Strategy
 from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
@@ -232,6 +234,48 @@ def test_nine_pours_in_ten_lie_in_the_band_whatever_the_model_told(
     assert inside == pytest.approx(0.9) or high == 0.0
     assert high - low <= 2.0 * 1.645 * normal.stdev
     assert replace(predicted, band=(0.1, 0.2)).of_a_pour() == (0.1, 0.2)
+
+
+def poured(*losses: float | None) -> list[PourTrial]:
+    """Pours that were each predicted as 0.2 ± 0.05."""
+    predicted = Prediction(0.2, 0.03, 0.04)
+    return [PourTrial(i, (0.5,), {}, predicted, 0.04, cost=loss) for i, loss in enumerate(losses, start=1)]
+
+
+def test_intervals_become_as_wide_as_the_earlier_pours_deviated() -> None:
+    predicted = Prediction(0.3, 0.03, 0.04, (0.2, 0.45))
+    assert scaled_interval(predicted, poured(), 1.0) == (0.2, 0.45)
+    assert scaled_interval(predicted, poured(None), 1.0) == (0.2, 0.45)
+    exact = scaled_interval(predicted, poured(*[0.2] * 6), 1.0)
+    assert exact == pytest.approx((0.25, 0.375))
+    twice = scaled_interval(predicted, poured(0.1, 0.3), 1.0)
+    assert twice == pytest.approx((0.3 - 0.1 * math.sqrt(2.5), 0.3 + 0.15 * math.sqrt(2.5)))
+    # one pour far outside counts as three deviations; a loss is between 0 and the worst
+    assert scaled_interval(predicted, poured(0.9), 1.0) == scaled_interval(predicted, poured(0.36), 1.0)
+    assert scaled_interval(predicted, poured(*[0.9] * 9), 0.5) == (pytest.approx(0.02, abs=0.02), 0.5)
+
+
+def test_an_interval_that_begins_at_nothing_still_does() -> None:
+    predicted = Prediction(0.02, 0.01, 0.01, (0.0, 0.06))
+    assert scaled_interval(predicted, poured(*[0.2] * 6), 1.0) == (0.0, pytest.approx(0.03))
+
+
+def test_d3_reports_intervals_scaled_by_its_earlier_pours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same pours with and without: the first interval is equal, later ones have other widths."""
+
+    def pours() -> list[Any]:
+        strategy = Hybrid(deployment_plan(strategy="D3", pours=6, model="adaptive"), SCENE, THETA, 1)
+        StrategyHarness(narrow_cup).run(strategy)
+        result: Any = strategy.result()
+        return list(result.pours)
+
+    scaled = pours()
+    monkeypatch.setattr(deployment_base, "scaled_interval", lambda prediction, *_: prediction.of_a_pour())
+    plain = pours()
+    assert [(a.loss, a.predicted) for a in scaled] == [(a.loss, a.predicted) for a in plain]
+    intervals = [[pour.predicted_interval for pour in some] for some in (scaled, plain)]
+    assert intervals[0][0] == intervals[1][0]
+    assert any(a != b for a, b in zip(*intervals, strict=True))
 
 
 def test_the_line_of_a_pour_says_both() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Generic, TypeVar, cast
 
 from actors.optimizer.questions import (
@@ -39,6 +40,7 @@ from orchestrator.strategies.deployment.real_pours import (
     expecting,
     point_of,
     prior_pours,
+    scaled_interval,
     trust,
 )
 from orchestrator.strategies.deployment.safe_window import WindowFound
@@ -228,12 +230,10 @@ class Deployment(ABC, Generic[S]):
         known = None
         if suggestion.means and not self._scalarization.exploring:
             noise = suggestion.noises[0] if suggestion.noises else None
-            known = Prediction(
-                suggestion.means[0],
-                suggestion.deviations[0],
-                self._scatter(suggestion, noise),
-                suggestion.bands[0] if suggestion.bands else None,
-            )
+            known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise))
+            if suggestion.bands:
+                predicted = replace(known, band=suggestion.bands[0])
+                known = replace(predicted, band=scaled_interval(predicted, self._pours, self._costing.worst))
         self._pour(suggestion.points[0], known)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:

@@ -3,6 +3,7 @@
 - `PourTrial` is a pour with its prediction and outcome; `PourRow` is its form in results.
 - `prior_pours` converts pours from before the campaign.
 - `trust` compares the first pours with their predictions.
+- `scaled_interval` corrects the width of a prediction interval by the deviations of earlier pours.
 
 The module requests no pours.
 """
@@ -30,6 +31,12 @@ from sim_engine.search_space import Space
 TRUST_POURS = 5
 TRUST_LIMIT = 3.0
 """Mean |z| of the first pours above which the predictions are reported as unreliable."""
+
+PRIOR_POURS = 2.0
+"""Number of pours with the predicted deviation that `scaled_interval` adds to those made."""
+
+LARGEST_Z = 3.0
+"""Largest |z| that counts in `scaled_interval`: one pour outside does not make all later intervals useless."""
 
 
 Status = Literal["pouring", "weighed", "refused", "failed", "added"]
@@ -203,15 +210,40 @@ def point_of(action: Action, actions: Space) -> Point:
     return tuple(min(max(float(u), 0.0), 1.0) for u in unit)
 
 
+def scaled_interval(prediction: Prediction, earlier: Sequence[PourTrial], worst: float) -> tuple[float, float]:
+    """The prediction interval of a pour, scaled by the deviations of the campaign's earlier pours.
+
+    The factor is the root mean square of their z, (loss − predicted mean) / predicted standard deviation (of a single
+    pour). It begins at 1 and tends to the measured value as pours are made. An interval that begins at 0 still does.
+
+    Args:
+        prediction: prediction of the pour, with its interval.
+        earlier: pours with their predictions; those without an outcome do not count.
+        worst: largest possible loss.
+    """
+    low, high = prediction.of_a_pour()
+    squares = [min(abs(z), LARGEST_Z) ** 2 for z in _z_scores(earlier)]
+    factor = math.sqrt((PRIOR_POURS + sum(squares)) / (PRIOR_POURS + len(squares)))
+    if low <= 0.0:
+        return 0.0, min(factor * high, worst)
+    mean = min(max(prediction.mean, low), high)
+    return max(mean - factor * (mean - low), 0.0), min(mean + factor * (high - mean), worst)
+
+
+def _z_scores(pours: Sequence[PourTrial]) -> list[float]:
+    """Loss minus predicted mean of the pours that have both, in standard deviations of a single pour."""
+    return [
+        (trial.cost - trial.predicted.mean) / max(math.hypot(trial.predicted.deviation, trial.noise), 1e-9)
+        for trial in pours
+        if trial.predicted is not None and trial.cost is not None
+    ]
+
+
 def trust(weighed: Sequence[PourTrial]) -> PredictionCheck:
     """Compare the first pours with their predictions, in predicted standard deviations (noise included).
 
     An inaccurate simulator makes D3 worse than no prior at all. The user is therefore warned.
     """
-    scores = []
-    for trial in weighed[:TRUST_POURS]:
-        if trial.predicted is not None and trial.cost is not None:
-            spread = math.hypot(trial.predicted.deviation, trial.noise)
-            scores.append((trial.cost - trial.predicted.mean) / max(spread, 1e-9))
+    scores = _z_scores(weighed[:TRUST_POURS])
     mean = sum(map(abs, scores)) / len(scores) if scores else None
     return PredictionCheck(z_scores=tuple(scores), alarm=len(scores) >= 3 and mean is not None and mean > TRUST_LIMIT)
