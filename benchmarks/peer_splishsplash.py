@@ -6,9 +6,10 @@ Runs in the peer's own environment (`peer.py` creates it and writes the job), so
 Settings: support 2d, CFL factor 1 (0.4 d per step), steps up to 4 ms, density error 0.1 %, viscosity 1e-6 m²/s, no
 surface tension. Spilled particles are frozen, because their speed would otherwise determine the time step.
 
-A job may specify another viscosity, which is then implicit and also acts on walls.
+A job may specify another viscosity, which is then implicit and also acts on walls, and walls of particles instead of
+volume maps, with steps up to 2 ms.
 
-Source: Bender & Koschier 2015 (DFSPH); Bender et al. 2019 (volume maps).
+Source: Bender & Koschier 2015 (DFSPH); Bender et al. 2019 (volume maps); Akinci et al. 2012 (walls of particles).
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from typing import Any
 import numpy as np
 import pysplishsplash as sph
 
-DFSPH, VOLUME_MAPS = 4, 2
-FIRST_STEP, LONGEST_STEP = 5e-4, 4e-3
+DFSPH, PARTICLE_WALLS, VOLUME_MAPS = 4, 0, 2
+FIRST_STEP, LONGEST_STEP, LONGEST_BY_PARTICLES = 5e-4, 4e-3, 2e-3
 MAP_RESOLUTION = [40, 40, 40]
 WEILER = 6
 """Implicit viscosity of Weiler et al. 2018, for jobs with a kinematic viscosity [m²/s]."""
@@ -34,7 +35,7 @@ FIXED = sph.ParticleState(2)
 
 def scene(job: dict[str, Any]) -> dict[str, Any]:
     """Return the scene file's content. The liquid is a block of 2 × 2 × N/4, then moved to the job's positions."""
-    d = 2.0 * job["radius"]
+    d, particle_walls = 2.0 * job["radius"], bool(job.get("particle_walls"))
 
     def body(mesh: str, at: list[float], moves: bool) -> dict[str, Any]:
         return {
@@ -48,19 +49,20 @@ def scene(job: dict[str, Any]) -> dict[str, Any]:
             "isWall": False,
             "mapInvert": False,
             "mapResolution": MAP_RESOLUTION,
+            "samplingMode": 0,
         }
 
     return {
         "Configuration": {
             "particleRadius": job["radius"],
             "simulationMethod": DFSPH,
-            "boundaryHandlingMethod": VOLUME_MAPS,
+            "boundaryHandlingMethod": PARTICLE_WALLS if particle_walls else VOLUME_MAPS,
             "gravitation": [0, 0, -9.81],
             "timeStepSize": FIRST_STEP,
             "cflMethod": 1,
             "cflFactor": 1.0,
             "cflMinTimeStepSize": 1e-5,
-            "cflMaxTimeStepSize": LONGEST_STEP,
+            "cflMaxTimeStepSize": LONGEST_BY_PARTICLES if particle_walls else LONGEST_STEP,
             "enableZSort": True,
             "stopAt": -1.0,
             "DFSPH": {

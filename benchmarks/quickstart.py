@@ -13,9 +13,10 @@ comparison continues.
 - `--random` pours this number of random actions of the deployment on the bench, drawn with the seed `--first`.
 - `--plans` pours this number of plans of the uncalibrated simulator.
 - With `--seeds 0` only `--random` and `--plans` are done.
+- `--arms "all pours"` makes 15 pours per seed and does not stop before, for the coverage of the prediction intervals.
 - `--write` makes no runs; it writes the tables of stored runs to docs/data/results.json, for docs/make_tables.py.
 
-The other arms change the program, for this benchmark only: there are no such settings.
+The arm `look-ahead` changes the program, for this benchmark only: there is no such setting.
 
 Questions, fixed before the first run on seeds from 401 on; seeds below 400 are for tuning or were used before:
 
@@ -23,6 +24,8 @@ Questions, fixed before the first run on seeds from 401 on; seeds below 400 are 
 2. Does the action planned by the uncalibrated simulator lose more than 5 % on the bench?
 3. Does calibration halve the mean error on the test pours, on at least 9 of 10 seeds?
 4. Is no pour above 10 % after the first below 1 %? Is the median number of pours until it stops four or fewer?
+5. (`all pours`.) Are 85 to 95 % of at least 300 pours in their 90 % intervals? Is the mean interval score better than
+   that of intervals that are not scaled by a campaign's earlier pours?
 """
 
 from __future__ import annotations
@@ -35,16 +38,17 @@ import os
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from machine import ROOT, run_self, say, write_table
-from players import interval
+from players import coverage, interval
 
 from actors.bench.ground_truth import draw_pose_error
 from actors.optimizer.questions import ModelDiscrepancy
@@ -52,6 +56,7 @@ from actors.simulators.job_runner import Simulator, pour_simulator
 from actors.simulators.local_worker import ThreadWorker
 from actors.simulators.pool import WorkerPool
 from orchestrator.journal.codec import digest, from_json, to_json
+from orchestrator.requests import Prediction
 from orchestrator.runs.stages import (
     EVALUATION,
     StageDefinition,
@@ -62,10 +67,12 @@ from orchestrator.runs.stages import (
 from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan
-from orchestrator.strategies.deployment import d3
+from orchestrator.strategies.deployment import d3, deployment_base
+from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome, SimulatedPour
+from sim_engine.prediction_band import LEVEL
 from sim_engine.scene import PourTask
 
 GOOD, BAD = 0.01, 0.10
@@ -78,17 +85,28 @@ PLANNED = 12
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 
-def _with_lookahead() -> None:
+def _with_lookahead(content: dict[str, Any]) -> None:
     def discrepancy(*args: Any, **changes: Any) -> ModelDiscrepancy:
         return ModelDiscrepancy(*args, **{**changes, "lookahead": True})
 
     vars(d3).update(ModelDiscrepancy=discrepancy)
 
 
-ARMS: dict[str, Callable[[], None]] = {
-    "shipped": lambda: None,
+def _with_all_pours(content: dict[str, Any]) -> None:
+    rules = ("stop", "good_enough")
+    kept = {key: value for key, value in content["deployment"].items() if key not in rules}
+    content["deployment"] = kept | {"pours": ALL_POURS}
+
+
+ALL_POURS = 15
+"""Number of pours per seed of the arm `all pours`."""
+
+ARMS: dict[str, Callable[[dict[str, Any]], None]] = {
+    "shipped": lambda content: None,
     "look-ahead": _with_lookahead,
+    "all pours": _with_all_pours,
 }
+"""What each arm changes in the content of the campaign, or in the program."""
 
 
 class KeptPours(WorkerPool):
@@ -120,10 +138,20 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
     from orchestrator.results.stage_views import deployments_of, evaluation_of, theta_of
     from orchestrator.run_service import RunRequest, RunResources, RunService, task_request
 
-    ARMS[arm]()
     pool = kept_pours(seed, into)
-    with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
-        campaign = build_campaign(on_numbers(seed, laboratory, folder), folder)
+    unscaled: list[tuple[float, float]] = []
+
+    def scale(prediction: Prediction, earlier: Sequence[PourTrial], worst: float) -> tuple[float, float]:
+        unscaled.append(prediction.of_a_pour())
+        return scaled_interval(prediction, earlier, worst)
+
+    with (
+        tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder,
+        patch.object(deployment_base, "scaled_interval", scale),
+    ):
+        content = on_numbers(seed, laboratory, folder)
+        ARMS[arm](content)
+        campaign = build_campaign(content, folder)
         assert campaign.deployment is not None
         assert campaign.calibration is not None
         request = task_request(campaign)
@@ -150,9 +178,12 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
                     "at": [round(u, 4) for u in actions.encode(pour.action_si)],
                     "loss": pour.loss,
                     "predicted": pour.predicted,
+                    "deviation": pour.predicted_deviation,
+                    "scatter": pour.predicted_scatter,
                     "band": pour.predicted_interval,
+                    "unscaled": band,
                 }
-                for pour in found.pours
+                for pour, band in zip(found.pours, unscaled, strict=False)
                 if pour.status == "weighed" and pour.loss is not None
             ],
             "recommended": None if known is None else [round(u, 4) for u in actions.encode(known.action_si)],
@@ -304,6 +335,24 @@ def pours_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return {"head": [*head, "why it ended"], "rows": rows}
 
 
+def coverage_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return head and rows: share of the pours in their 90 % intervals, and the mean interval score."""
+    parts = {
+        "first pours": [run["pours"][0] for run in runs],
+        "all others": [pour for run in runs for pour in run["pours"][1:]],
+        "all": [pour for run in runs for pour in run["pours"]],
+    }
+    rows = []
+    for name, pours in parts.items():
+        cells = []
+        for key in ("band", "unscaled"):
+            inside, score = coverage([(*pour[key], pour["loss"]) for pour in pours], LEVEL)
+            cells += [f"{100 * inside:.0f} %", f"{score:.4f}"]
+        rows.append([name, str(len(pours)), *cells])
+    head = ["pours", "number", "in their 90 % intervals", "interval score", "not scaled by earlier pours"]
+    return {"head": [*head, "interval score"], "rows": rows}
+
+
 def summary(runs: list[dict[str, Any]]) -> str:
     """Return the summary over all seeds."""
     found = [figures(run) for run in runs]
@@ -425,10 +474,15 @@ def main() -> None:
         poured = [run for run in chosen if "pours" in run]
         if poured:
             print(f"{arm}\n\n{table(poured)}\n")
+        seeds = f"--seeds {asked.seeds} --first {asked.first}"
+        bench = "quickstart.yaml on a simulated bench with the ground truth of virtual.yaml"
+        command = f"python benchmarks/quickstart.py {seeds}"
+        if asked.write and poured and arm == "all pours":
+            settings = f"{bench}; {ALL_POURS} pours per seed"
+            write_table(
+                "quickstart-coverage", **coverage_table(poured), command=f"{command} --arms '{arm}'", settings=settings
+            )
         if asked.write and arm == "shipped":
-            seeds = f"--seeds {asked.seeds} --first {asked.first}"
-            bench = "quickstart.yaml on a simulated bench with the ground truth of virtual.yaml"
-            command = f"python benchmarks/quickstart.py {seeds}"
             shown = f"{command} --calibration-only"
             write_table("quickstart-calibration", **calibration_table(chosen), command=shown, settings=bench)
             if poured:

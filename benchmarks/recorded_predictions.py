@@ -12,7 +12,8 @@ up or down. Rounding on another processor changes results by less. The output re
 differ, and how many predictions lie in each other's intervals.
 
 Each calibration runs in its own process and is stored in the cache directory, so an interrupted comparison continues.
-`--write` makes no calibrations; it writes the stored ones to docs/data.
+`--write` makes no calibrations; it writes the stored ones to docs/data. Seeds that are already there stay, if they were
+measured with the same settings.
 """
 
 from __future__ import annotations
@@ -142,6 +143,10 @@ def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]], again: 
         f"{options.draws} draws of the posterior for each prediction"
     )
     command = f"python benchmarks/recorded_predictions.py --simulations {options.simulations} --draws {options.draws}"
+    kept = json.loads(PREDICTIONS.read_text(encoding="utf-8"))
+    if kept["settings"] == settings:
+        earlier = {int(seed): {"pours": pours} for seed, pours in kept["seeds"].items()}
+        seeds = {**earlier, **seeds}
     head = ["seed", "test, 4 pours", "another receiver, 16 pours", "pours inside their 90 % intervals"]
     named = " ".join(map(str, sorted(seeds)))
     write_table("recorded", head, seed_rows(seeds), f"{command} --seeds {named}", settings)

@@ -1,9 +1,10 @@
 """Answer the six questions of the study of hidden benches (docs/evidence/study-questions.md) from its finished cells.
 
-    python benchmarks/study_questions.py [runs/study-benches] [--write]
+    python benchmarks/study_questions.py [runs/study-benches] [--write] [--intervals]
 
 Each value belongs to a bench: the mean over its repetitions (and receivers) of differences paired by repetition. The
-mean over the benches has a 95 % t interval. `--write` puts the table into docs/evidence/results.md.
+mean over the benches has a 95 % t interval. `--write` puts the table into docs/evidence/results.md. `--intervals` only
+counts the pours of D3 in their 90 % intervals; with `--write` it stores this table in docs/data/results.json.
 """
 
 from __future__ import annotations
@@ -14,11 +15,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from machine import ROOT
+from machine import ROOT, write_table
+from players import coverage
 
 from orchestrator.cli.study_command import read_study
+from orchestrator.results.stage_views import deployments_of
 from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
-from orchestrator.study.study_folder import finished_results
+from orchestrator.study.study_folder import CellResult, finished_results
 from orchestrator.study.study_plan import cells_of
 from orchestrator.study.study_statistics import (
     LEVEL,
@@ -32,6 +35,7 @@ from orchestrator.study.study_statistics import (
     running_least,
     tests_of,
 )
+from sim_engine.prediction_band import LEVEL as INTERVAL
 
 PAGE = ROOT / "docs" / "evidence" / "results.md"
 BEGIN, END = "<!-- measured: hidden benches -->\n", "<!-- end of measured -->"
@@ -150,15 +154,46 @@ def table(found: Gathered, levels: list[str], receivers: list[str]) -> str:
     )
 
 
+def interval_rows(results: Mapping[str, CellResult]) -> list[list[str]]:
+    """Return rows: share of D3's pours in their 90 % intervals, and the mean interval score."""
+    rows = []
+    for cell, one in results.items():
+        if cell.startswith("deployment.") and "D3" in cell.split("."):
+            for deployed in deployments_of(one.results).values():
+                known = [(pour.predicted_interval, pour.loss) for pour in deployed.pours]
+                rows.append([(*ends, loss) for ends, loss in known if ends is not None and loss is not None])
+    parts = {
+        "first pours": [pours[0] for pours in rows if pours],
+        "all others": [pour for pours in rows for pour in pours[1:]],
+        "all": [pour for pours in rows for pour in pours],
+    }
+    shown = []
+    for name, pours in parts.items():
+        inside, score = coverage(pours, INTERVAL)
+        shown.append([name, str(len(pours)), f"{100 * inside:.0f} %", f"{score:.4f}"])
+    return shown
+
+
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "runs" / "study-benches")
     parser.add_argument("--study", type=Path, default=STUDY)
     parser.add_argument("--write", action="store_true", help="write the table into docs/evidence/results.md")
+    parser.add_argument("--intervals", action="store_true", help="count the pours of D3 in their 90 %% intervals")
     asked = parser.parse_args()
     study = read_study(asked.study)
-    found = gather(study, finished_results(asked.folder, cells_of(study)))
+    results = finished_results(asked.folder, cells_of(study))
+    if asked.intervals:
+        rows = interval_rows(results)
+        for row in rows:
+            print(" | ".join(row))
+        if asked.write:
+            head = ["pours", "number", "in their 90 % intervals", "interval score"]
+            command = f"python benchmarks/study_questions.py --study {asked.study} --intervals"
+            write_table("study-intervals", head, rows, command, f"D3 of {asked.study}")
+        return
+    found = gather(study, results)
     if not (found.finals and {"C4", "C4-active", UNCALIBRATED, RANDOM} <= found.calibrated.keys()):
         parser.error(f"{asked.folder}: too few cells are finished; first: decant study run {asked.study}")
     receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})

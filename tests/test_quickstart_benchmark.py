@@ -65,6 +65,30 @@ def test_the_table_says_what_was_asked(quickstart: ModuleType) -> None:
     assert "3 of 4 pours (75 %)" in quickstart.summary([run_of(0.02, 0.04, 0.03, 0.005, recommended=0)])
 
 
+def test_coverage_counts_pours_with_and_without_scaled_intervals(quickstart: ModuleType) -> None:
+    runs = [run_of(0.02, 0.01, 0.04, recommended=0), run_of(0.5, 0.02, recommended=0)]
+    for run in runs:
+        for pour in run["pours"]:
+            pour["unscaled"] = [0.0, 1.0]
+    rows = quickstart.coverage_table(runs)["rows"]
+    # the score of an interval is its width, and 20 times the distance of a loss outside
+    assert rows == [
+        ["first pours", "2", "50 %", "4.7250", "100 %", "1.0000"],
+        ["all others", "3", "67 %", "0.0917", "100 %", "1.0000"],
+        ["all", "5", "60 %", "1.9450", "100 %", "1.0000"],
+    ]
+
+
+def test_the_arm_of_all_pours_does_not_stop(quickstart: ModuleType, tmp_path: Path) -> None:
+    from decant.running import build_campaign
+
+    content = quickstart.on_numbers(3, quickstart.ROOT / "configs" / "laboratories" / "twin.yaml", str(tmp_path))
+    quickstart.ARMS["all pours"](content)
+    deployment = build_campaign(content, tmp_path).deployment
+    assert deployment is not None
+    assert (deployment.settings.pours, deployment.settings.stop, deployment.settings.good_enough) == (15, None, None)
+
+
 def test_a_seed_counts_as_halved_by_its_error_on_the_test_pours(quickstart: ModuleType) -> None:
     theta = {"friction": 0.3, "receiver_x": 0.0132}
     runs = [

@@ -257,7 +257,7 @@ def test_intervals_become_as_wide_as_the_earlier_pours_deviated() -> None:
 
 def test_an_interval_that_begins_at_nothing_still_does() -> None:
     predicted = Prediction(0.02, 0.01, 0.01, (0.0, 0.06))
-    assert scaled_interval(predicted, poured(*[0.2] * 6), 1.0) == (0.0, pytest.approx(0.03))
+    assert scaled_interval(predicted, poured(*[0.2] * 6), 1.0) == (0.0, pytest.approx(0.04))
 
 
 def test_d3_reports_intervals_scaled_by_its_earlier_pours(monkeypatch: pytest.MonkeyPatch) -> None:

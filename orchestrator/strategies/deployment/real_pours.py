@@ -224,10 +224,9 @@ def scaled_interval(prediction: Prediction, earlier: Sequence[PourTrial], worst:
     low, high = prediction.of_a_pour()
     squares = [min(abs(z), LARGEST_Z) ** 2 for z in _z_scores(earlier)]
     factor = math.sqrt((PRIOR_POURS + sum(squares)) / (PRIOR_POURS + len(squares)))
-    if low <= 0.0:
-        return 0.0, min(factor * high, worst)
     mean = min(max(prediction.mean, low), high)
-    return max(mean - factor * (mean - low), 0.0), min(mean + factor * (high - mean), worst)
+    begin = 0.0 if low <= 0.0 else max(mean - factor * (mean - low), 0.0)
+    return begin, min(mean + factor * (high - mean), worst)
 
 
 def _z_scores(pours: Sequence[PourTrial]) -> list[float]:
