@@ -2,7 +2,7 @@
 
     python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--settled 0.005] [--out FILE]
-                                  [--receivers] [--write] [--write-steep] [--budgets N=FILE ...]
+                                  [--receivers] [--write] [--write-steep [--before FILE]] [--budgets N=FILE ...]
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are stored in FILE, so an
@@ -240,33 +240,22 @@ def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
     return "\n".join(lines)
 
 
-BEFORE = {
-    "none": ("0.007", "0.000", "0.000"),
-    "small": ("0.198", "0.014", "0.000"),
-    "moderate": ("0.632", "0.113", "0.004"),
-    "large": ("0.995", "0.339", "0.127"),
-    "anti-correlated": ("–", "0.074", "–"),
-    "changed": ("0.198", "0.156", "0.306"),
-    "four axes": ("–", "–", "–"),
-}
-"""First pour, mean of 15 pours, and pours 9 to 15, of seeds from 3000 (anti-correlated: 2000 to 2008), from before
-simulated valleys became oblique."""
-
-
-def steep_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
-    """Return a row per level with steep walls: earlier figures (other seeds) and current ones, with standard errors."""
+def steep_rows(runs: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[list[str]]:
+    """Return a row per level with steep walls: means with standard errors of an earlier version and of this one."""
     found = []
-    for level, earlier in BEFORE.items():
-        poured = np.array([run["poured"] for run in runs if run["level"] == f"cliff, {level}"])
-        if len(poured) == 0:
-            found.append([level, "0", earlier[0], "–", earlier[1], "–", earlier[2], "–"])
-        else:
-            now = []
-            for values in (poured[:, 0], poured.mean(axis=1), poured[:, CHANGED_AFTER:].mean(axis=1)):
-                error = float(values.std(ddof=1)) / len(values) ** 0.5
-                now.append(f"{values.mean():.3f} ± {error:.3f}")
-            pairs = zip(earlier, now, strict=True)
-            found.append([level, str(len(poured)), *(cell for pair in pairs for cell in pair)])
+    for level in CLIFFS:
+        cells: list[list[str]] = []
+        for some in (before, runs):
+            poured = np.array([run["poured"] for run in some if run["level"] == level])
+            cells.append([])
+            for part in (slice(0, 1), slice(None), slice(CHANGED_AFTER, None)):
+                values = poured[:, part].mean(axis=1) if len(poured) else np.empty(0)
+                error = float(values.std(ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 0.0
+                cells[-1].append(f"{values.mean():.3f} ± {error:.3f}" if len(values) else "–")
+        if cells[1] != ["–"] * 3:
+            number = sum(run["level"] == level for run in runs)
+            pairs = zip(*cells, strict=True)
+            found.append([level.removeprefix("cliff, "), str(number), *(cell for pair in pairs for cell in pair)])
     return found
 
 
@@ -322,22 +311,21 @@ def write_budgets(runs: list[dict[str, Any]], others: dict[int, list[dict[str, A
     write_table("budgets", head, budget_rows(runs, others), command, settings)
 
 
-def write_steep(runs: list[dict[str, Any]]) -> None:
+def write_steep(runs: list[dict[str, Any]], before: list[dict[str, Any]]) -> None:
     """Store the runs in docs/data/steep-walls.json, and their two tables."""
     kept = TABLES.with_name("steep-walls.json")
-    kept.write_text(json.dumps({"machine": describe(), "runs": rounded(runs)}) + "\n")
+    kept.write_text(json.dumps({"machine": describe(), "runs": rounded(runs), "before": rounded(before)}) + "\n")
     command = (
         "python benchmarks/mismatch.py --levels 'cliff, none' … --arms adaptive --first 8120 --seeds 20 --settled "
-        "0.005 --out FILE --write-steep"
+        "0.005 --out FILE --before FILE --write-steep"
     )
     sought = ["first pour", "mean of 15 pours", "pours 9 to 15"]
-    head = ["simulator", "seeds", *(cell for one in sought for cell in (f"{one}, before", "now ± standard error"))]
+    head = ["simulator", "seeds", *(cell for one in sought for cell in (f"{one}, version 0.2", "now"))]
     settings = (
-        "37 simulations, 15 pours, two simulations next to each; loss without scatter; a campaign ends after three "
-        "pours below 0.5 %; before: seeds from 3000 (anti-correlated: from 2000), now: seeds from 8120, not used for "
-        "tuning"
+        "37 simulations, 15 pours, two simulations next to each; loss without scatter, ± standard error; a campaign "
+        "ends after three pours below 0.5 %; seeds not used for tuning"
     )
-    write_table("cliffs", head, steep_rows(runs), command, settings)
+    write_table("cliffs", head, steep_rows(runs, before), command, settings)
     head = ["pours", "number", *(f"in {100 * share:.0f} % (interval score)" for share in SHARES)]
     write_table("intervals", head, interval_rows(runs), command, "all pours of the table above, as observed")
 
@@ -379,6 +367,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/evidence/results.md")
     parser.add_argument("--write-steep", action="store_true", help="write the tables of the levels with steep walls")
+    parser.add_argument("--before", type=Path, help="with --write-steep: runs of an earlier version on the same worlds")
     parser.add_argument("--budgets", nargs="+", metavar="N=FILE", help="write the table of runs with N simulations")
     parser.add_argument("--receivers", action="store_true", help="three receivers in sequence on one bench")
     asked = parser.parse_args()
@@ -397,7 +386,11 @@ def main() -> None:
         return
     if asked.write_steep:
         seeds = range(asked.first, asked.first + asked.seeds)
-        write_steep([run for run in runs if run["level"] in CLIFFS and run["seed"] in seeds])
+        lines = asked.before.read_text().splitlines() if asked.before is not None else []
+        write_steep(
+            [run for run in runs if run["level"] in CLIFFS and run["seed"] in seeds],
+            [run for run in map(json.loads, lines) if run["seed"] in seeds],
+        )
         return
     for level in () if asked.write else asked.levels:
         for arm in asked.arms:
