@@ -40,6 +40,7 @@ from sim_engine.prediction_band import LEVEL as INTERVAL
 PAGE = ROOT / "docs" / "evidence" / "results.md"
 BEGIN, END = "<!-- measured: hidden benches -->\n", "<!-- end of measured -->"
 STUDY = ROOT / "configs" / "studies" / "benches.yaml"
+COMMAND = "python benchmarks/study_questions.py"
 NEAR = 0.005
 """'Within half a point', and the largest excess error allowed for six active pours compared with twelve."""
 
@@ -190,8 +191,7 @@ def main() -> None:
             print(" | ".join(row))
         if asked.write:
             head = ["pours", "number", "in their 90 % intervals", "interval score"]
-            command = f"python benchmarks/study_questions.py --study {asked.study} --intervals"
-            write_table("study-intervals", head, rows, command, f"D3 of {asked.study}")
+            write_table("study-intervals", head, rows, f"{COMMAND} --intervals", f"D3 of {asked.study.name}")
         return
     found = gather(study, results)
     if not (found.finals and {"C4", "C4-active", UNCALIBRATED, RANDOM} <= found.calibrated.keys()):
