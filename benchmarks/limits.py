@@ -1,7 +1,7 @@
 """Compare the limits of fine particles of Decant and SPlisHSPlasH for six pours into three receivers.
 
-    python benchmarks/limits.py --store FILE [--ours 1000 2000 5000 10000] [--theirs 1000 2000 5000] [--seeds 2]
-                                [--table | --write]
+    python benchmarks/limits.py --store FILE [--ours 1000 2000 5000 10000 20000] [--theirs 1000 2000 5000 10000]
+                                [--seeds 2] [--table | --write]
 
 The pours are six of `sim_engine.validation.convergence`, two into each of its first three receivers, chosen before any
 run of SPlisHSPlasH: water without surface tension, uncalibrated, spilled over poured. Below 5,000 particles, both
@@ -23,16 +23,16 @@ from pathlib import Path
 import numpy as np
 import peer
 from convergence import VOLUME, Store
-from machine import pin, say, write_table
+from machine import say, write_table
+from numpy.typing import NDArray
 from scipy.stats import t as student
-from standard_pour import Floats
+from standard_pour import Floats, in_cup, in_frame
 
-from sim_engine.collision import rotations
 from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import plan_motion
 from sim_engine.simulator import PourSimulator, spacing
 from sim_engine.validation.convergence import FOUND, LIP_RADIUS, ConvergencePour, spillage
-from sim_engine.vessel.vessel import Vessel, build_vessel
+from sim_engine.vessel.vessel import build_vessel
 
 POURS = (FOUND[0], FOUND[1], FOUND[4], FOUND[3], FOUND[5], FOUND[6])
 COARSE = 5_000
@@ -60,19 +60,17 @@ def peer_spillage(scene: peer.PeerScene, points: Floats, time: float, slack: flo
         time: time of these places [s].
         slack: depth in a wall that counts as inside [m].
     """
-    pose = scene.motion.sample(np.array([time]))
-    (rotation,) = rotations(pose)
-    retained = in_cup((points - pose[0, :3]) @ rotation, scene.pourer, LIP_RADIUS + slack, slack)
+    retained = in_pourer(scene, points, time, slack)
     across = float(np.hypot(*scene.receiver.solid_vertices[:, :2].T).max())
-    received = in_cup(points, scene.receiver, across, slack) & ~retained
+    received = in_cup(points, scene.receiver, across, slack, above=slack) & ~retained
     poured = 1.0 - float(np.mean(retained))
     return max(poured - float(np.mean(received)), 0.0) / max(poured, 1e-9)
 
 
-def in_cup(points: Floats, vessel: Vessel, radius: float, slack: float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return which points (N, 3), in the vessel's frame, are within a radius, above its floor and below its rim."""
-    height, across = points[:, 2], np.hypot(points[:, 0], points[:, 1])
-    return np.asarray((across < radius) & (height > vessel.inner_floor - slack) & (height < vessel.rim_height + slack))
+def in_pourer(scene: peer.PeerScene, points: Floats, time: float, slack: float) -> NDArray[np.bool_]:
+    """Return which points (N, 3) are in the pourer; arguments as in `peer_spillage`."""
+    local = in_frame(points, time, scene.motion)
+    return in_cup(local, scene.pourer, LIP_RADIUS + slack, slack, above=slack)
 
 
 def run_peer(python: Path, pour: ConvergencePour, particles: int, seed: int) -> tuple[float, float]:
@@ -85,9 +83,7 @@ def run_peer(python: Path, pour: ConvergencePour, particles: int, seed: int) -> 
     arrays = peer.simulate(python, scene, particles, seed, particle_walls=True)
     times, frames = arrays["times"], arrays["frames"].astype(float)
     early = int(np.argmax(scene.motion.tilt(times) > math.radians(20.0)))
-    pose = scene.motion.sample(times[early : early + 1])
-    (rotation,) = rotations(pose)
-    kept = in_cup((frames[early] - pose[0, :3]) @ rotation, scene.pourer, LIP_RADIUS + slack, slack)
+    kept = in_pourer(scene, frames[early], float(times[early]), slack)
     if not kept.all():
         raise SystemExit(f"{pour.name}, {particles} particles: {np.sum(~kept)} leaked from the pourer at 20°")
     return peer_spillage(scene, frames[-1], float(times[-1]), slack), float(arrays["cpu_s"])
@@ -140,15 +136,12 @@ def main() -> None:
     """Run the missing simulations, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--store", type=Path, required=True)
-    parser.add_argument("--ours", type=int, nargs="*", default=[1_000, 2_000, 5_000, 10_000])
-    parser.add_argument("--theirs", type=int, nargs="*", default=[1_000, 2_000, 5_000])
+    parser.add_argument("--ours", type=int, nargs="*", default=[1_000, 2_000, 5_000, 10_000, 20_000])
+    parser.add_argument("--theirs", type=int, nargs="*", default=[1_000, 2_000, 5_000, 10_000])
     parser.add_argument("--seeds", type=int, default=2, help=f"seeds below {COARSE:,} particles")
-    parser.add_argument("--core", type=int, help="run on this core")
     parser.add_argument("--table", action="store_true", help="only print the table")
     parser.add_argument("--write", action="store_true", help="write the table to docs/data/results.json")
     options = parser.parse_args()
-    if options.core is not None:
-        pin(options.core)
     store = Store(options.store)
     if not (options.table or options.write):
         simulator, python = PourSimulator(), peer.environment()

@@ -7,6 +7,7 @@
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are stored in FILE, so an
 interrupted comparison continues. `--write` makes no runs; it writes the rows of FILE to docs/evidence/results.md.
+`--before` reads runs of an earlier version: its D3 with default settings, played on the present `mismatch_worlds.py`.
 
 Primary questions, fixed before the first run. Seeds below 1000 are for tuning. Seeds from 1000 on are for answers: 1000
 to 1019; and 2000, 3000 and 7000 to 7019 for changes made after the previous answers were known (5000 to 5019 were also
@@ -54,7 +55,7 @@ import numpy as np
 from machine import TABLES, describe, write_table
 from mismatch_worlds import CHANGED_AFTER, CLIFFS, LEVELS, Valley
 from optimiser_problems import Floats
-from players import SCENE, Numbers, coverage, interval, play
+from players import SCENE, Numbers, by_turn, coverage, interval, play
 
 from actors.optimizer.model_discrepancy import ModelAveragedProcess
 from orchestrator.requests import Outcome, Prediction, Request
@@ -113,6 +114,7 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int, sett
     since = CHANGED_AFTER if valley.changes else 0
     unscaled: list[list[tuple[float, float]]] = []
     scaled: list[list[tuple[float, float]]] = []
+    latest: list[tuple[float, float]] = []
 
     def answer(request: Request) -> Outcome:
         outcome = world.answer(request)
@@ -131,7 +133,6 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int, sett
         scaled.append([scaled_interval(replace(prediction, band=band), earlier, worst) for band in latest])
         return scaled_interval(prediction, earlier, worst)
 
-    latest: list[tuple[float, float]] = []
     of_surrogate = ModelAveragedProcess.bands
     with (
         patch.object(ModelAveragedProcess, "bands", bands),
@@ -261,12 +262,8 @@ def steep_rows(runs: list[dict[str, Any]], before: list[dict[str, Any]]) -> list
 
 def interval_rows(runs: list[dict[str, Any]]) -> list[list[str]]:
     """Return rows for first pours, all others and all: share in their intervals, and the mean interval score."""
-    parts = {
-        "first pours": [run["intervals"][0] for run in runs],
-        "all others": [pour for run in runs for pour in run["intervals"][1:]],
-        "all": [pour for run in runs for pour in run["intervals"]],
-        "all, not scaled by earlier pours": [pour for run in runs for pour in run["unscaled"]],
-    }
+    parts = by_turn([run["intervals"] for run in runs])
+    parts["all, not scaled by earlier pours"] = [pour for run in runs for pour in run["unscaled"]]
     found = []
     for name, shown in parts.items():
         cells = []

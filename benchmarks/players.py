@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from optimiser_problems import Floats
@@ -34,6 +34,8 @@ SCENE = Scene(
     Liquid(mass=0.2),
     fixed={"height": 0.03},
 )
+
+T = TypeVar("T")
 
 
 def play(strategy: Strategy, answer: Callable[[Request], Outcome], *, pours_last: bool = True) -> None:
@@ -111,6 +113,15 @@ def interval(values: list[float]) -> tuple[float, float, float]:
     draws = random.Random(0)
     means = sorted(float(np.mean(draws.choices(values, k=len(values)))) for _ in range(2000))
     return float(np.mean(values)), means[50], means[1949]
+
+
+def by_turn(campaigns: Sequence[Sequence[T]]) -> dict[str, list[T]]:
+    """Return the first pours of campaigns, all others, and all, by the name of a row."""
+    return {
+        "first pours": [pours[0] for pours in campaigns if pours],
+        "all others": [pour for pours in campaigns for pour in pours[1:]],
+        "all": [pour for pours in campaigns for pour in pours],
+    }
 
 
 def coverage(intervals: Sequence[Sequence[float]], share: float) -> tuple[float, float]:

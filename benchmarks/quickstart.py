@@ -48,7 +48,7 @@ from unittest.mock import patch
 
 import numpy as np
 from machine import ROOT, run_self, say, write_table
-from players import coverage, interval
+from players import by_turn, coverage, interval
 
 from actors.bench.ground_truth import draw_pose_error
 from actors.optimizer.questions import ModelDiscrepancy
@@ -178,8 +178,6 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
                     "at": [round(u, 4) for u in actions.encode(pour.action_si)],
                     "loss": pour.loss,
                     "predicted": pour.predicted,
-                    "deviation": pour.predicted_deviation,
-                    "scatter": pour.predicted_scatter,
                     "band": pour.predicted_interval,
                     "unscaled": band,
                 }
@@ -337,13 +335,8 @@ def pours_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def coverage_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Return head and rows: share of the pours in their 90 % intervals, and the mean interval score."""
-    parts = {
-        "first pours": [run["pours"][0] for run in runs],
-        "all others": [pour for run in runs for pour in run["pours"][1:]],
-        "all": [pour for run in runs for pour in run["pours"]],
-    }
     rows = []
-    for name, pours in parts.items():
+    for name, pours in by_turn([run["pours"] for run in runs]).items():
         cells = []
         for key in ("band", "unscaled"):
             inside, score = coverage([(*pour[key], pour["loss"]) for pour in pours], LEVEL)

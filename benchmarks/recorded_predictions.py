@@ -143,10 +143,9 @@ def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]], again: 
         f"{options.draws} draws of the posterior for each prediction"
     )
     command = f"python benchmarks/recorded_predictions.py --simulations {options.simulations} --draws {options.draws}"
-    kept = json.loads(PREDICTIONS.read_text(encoding="utf-8"))
-    if kept["settings"] == settings:
-        earlier = {int(seed): {"pours": pours} for seed, pours in kept["seeds"].items()}
-        seeds = {**earlier, **seeds}
+    earlier = json.loads(PREDICTIONS.read_text(encoding="utf-8"))
+    if earlier["settings"] == settings:
+        seeds = {int(seed): {"pours": pours} for seed, pours in earlier["seeds"].items()} | seeds
     head = ["seed", "test, 4 pours", "another receiver, 16 pours", "pours inside their 90 % intervals"]
     named = " ".join(map(str, sorted(seeds)))
     write_table("recorded", head, seed_rows(seeds), f"{command} --seeds {named}", settings)

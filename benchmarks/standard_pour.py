@@ -155,16 +155,17 @@ def iterations_of(outcome: PourOutcome) -> int:
     return engine().iterations()
 
 
-def in_frame(points: Floats, time_: float) -> Floats:
+def in_frame(points: Floats, time_: float, moved: PourMotion | None = None) -> Floats:
     """Transform points from the world to the frame of the pourer at a time [m].
 
     Args:
         points: (N, 3), world [m].
         time_: time [s].
+        moved: motion of the pourer; None: of the standard pour.
     """
     from sim_engine.collision import rotations
 
-    poses = motion().sample(np.array([time_]))
+    poses = (moved or motion()).sample(np.array([time_]))
     (rotation,) = rotations(poses)
     return np.asarray((points - poses[0, :3]) @ rotation, dtype=float)
 
@@ -199,7 +200,7 @@ def left_in_pourer(points: Floats, time_: float, slack: float) -> float:
         slack: depth in the wall that counts as inside [m].
     """
     pourer = vessels()[0]
-    return float(np.mean(_in_cup(in_frame(points, time_), pourer, POURER_RADIUS, slack)))
+    return float(np.mean(in_cup(in_frame(points, time_), pourer, POURER_RADIUS + slack, slack)))
 
 
 def delivered(points: Floats, slack: float) -> float:
@@ -209,16 +210,20 @@ def delivered(points: Floats, slack: float) -> float:
         points: (N, 3), world [m].
         slack: depth in the wall, and height above the rim, that count as inside [m].
     """
-    receiver = vessels()[1]
-    inside = _in_cup(points, receiver, RECEIVER_RADIUS, slack) | _in_cup(
-        points - np.array([0.0, 0.0, slack]), receiver, RECEIVER_RADIUS, slack
-    )
-    return float(np.mean(inside))
+    return float(np.mean(in_cup(points, vessels()[1], RECEIVER_RADIUS + slack, slack, above=slack)))
 
 
-def _in_cup(points: Floats, vessel: Vessel, radius: float, slack: float) -> NDArray[np.bool_]:
-    across = np.hypot(points[:, 0], points[:, 1]) < radius + slack
-    inside = across & (points[:, 2] > vessel.inner_floor - slack) & (points[:, 2] < vessel.rim_height)
+def in_cup(points: Floats, vessel: Vessel, radius: float, below: float, above: float = 0.0) -> NDArray[np.bool_]:
+    """Return which points lie within a radius of a vessel's axis, between its floor and its rim.
+
+    Args:
+        points: (N, 3), in the vessel's frame [m].
+        vessel: a vessel of revolution.
+        radius: [m].
+        below, above: distances below the floor and above the rim that count as inside [m].
+    """
+    across = np.hypot(points[:, 0], points[:, 1]) < radius
+    inside = across & (points[:, 2] > vessel.inner_floor - below) & (points[:, 2] < vessel.rim_height + above)
     return np.asarray(inside, dtype=bool)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from machine import ROOT, write_table
-from players import coverage
+from players import by_turn, coverage
 
 from orchestrator.cli.study_command import read_study
 from orchestrator.results.stage_views import deployments_of
@@ -163,13 +163,8 @@ def interval_rows(results: Mapping[str, CellResult]) -> list[list[str]]:
             for deployed in deployments_of(one.results).values():
                 known = [(pour.predicted_interval, pour.loss) for pour in deployed.pours]
                 rows.append([(*ends, loss) for ends, loss in known if ends is not None and loss is not None])
-    parts = {
-        "first pours": [pours[0] for pours in rows if pours],
-        "all others": [pour for pours in rows for pour in pours[1:]],
-        "all": [pour for pours in rows for pour in pours],
-    }
     shown = []
-    for name, pours in parts.items():
+    for name, pours in by_turn(rows).items():
         inside, score = coverage(pours, INTERVAL)
         shown.append([name, str(len(pours)), f"{100 * inside:.0f} %", f"{score:.4f}"])
     return shown

@@ -8,6 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from sim_engine.collision import rotations
 from sim_engine.simulator import fill
 
 
@@ -37,8 +38,8 @@ def test_every_particle_of_the_peer_is_retained_received_or_spilled(limits: Modu
     pour = limits.POURS[0]
     scene = limits.peer_scene(pour)
     d = limits.spacing(limits.VOLUME, 400)
-    (end,) = scene.motion.sample(np.array([scene.end]))[:, :3]
-    (rotation,) = limits.rotations(scene.motion.sample(np.array([scene.end])))
+    pose = scene.motion.sample(np.array([scene.end]))
+    (end,), (rotation,) = pose[:, :3], rotations(pose)
     upright = fill(scene.pourer, limits.VOLUME, 400, 1).astype(float)
     retained = upright[:100] @ rotation.T + end
     received = fill(scene.receiver, 1e-4, 200, 1).astype(float)

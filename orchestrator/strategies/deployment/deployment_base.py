@@ -230,10 +230,10 @@ class Deployment(ABC, Generic[S]):
         known = None
         if suggestion.means and not self._scalarization.exploring:
             noise = suggestion.noises[0] if suggestion.noises else None
-            known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise))
-            if suggestion.bands:
-                predicted = replace(known, band=suggestion.bands[0])
-                known = replace(predicted, band=scaled_interval(predicted, self._pours, self._costing.worst))
+            band = suggestion.bands[0] if suggestion.bands else None
+            known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise), band)
+            if band is not None:
+                known = replace(known, band=scaled_interval(known, self._pours, self._costing.worst))
         self._pour(suggestion.points[0], known)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
