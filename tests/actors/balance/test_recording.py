@@ -143,8 +143,8 @@ def test_answers_come_in_the_pieces_and_at_the_pace_of_then(tmp_path):
     try:
         with serial.Serial(far.port, 9600, timeout=2.0) as port:
             assert port.in_waiting == 0
+            started = time.monotonic()  # before the question: the pace counts from when it arrives
             port.write(b"w")
-            started = time.monotonic()
             assert port.read(2) == b"12"
             assert port.read(2) == b"34"
             assert time.monotonic() - started >= 0.5
