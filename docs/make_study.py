@@ -1,9 +1,10 @@
-"""Brings a study's figures and tables into docs/evidence/results.md.
+"""Brings figures and tables of a study into docs/evidence/results.md.
 
-    python docs/make_study.py runs/study-benches/report
+    python docs/make_study.py runs/study-NAME/report
 
-Figures go to docs/images/study; tables stand between `<!-- study: NAME ... -->` and `<!-- end of study -->`.
-What follows the name picks rows: `mismatch=small/large; strategy=D3`. A column of one wanted value is left out.
+Figures go to docs/images/study (benches) or docs/images/paper-study. Tables are between
+`<!-- study: NAME/TABLE ... -->` and `<!-- end of study -->`. What follows the table's name selects rows:
+`mismatch=small/large; strategy=D3`. A column with one selected value is left out.
 """
 
 from __future__ import annotations
@@ -15,10 +16,15 @@ import sys
 from pathlib import Path
 
 DOCS = Path(__file__).parent
-PAGE, IMAGES = DOCS / "evidence" / "results.md", DOCS / "images" / "study"
-MARKED = re.compile(r"(<!-- study: (?P<name>[\w-]+)(?P<wanted>[^>]*) -->\n).*?(<!-- end of study -->)", re.DOTALL)
-FIGURES = ("3b", "6", "final")
-"""Those that the page shows."""
+PAGE, IMAGES = DOCS / "evidence" / "results.md", DOCS / "images"
+MARKED = re.compile(
+    r"(<!-- study: (?P<study>\w+)/(?P<name>[\w-]+)(?P<wanted>[^>]*) -->\n).*?(<!-- end of study -->)", re.DOTALL
+)
+FIGURES = {
+    "benches": ("study", ("3b", "6", "final")),
+    "paper": ("paper-study", ("3b", "3c", "4", "5a", "5b", "6", "7", "final")),
+}
+"""Folder of the images, and the figures that the page shows, by the name of the study."""
 
 
 def table(path: Path, wanted: dict[str, set[str]]) -> str:
@@ -41,10 +47,12 @@ def cell(row: dict[str, str], name: str) -> str:
     return f"{mean:.1f} [{low:.1f}, {high:.1f}]" if low == low else f"{mean:.1f}"
 
 
-def fill(text: str, report: Path) -> str:
-    """The page with its tables as the report has them."""
+def fill(text: str, report: Path, study: str) -> str:
+    """The page with the tables of a study as its report has them."""
 
     def filled(match: re.Match[str]) -> str:
+        if match["study"] != study:
+            return match[0]
         wanted: dict[str, set[str]] = {}
         for part in match["wanted"].strip(" ;").split(";"):
             if part.strip():
@@ -57,13 +65,13 @@ def fill(text: str, report: Path) -> str:
 
 def main() -> None:
     """Write them."""
-    report = Path(sys.argv[1])
-    IMAGES.mkdir(parents=True, exist_ok=True)
-    for number in FIGURES:
-        if number == "final" and not (report / "figure-final.png").is_file():
-            continue  # the study has no `confirm`
-        shutil.copyfile(report / f"figure-{number}.png", IMAGES / f"figure-{number}.png")
-    PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), report), encoding="utf-8")
+    report = Path(sys.argv[1]).resolve()
+    study = report.parent.name.removeprefix("study-")
+    folder, numbers = FIGURES[study]
+    (IMAGES / folder).mkdir(parents=True, exist_ok=True)
+    for number in numbers:
+        shutil.copyfile(report / f"figure-{number}.png", IMAGES / folder / f"figure-{number}.png")
+    PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), report, study), encoding="utf-8")
 
 
 if __name__ == "__main__":

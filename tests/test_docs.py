@@ -259,7 +259,7 @@ def test_counts_of_physical_criteria_are_those_of_the_validation_page() -> None:
 
 def hand_written(page: Path) -> int:
     """Words of a page without code and generated tables."""
-    generated = r"<!-- (?:table|measured|vessel sources|timing)\b.*?<!-- end of [\w ]+ -->"
+    generated = r"<!-- (?:table|measured|study|vessel sources|timing)\b.*?<!-- end of [\w ]+ -->"
     return len(re.sub(generated, "", prose_of(page), flags=re.DOTALL).split())
 
 

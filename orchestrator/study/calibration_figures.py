@@ -221,7 +221,7 @@ def draw_calibrations(study: StudyPlan, found: Gathered) -> list[Drawn]:
     strategies = {name: one for name, one in known.items() if name not in (UNCALIBRATED, RANDOM)}
     drawn = [_boxes(known)] if known else []
     if strategies:
-        drawn.append(_against_simulations(strategies))
+        drawn.append(_against_simulations(strategies, known.get(UNCALIBRATED)))
         drawn.append(_over_theta(study, strategies))
     return drawn
 
@@ -257,7 +257,7 @@ def _boxes(known: Mapping[str, Found]) -> Drawn:
     )
 
 
-def _against_simulations(known: Mapping[str, Found]) -> Drawn:
+def _against_simulations(known: Mapping[str, Found], uncalibrated: Found | None) -> Drawn:
     figure, axes = style.new_figure(size=(6.4, 4.2))
     rows: list[list[object]] = []
     for name, one in known.items():
@@ -287,6 +287,10 @@ def _against_simulations(known: Mapping[str, Found]) -> Drawn:
             axes.errorbar(
                 spent[-1:], means[-1:], yerr=error(points[-1][1]), fmt="o", color=colour(name), capsize=4, clip_on=False
             )
+    if uncalibrated is not None and any(uncalibrated.train):
+        e = estimate([mean(train) for train in uncalibrated.train if train], SHARE).scaled(100)
+        rows.append([UNCALIBRATED, 0, e.count, e.mean, e.low, e.high])
+        axes.axhline(e.mean, color=colour(UNCALIBRATED), linestyle="--", label=UNCALIBRATED, zorder=1)
     log_axis(axes.xaxis)
     axes.set_ylim(bottom=0.0)
     legend(figure, list(known))
@@ -297,7 +301,7 @@ def _against_simulations(known: Mapping[str, Found]) -> Drawn:
         "Best discrepancy against simulations",
         "On training pours. C3: least mean discrepancy of the θ tried so far; C4: least that its surrogate had "
         "expected of a θ it chose, and at last of θ*; C1 and C2 choose all θ beforehand, and are one point. Bars, of "
-        "a curve at its end: 95 % t intervals over repetitions.",
+        "a curve at its end: 95 % t intervals over repetitions. Dashed: the uncalibrated simulator.",
         figure,
         ("strategy", "simulations", "repetitions", "best_percent", "low", "high"),
         rows,

@@ -182,6 +182,8 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
     curves = [row for row in rows(tmp_path, "figure-3c") if row["strategy"] == "C3"]
     assert [int(row["simulations"]) for row in curves] == [4, 8, 12, 16]
     assert [float(row["best_percent"]) for row in curves] == pytest.approx([20, 20, 10, 10])
+    baseline = next(row for row in rows(tmp_path, "figure-3c") if row["strategy"] == "uncalibrated")
+    assert (int(baseline["simulations"]), float(baseline["best_percent"])) == (0, pytest.approx(10.0))
     hybrid = [r for r in rows(tmp_path, "figure-6") if (r["level"], r["strategy"]) == ("large", "D3")]
     assert [float(row["least_%"]) for row in hybrid] == pytest.approx([11, 11, 6])
     planned = [r for r in rows(tmp_path, "figure-6") if (r["level"], r["strategy"]) == ("large", "D1-2")]
