@@ -18,7 +18,7 @@ from pathlib import Path
 DOCS = Path(__file__).parent
 PAGE, IMAGES = DOCS / "evidence" / "results.md", DOCS / "images"
 MARKED = re.compile(
-    r"(<!-- study: (?P<study>\w+)/(?P<name>[\w-]+)(?P<wanted>[^>]*) -->\n).*?(<!-- end of study -->)", re.DOTALL
+    r"(<!-- study: (?P<study>\w+)/(?P<name>[\w-]+)(?P<wanted>[^>]*) -->\n).*?(?P<end><!-- end of study -->)", re.DOTALL
 )
 FIGURES = {
     "benches": ("study", ("3b", "6", "final")),
@@ -44,7 +44,7 @@ def table(path: Path, wanted: dict[str, set[str]]) -> str:
 def cell(row: dict[str, str], name: str) -> str:
     """'1.23 [0.80, 1.71]'."""
     mean, low, high = (float(row[key]) for key in (name, f"{name}, low", f"{name}, high"))
-    return f"{mean:.1f} [{low:.1f}, {high:.1f}]" if low == low else f"{mean:.1f}"
+    return f"{mean:.2f} [{low:.2f}, {high:.2f}]" if low == low else f"{mean:.2f}"
 
 
 def fill(text: str, report: Path, study: str) -> str:
@@ -58,7 +58,7 @@ def fill(text: str, report: Path, study: str) -> str:
             if part.strip():
                 name, _, values = part.strip().partition("=")
                 wanted[name.strip()] = {value.strip() for value in values.split("/")}
-        return match[1] + table(report / f"{match['name']}.csv", wanted) + match[4]
+        return match[1] + table(report / f"{match['name']}.csv", wanted) + match["end"]
 
     return MARKED.sub(filled, text)
 
