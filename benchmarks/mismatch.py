@@ -298,14 +298,16 @@ def budget_rows(runs: list[dict[str, Any]], others: dict[int, list[dict[str, Any
 
 
 def write_budgets(runs: list[dict[str, Any]], others: dict[int, list[dict[str, Any]]], seeds: int) -> None:
-    """Store the table of runs with other numbers of simulations."""
+    """Store the table of runs with other numbers of simulations; numbers without new runs keep their rows."""
     head = ["simulations before the first pour", *(level.removeprefix("cliff, ") for level in BUDGET_LEVELS)]
     command = f"python benchmarks/mismatch.py --out FILE --budgets 9=FILE … --first 8120 --seeds {seeds}"
     settings = (
         "mean loss of 15 pours; in brackets the difference from 37 simulations on the same benches, with its 95 % "
         f"bootstrap interval over {seeds} seeds; –: not all seeds were run"
     )
-    write_table("budgets", head, budget_rows(runs, others), command, settings)
+    rows = {int(row[0]): row for row in json.loads(TABLES.read_text()).get("budgets", {}).get("rows", [])}
+    rows |= {int(row[0]): row for row in budget_rows(runs, others)}
+    write_table("budgets", head, [rows[number] for number in sorted(rows)], command, settings)
 
 
 def write_steep(runs: list[dict[str, Any]], before: list[dict[str, Any]]) -> None:

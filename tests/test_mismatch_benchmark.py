@@ -6,6 +6,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 
 
@@ -43,3 +44,17 @@ def test_a_table_says_where_its_figures_come_from(
     assert tables["budgets"] | {"head": ["a"], "rows": [["b"]], "command": "a command"} == tables["budgets"]
     assert tables["budgets"]["settings"] == "some settings"
     assert {"date", "version", "machine"} <= set(tables["budgets"])
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("level", ["cliff, moderate", "cliff, four axes"])
+def test_one_hypothesis_of_the_ideal_player_is_the_bench(mismatch: ModuleType, level: str, seed: int) -> None:
+    import ideal_player
+
+    rng = np.random.default_rng(seed)
+    valley = mismatch.Valley(level, seed)
+    hypotheses = ideal_player.Hypotheses(valley, "sign", rng)
+    actions = rng.random((200, len(valley.space.axes)))
+    differences = np.abs(hypotheses.losses(actions) - [valley.true(one) for one in actions]).max(axis=1)
+    assert differences.min() < 1e-9
+    assert differences.max() > 0.1, "hypotheses differ"
