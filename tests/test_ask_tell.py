@@ -161,7 +161,10 @@ def test_an_added_pour_is_learned_from_and_is_not_one_of_the_campaigns(tmp_path:
         while (pour := session.ask()) is not None:
             predicted.append(pour.predicted is not None)
             session.tell(pour, spilled_g=5.0, received_g=94.0)
-    assert predicted == [True, True, True]  # three weighed pours are enough for a surrogate, whoever made them
+    # Three weighed pours are enough for a surrogate, whoever made them. The first session may have chosen the second
+    # pour before it was closed, and thus before the others were added.
+    assert len(predicted) == 3
+    assert predicted[1:] == [True, True]
     assert session.run is not None
     pours = session.run.pours
     assert sorted(pours["number"]) == [0, 0, 1, 2, 3, 4]
