@@ -6,6 +6,7 @@ print, and its only clock is the time of the events.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 from actors.interfaces import PourProgress
@@ -95,7 +96,8 @@ class ProgressState:
         simulators: number of simulators in the pool.
         running: ids of running simulations.
         ahead: number of running and unused speculative simulations.
-        simulations, failed_simulations: number of finished and of failed simulations.
+        simulations: number of finished simulations.
+        failures: number of failed simulations by their reason in a few words.
         simulation_seconds: total wall seconds of finished simulations, without replayed ones.
         timed_simulations: number of simulations in `simulation_seconds`.
         best: best measured loss by scene.
@@ -110,7 +112,7 @@ class ProgressState:
     running: set[int] = field(default_factory=set)
     ahead: SpeculationProgressed = field(default_factory=lambda: SpeculationProgressed(running=0, waiting=0))
     simulations: int = 0
-    failed_simulations: int = 0
+    failures: Counter[str] = field(default_factory=Counter)
     simulation_seconds: float = 0.0
     timed_simulations: int = 0
     pour: PourProgressState | None = None
@@ -188,8 +190,8 @@ class ProgressState:
                     if event.seconds > 0.0:
                         self.simulation_seconds += event.seconds
                         self.timed_simulations += 1
-                else:
-                    self.failed_simulations += 1
+                elif isinstance(outcome, Failed):
+                    self.failures[outcome.reason.partition(":")[0]] += 1
             case Pour() as pour, Poured() as outcome:
                 loss = loss_of_pour(self.plan, pour, outcome.measurement)
                 if self.pour is not None:
@@ -240,8 +242,9 @@ class ProgressState:
         parts = [f"{self.simulations} simulation{'s' * (self.simulations != 1)}{each}"]
         if self.ahead.waiting and (self.ahead.running or self._calibration_pour):  # some of them are never requested
             parts.append(f"{self.ahead.waiting} more made ahead")
-        if self.failed_simulations:
-            parts.append(f"{self.failed_simulations} failed")
+        if self.failures:
+            ((reason, _),) = self.failures.most_common(1)
+            parts.append(f"{self.failures.total()} failed ({'' if len(self.failures) == 1 else 'mostly '}{reason})")
         wanted = self.pour.scene if scene is None and self.pour is not None else scene
         if wanted is not None and wanted in self.best:
             best = self.best[wanted]

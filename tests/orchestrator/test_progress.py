@@ -194,7 +194,11 @@ def test_failed_pours_and_simulations_are_shown_as_such() -> None:
         e for e in events(plan) if isinstance(e, RequestFinished) and isinstance(e.request, Simulate)
     )
     tally(replace(simulation, outcome=Failed("simulation", "diverged"), frames=None))
-    assert "1 failed" in tally.pool_line()
+    assert "1 failed (diverged)" in tally.pool_line()
+    for _ in range(2):
+        touching = Failed("invalid_action", "cups touch: at tilt 37° the pourer enters the receiver by 4.1 mm")
+        tally(replace(simulation, outcome=touching, frames=None))
+    assert "3 failed (mostly cups touch)" in tally.pool_line()
     for event in events(plan):
         if isinstance(event, RequestFinished) and isinstance(event.request, Pour):
             tally(replace(event, outcome=Failed("pour_failed", "the gripper slipped")))
