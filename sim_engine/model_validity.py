@@ -49,9 +49,13 @@ For liquids as thin as water only; for others viscosity is simulated, …"""
 CREEPING = 2.0
 """… up to this viscosity [Pa s], the largest that was compared with theory (`decant validate-solver film`) …"""
 
-FLOOR = 300e-6
-"""… and approximately below this kinematic viscosity [m²/s], the largest that the solver itself adds in a tank 41 mm
-deep (`decant validate-solver floor`, spacings of 4.1 to 5.9 mm, 0.05 and 0.2 m/s)."""
+ADDED = 3.0
+"""… and above the kinematic viscosity ADDED · d² [m²/s] that the solver itself adds at a spacing d: vortices of
+10 mm²/s decay as those of 156, 87, 58 and 48 mm²/s at spacings of 6.9, 5.8, 4.6 and 2.9 mm (0.2 m/s;
+`sim_engine.validation.viscous_flows.own_viscosity`) …"""
+
+LEAST_ADDED = 40e-6
+"""… and never less than this [m²/s]."""
 
 PARTICLES_ACROSS = 2.0
 """Particles across the falling stream: with fewer, no particle has neighbours all around it, and the stream is a
@@ -129,7 +133,7 @@ def regimes(
     found = [
         _dribbling(course, liquid),
         _wetting(course, liquid),
-        _viscous(course, liquid),
+        _viscous(course, liquid, spacing),
         _thin_stream(course, liquid, spacing),
         _without_air(course, liquid, pourer),
     ]
@@ -163,16 +167,17 @@ def _wetting(course: FlowCourse, liquid: Liquid) -> NotCovered:
     )
 
 
-def _viscous(course: FlowCourse, liquid: Liquid) -> NotCovered:
+def _viscous(course: FlowCourse, liquid: Liquid, spacing: float) -> NotCovered:
     if liquid.is_thick:
-        stiff, limit = liquid.dynamic_viscosity > CREEPING, f"was held against theory up to {CREEPING:g} Pa*s"
+        stiff, limit = liquid.dynamic_viscosity > CREEPING, f"was compared with theory up to {CREEPING:g} Pa*s"
+        added = max(ADDED * spacing**2, LEAST_ADDED)
         if not stiff:
             limit = (
-                f"adds up to {1e6 * FLOOR:g} mm^2/s of its own, so that a liquid below that pours later than it "
-                "should; calibrate viscosity_factor on pours of this very liquid"
+                f"adds about {1e6 * added:.0f} mm^2/s at this number of particles, so that a liquid below that pours "
+                "later than it should; use more particles, or calibrate viscosity_factor on pours of this liquid"
             )
         amount = f"{liquid.dynamic_viscosity:.3g} Pa*s ({1e6 * liquid.kinematic_viscosity:.3g} mm^2/s)"
-        share = float(stiff or liquid.kinematic_viscosity < FLOOR)
+        share = float(stiff or liquid.kinematic_viscosity < added)
         return NotCovered("viscous", share, f"the viscosity is {amount}; the simulator {limit}")
     share = course.share(reynolds(liquid, course.velocity, course.film) < VISCOUS_REYNOLDS)
     return NotCovered(

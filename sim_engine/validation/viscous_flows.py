@@ -232,7 +232,7 @@ def left_on_a_wall(
                  particles=len(start)),
     ], [
         Series(f"ν = {_mm2(viscosity)}, {layers} spacings", tuple(times.tolist()), tuple(left)),
-        Series(f"ν = {_mm2(viscosity)}", tuple(times.tolist()), tuple(wanted), "reference"),
+        Series(f"Jeffreys, ν = {_mm2(viscosity)}", tuple(times.tolist()), tuple(wanted), "reference"),
     ]  # fmt: skip
 
 
@@ -280,7 +280,7 @@ def spreading(
         reported(f"power of time that the radius grows with, {name}", power, reference=0.125, particles=len(start)),
     ], [
         Series(f"{name}, {len(start):,} particles", tuple(times.tolist()), tuple(radii)),
-        Series(name, tuple(times.tolist()), tuple(wanted.tolist()), "reference"),
+        Series(f"Huppert, {name}", tuple(times.tolist()), tuple(wanted.tolist()), "reference"),
     ]  # fmt: skip
 
 
@@ -305,7 +305,8 @@ DRAINAGE = "A film of 8 mm, ν = 1,000 mm²/s, drains from a vertical wall of 10
 PUDDLE = "250 mL are let go on a plane: the radius is 0.894 (gV³t/3ν)^⅛ once they are flat (Huppert 1982)."
 CUP = (
     "The standard pour with 0.1 and 1 Pa s, at 1,000 kg/m³. Reference: SPlisHSPlasH 2.19 with the implicit viscosity "
-    "of Weiler et al. 2018, in the liquid and on walls."
+    "of Weiler et al. 2018, in the liquid and on walls of volume maps. With walls of particles it leaves 0.50 of the "
+    "thicker liquid at 3.1 s instead of 0.34, so the criterion is finer than the reference is certain."
 )
 
 SIDE, VOLUME = 0.07, 200e-6
@@ -458,7 +459,7 @@ def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure
                            criterion=f"within {FAR:g}", particles=particles)
                 )  # fmt: skip
             found.append(reported(f"left at 3.1 s, {name}", float(left[TIMES.index(3.1)]), particles=particles))
-    curves += [Series(f"{nu * 1e3:g} Pa s", TIMES, values, "reference") for nu, values in PEER.items()]
+    curves += [Series(f"SPlisHSPlasH, {nu * 1e3:g} Pa s", TIMES, values, "reference") for nu, values in PEER.items()]
     return found, Figure(("Thick liquids leave a cup",), ("time [s]",), ("left in the pourer",), tuple(curves))
 
 
