@@ -96,6 +96,7 @@ def summarise(
     found, evaluation, gain = theta_of(results), evaluation_of(results), gain_of(results)
     posterior = None if found is None or found.posterior is None else found.posterior.summary()
     space = None if plan.calibration is None else plan.calibration.parameters
+    liquid = None if plan.calibration is None else plan.calibration.scene.liquid
     expected = None if found is None else found.predicted_discrepancy
     deviation = None if found is None else found.predicted_deviation
     discrepancy = _discrepancies(evaluation)
@@ -125,7 +126,7 @@ def summarise(
         predicted_deviation=deviation,
         posterior=posterior,
         parameters=() if found is None else _parameters(plan.calibration, found),
-        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain)),
+        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain, liquid)),
         discrepancy=discrepancy,
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,

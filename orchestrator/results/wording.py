@@ -32,6 +32,7 @@ from orchestrator.strategies.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.strategies.deployment.real_pours import PredictionCheck
 from orchestrator.strategies.deployment.safe_window import WindowFound
 from orchestrator.strategies.dispense import Dispensed
+from sim_engine.liquids import Liquid
 from sim_engine.prediction_band import PredictionInterval
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
@@ -312,14 +313,31 @@ def theta_sentences(
     posterior: PosteriorSummary | None,
     space: Space | None,
     gain: CalibrationGain | None,
+    liquid: Liquid | None = None,
 ) -> list[str]:
-    """The knowledge of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified."""
+    """The knowledge of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified.
+
+    Args:
+        liquid: of the pours, as declared; its viscosity is stated if the pours determine it.
+    """
     said = []
     if expected is not None:
         said.append(f"Expected {DISCREPANCY.meaning} of θ*: {DISCREPANCY.text(expected, deviation or 0.0)}.")
     if posterior is not None and space is not None:
         said += map(_sentence, posterior_lines(posterior, space))
+        if liquid is not None and liquid.is_thick:
+            said += _identified_viscosity(posterior, liquid)
     return said if gain is None else [*said, _sentence(gain.text)]
+
+
+def _identified_viscosity(posterior: PosteriorSummary, liquid: Liquid) -> list[str]:
+    """The posterior of the viscosity itself; nothing if it was not searched or the pours do not determine it."""
+    if "viscosity_factor" not in posterior.region or "viscosity_factor" in posterior.open:
+        return []
+    declared = 1e3 * liquid.dynamic_viscosity
+    low, high = (f"{declared * factor:.3g}" for factor in posterior.region["viscosity_factor"])
+    known = f"{low} … {high} mPa*s ({100 * posterior.level:.0f} %; declared {declared:.3g} mPa*s)"
+    return [f"Viscosity of {liquid.name}, by these pours: {known}."]
 
 
 def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:

@@ -15,7 +15,7 @@ from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.results.figure_style import save
 from orchestrator.results.publishing import theta_file
 from orchestrator.results.surrogate_figures import draw_posterior
-from orchestrator.results.wording import posterior_lines
+from orchestrator.results.wording import posterior_lines, theta_sentences
 from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.posterior_summary import (
@@ -31,7 +31,7 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.single_action import RepeatedSimulation
 from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness
 from sim_engine.action import DEG
-from sim_engine.liquids import SimulationParameters
+from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space
 from tests.support.example_results import is_picture
@@ -169,6 +169,27 @@ def test_people_read_what_is_determined_and_what_is_not() -> None:
         "90 % of the θ that fit the pours have particles 900 … 1 300 (searched 500 … 4 000)",
         "the pours do not determine cohesion (0 … 0.1 N/m): nearly the whole searched range fits them as well as θ*",
     ]
+
+
+def test_people_read_the_viscosity_that_the_pours_mean() -> None:
+    said = PosteriorSummary(
+        level=0.9,
+        mean={},
+        region={"viscosity_factor": (0.5, 0.8)},
+        open=(),
+        correlation=(),
+        directions=(),
+        remaining_discrepancy=RemainingDiscrepancy(low=0.0, median=0.0, high=0.0),
+        effective=100.0,
+    )
+    space = Space((Axis("viscosity_factor", 0.1, 10.0, "log"),))
+    shampoo = Liquid(name="shampoo", mass=0.18, density=1000.0, dynamic_viscosity=0.15)
+    wanted = "Viscosity of shampoo, by these pours: 75 … 120 mPa*s (90 %; declared 150 mPa*s)."
+    assert wanted in theta_sentences(None, None, said, space, None, shampoo)
+    undetermined = said.model_copy(update={"open": ("viscosity_factor",)})
+    water = Liquid(mass=0.18)  # simulated without its viscosity
+    for posterior, liquid in ((undetermined, shampoo), (said, water)):
+        assert not any("by these pours" in one for one in theta_sentences(None, None, posterior, space, None, liquid))
 
 
 @pytest.mark.slow
