@@ -34,6 +34,7 @@ COLOURS = {
     "C4": style.BEST,
     "C4-paper": style.ESCAPED,
     "D1": style.PREDICTED,
+    "D1-uncalibrated": style.GREY,
     "D2": style.MEASURED,
     "D2-paper": style.FALLING,
     "D3": style.BEST,
@@ -49,7 +50,7 @@ LINES = (":", "--", "-", "-.")
 MARKERS = ("v", "^", "<", ">")
 """Line styles and markers of several D1, by number of iterations."""
 
-MARKER = {"D1": "v", "D2": "s", "D3": "o"}
+MARKER = {"D1": "v", "D1-uncalibrated": "X", "D2": "s", "D3": "o"}
 """Marker of each strategy; calibrations have a diamond."""
 
 MOST_ABREAST = 8
@@ -140,10 +141,12 @@ def series_style(arm: str, arms: Sequence[str]) -> SeriesStyle:
         arm: label of the arm.
         arms: labels of all arms of the figure, including this one.
     """
-    marker = MARKER.get(strategy_of(arm), "D")
+    marker = MARKER.get(arm) or MARKER.get(strategy_of(arm), "D")
     if arm.endswith(PAPER):
         return SeriesStyle(colour(arm), "--", marker, filled=False)
-    kin = sorted((other for other in arms if _iterations(other) is not None), key=lambda other: _iterations(other) or 0)
+    kin = sorted(
+        (other for other in arms if d1_iterations(other) is not None), key=lambda other: d1_iterations(other) or 0
+    )
     if arm not in kin or len(kin) == 1:
         return SeriesStyle(colour(arm), "-", marker)
     place = kin.index(arm)
@@ -151,7 +154,8 @@ def series_style(arm: str, arms: Sequence[str]) -> SeriesStyle:
     return SeriesStyle(_shade(colour(arm), share), LINES[place % len(LINES)], MARKERS[place % len(MARKERS)])
 
 
-def _iterations(arm: str) -> int | None:
+def d1_iterations(arm: str) -> int | None:
+    """Iterations of an arm with D1: 15 of 'D1-15'; None for all others."""
     strategy, _, number = arm.partition("-")
     return int(number) if strategy == "D1" and number.isdigit() else None
 

@@ -18,6 +18,7 @@ from orchestrator.study.calibration_figures import (
     Drawn,
     SeriesStyle,
     colour,
+    d1_iterations,
     is_first,
     legend,
     level_panels,
@@ -310,7 +311,7 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
                     continue
                 rows += [[level, simulation, pour, arm, t, unit.factor * v] for t, v in zip(times, values)]  # noqa: B905
                 shown = [max(unit.factor * value, least) for value in values]
-                if arm.startswith("D1"):
+                if d1_iterations(arm) is not None:
                     planned += list(zip(times, shown))  # noqa: B905
                 else:
                     style_of = series_style(arm, arms)
@@ -329,7 +330,7 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
         "What pays off at which costs",
         f"Least loss so far, mean over repetitions and receivers ({level_words(level)}), against the time that it "
         "would have taken at hypothesised costs. D3's simulations during a pour cost time only if they take longer "
-        "than the pour. Calibration is not counted: D1 and D3 share it. "
+        "than the pour. Calibration is not counted: D1 and D3 share it, and D1-uncalibrated has none. "
         f"Less than {least:g} {unit.unit} is drawn there.",
         figure,
         ("level", "seconds_per_simulation", "seconds_per_pour", "strategy", "total_seconds", f"least_{unit.unit}"),

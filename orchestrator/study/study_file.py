@@ -112,6 +112,9 @@ class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial_sampl
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
 
 
+D1UncalibratedArm: Any = _arm(D1Settings, "iterations", "simulations_per_iteration", "initial_samples", "kappa")
+
+
 class D3ArmSettings(_arm(D3Settings, "prior_simulations", "initial_samples", "kappa", pours="15")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
@@ -163,6 +166,9 @@ class DeploymentsBase(Settings):
 
     D1: D1ArmSettings | None = None
     """Plan in simulation, pour once."""
+
+    D1_uncalibrated: D1UncalibratedArm | None = None
+    """D1 in the simulator with its defaults instead of C4's parameters: the baseline of every deployment."""
 
     D2: D2Arm | None = None
     """Learn from real pours."""
@@ -440,6 +446,9 @@ AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
 }
 """Settings in which the paper's forms differ from the defaults."""
 
+UNCALIBRATED_KEY = "D1_uncalibrated"
+"""Deployment that no calibration precedes."""
+
 
 def _bench(laboratory: LaboratorySettings, at: Place, report: Report) -> BenchSettings | None:
     """The bench of a study. Without a usable one, the reason is added to the report and the result is None."""
@@ -543,7 +552,8 @@ def _deployment_arms(
         if key == "D2_paper" and arm.mean == "constant":
             report.add(at.at("mean"), "D2_paper has the paper's mean, 'zero'; remove the key, or compare with D2")
         repetitions = arm.repetitions or 1
-        if kind.simulates and repetitions > most:
+        after_calibration = key != UNCALIBRATED_KEY
+        if kind.simulates and after_calibration and repetitions > most:
             report.add(
                 at.at("repetitions") if arm.repetitions is not None else at,
                 f"{arm.variant} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
@@ -552,12 +562,12 @@ def _deployment_arms(
         if not arm.complete:
             continue
         changes = arm.changes() | AS_IN_THE_PAPER.get(key, {})
-        rounds = changes.pop("iterations", None)
+        rounds = changes.pop("iterations", None) if after_calibration else None
         settings = kind.like(base.settings, without=BUDGETS, **changes)
         settings.check(Premises(base.actions, base.objectives is not None), PlacedProblems(at, report))
         common = replace(base, settings=settings, data=None, confirm=0)  # a study has its own 'confirm'
         if rounds is None:
-            arms.append(DeploymentArm(_label(key), common, repetitions))
+            arms.append(DeploymentArm(_label(key), common, repetitions, after_calibration))
         for n in sorted(set(rounds or ())):
             plan = common.with_settings(iterations=n)
             arms.append(DeploymentArm(f"{key}-{n}", plan, repetitions))

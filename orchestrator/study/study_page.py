@@ -24,7 +24,14 @@ from orchestrator.results.loss_units import deployment_unit
 from orchestrator.results.wording import ResultRow, ResultTable, minutes
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
-from orchestrator.study.calibration_figures import Drawn, draw_calibrations, is_ours, level_words, write_csv
+from orchestrator.study.calibration_figures import (
+    Drawn,
+    d1_iterations,
+    draw_calibrations,
+    is_ours,
+    level_words,
+    write_csv,
+)
 from orchestrator.study.deployment_figures import CAPTION, Losses, draw_deployments
 from orchestrator.study.study_folder import code_summary, finished_results, write_whole
 from orchestrator.study.study_plan import Level, StudyPlan, cells_of
@@ -51,10 +58,10 @@ TABLE_POURS = (1, 3, 15)
 _PAIRED = (
     "Mean differences, paired by repetition, level and receiver [95 % t interval of these differences]; below 0 the "
     "first is better. C1 to C4 of a repetition share its weighed pours and the seeds that they are scored with. "
-    "Deployments share the bench's systematic errors, and all but D2 the θ* of the repetition; the chance errors of "
-    "their pours are drawn for each, but final actions' pours share them one by one. Probability: that chance alone "
-    "gives such a difference (sign changes of the repetitions' differences); '—' below five repetitions. Many rows "
-    "are tested: one in twenty is below 0.05 by chance."
+    "Deployments share the bench's systematic errors, and all but D2 and D1-uncalibrated the θ* of the repetition; the "
+    "chance errors of their pours are drawn for each, but final actions' pours share them one by one. Probability: "
+    "that chance alone gives such a difference (sign changes of the repetitions' differences); '—' below five "
+    "repetitions. Many rows are tested: one in twenty is below 0.05 by chance."
 )
 _EFFECT_COLUMNS = ("compared", "of", "mismatch", "receiver", "repetitions", "difference", "better in", "probability")
 _NEEDED = (
@@ -157,7 +164,10 @@ PAIRS = (
 ARMS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3-paper", "D2-paper"), ("D2", "D2-paper"))
 """Pairs of deployments whose losses are compared; deployments of packages are compared with D2."""
 
-FINAL_PAIRS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3", "D1"))
+FINAL_PAIRS = (
+    *(("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3", "D1")),
+    *((arm, "D1-uncalibrated") for arm in ("D1", "D2", "D3")),
+)
 """Pairs whose recommended actions are compared, as `ARMS`; D1 is the one with the most iterations."""
 
 
@@ -175,8 +185,9 @@ def _deployment_effects(study: StudyPlan, found: Gathered) -> Iterator[TableRow]
         if not (found.finals if final else found.losses):
             continue
         losses = Losses(study, found, final=final)
-        longest = max((arm for arm in losses.arms if arm.startswith("D1-")), key=lambda arm: int(arm[3:]), default="")
-        known = [(first, longest if second == "D1" else second) for first, second in pairs]
+        longest = max(filter(d1_iterations, losses.arms), key=lambda arm: d1_iterations(arm) or 0, default="")
+        named = {"D1": longest}
+        known = [(named.get(first, first), named.get(second, second)) for first, second in pairs]
         known += [(arm, "D2") for arm in losses.arms if not is_ours(arm)]
         shown: list[tuple[str, Callable[[str, Sequence[str], str], Mapping[int, float]]]] = [
             (f"least {losses.unit.label} after {pour}", functools.partial(losses.after, pour=pour))
@@ -309,8 +320,9 @@ _RESAMPLED = (
     "95 % where repetitions scatter about normally, and those of shares end at 0 and 100 %."
 )
 
-_AS_IN_THE_PAPER = {
+_FORMS = {
     "C4-paper": ". As in the paper: the surrogate is over θ alone, and takes the action's influence for noise",
+    "D1-uncalibrated": ". The simulator keeps its defaults: the baseline of the other deployments",
     "D2-paper": ". As in the paper: the surrogate has a zero mean",
     "D3-paper": ". As in the paper: a surrogate of the residual around the simulations' mean, always trusted",
 }
@@ -406,10 +418,10 @@ def _settings(study: StudyPlan) -> list[str]:
         axes = ", ".join(f"{axis.name} {axis.lower:g} to {axis.upper:g}" for axis in arm.plan.parameters.axes)
         lines.append(
             f"{arm.label}: {arm.plan.settings.simulations_on(train)} simulations, {arm.repetitions} repetitions, "
-            f"searching {axes}; at {level_words(*arm.levels)}{_AS_IN_THE_PAPER.get(arm.label, '')}."
+            f"searching {axes}; at {level_words(*arm.levels)}{_FORMS.get(arm.label, '')}."
         )
     for each in study.deployments:
-        paper = _AS_IN_THE_PAPER.get(each.label, "")
+        paper = _FORMS.get(each.label, "")
         lines.append(
             f"{each.label}: {each.plan.settings.spending}; {each.repetitions} repetitions into each receiver{paper}."
         )

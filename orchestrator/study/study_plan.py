@@ -66,13 +66,20 @@ class DeploymentArm:
     """A compared deployment with its budget (in `plan`, which has all receivers).
 
     Attributes:
-        label: 'D1-15' for D1 with 15 iterations, 'D2-paper' and 'D3-paper' for the paper's forms, otherwise the
-            strategy.
+        label: 'D1-15' for D1 with 15 iterations, 'D1-uncalibrated' for the baseline, 'D2-paper' and 'D3-paper' for the
+            paper's forms, otherwise the strategy.
+        calibrated: whether it simulates with C4's θ* of the repetition; otherwise with the default θ.
     """
 
     label: str
     plan: DeploymentPlan
     repetitions: int
+    calibrated: bool = True
+
+    @property
+    def needs_calibration(self) -> bool:
+        """Whether it simulates with the result of a calibration."""
+        return self.calibrated and self.plan.settings.simulates
 
 
 @dataclass(frozen=True)
@@ -225,7 +232,7 @@ def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
             for deployment in (a for a in study.deployments if number <= a.repetitions):
                 plan = deployment.plan
                 theta = f"calibration.{level.name}.C4.{number:02d}"
-                needs = (theta,) if plan.settings.simulates else ()
+                needs = (theta,) if deployment.needs_calibration else ()
                 for scene in plan.scenes:
                     there: dict[str, str | int] = {**place, "arm": deployment.label, "receiver": scene.name}
                     deployed = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)

@@ -26,14 +26,29 @@ from tests.support.study_files import ROOT, STUDIES, read, small, without, writt
 def test_the_paper_study_has_the_repetitions_that_it_promises() -> None:
     cells = cells_of(load_study(STUDIES / "paper.yaml"))
     count = Counter((cell.kind, cell.arm, cell.level) for cell in cells)
-    assert [count["calibration", arm, "moderate"] for arm in ("C1", "C2", "C3", "C4")] == [10, 5, 5, 10]
+    assert [count["calibration", arm, "moderate"] for arm in ("C1", "C2", "C3", "C4")] == [6, 3, 3, 6]
     for level in ("small", "moderate", "large"):
-        assert count["pours", "", level] == 10
-        for arm in ("D1-15", "D2", "D3"):
-            assert count["deployment", arm, level] == 3 * 10
+        assert count["pours", "", level] == 6
+        for arm in ("D1-uncalibrated", "D1-15", "D2", "D3"):
+            assert count["deployment", arm, level] == 3 * 6
     spent = {arm: sum(c.simulations - 32 for c in cells if c.arm == arm) for arm in ("C2", "C3")}
-    assert spent == {"C2": 5 * 504, "C3": 5 * 1652}
+    assert spent == {"C2": 3 * 504, "C3": 3 * 1652}
     assert [c.simulations for c in cells if c.kind == "grid"] == [100 * 32]
+
+
+def test_the_uncalibrated_baseline_plans_with_the_defaults_and_needs_no_calibration(tmp_path: Path) -> None:
+    arm = {"repetitions": 2, "simulations_per_iteration": 1}
+    arms = {"D1": {**arm, "iterations": [2]}, "D1_uncalibrated": {**arm, "iterations": 2}}
+    study = load_study(written(tmp_path, {**read("quick"), "deployment": arms}))
+    cells = {cell.arm: cell for cell in cells_of(study) if cell.kind == "deployment" and cell.repetition == 1}
+    assert cells["D1-2"].needs == ("calibration.large.C4.01",)
+    assert cells["D1-uncalibrated"].needs == ()
+    assert cells["D1-2"].seed == cells["D1-uncalibrated"].seed, "they differ in θ alone"
+    plan, _ = campaign_of(study, cells["D1-uncalibrated"], lambda _: pytest.fail("it loads no results"), tmp_path)
+    assert plan.parameters == study.base.parameters
+    without_c4 = {key: value for key, value in read("quick").items() if key != "calibration"}
+    alone = load_study(written(tmp_path / "alone", {**without_c4, "deployment": {"D1_uncalibrated": arm}}))
+    assert {cell.kind for cell in cells_of(alone)} == {"deployment", "final"}
 
 
 def test_a_study_may_have_other_values_and_ranges_of_parameters_than_its_campaign(tmp_path: Path) -> None:

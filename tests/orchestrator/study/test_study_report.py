@@ -198,7 +198,7 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
 
 
 def test_no_two_arms_of_a_figure_look_alike() -> None:
-    arms = ["D1-5", "D1-15", "D1-10", "D2", "D2-paper", "D3", "D3-paper"]
+    arms = ["D1-uncalibrated", "D1-5", "D1-15", "D1-10", "D2", "D2-paper", "D3", "D3-paper"]
     looks = [series_style(arm, arms) for arm in arms]
     assert len({one.colour for one in looks}) == len(arms)
     planned = [series_style(arm, arms) for arm in ("D1-5", "D1-10", "D1-15")]
