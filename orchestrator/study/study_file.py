@@ -112,9 +112,6 @@ class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial_sampl
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
 
 
-D1UncalibratedArm: Any = _arm(D1Settings, "iterations", "simulations_per_iteration", "initial_samples", "kappa")
-
-
 class D3ArmSettings(_arm(D3Settings, "prior_simulations", "initial_samples", "kappa", pours="15")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
@@ -167,7 +164,7 @@ class DeploymentsBase(Settings):
     D1: D1ArmSettings | None = None
     """Plan in simulation, pour once."""
 
-    D1_uncalibrated: D1UncalibratedArm | None = None
+    D1_uncalibrated: D1ArmSettings | None = None
     """D1 in the simulator with its defaults instead of C4's parameters: the baseline of every deployment."""
 
     D2: D2Arm | None = None
@@ -562,15 +559,18 @@ def _deployment_arms(
         if not arm.complete:
             continue
         changes = arm.changes() | AS_IN_THE_PAPER.get(key, {})
-        rounds = changes.pop("iterations", None) if after_calibration else None
+        rounds = changes.pop("iterations", None)
+        if not after_calibration and len(rounds) > 1:
+            report.add(at.at("iterations"), f"{len(rounds)} numbers, but the baseline is one plan; give one: [15]")
         settings = kind.like(base.settings, without=BUDGETS, **changes)
         settings.check(Premises(base.actions, base.objectives is not None), PlacedProblems(at, report))
         common = replace(base, settings=settings, data=None, confirm=0)  # a study has its own 'confirm'
         if rounds is None:
-            arms.append(DeploymentArm(_label(key), common, repetitions, after_calibration))
+            arms.append(DeploymentArm(_label(key), common, repetitions))
         for n in sorted(set(rounds or ())):
             plan = common.with_settings(iterations=n)
-            arms.append(DeploymentArm(f"{key}-{n}", plan, repetitions))
+            label = f"{key}-{n}" if after_calibration else _label(key)
+            arms.append(DeploymentArm(label, plan, repetitions, after_calibration))
     return tuple(arms)
 
 

@@ -38,7 +38,7 @@ def test_the_paper_study_has_the_repetitions_that_it_promises() -> None:
 
 def test_the_uncalibrated_baseline_plans_with_the_defaults_and_needs_no_calibration(tmp_path: Path) -> None:
     arm = {"repetitions": 2, "simulations_per_iteration": 1}
-    arms = {"D1": {**arm, "iterations": [2]}, "D1_uncalibrated": {**arm, "iterations": 2}}
+    arms = {"D1": {**arm, "iterations": [2]}, "D1_uncalibrated": {**arm, "iterations": [2]}}
     study = load_study(written(tmp_path, {**read("quick"), "deployment": arms}))
     cells = {cell.arm: cell for cell in cells_of(study) if cell.kind == "deployment" and cell.repetition == 1}
     assert cells["D1-2"].needs == ("calibration.large.C4.01",)
@@ -49,6 +49,12 @@ def test_the_uncalibrated_baseline_plans_with_the_defaults_and_needs_no_calibrat
     without_c4 = {key: value for key, value in read("quick").items() if key != "calibration"}
     alone = load_study(written(tmp_path / "alone", {**without_c4, "deployment": {"D1_uncalibrated": arm}}))
     assert {cell.kind for cell in cells_of(alone)} == {"deployment", "final"}
+    with pytest.raises(ConfigError, match=r"D1_uncalibrated.iterations: 2 numbers, but the baseline is one plan"):
+        load_study(
+            written(
+                tmp_path / "two", {**read("quick"), "deployment": {"D1_uncalibrated": {**arm, "iterations": [2, 3]}}}
+            )
+        )
 
 
 def test_a_study_may_have_other_values_and_ranges_of_parameters_than_its_campaign(tmp_path: Path) -> None:
