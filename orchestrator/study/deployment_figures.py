@@ -315,7 +315,12 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
                     planned += list(zip(times, shown))  # noqa: B905
                 else:
                     style_of = series_style(arm, arms)
-                    axes.plot(times, shown, style_of.line, marker=".", color=style_of.colour, label=arm, markersize=4)
+                    # A single point, of a strategy that pours once, is above the lines.
+                    marker, size, order = (".", 4, 2) if len(times) > 1 else (style_of.marker, 7, 4)
+                    axes.plot(
+                        times, shown, style_of.line, marker=marker, color=style_of.colour, label=arm, markersize=size,
+                        zorder=order,
+                    )  # fmt: skip
             if planned:
                 planned.sort()
                 axes.plot(*np.transpose(planned), "s--", color=colour("D1"), label="D1", markersize=5)
