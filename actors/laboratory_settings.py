@@ -101,6 +101,10 @@ class HiddenLiquidBase(Settings):
         """The hidden θ."""
         return SimulationParameters.from_values(self.model_dump())
 
+    def free_fields(self) -> frozenset[str]:
+        """As those of `SimulationParameters`."""
+        return self.parameters().free_fields()
+
 
 def _hidden_liquid() -> type[HiddenLiquidBase]:
     """The settings with one key per parameter of the solver; the nuisances of a bench are its `pose_error`."""

@@ -223,13 +223,10 @@ def actions() -> str:
 
 def parameters() -> str:
     """What calibration may turn."""
-    default = SimulationParameters().model_dump()
     rows = []
     for name, info in SimulationParameters.info().items():
         unit = "" if info.shown == "1" else f" {info.shown}"
-        lower, upper, usual = (
-            f"{round(value / info.factor, 6):g}" for value in (info.lower, info.upper, default[name])
-        )
+        lower, upper, usual = (f"{round(value / info.factor, 6):g}" for value in (info.lower, info.upper, info.default))
         beforehand = f" Beforehand ± {info.tolerance / info.factor:.2g}{unit}." if info.nuisance else ""
         rows.append((f"`{name}`", f"{lower} … {upper}{unit}", f"{usual}{unit}", _one_line(info.meaning) + beforehand))
     return _table(("name", "bounds", "default", "meaning"), rows)

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.hydrostatics import GRAVITY, LipFlow, lip_flow
+from sim_engine.hydrostatics import DISCHARGE, GRAVITY, LipFlow, lip_flow
 from sim_engine.liquids import Liquid
 from sim_engine.motion import Motion
 from sim_engine.vessel.vessel import Vessel
@@ -107,6 +107,7 @@ class FlowCourse:
         covered: whether liquid covers the whole opening.
         lip: x of the lip in the world [m].
         fall: from the lip to the level of the receiver's rim, 0 if it is not above it [m].
+        time: at which the step begins [s].
     """
 
     volume: Floats
@@ -117,6 +118,7 @@ class FlowCourse:
     covered: Which
     lip: Floats
     fall: Floats
+    time: Floats
 
     def landing(self) -> float:
         """Position at which the middle of the stream passes the level of the receiver's rim, x in the world [m].
@@ -180,11 +182,7 @@ def flow_course(motion: Motion, liquid: Liquid, pourer: Vessel, receiver: Vessel
     lip, fall = (along[leaving] for along in _lip(motion, flow, pourer, receiver))
     outflow = flow.outflow[leaving]
     opening = _wetted(pourer.opening_radius, flow.heads[leaving], flow.tilts[leaving])
-    flux = outflow / opening.width
-    by_inertia = flux * opening.area / opening.ideal_flow
-    by_viscosity = np.cbrt(3.0 * liquid.kinematic_viscosity * flux / GRAVITY)
-    film = np.maximum(by_inertia, by_viscosity)
-    velocity = flux / film
+    velocity, film = _film(liquid, outflow, opening)
     falling = np.sqrt(velocity**2 + 2.0 * GRAVITY * fall)
     return FlowCourse(
         volume=left[leaving],
@@ -195,7 +193,34 @@ def flow_course(motion: Motion, liquid: Liquid, pourer: Vessel, receiver: Vessel
         covered=opening.covered,
         lip=lip,
         fall=fall,
+        time=flow.times[leaving],
     )
+
+
+def film_of_flow(liquid: Liquid, pourer: Vessel, outflow: Floats, tilt: float) -> tuple[Floats, Floats]:
+    """Film at the lip of a steady flow, whatever caused it.
+
+    Args:
+        liquid, pourer: of the pour.
+        outflow: above 0, shape (K,) [m³/s].
+        tilt: above 0 [rad].
+
+    Returns:
+        Velocity [m/s] and thickness [m], (K,) each.
+    """
+    heads = 2.0 * pourer.opening_radius * np.linspace(0.0, 1.0, 400)[1:] ** 2
+    flows = DISCHARGE * _wetted(pourer.opening_radius, heads, np.full(len(heads), tilt)).ideal_flow
+    at = np.interp(outflow, flows, heads)
+    return _film(liquid, outflow, _wetted(pourer.opening_radius, at, np.full(len(at), tilt)))
+
+
+def _film(liquid: Liquid, outflow: Floats, opening: _Opening) -> tuple[Floats, Floats]:
+    """Velocity and thickness of the film, (K,) each."""
+    flux = outflow / opening.width
+    by_inertia = flux * opening.area / opening.ideal_flow
+    by_viscosity = np.cbrt(3.0 * liquid.kinematic_viscosity * flux / GRAVITY)
+    film = np.maximum(by_inertia, by_viscosity)
+    return flux / film, film
 
 
 def _lip(motion: Motion, flow: LipFlow, pourer: Vessel, receiver: Vessel) -> tuple[Floats, Floats]:

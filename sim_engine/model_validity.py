@@ -111,7 +111,14 @@ class ModelValidity:
 
 
 def regimes(
-    scene: Scene, action: Action, pourer: Vessel, receiver: Vessel, *, spacing: float, motion: Motion | None = None
+    scene: Scene,
+    action: Action,
+    pourer: Vessel,
+    receiver: Vessel,
+    *,
+    spacing: float,
+    adhesion: float = 0.0,
+    motion: Motion | None = None,
 ) -> ModelValidity:
     """Analyse a planned pour without simulating it.
 
@@ -120,6 +127,7 @@ def regimes(
         action: complete action.
         pourer, receiver: geometry of the scene's vessels.
         spacing: of the particles in the pour's simulation [m].
+        adhesion: its `lip_adhesion`; above 0, dribbling is simulated.
         motion: to use instead of the planned one.
 
     Raises:
@@ -131,7 +139,7 @@ def regimes(
     if course is None:
         return ModelValidity(0.0)
     found = [
-        _dribbling(course, liquid),
+        *([_dribbling(course, liquid)] if adhesion == 0.0 else []),
         _wetting(course, liquid),
         _viscous(course, liquid, spacing),
         _thin_stream(course, liquid, spacing),
@@ -152,7 +160,7 @@ def _dribbling(course: FlowCourse, liquid: Liquid) -> NotCovered:
         share,
         f"{_percent(share)} of what is poured leaves the lip at a Weber number below {DRIBBLING_WEBER:g} and may run "
         "down the outside of the wall, which is not simulated. More may be spilled than predicted; tilt faster or "
-        "farther",
+        "farther, or set the parameter lip_adhesion (1 for a sharp rim)",
     )
 
 

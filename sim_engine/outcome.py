@@ -72,6 +72,7 @@ class PourOutcome:
         curve_poured: fraction that has left the pourer at those times.
         curve_spilled: fraction spilled at those times.
         invalid: why the outcome must not be used; None for a valid one.
+        dribbled: ran down the outside of the pourer (`sim_engine.dribbling`); part of `received` and `spilled`.
     """
 
     received: float
@@ -90,6 +91,7 @@ class PourOutcome:
     curve_poured: tuple[float, ...] = ()
     curve_spilled: tuple[float, ...] = ()
     invalid: str | None = None
+    dribbled: float = 0.0
 
     @property
     def fractions(self) -> Fractions:
@@ -104,6 +106,7 @@ class PourOutcome:
             "retained": self.retained,
             "in_flight": self.in_flight,
             "escaped": self.escaped,
+            "dribbled": self.dribbled,
             "particles": self.particles,
             "spacing_mm": self.spacing * 1e3,
             "density_error": self.density_error,

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.collision import contact_during, describe_contact, rotations
+from sim_engine.dribbling import DribblingCourse, dribbling_course, rivulet_frames
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, SolidWalls
 from sim_engine.hydrostatics import GRAVITY, level
@@ -127,6 +128,8 @@ class TimeLoop:
         scene: its index in the engine.
         times, poured, spilled: recorded curve: [s], fractions.
         frames: time, positions (N, 3) [m], states (N,).
+        dribbling: what runs down the outside of the pourer; None if that is not simulated.
+        states: of the particles at the times of the curve, (N,) each, if `dribbling` is set.
         slices: time reached, in `SLICE`.
         over: whether the outcome is final.
         cpu_s: CPU time of the process for this pour [s]; pours that run side by side share it evenly.
@@ -143,6 +146,8 @@ class TimeLoop:
     poured: list[float] = field(default_factory=lambda: [0.0])
     spilled: list[float] = field(default_factory=lambda: [0.0])
     frames: list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]] = field(default_factory=list)
+    dribbling: DribblingCourse | None = None
+    states: list[NDArray[np.uint8]] = field(default_factory=list)
     slices: int = 0
     over: bool = False
     cpu_s: float = 0.0
@@ -153,6 +158,8 @@ class TimeLoop:
         self.slices = round(self.start / SLICE)
         if abs(self.start - self.clock) > 1e-9:
             raise ValueError(f"a pour is simulated from a multiple of {SLICE:g} s on, not from {self.start:.6g} s")
+        if self.dribbling is not None:
+            self.states.append(np.full(self.task.parameters.particles, int(ParticleState.IN_POURER), np.uint8))
 
     @property
     def clock(self) -> float:
@@ -176,6 +183,8 @@ class TimeLoop:
             self.times.append(now)
             self.poured.append(1.0 - float(counts[ParticleState.IN_POURER]) / n)
             self.spilled.append(float(counts[ParticleState.SPILLED]) / n)
+            if self.dribbling is not None:
+                self.states.append(fluid.particles(self.scene)[1])
         if fluid.fault(self.scene) is not None or self.clock >= self.motion.duration + LONGEST_TAIL:
             self.over = True
             return
@@ -228,7 +237,13 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
         loading: CPU time of its setup [s].
     """
     n, scene = course.task.parameters.particles, course.scene
-    counts = fluid.census(scene)
+    counts, spilled_then, dribbled = fluid.census(scene), course.spilled, 0
+    if course.dribbling is not None:
+        states = np.array(course.states)
+        found = course.dribbling.select(states)
+        placed, dribbled = found.placed(states), len(found.particles)
+        counts = np.bincount(placed[-1], minlength=len(ParticleState)).astype(np.int32)
+        spilled_then = list((placed == ParticleState.SPILLED).mean(axis=1))
     received, spilled, retained, in_flight, escaped = (
         float(counts[state]) / n
         for state in (
@@ -260,8 +275,9 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
         seed=course.task.seed,
         curve_times=tuple(course.times),
         curve_poured=tuple(course.poured),
-        curve_spilled=tuple(course.spilled),
+        curve_spilled=tuple(map(float, spilled_then)),
         invalid=invalid,
+        dribbled=dribbled / n,
     )
 
 
@@ -498,7 +514,7 @@ class PourSimulator:
         fluid.load([self._setup(*one) for one in zip(tasks, motions, starts, strict=True)])
         loading = (time.process_time() - begun) / len(tasks)
         courses = [
-            TimeLoop(task, motion, start, scene)
+            TimeLoop(task, motion, start, scene, dribbling=self._dribbling(task, motion))
             for scene, (task, motion, start) in enumerate(zip(tasks, motions, starts, strict=True))
         ]
         if fluid.backend == "cpu":
@@ -510,10 +526,29 @@ class PourSimulator:
         for course, task, motion in zip(courses, tasks, motions, strict=True):
             if task.frame_rate > 0.0:
                 course.frames[:0] = self._level_frames(task, motion, course.start)
+                if course.dribbling is not None:
+                    found = course.dribbling.select(np.array(course.states))
+                    times = np.array(course.times)
+                    course.frames = rivulet_frames(course.dribbling, found, motion, times, course.frames)
         return [
             SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
             for course, motion in zip(courses, motions, strict=True)
         ]
+
+    def _dribbling(self, task: PourTask, motion: Motion) -> DribblingCourse | None:
+        """What runs down the outside of the pourer; None if nothing does."""
+        if task.parameters.lip_adhesion == 0.0:
+            return None
+        scene, error = task.scene, task.placement
+        course = dribbling_course(
+            motion,
+            scene.liquid,
+            self.vessel(scene.pourer),
+            self.vessel(scene.receiver),
+            adhesion=task.parameters.lip_adhesion,
+            receiver_at=(error.x, error.y, error.z),
+        )
+        return course if course is not None and course.dribbles.any() else None
 
     def _laid(self, task: PourTask, motion: Motion, at: float) -> NDArray[np.float32]:
         """Positions of the liquid at rest in the pourer in its pose at a time [s], (N, 3) in the world [m]."""

@@ -165,6 +165,9 @@ class SimulateOutput(_Output):
     escaped: float
     """Fraction that left the simulated box."""
 
+    dribbled: float
+    """Fraction that ran down the outside of the pourer; part of received and spilled."""
+
     particles: int
     spacing_mm: float
     density_error: float

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -250,6 +251,8 @@ def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, SampleStatistics]
     first = outcomes[0]
     shown = {name: over_seeds[name].percent(2 if name == "escaped" else 1) for name in FRACTIONS if name in over_seeds}
     fractions = "  ".join(f"{name.replace('_', ' ')} {text}" for name, text in shown.items())
+    dribbled = statistics.fmean(outcome.dribbled for outcome in outcomes)
+    fractions += f"  down the outside {100 * dribbled:.1f} %" if dribbled else ""
     fractions += f"  delivered {delivered}" if delivered else ""
     valid = sum(outcome.invalid is None for outcome in outcomes)
     seeds = (
@@ -265,7 +268,7 @@ def _regimes(task: PourTask) -> ModelValidity | None:
     from orchestrator.results.validity_warnings import numbers_line, regimes_of
 
     try:
-        found = regimes_of(task.scene, task.action, task.parameters.particles)
+        found = regimes_of(task.scene, task.action, task.parameters.particles, task.parameters.lip_adhesion)
     except (ValueError, OSError) as error:
         print_note(f"note: whether something is not simulated could not be worked out: {error}")
         return None

@@ -141,7 +141,8 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
         (
             "outcome",
             f"received {100 * outcome.received:.2f} %, spilled {100 * outcome.spilled:.2f} %, "
-            f"retained {100 * outcome.retained:.2f} %, in flight {100 * outcome.in_flight:.2f} %",
+            f"retained {100 * outcome.retained:.2f} %, in flight {100 * outcome.in_flight:.2f} %, "
+            f"down the outside {100 * outcome.dribbled:.2f} %",
         ),
     ):
         level = rr.TextLogLevel.WARN if source == "outcome" and outcome.invalid is not None else rr.TextLogLevel.INFO

@@ -27,20 +27,24 @@ MOST_CORNERS = 32
 _vessel = lru_cache(maxsize=16)(build_vessel)
 
 
-def regimes_of(scene: Scene, action: Action, particles: float) -> ModelValidity:
+def regimes_of(scene: Scene, action: Action, particles: float, adhesion: float) -> ModelValidity:
     """Model validity of one action.
 
     Args:
         particles: number of particles of a simulation.
+        adhesion: its `lip_adhesion`.
 
     Raises:
         ValueError, OSError: its vessels can't be built, or don't hold the load.
     """
     distance = spacing(scene.liquid.volume, max(round(particles), 1))
-    return regimes(scene, action, _vessel(scene.pourer), _vessel(scene.receiver), spacing=distance)
+    vessels = _vessel(scene.pourer), _vessel(scene.receiver)
+    return regimes(scene, action, *vessels, spacing=distance, adhesion=adhesion)
 
 
-def space_warnings(scene: Scene, actions: Space, particles: float, receiver: str) -> list[NotSimulated]:
+def space_warnings(
+    scene: Scene, actions: Space, particles: float, adhesion: float, receiver: str
+) -> list[NotSimulated]:
     """Effects that are not simulated at the middle and the corners of an action space, each kind once.
 
     Args:
@@ -53,7 +57,7 @@ def space_warnings(scene: Scene, actions: Space, particles: float, receiver: str
     tried = [actions.decode(point) for point in ((0.5,) * actions.dimension, *corners)]
     found: dict[str, list[tuple[NotCovered, dict[str, float]]]] = {}
     for values in tried:
-        for one in regimes_of(scene, scene.action(values), particles).not_covered:
+        for one in regimes_of(scene, scene.action(values), particles, adhesion).not_covered:
             found.setdefault(one.kind, []).append((one, values))
     warnings = []
     for kind, hits in found.items():
@@ -75,20 +79,23 @@ def space_warnings(scene: Scene, actions: Space, particles: float, receiver: str
 def campaign_warnings(plan: CampaignPlan) -> dict[str, list[NotSimulated]]:
     """Effects that are not simulated in a campaign's action spaces, by scene; scenes without warnings are left out.
 
-    If calibration searches the number of particles, the middle of its range is used.
+    If calibration searches the number of particles or the adhesion, the middle of its range is used.
 
     Raises:
         ValueError, OSError: as `regimes_of`.
     """
-    spaces: list[tuple[Scene, Space, float]] = []
-    particles, names = float(plan.parameters.particles), receiver_names(plan)
+    spaces: list[tuple[Scene, Space]] = []
+    particles, adhesion = float(plan.parameters.particles), plan.parameters.lip_adhesion
+    names = receiver_names(plan)
     if plan.calibration is not None:
-        particles = _middle(plan.calibration, particles)
-        spaces += [(scene, plan.calibration.actions, particles) for scene in plan.calibration.scenes]
+        particles = _middle(plan.calibration, "particles", particles)
+        adhesion = _middle(plan.calibration, "lip_adhesion", adhesion)
+        spaces += [(scene, plan.calibration.actions) for scene in plan.calibration.scenes]
     if plan.deployment is not None:
-        spaces += [(scene, plan.deployment.actions, particles) for scene in plan.deployment.scenes]
+        spaces += [(scene, plan.deployment.actions) for scene in plan.deployment.scenes]
     found = {
-        scene.name: space_warnings(scene, actions, n, names.get(scene.name, scene.name)) for scene, actions, n in spaces
+        scene.name: space_warnings(scene, actions, particles, adhesion, names.get(scene.name, scene.name))
+        for scene, actions in spaces
     }
     return {name: warnings for name, warnings in found.items() if warnings}
 
@@ -99,13 +106,13 @@ def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list
     Raises:
         ValueError, OSError: as `regimes_of`.
     """
-    particles = (recommended_theta_of(results) or plan.parameters).particles
+    theta = recommended_theta_of(results) or plan.parameters
     scenes = {} if plan.deployment is None else {scene.name: scene for scene in plan.deployment.scenes}
     found = {}
     for name, result in deployments_of(results).items():
         if name in scenes and result.recommended is not None:
             action = scenes[name].action(dict(result.recommended.action_si))
-            found[name] = list(regimes_of(scenes[name], action, particles).not_covered)
+            found[name] = list(regimes_of(scenes[name], action, theta.particles, theta.lip_adhesion).not_covered)
     return found
 
 
@@ -140,8 +147,8 @@ def _number(value: float) -> str:
     return f"{round(value / digits) * digits:,}".replace(",", " ")
 
 
-def _middle(calibration: CalibrationPlan, otherwise: float) -> float:
+def _middle(calibration: CalibrationPlan, name: str, otherwise: float) -> float:
     for axis in calibration.parameters.axes:
-        if axis.name == "particles":
+        if axis.name == name:
             return axis.decode(0.5)
-    return calibration.fixed_parameters.get("particles", otherwise)
+    return calibration.fixed_parameters.get(name, otherwise)

@@ -13,13 +13,16 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from actors.laboratory_settings import HiddenLiquidBase
 from orchestrator.journal.codec import to_json
 from orchestrator.requests import WRITTEN_IF_SET
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from sim_engine.liquids import Liquid
+from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import Scene
 from sim_engine.settings.model import BY_CONTENT, NOT_IN_FINGERPRINT, SET_BY_PROGRAM, marks_of
 from sim_engine.vessel.shapes import ProfileShape, Shape
+
+WITH_FREE_FIELDS = HiddenLiquidBase, Liquid, ProfileShape, SimulationParameters
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:
@@ -50,7 +53,7 @@ def deciding(value: Any) -> Any:
     if isinstance(value, ProfileShape) and value.unit != "m":
         return deciding(value.outline())  # the same shape in another unit is the same
     if isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, type)):
-        free = value.free_fields() if isinstance(value, Liquid | ProfileShape) else _absent(value)
+        free = value.free_fields() if isinstance(value, WITH_FREE_FIELDS) else _absent(value)
         fields = {
             name: (getattr(value, name), mark)
             for name, mark in marks_of(type(value)).items()

@@ -114,12 +114,12 @@ def test_the_summary_has_them_for_people_and_for_programs(results: dict[str, Any
 
 def test_numbers_are_told_with_digits_that_mean_something() -> None:
     scene = example_run.NARROW
-    found = regimes_of(scene, example_run.ACTION, 2_000)
+    found = regimes_of(scene, example_run.ACTION, 2_000, 0.0)
     assert found.lip is not None
     line = numbers_line(found)
     assert f"We {found.lip.weber.smallest:.2g} … {found.lip.weber.largest:.2g}" in line
     assert "e+" not in line
-    nothing = regimes_of(scene, example_run.ACTION.with_values(max_angle=10 * DEG), 2_000)
+    nothing = regimes_of(scene, example_run.ACTION.with_values(max_angle=10 * DEG), 2_000, 0.0)
     assert numbers_line(nothing) == "nothing leaves the pourer, as far as hydrostatics tells"
 
 
