@@ -34,6 +34,7 @@ from machine import ROOT, say, write_table
 from quickstart import KeptPours, calibration_and_test
 
 from decant.running import build_campaign, load_campaign
+from orchestrator.journal.codec import Results
 from orchestrator.results.stage_views import theta_of
 from orchestrator.run_service import RunRequest, RunResources, RunService
 
@@ -54,31 +55,44 @@ def drawn(nominal: float, bench: str, seed: int) -> tuple[float, dict[str, Any]]
     content: dict[str, Any] = json.loads(json.dumps(load_campaign(CAMPAIGN).resolved))
     particles = BENCHES[bench] * content["simulator"]["parameters"]["particles"]
     true = nominal * SPREAD ** rng.uniform(-1.0, 1.0)
-    x, y, tilt, speed = rng.standard_normal(4)
     content["seed"], content["liquid"]["viscosity"] = seed, f"{GUESSES[nominal]} Pa*s"
     content["laboratory"]["bench"] |= {
         "liquid": {"particles": particles, "viscosity_factor": true / GUESSES[nominal]},
+        **bench_errors(rng),
+    }
+    return true, content
+
+
+def bench_errors(rng: np.random.Generator) -> dict[str, Any]:
+    """Return drawn errors of placement, tilt and speed as keys of a simulated bench."""
+    x, y, tilt, speed = rng.standard_normal(4)
+    return {
         "pose_error": {
             "x": f"{2.0 * x} mm", "y": f"{y} mm", "tilt": f"{0.3 * tilt} deg", "speed_factor": 1.0 + 0.01 * speed,
         },
         "time_scale": 3000,  # only speeds the bench up; the results are the same
     }  # fmt: skip
-    return true, content
 
 
-def identified(nominal: float, bench: str, seed: int) -> dict[str, Any]:
-    """Return the truth and the posterior's 5, 50 and 95 % quantiles [Pa s] of one campaign."""
-    true, content = drawn(nominal, bench, seed)
-    begun = time.process_time()
-    with tempfile.TemporaryDirectory(prefix="decant-viscosity-") as folder:
+def calibrated(content: dict[str, Any]) -> Results:
+    """Return the results of a campaign that only calibrates; its bench's pours are not journalled."""
+    with tempfile.TemporaryDirectory(prefix="decant-identify-") as folder:
         content["outputs"] = {"directory": folder, "recording": False, "figures": False}
         campaign = build_campaign(content, folder)
         assert campaign.calibration is not None
         pool = KeptPours(Path(folder) / "pours.jsonl")
         request = RunRequest(campaign, calibration_and_test(campaign.calibration))
         handle = RunService().start(request, RunResources(in_process=True, simulators=pool))
-        found = theta_of(asyncio.run(handle.wait()).results)
+        results = asyncio.run(handle.wait()).results
         asyncio.run(pool.close())
+    return results
+
+
+def identified(nominal: float, bench: str, seed: int) -> dict[str, Any]:
+    """Return the truth and the posterior's 5, 50 and 95 % quantiles [Pa s] of one campaign."""
+    true, content = drawn(nominal, bench, seed)
+    begun = time.process_time()
+    found = theta_of(calibrated(content))
     assert found is not None
     assert found.posterior is not None
     draws = [GUESSES[nominal] * theta["viscosity_factor"] for theta in found.posterior.thetas]

@@ -199,10 +199,7 @@ class SimulationParameters(BaseModel):
     speed_factor: float = Field(default=1.0, ge=0.8, le=1.25, json_schema_extra=_nuisance("1", "1", 0.02))
     """Executed over commanded angular velocity."""
 
-    # Zero is not written, as by earlier versions: their runs can be resumed and compared.
-    lip_adhesion: float = Field(
-        default=0.0, ge=0.0, le=5.0, exclude_if=lambda value: value == 0.0, json_schema_extra={"unit": "1"}
-    )
+    lip_adhesion: float = Field(default=0.0, ge=0.0, le=5.0, json_schema_extra={"unit": "1"})
     """Adhesion of the film at the lip: below the Weber number lip_adhesion · (1 + cos of the contact angle) it runs
     down the outside of the pourer (teapot effect). 1 for a sharp edge at a right angle, more for round edges; 0: no
     liquid dribbles."""
