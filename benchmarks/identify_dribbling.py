@@ -2,8 +2,8 @@
 
     python benchmarks/identify_dribbling.py --kept FILE [--first 601] [--seeds 12] [--write]
 
-The campaign is `configs/campaigns/dribbling.yaml`: ten slow pours that stop half-way, eight of them to calibrate on. Per
-seed the true adhesion is drawn between 0.6 and 2.4, evenly on a logarithmic scale, and so are the bench's errors of
+The campaign is `configs/campaigns/dribbling.yaml`: ten slow pours that stop half-way, eight of them to calibrate on.
+Per seed the true adhesion is drawn between 0.6 and 2.4, evenly on a logarithmic scale, and so are the bench's errors of
 placement, tilt and speed; only the receiver's distance is searched with the adhesion. The bench's liquid has as many
 particles as in the simulator, or four times as many.
 
@@ -59,7 +59,7 @@ def identified(bench: str, seed: int) -> dict[str, Any]:
         "seed": seed,
         "true": round(true, 4),
         "quantiles": [round(float(q), 4) for q in np.quantile(draws, (0.05, 0.5, 0.95))],
-        "test": {name: round(scores.discrepancy[name]["test"], 5) for name in ("theta", "uncalibrated")},
+        "test": {name: scores.discrepancy[name]["test"] for name in ("theta", "uncalibrated")},
     }
 
 
@@ -112,8 +112,8 @@ def main() -> None:
             "median over truth", "test error halved", "median test error, points",
         ]  # fmt: skip
         settings = (
-            f"{asked.seeds} seeds from {asked.first}, not used before; truth from {LEAST} to {LARGEST}, searched from 0 "
-            "to 3; simulator with 600 particles; goals: 10 of 12, factor 1.25, 10 of 12"
+            f"{asked.seeds} seeds from {asked.first}, not used before; truth from {LEAST} to {LARGEST}, searched from "
+            "0 to 3; simulator with 600 particles; goals: 10 of 12, factor 1.25, 10 of 12"
         )
         write_table("dribbling", head, rows, command, settings)
 

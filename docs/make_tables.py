@@ -356,7 +356,18 @@ MEASURED = (
         "quickstart-calibration",
         "quickstart-coverage",
     ),
-    *("cliffs", "ideal", "intervals", "study-intervals", "learning", "budgets", "risk", "optimizers", "viscosity"),
+    *(
+        "cliffs",
+        "ideal",
+        "intervals",
+        "study-intervals",
+        "learning",
+        "budgets",
+        "risk",
+        "optimizers",
+        "viscosity",
+        "dribbling",
+    ),
 )
 """Tables of docs/data/results.json that a page shows."""
 
