@@ -33,8 +33,8 @@ valleys became oblique and space-filling continued until it found a valley; for 
 
 Seeds 9000 to 9059 are for tuning changes of the hypotheses. Seeds 8400 to 8419 were used once, for the answer about one
 of them at `cliff, large` and `four axes`. The question was fixed before: is the mean of 15 pours at `cliff, large`
-lower by 0.04 or more, and higher at no other level? It was not lower, so the change was left out and no other level was run
-(docs/notes/deployment-tried.md).
+lower by 0.04 or more, and higher at no other level? It was not lower, so the change was left out and no other level
+was run (docs/notes/deployment-tried.md).
 
 Questions on a learned emulator of the simulator, written before its runs. It cannot do better than unlimited exact
 simulations, so D3 runs with 9, 18, 37, 111 and 222 `--simulations` (levels `cliff, small`, `moderate`, `large`; seeds
