@@ -157,9 +157,7 @@ def dribbling_course(
     wall = outer_wall(pourer)
     tilts, poses = motion.tilt(course.time), motion.sample(course.time)
     x, z = _turned(wall, tilts, poses)
-    lowest, _ = _drip_points(z)
-    rows = np.arange(len(z))
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(wall, axis=0).T))])
+    lowest, rows = _drip_points(z), np.arange(len(z))
     below_critical = weber(liquid, course.velocity, course.film) < critical_weber(adhesion, liquid.contact_angle)
     runs_down = z[:, 0] - z[rows, lowest] > capillary_length(liquid)
     inside = np.hypot(x[rows, lowest] - receiver_at[0], receiver_at[1]) < receiver.opening_radius
@@ -168,7 +166,7 @@ def dribbling_course(
         dribbles=below_critical & runs_down,
         received=inside & (z[rows, lowest] > receiver.rim_height + receiver_at[2]),
         speed=course.velocity,
-        length=along[lowest],
+        length=_along(wall)[lowest],
         wall=wall,
     )
 
@@ -214,12 +212,16 @@ def _turned(wall: Floats, tilts: Floats, poses: Floats) -> tuple[Floats, Floats]
     return x, poses[:, 2:3] - wall[:, 0] * sine + wall[:, 1] * cosine
 
 
-def _drip_points(heights: Floats) -> tuple[NDArray[np.int64], Floats]:
-    """Index (K,) of the lowest point that liquid reaches downhill along a wall, and its height, of heights (K, M)."""
+def _drip_points(heights: Floats) -> NDArray[np.int64]:
+    """Indices (K,) of the lowest points that liquid reaches downhill along a wall of heights (K, M)."""
     lowest = np.minimum.accumulate(heights, axis=1)
     reached = np.logical_and.accumulate(heights <= lowest + BRIDGED, axis=1)
-    index = np.argmin(np.where(reached, heights, np.inf), axis=1)
-    return index, heights[np.arange(len(heights)), index]
+    return np.asarray(np.argmin(np.where(reached, heights, np.inf), axis=1))
+
+
+def _along(wall: Floats) -> Floats:
+    """Distances of a wall's points (M, 2) from its first one, along the wall (M,) [m]."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(wall, axis=0).T))])
 
 
 def rivulet_frames(
@@ -237,8 +239,7 @@ def rivulet_frames(
         times: of the states from which the particles were selected, shape (T,) [s].
         frames: time [s], positions (N, 3) [m], states (N,).
     """
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(course.wall, axis=0).T))])
-    begun = times[np.minimum(dribbled.left, len(times) - 1)]
+    begun, along = times[np.minimum(dribbled.left, len(times) - 1)], _along(course.wall)
     speed, length = course.speed[dribbled.step], course.length[dribbled.step]
     drips = begun + length / np.maximum(speed, 1e-3)
     final = np.where(dribbled.received, ParticleState.RECEIVED, ParticleState.SPILLED)
