@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -229,6 +229,15 @@ class SimulationParameters(BaseModel):
     def free_fields(self) -> frozenset[str]:
         """Fields that do not affect any request: an adhesion of zero, which runs of earlier versions lack."""
         return frozenset({"lip_adhesion"} if self.lip_adhesion == 0.0 else ())
+
+    def fixed_values(self, searched: Collection[str]) -> dict[str, float]:
+        """Values by name of the parameters that a calibration does not search, without `free_fields`.
+
+        Args:
+            searched: names of parameters.
+        """
+        omitted = self.free_fields().union(searched)
+        return {name: float(value) for name, value in self.model_dump().items() if name not in omitted}
 
     @classmethod
     def nuisances(cls) -> dict[str, ParameterInfo]:

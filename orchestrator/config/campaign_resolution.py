@@ -337,8 +337,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     fixed = {} if parameters is None else parameters.fixed()
     searched = {} if parameters is None else parameters.searched()
     default = SimulationParameters().model_dump()
-    omitted = searched.keys() | SimulationParameters().free_fields()  # so that earlier runs have the same plan
-    fixed = {name: float(value) for name, value in default.items() if name not in omitted} | fixed
+    fixed = SimulationParameters.from_values(fixed).fixed_values(searched)
     calibration = deployment = None
     if file.calibration is not None:
         calibration = resolve_calibration(

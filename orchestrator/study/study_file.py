@@ -328,9 +328,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         pour_count=0,
         holdout=0,
         random_baseline=file.random_baseline,
-        fixed_parameters={
-            name: value for name, value in base.parameters.model_dump().items() if name not in searched.names
-        },
+        fixed_parameters=base.parameters.fixed_values(searched.names),
     )
     arms = _calibration_arms(file.calibration, plan, count - holdout, names, compared, root, report)
     poured = _deployment_arms(file.deployment, base.deployment, arms, root, report)
