@@ -13,6 +13,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.dribbling import DribblingCourse, critical_weber, dribbling_course, outer_wall
 from sim_engine.lip_flow import flow_course, weber
 from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.model_validity import regimes
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import ParticleState, PourOutcome
 from sim_engine.scene import PourTask, Scene
@@ -87,6 +88,13 @@ def test_drops_above_the_receiver_are_received() -> None:
     there = course(2.0, receiver_at=(-0.15, 0.0, 0.0))
     assert there.received[there.dribbles].any()
     assert not course(2.0, receiver_at=(-0.15, 0.05, 0.0)).received.any()
+
+
+def test_a_pour_that_is_simulated_with_adhesion_is_not_warned_of() -> None:
+    cups = build_vessel(CUP), build_vessel(GLASS)
+    warned, simulated = (regimes(SCENE, TRICKLE, *cups, spacing=1e-3, adhesion=adhesion) for adhesion in (0.0, 1.0))
+    assert "dribbling" in {one.kind for one in warned.not_covered}
+    assert {one.kind for one in warned.not_covered} - {one.kind for one in simulated.not_covered} == {"dribbling"}
 
 
 def outline(vessel: Vessel) -> tuple[float, float]:
