@@ -156,7 +156,7 @@ def dribbling_course(
         return None
     wall = outer_wall(pourer)
     tilts, poses = motion.tilt(course.time), motion.sample(course.time)
-    x, z = _turned(wall, tilts, poses)
+    x, z = _turned(wall, tilts[:, None], poses[:, None])
     lowest, rows = _drip_points(z), np.arange(len(z))
     below_critical = weber(liquid, course.velocity, course.film) < critical_weber(adhesion, liquid.contact_angle)
     runs_down = z[:, 0] - z[rows, lowest] > capillary_length(liquid)
@@ -206,10 +206,10 @@ def outer_wall(vessel: Vessel) -> Floats:
 
 
 def _turned(wall: Floats, tilts: Floats, poses: Floats) -> tuple[Floats, Floats]:
-    """World x and z of a wall's points (M, 2) at tilts (K,) and poses (K, 7), both of shape (K, M) [m]."""
-    cosine, sine = np.cos(tilts)[:, None], np.sin(tilts)[:, None]
-    x = poses[:, :1] + wall[:, 0] * cosine + wall[:, 1] * sine
-    return x, poses[:, 2:3] - wall[:, 0] * sine + wall[:, 1] * cosine
+    """World x and z of points (…, 2) of a wall at tilts (…) and poses (…, 7), broadcast against each other [m]."""
+    cosine, sine = np.cos(tilts), np.sin(tilts)
+    x = poses[..., 0] + wall[..., 0] * cosine + wall[..., 1] * sine
+    return x, poses[..., 2] - wall[..., 0] * sine + wall[..., 1] * cosine
 
 
 def _drip_points(heights: Floats) -> NDArray[np.int64]:
@@ -251,7 +251,6 @@ def rivulet_frames(
         place = np.minimum((at_wall - begun[gone]) * speed[gone], length[gone])
         wall = np.column_stack([np.interp(place, along, course.wall[:, i]) for i in range(2)])
         x, z = _turned(wall, motion.tilt(at_wall), motion.sample(at_wall))
-        x, z = np.diagonal(x).copy(), np.diagonal(z).copy()
         z -= 0.5 * GRAVITY * np.square(time - at_wall)
         states[dribbled.particles[gone]] = np.where(z > 0.0, ParticleState.IN_FLIGHT, final[gone])
         positions[dribbled.particles[gone]] = np.column_stack([x, np.zeros(len(gone)), np.maximum(z, 0.0)])

@@ -312,7 +312,8 @@ CASES: tuple[Case, ...] = (
         "Onset of dribbling",
         "Cups tilted to 80° with `lip_adhesion` 1 and a contact angle of 90°: what leaves at a Weber number below 1 "
         "runs down the outside (momentum flux against the work of adhesion; Kistler & Scriven 1994, Duez et al. 2010). "
-        "Reference: the same fraction from the outflow that 5,000 particles have without the model.",
+        "Reference: the same fraction from the outflow that 5,000 particles have without the model. This checks flow "
+        "and resolution; the critical number and the film of a flow are the model's own.",
         _dribbling,
     ),
     *(Case(name, title, about, _of_thick_liquids(work)) for name, title, about, work in viscous_flows.CASES),

@@ -3,7 +3,8 @@
 200 mL of water in a straight cup are tilted to 80° at several speeds. The film of the simulated outflow is compared
 with the critical Weber number of a sharp edge with contact angle 90°, We_c = 1 (`sim_engine.dribbling`): the liquid
 that leaves while the film is slower is the reference. It comes from the outflow curve of many particles without the
-model, so it does not depend on the tilting-cup equation from which the model predicts the flow.
+model. This checks the predicted flow, and that the number of particles has no effect. It does not check the critical
+Weber number, nor the relation of a flow to its film: both are those of the model.
 """
 
 from __future__ import annotations

@@ -111,10 +111,11 @@ def test_outer_wall_is_that_of_the_vessel() -> None:
     assert steps.max() < 2e-3
 
 
-def test_without_adhesion_no_bit_changes(simulator: PourSimulator) -> None:
-    plain = simulator.simulate(PourTask(SCENE, TRICKLE, SimulationParameters(particles=500), 1)).outcome
-    assert replace(simulated(simulator, 0.0), cpu_s=0.0) == replace(plain, cpu_s=0.0)
-    assert plain.dribbled == 0.0
+def test_adhesion_changes_where_liquid_ends_and_nothing_else(simulator: PourSimulator) -> None:
+    jet, wet = simulated(simulator, 0.0), simulated(simulator, 2.0)
+    assert wet.dribbled > jet.dribbled == 0.0
+    fate = {"received": 0.0, "spilled": 0.0, "in_flight": 0.0, "dribbled": 0.0, "curve_spilled": (), "cpu_s": 0.0}
+    assert replace(wet, **fate) == replace(jet, **fate)
 
 
 def test_dribbling_is_spilled_next_to_the_receiver(simulator: PourSimulator) -> None:
