@@ -51,7 +51,7 @@ CREEPING = 2.0
 
 ADDED = 3.0
 """… and above the kinematic viscosity ADDED · d² [m²/s] that the solver itself adds at a spacing d: vortices of
-10 mm²/s decay as those of 156, 87, 58 and 48 mm²/s at spacings of 6.9, 5.8, 4.6 and 2.9 mm (0.2 m/s;
+10 mm²/s decay as those of 110, 84, 50 and 49 mm²/s at spacings of 6.9, 5.8, 4.6 and 2.9 mm (0.2 m/s;
 `sim_engine.validation.viscous_flows.own_viscosity`) …"""
 
 LEAST_ADDED = 40e-6

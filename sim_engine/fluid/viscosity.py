@@ -20,13 +20,17 @@ first round's result.
 
 Walls. A layer of particles next to a wall represents the linear part of the boundary layer, from the wall, where liquid
 is at rest, to the layer's own middle at a distance s. The stress there is μ u / s, and acts on a layer whose mass per
-area is ρ d:
+area is ρ d c:
 
-    drag = ν / (d s) · (u along the wall, relative to it),    fading between ¾ and 1¼ spacings from the wall.
+    drag = ν / (c d s) · (u along the wall, relative to it),    fading between ¾ and 1¼ spacings from the wall.
 
-A layer at d/2 and particles at other distances receive the same stress: ∫ drag s ds = ν u/s. A film of one layer has
-nothing above it to pull it along; gravity moves it by g e²/3ν on average (Nusselt 1916). Sparse particles represent a
-film thinner than d: their drag is 3ν/e², and e follows from their number of neighbours.
+c is the cover of the wall: the particles of the layer per d² of wall, 1 in a square lattice. Curved walls and liquid
+that expands or contracts leave 0.7 to 0.8 of them, and the stress of the same area of wall acts on fewer. It is the
+kernel's sum over the layer with distances along the wall, over that of the lattice. A layer at d/2 and particles at
+other distances receive the same stress: ∫ drag s ds = ν u/s. A film of one layer has nothing above it to pull it along;
+gravity moves it by g e²/3ν on average (Nusselt 1916). Sparse particles represent a film thinner than d: their drag is
+3ν/e², and e follows from their number of neighbours. In between, the two are weighted by the height of the liquid above
+the layer, up to one spacing.
 
 Unresolved motion keeps the eddy viscosity (see below) if that is larger. A boundary layer that is thinner than d/2,
 √(πνt) < d/2 after a time t, takes more momentum from the liquid than this model does.
@@ -102,6 +106,8 @@ BESIDE = 0.386
 """… the part that its neighbours in a plane layer add …"""
 ABOVE = 0.16
 """… and the part of a layer above, times its height in spacings."""
+SPARSEST = 0.3
+"""Least cover of a wall by the layer next to it, in particles per d²."""
 THINNEST = 0.15
 """Least thickness of films, in spacings."""
 LEAST_INERTIA = 0.02
@@ -111,32 +117,23 @@ ROUNDS = 2
 
 
 @ti.func
-def film(beside, above):
-    """Thickness of the film that a particle next to a wall belongs to, in spacings, up to 2.
-
-    Args:
-        beside: kernel sum over its neighbours.
-        above: the same, each weighted by its additional distance from the wall, in spacings.
-    """
-    return ti.min(ti.max(beside / BESIDE, THINNEST), 1.0) + ti.min(ti.max(above / ABOVE, 0.0), 1.0)
-
-
-@ti.func
-def drag(distance, e):
+def drag(distance, film, cover, above):
     """Drag of a wall on a particle, in units of ν/d².
 
     Args:
         distance: from the wall, in spacings.
-        e: thickness of the film, in spacings.
+        film: thickness of a film without a layer above, in spacings, up to 1.
+        cover: particles of the layer next to the wall per d² of wall.
+        above: thickness of the liquid above that layer, in spacings, up to 1.
     """
     s = ti.max(distance, NEAREST)
-    layer = ti.min(ti.max((ENDS - s) / (ENDS - FADES), 0.0), 1.0) / s
-    thin = ti.cast(1.0, ti.f32)
-    if e < 1.0:
-        thin = 1.5 / (e * e)
-    else:
-        thin = 1.0 + 0.5 * (2.0 - e)
-    return layer * thin
+    return beside(s) / s * (above / cover + (1.0 - above) * 1.5 / (film * film))
+
+
+@ti.func
+def beside(distance):
+    """How far a particle belongs to the layer next to a wall at a distance in spacings, 0 to 1."""
+    return ti.min(ti.max((ENDS - distance) / (ENDS - FADES), 0.0), 1.0)
 
 
 @ti.func
@@ -149,8 +146,10 @@ def survey(f: ti.template(), s, dt):
         f.squares[i] = 0.0
         f.dp[i] = 0.0
         f.dx[i] = ti.Vector([0.0, 0.0, 0.0])
+        for b in ti.static(range(VESSELS)):
+            f.push[i][b] = 0.0
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        cover = ti.cast(0.0, ti.f32)
+        total = ti.cast(0.0, ti.f32)
         strain = ti.cast(0.0, ti.f32)
         lean = ti.Vector([0.0, 0.0, 0.0])
         for k in range(f.first[i], f.first[i] + f.count[i]):
@@ -160,13 +159,21 @@ def survey(f: ti.template(), s, dt):
             w = weight(ti.max(1.0 - ti.sqrt(r2) * inv_h, 0.0))
             parting = dot(f.v[i] - f.v[j], r) / (r2 + closest)
             part = w * parting * parting * r2 / (r2 + closest)
-            cover += w
+            total += w
             strain += part
             lean += w * r
             f.dx[j] = f.dx[j] + w * r
             f.squares[j] = f.squares[j] + w
             f.dp[j] = f.dp[j] + part
-        f.squares[i] = f.squares[i] + cover
+            for b in ti.static(range(VESSELS)):
+                of_i, of_j = beside(f.phi[i][b] / d), beside(f.phi[j][b] / d)
+                if of_i * of_j > 0.0:
+                    n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
+                    along = ti.sqrt(ti.max(r2 - dot(n, r) ** 2, 0.0))
+                    lateral = weight(ti.max(1.0 - along * inv_h, 0.0))
+                    f.push[i][b] = f.push[i][b] + lateral * of_j
+                    f.push[j][b] = f.push[j][b] + lateral * of_i
+        f.squares[i] = f.squares[i] + total
         f.dp[i] = f.dp[i] + strain
         f.dx[i] = f.dx[i] - lean
     nu = f.kinematic[s]
@@ -176,8 +183,11 @@ def survey(f: ti.template(), s, dt):
         f.dp[i] = ti.max(nu, 0.2 * f.eddies[s] * d * d * strain)
         for b in ti.static(range(VESSELS)):
             n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
-            e = film(ALONE * f.squares[i], ALONE * dot(f.dx[i], n) / d)
-            f.push[i][b] = f.no_slip[s] * dt * nu / (d * d) * drag(f.phi[i][b] / d, e)
+            above = ti.min(ti.max(ALONE * dot(f.dx[i], n) / (d * ABOVE), 0.0), 1.0)
+            q = f.phi[i][b] / d
+            cover = ALONE * (beside(q) + f.push[i][b]) / (ALONE + BESIDE)
+            film = ti.min(ti.max(ALONE * f.squares[i] / BESIDE, THINNEST), 1.0)
+            f.push[i][b] = f.no_slip[s] * dt * nu / (d * d) * drag(q, film, ti.max(cover, SPARSEST), above)
 
 
 @ti.func

@@ -294,9 +294,7 @@ def test_cases_are_found_by_name_and_a_wrong_name_lists_them() -> None:
 NOT_MET: dict[str, str] = {
     "retention": "12 mL too much with 500 particles at 80°, where 10 are allowed",
     "landing": "the spread at 30 °/s is 1.7 mm more with 500 particles than with 10,000",
-    "tube": "no pressure holds a falling plug together",
     "drainage": "a vertical film runs off too early",
-    "thick-outflow": ".1 Pa s leave later than in SPlisHSPlasH, where they leave as water does",
 }
 
 
