@@ -44,6 +44,8 @@ from machine import say
 from numpy.typing import NDArray
 
 from actors.runtime.child_process import ChildProcess
+from sim_engine.hydrostatics import GRAVITY
+from sim_engine.validation.viscous_flows import TIMES
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -64,14 +66,11 @@ VOLUME, DENSITY, SURFACE_TENSION = 200e-6, 1000.0, 0.033
 AIR_DENSITY, AIR_VISCOSITY, AIR_SHARE = 1.0, 1e-3, 0.2
 """Density [kg/m³], viscosity [Pa s], and largest ratio of its viscosity to the liquid's."""
 
-SPEED, GRAVITY = math.radians(30.0), 9.81
-"""Angular velocity of the cup [rad/s], and g [m/s²]."""
+SPEED = math.radians(30.0)
+"""Angular velocity of the cup [rad/s]."""
 
-START, END = 1.0, 3.5
+START, END = 1.0, TIMES[-1]
 """Start of the computation and the last time of the table [s]. At 0 s the cup is upright."""
-
-TIMES = (2.1, 2.3, 2.5, 2.7, 2.9, 3.1, 3.3, 3.5)
-"""Times of the table [s]."""
 
 MARGIN = 0.01
 """Computed beyond `END`, so that the last time is not extrapolated [s]."""

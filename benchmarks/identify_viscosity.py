@@ -160,8 +160,8 @@ def main() -> None:
             "median error of the median, factor", "median over truth", "95 % over 5 % quantile",
         ]  # fmt: skip
         settings = (
-            f"{asked.seeds} seeds from {asked.first}, not used for tuning; guesses 30, 150 and 500 mPa s, truth within a "
-            "factor of 1.5 of the nominal value; simulator with 600 particles; goals: 10 of 12, factor 1.25"
+            f"{asked.seeds} seeds from {asked.first}, not used for tuning; guesses 30, 150 and 500 mPa s, truth within "
+            "a factor of 1.5 of the nominal value; simulator with 600 particles; goals: 10 of 12, factor 1.25"
         )
         write_table("viscosity", head, rows, command, settings)
 

@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -121,39 +121,20 @@ def down_a_tube(
         parameters: θ; its number of particles is ignored.
         radius: of the tube [m].
     """
-    from sim_engine.fluid.engine import engine
-
-    d = radius / layers
-    length = 8.0 * radius
-    mean = GRAVITY * radius**2 / (8.0 * viscosity)
-    settled = 0.6 * radius**2 / viscosity
-    times = settled + np.linspace(0.0, 0.3 * radius / mean + 0.02, 8)
-    start = ring(0.0, radius, 0.0, length, d)
-    pipe = tube(radius, length + 0.05, -1.5 * mean * float(times[-1]) - 0.05, 0.4 * d)
-    places, speeds = [], []
-    for _ in run(start, d, pipe, parameters, times, viscosity=viscosity, settling=SETTLING):
-        x, v = engine().particles()[0].astype(float), engine().velocities().astype(float)
-        middle = np.abs(x[:, 2] - np.median(x[:, 2])) < radius
-        places.append(np.hypot(x[middle, 0], x[middle, 1]))
-        speeds.append(-v[middle, 2])
-    r, u = np.concatenate(places), np.concatenate(speeds)
-    found = within(
-        f"mean velocity, {layers} spacings in the radius, ν = {_mm2(viscosity)}",
-        float(u.mean()),
-        mean,
-        0.10 * mean,
-        unit="m/s",
-        criterion="within 10 %",
-        particles=len(start),
-    )
-    bins = (np.arange(layers) + 0.5) * d
-    profile = [float(u[np.abs(r - b) < 0.5 * d].mean()) / mean for b in bins]
-    name = f"{layers} spacings"
-    fine = np.linspace(0.0, 1.0, 40)
-    return [found], [
-        Series(name, tuple((bins / radius).tolist()), tuple(profile)),
-        Series("Poiseuille", tuple(fine.tolist()), tuple((2.0 * (1.0 - fine**2)).tolist()), "reference"),
-    ]
+    length, mean = 8.0 * radius, GRAVITY * radius**2 / (8.0 * viscosity)
+    d, times, bottom = radius / layers, *_when_steady(0.6, radius, viscosity, mean)
+    return _fall(
+        f"{layers} spacings in the radius, ν = {_mm2(viscosity)}",
+        ring(0.0, radius, 0.0, length, d),
+        radius,
+        d,
+        run_in=lambda start: run(start, d, tube(radius, length + 0.05, bottom, 0.4 * d), parameters, times,
+                                 viscosity=viscosity, settling=SETTLING),
+        from_middle=lambda x: np.hypot(x[:, 0], x[:, 1]),
+        chosen=lambda x: np.abs(x[:, 2] - np.median(x[:, 2])) < radius,
+        mean=mean,
+        fastest=2.0,
+    )  # fmt: skip
 
 
 def down_a_slot(
@@ -167,40 +148,72 @@ def down_a_slot(
         parameters: θ; its number of particles is ignored.
         half_gap: half the distance of the plates [m].
     """
+    length, width, mean = 10.0 * half_gap, 8.0 * half_gap, GRAVITY * half_gap**2 / (3.0 * viscosity)
+    times, bottom = _when_steady(1.5, half_gap, viscosity, mean)
+    low, high = np.array([-half_gap, -width / 2.0, 0.0]), np.array([half_gap, width / 2.0, length])
+    start, d = block(low, high, 160 * layers**3, 1)
+    return _fall(
+        f"{layers} spacings in half the gap, ν = {_mm2(viscosity)}",
+        start,
+        half_gap,
+        d,
+        run_in=lambda start: run(start, d, slot(half_gap, 1.5 * width, length + 0.05, bottom, 0.4 * d), parameters,
+                                 times, viscosity=viscosity, settling=SETTLING),
+        from_middle=lambda x: np.abs(x[:, 0]),
+        chosen=lambda x: (np.abs(x[:, 2] - np.median(x[:, 2])) < length / 6.0) & (np.abs(x[:, 1]) < width / 4.0),
+        mean=mean,
+        fastest=1.5,
+    )  # fmt: skip
+
+
+def _when_steady(settled: float, half: float, viscosity: float, mean: float) -> tuple[Floats, float]:
+    """Times at which a fall is measured, from `settled` half²/ν on [s], and the bottom that it does not reach [m]."""
+    times = settled * half**2 / viscosity + np.linspace(0.0, 0.3 * half / mean + 0.02, 8)
+    return times, -1.5 * mean * float(times[-1]) - 0.05
+
+
+def _fall(
+    name: str,
+    start: Floats,
+    half: float,
+    d: float,
+    *,
+    run_in: Callable[[Floats], Iterable[object]],
+    from_middle: Callable[[Floats], Floats],
+    chosen: Callable[[Floats], NDArray[np.bool_]],
+    mean: float,
+    fastest: float,
+) -> tuple[list[Measurement], list[Series]]:
+    """Compare the velocity of liquid that falls in a vertical channel with Poiseuille's.
+
+    Args:
+        name: of the case.
+        start: particles (N, 3) [m].
+        half: distance of the wall from the channel's axis or middle [m].
+        d: spacing [m].
+        run_in: runs the channel, and stops at the times of measurement.
+        from_middle: distances of particles (N, 3) from the axis or middle (N,) [m].
+        chosen: which particles (N, 3) are measured.
+        mean: the mean velocity by theory [m/s].
+        fastest: velocity in the middle over the mean.
+    """
     from sim_engine.fluid.engine import engine
 
-    d = half_gap / layers
-    length, width = 10.0 * half_gap, 8.0 * half_gap
-    mean = GRAVITY * half_gap**2 / (3.0 * viscosity)
-    settled = 1.5 * half_gap**2 / viscosity
-    times = settled + np.linspace(0.0, 0.3 * half_gap / mean + 0.02, 8)
-    axes = [low + d * (np.arange(many) + 0.5) for low, many in (
-        (-half_gap, 2 * layers), (-width / 2.0, 8 * layers), (0.0, 10 * layers))]  # fmt: skip
-    start = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    start = start + np.random.default_rng(1).uniform(-0.05, 0.05, start.shape) * d
-    plates = slot(half_gap, 1.5 * width, length + 0.05, -1.5 * mean * float(times[-1]) - 0.05, 0.4 * d)
     places, speeds = [], []
-    for _ in run(start, d, plates, parameters, times, viscosity=viscosity, settling=SETTLING):
+    for _ in run_in(start):
         x, v = engine().particles()[0].astype(float), engine().velocities().astype(float)
-        middle = (np.abs(x[:, 2] - np.median(x[:, 2])) < length / 6.0) & (np.abs(x[:, 1]) < width / 4.0)
-        places.append(np.abs(x[middle, 0]))
-        speeds.append(-v[middle, 2])
+        measured = chosen(x)
+        places.append(from_middle(x[measured]))
+        speeds.append(-v[measured, 2])
     r, u = np.concatenate(places), np.concatenate(speeds)
-    found = within(
-        f"mean velocity, {layers} spacings in half the gap, ν = {_mm2(viscosity)}",
-        float(u.mean()),
-        mean,
-        0.10 * mean,
-        unit="m/s",
-        criterion="within 10 %",
-        particles=len(start),
-    )
-    bins = (np.arange(layers) + 0.5) * d
+    found = within(f"mean velocity, {name}", float(u.mean()), mean, 0.10 * mean, unit="m/s", criterion="within 10 %",
+                   particles=len(start))  # fmt: skip
+    bins = (np.arange(round(half / d)) + 0.5) * d
     profile = [float(u[np.abs(r - b) < 0.5 * d].mean()) / mean for b in bins]
     fine = np.linspace(0.0, 1.0, 40)
     return [found], [
-        Series(f"{layers} spacings", tuple((bins / half_gap).tolist()), tuple(profile)),
-        Series("Poiseuille", tuple(fine.tolist()), tuple((1.5 * (1.0 - fine**2)).tolist()), "reference"),
+        Series(f"{round(half / d)} spacings", tuple((bins / half).tolist()), tuple(profile)),
+        Series("Poiseuille", tuple(fine.tolist()), tuple((fastest * (1.0 - fine**2)).tolist()), "reference"),
     ]
 
 
