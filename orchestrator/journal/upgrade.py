@@ -39,7 +39,8 @@ def renamed(data: Any) -> Any:
             names |= more if key in data else {}
         if "Pa*s" in str(data.get("viscosity")):  # of a liquid in a recorded campaign, and no parameter
             names.pop("viscosity")
-        return {names.get(key, key): renamed(value) for key, value in data.items()}
+        own = () if "lower" in data else ("name",)  # a campaign's or laboratory's name; an axis has that of a parameter
+        return {names.get(key, key): value if key in own else renamed(value) for key, value in data.items()}
     if isinstance(data, list | tuple) and data and not isinstance(data[0], int | float):
         return [renamed(item) for item in data]
     return RETIRED_PARAMETERS.get(data, data) if isinstance(data, str) else data
