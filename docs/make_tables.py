@@ -358,6 +358,7 @@ MEASURED = (
     ),
     *(
         "cliffs",
+        "milder",
         "ideal",
         "intervals",
         "study-intervals",
