@@ -60,7 +60,8 @@ s² = Var(f_j(x̂) − f_j(x)), n is a pour's noise, w_j the weight of hypothesi
 
 **Simulations next to pours** (`instructive`). A simulation is made where it reduces the uncertainty of the heaviest
 hypotheses most, at the poured places, which distinguish the hypotheses, and at the best places for the next pours. Each
-hypothesis maps these places to other places of the simulator.
+hypothesis maps these places to other places of the simulator. While no good action is known, simulations search for one
+(`searching`).
 """
 
 from __future__ import annotations
@@ -274,6 +275,12 @@ GAIN_AT = 256
 DRAWN = 64
 """Number of bench offsets that are passed on to another receiver."""
 
+PROMISING = 0.8
+"""Simulated cost, relative to the largest one, below which there may be a valley."""
+
+SAME = 0.01
+"""Largest difference along an axis of the unit cube between a pour and a simulation that counts as the same action."""
+
 FORBIDDEN = 1e3
 """Penalty per unit of probability above a limit's, in units of the largest cost."""
 
@@ -408,9 +415,48 @@ def proposals(
     if found_good(arrays.simulated_costs) or found_good(arrays.costs):
         simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
     else:
-        known = np.concatenate([arrays.simulated, arrays.busy])
-        simulations = acquisition.between(query.count - 1, known, arrays.region, rng, feasibility)
+        simulations = searching(query.count - 1, arrays, process.simulated, pour, feasibility, rng)
     return np.concatenate([pour[None, :], simulations])
+
+
+def searching(
+    count: int,
+    arrays: QueryArrays,
+    simulated: GaussianProcess,
+    pour: Array,
+    feasibility: Feasibility | None,
+    rng: np.random.Generator,
+) -> Array:
+    """Choose places (count, dimension) for simulations while no good action is known.
+
+    The first is where the simulations promise the least cost, if one of them was below the others; the second the next
+    pour itself, so that its outcome can be compared; the others fill the holes between them. In four dimensions, the
+    holes between 37 simulations are larger than a valley: filling alone does not find it.
+
+    Args:
+        count: number of places.
+        arrays: known and pending places.
+        simulated: surrogate of the simulations.
+        pour: (dimension,), the next one.
+        feasibility: of requests.
+        rng: random numbers.
+    """
+    known, costs = np.concatenate([arrays.simulated, arrays.busy]), arrays.simulated_costs
+    chosen = np.empty((0, len(pour)))
+    if len(costs) and costs.min() < PROMISING * costs.max():
+        best = arrays.simulated[np.argsort(costs, kind="stable")[:4]]
+        score = acquisition.lower_confidence_bound(simulated, 1.0)
+        score = acquisition.without_replicates(score, simulated, simulated.noise)
+        candidates = acquisition.search_candidates(arrays.region, len(pour), list(best), rng)
+        chosen = acquisition.minimise(score, candidates, arrays.region, rng)[None, :]
+    if not len(known) or np.abs(known - pour).max(axis=1).min() > SAME:
+        chosen = np.concatenate([chosen, pour[None, :]])
+    chosen = chosen[:count]
+    if len(chosen) < count:
+        taken = np.concatenate([known, chosen])
+        filling = acquisition.between(count - len(chosen), taken, arrays.region, rng, feasibility)
+        chosen = np.concatenate([chosen, filling])
+    return chosen
 
 
 def pourable(arrays: QueryArrays, feasibility: Feasibility | None) -> Array:
