@@ -278,9 +278,6 @@ DRAWN = 64
 PROMISING = 0.8
 """Simulated cost, relative to the largest one, below which there may be a valley."""
 
-SAME = 0.01
-"""Largest difference along an axis of the unit cube between a pour and a simulation that counts as the same action."""
-
 FORBIDDEN = 1e3
 """Penalty per unit of probability above a limit's, in units of the largest cost."""
 
@@ -415,7 +412,7 @@ def proposals(
     if found_good(arrays.simulated_costs) or found_good(arrays.costs):
         simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
     else:
-        simulations = searching(query.count - 1, arrays, process.simulated, pour, feasibility, rng)
+        simulations = searching(query.count - 1, arrays, process.simulated, feasibility, rng)
     return np.concatenate([pour[None, :], simulations])
 
 
@@ -423,40 +420,34 @@ def searching(
     count: int,
     arrays: QueryArrays,
     simulated: GaussianProcess,
-    pour: Array,
     feasibility: Feasibility | None,
     rng: np.random.Generator,
 ) -> Array:
     """Choose places (count, dimension) for simulations while no good action is known.
 
-    The first is where the simulations promise the least cost, if one of them was below the others; the second the next
-    pour itself, so that its outcome can be compared; the others fill the holes between them. In four dimensions, the
-    holes between 37 simulations are larger than a valley: filling alone does not find it.
+    If one simulation was below the others, one place (with a count of one, every other time) is where their surrogate
+    promises the least cost. All others fill the holes between simulations. In four dimensions, the holes between 37
+    simulations are larger than a valley, and filling alone does not find it. A slope of a plateau may mislead the
+    search, so filling goes on.
 
     Args:
         count: number of places.
-        arrays: known and pending places.
+        arrays: known and pending places, at least one.
         simulated: surrogate of the simulations.
-        pour: (dimension,), the next one.
         feasibility: of requests.
         rng: random numbers.
     """
     known, costs = np.concatenate([arrays.simulated, arrays.busy]), arrays.simulated_costs
-    chosen = np.empty((0, len(pour)))
-    if len(costs) and costs.min() < PROMISING * costs.max():
-        best = arrays.simulated[np.argsort(costs, kind="stable")[:4]]
+    chosen = np.empty((0, known.shape[1]))
+    if count + len(known) % 2 >= 2 and len(costs) and costs.min() < PROMISING * costs.max():
+        best = [arrays.simulated[i] for i in np.argsort(costs, kind="stable")[:4]]
         score = acquisition.lower_confidence_bound(simulated, 1.0)
         score = acquisition.without_replicates(score, simulated, simulated.noise)
-        candidates = acquisition.search_candidates(arrays.region, len(pour), list(best), rng)
+        candidates = acquisition.search_candidates(arrays.region, known.shape[1], best, rng)
         chosen = acquisition.minimise(score, candidates, arrays.region, rng)[None, :]
-    if not len(known) or np.abs(known - pour).max(axis=1).min() > SAME:
-        chosen = np.concatenate([chosen, pour[None, :]])
-    chosen = chosen[:count]
-    if len(chosen) < count:
-        taken = np.concatenate([known, chosen])
-        filling = acquisition.between(count - len(chosen), taken, arrays.region, rng, feasibility)
-        chosen = np.concatenate([chosen, filling])
-    return chosen
+    taken = np.concatenate([known, chosen])
+    filling = acquisition.between(count - len(chosen), taken, arrays.region, rng, feasibility)
+    return np.concatenate([chosen, filling])
 
 
 def pourable(arrays: QueryArrays, feasibility: Feasibility | None) -> Array:
