@@ -32,12 +32,15 @@ valleys became oblique and space-filling continued until it found a valley; for 
    intervals are scaled by earlier pours: the same, and is the interval score better than without?)
 
 Questions on the levels `milder, …`, whose errors were chosen so that version 0.2 loses what was once reported of it
-(`mismatch_worlds.SHARE`). They were fixed before seeds 8500 to 8523 were used once; seeds 5000 to 5023 are for tuning.
-All goals but that for four axes were met (0.090). Then simulations next to pours were made to search for a good action
-while none is known, tuned on seeds 9000 to 9019, and the questions were repeated once with seeds 8600 to 8623.
+(`mismatch_worlds.SHARE`). They were fixed before seeds 8500 to 8523 were used; seeds 5000 to 5023 are for tuning.
 
 10. The same as question 6, and the mean of 15 pours on four axes: at most 0.073?
-11. Seeds 8600 to 8659, `cliff, four axes` and `milder, four axes`: is the mean lower with that search than without?
+
+The mean on four axes was 0.090. Then a search for good actions next to pours was tuned on seeds 9000 to 9019. Seeds 8600
+to 8659 were used once, for this question, which was fixed before, and 8600 to 8623 once for the other levels:
+
+11. Is the mean of 15 pours at `cliff, four axes` and `milder, four axes` lower with that search than without? It was not
+    (-0.003 ± 0.003 and 0.000 ± 0.010), so the search was left out (docs/notes/deployment-tried.md).
 
 Seeds 9000 to 9059 are for tuning changes of the hypotheses. Seeds 8400 to 8419 were used once, for the answer about one
 of them at `cliff, large` and `four axes`. The question was fixed before: is the mean of 15 pours at `cliff, large`

@@ -60,8 +60,7 @@ s² = Var(f_j(x̂) − f_j(x)), n is a pour's noise, w_j the weight of hypothesi
 
 **Simulations next to pours** (`instructive`). A simulation is made where it reduces the uncertainty of the heaviest
 hypotheses most, at the poured places, which distinguish the hypotheses, and at the best places for the next pours. Each
-hypothesis maps these places to other places of the simulator. While no good action is known, simulations search for one
-(`searching`).
+hypothesis maps these places to other places of the simulator.
 """
 
 from __future__ import annotations
@@ -275,9 +274,6 @@ GAIN_AT = 256
 DRAWN = 64
 """Number of bench offsets that are passed on to another receiver."""
 
-PROMISING = 0.8
-"""Simulated cost, relative to the largest one, below which there may be a valley."""
-
 FORBIDDEN = 1e3
 """Penalty per unit of probability above a limit's, in units of the largest cost."""
 
@@ -412,42 +408,9 @@ def proposals(
     if found_good(arrays.simulated_costs) or found_good(arrays.costs):
         simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
     else:
-        simulations = searching(query.count - 1, arrays, process.simulated, feasibility, rng)
+        known = np.concatenate([arrays.simulated, arrays.busy])
+        simulations = acquisition.between(query.count - 1, known, arrays.region, rng, feasibility)
     return np.concatenate([pour[None, :], simulations])
-
-
-def searching(
-    count: int,
-    arrays: QueryArrays,
-    simulated: GaussianProcess,
-    feasibility: Feasibility | None,
-    rng: np.random.Generator,
-) -> Array:
-    """Choose places (count, dimension) for simulations while no good action is known.
-
-    If one simulation was below the others, one place (with a count of one, every other time) is where their surrogate
-    promises the least cost. All others fill the holes between simulations. In four dimensions, the holes between 37
-    simulations are larger than a valley, and filling alone does not find it. A slope of a plateau may mislead the
-    search, so filling goes on.
-
-    Args:
-        count: number of places.
-        arrays: known and pending places, at least one.
-        simulated: surrogate of the simulations.
-        feasibility: of requests.
-        rng: random numbers.
-    """
-    known, costs = np.concatenate([arrays.simulated, arrays.busy]), arrays.simulated_costs
-    chosen = np.empty((0, known.shape[1]))
-    if count + len(known) % 2 >= 2 and len(costs) and costs.min() < PROMISING * costs.max():
-        best = [arrays.simulated[i] for i in np.argsort(costs, kind="stable")[:4]]
-        score = acquisition.lower_confidence_bound(simulated, 1.0)
-        score = acquisition.without_replicates(score, simulated, simulated.noise)
-        candidates = acquisition.search_candidates(arrays.region, known.shape[1], best, rng)
-        chosen = acquisition.minimise(score, candidates, arrays.region, rng)[None, :]
-    taken = np.concatenate([known, chosen])
-    filling = acquisition.between(count - len(chosen), taken, arrays.region, rng, feasibility)
-    return np.concatenate([chosen, filling])
 
 
 def pourable(arrays: QueryArrays, feasibility: Feasibility | None) -> Array:
