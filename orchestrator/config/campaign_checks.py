@@ -462,6 +462,13 @@ def check_campaign(
     at: Loc
     if (problem := why_not_writable(plan.outputs.folder)) is not None:
         checker.add((("outputs", "directory"),), problem)
+    for at, source in (
+        (("calibration", "pours", "from"), plan.calibration and plan.calibration.records),
+        (("calibration", "pours", "transfer", "from"), plan.calibration and plan.calibration.transfer),
+        (("deployment", "data", "from"), plan.deployment and plan.deployment.data),
+    ):
+        if source is not None and source.assumed:
+            warn(checker.problem((at,), source.assumed))
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)
         if calibration.records is None:

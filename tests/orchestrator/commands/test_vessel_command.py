@@ -260,7 +260,12 @@ def written(text: str) -> Door:
         (lambda of, folder: {"depth": of.photo(folder / "p.png"), "focal": FOCAL, "wall": "3 mm"}, r"16 bits"),
         (steep, r"no table is seen"),
         (lambda of, folder: {"mesh": folder / "x.stl", "tilt": folder / "t.csv"}, r"--tilt goes with turned vessels"),
-        (written("level,mass\n1,2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
+        (written("mass_g\n2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
+        (written("level,mass\n1,2\n"), r"fill.csv:1:1: level: has no unit; write 'level_mm' or 'level \[mm\]'"),
+        (
+            written("level [g],mass [g]\n1,2\n"),
+            r"fill.csv:1:1: level \[g\]: the unit 'g' is a mass; should be a length",
+        ),
         (written("level_mm,mass_g\n10,20\n20,x\n"), r"fill.csv:3: should be two numbers"),
         (written("level_mm,mass_g\n10,20\n200,30\n"), r"fill.csv:3: level_mm is 200; should be .* at most 100"),
         (written("level_mm,mass_g\n10,20\n"), r"at least 3"),
