@@ -283,7 +283,7 @@ def _cell(value: object) -> Cell:
 
 
 def _clean(text: str) -> str:
-    return text.strip().strip(_INVISIBLE).strip().replace("−", "-")
+    return text.strip().strip(_INVISIBLE).strip().replace("−", "-").replace("–", "-")
 
 
 def _text_rows(text: str, assumed: list[str]) -> list[TableRow]:

@@ -87,7 +87,7 @@ KINDS = {
 LONGEST = 80
 """Longest text of a quantity [characters]: longer texts are not parsed."""
 
-_QUANTITY = re.compile(r"\s*([-+−]?(?:[0-9][0-9_]*\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*\Z", re.DOTALL)
+_QUANTITY = re.compile(r"\s*([-+−–]?(?:[0-9][0-9_]*\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*\Z", re.DOTALL)
 
 _TERM = r"(?:[^\W\d_]+|[°%]|1)(?:\s*(?:\^|\*\*)\s*-?\d)?"
 _UNIT = re.compile(rf"{_TERM}(?:\s*[*/·\s]\s*{_TERM})*")
@@ -128,7 +128,7 @@ def parse_quantity(value: Any, unit: str, example: str) -> float:
     match = _QUANTITY.match(value) if isinstance(value, str) else None
     if isinstance(value, str) and match is None:
         raise QuantityError(f"{value!r} is not a quantity; should be {kind}, for example '{example}'")
-    number = float(match[1].replace("−", "-").replace("_", "")) if match else float(value)
+    number = float(match[1].replace("−", "-").replace("–", "-").replace("_", "")) if match else float(value)
     text = match[2] if match else ""
     if not math.isfinite(number):
         raise QuantityError(f"{value} is not finite; should be {kind}, for example '{example}'")

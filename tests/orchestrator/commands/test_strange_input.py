@@ -86,7 +86,7 @@ BAD: dict[str, str] = {
     "server start state.yaml": "README.md is not a folder",
     "server start word.yaml": "word.yaml:1:15: notify.to[0]: is not a URL that apprise knows",
     "server start rigs.yaml": "rigs.a: duplicate key; it stands in line 1 already",
-    "simulate campaigns/recorded.yaml --from twice.csv": "twice.csv:1:62: poured_g: stands twice in the header",
+    "simulate campaigns/recorded.yaml --from twice.csv": "twice.csv:1:71: poured_g: stands twice in the header",
     "simulate campaigns/recorded.yaml --from excel.csv": "excel.csv:2:10: poured_g: '199,602' may be 199.602 or",
     "simulate campaigns/recorded.yaml --from infinite.csv": "infinite.csv:2:1: angular_velocity_deg_s: '1e999' is not",
     "simulate campaigns/recorded.yaml --from utf16.csv": "utf16.csv: is not text in UTF-8 (perhaps UTF-16 without",
