@@ -447,19 +447,19 @@ def _find_decimals(table: SavedTable) -> None:
         name = str(table.header.cells[index]) if index < len(table.header.cells) else ""
         return _RowError(message, row, index, name)
 
-    def cell(kind: str) -> str:
+    def shown(kind: str) -> str:
         row, index = first[kind]
         return str(row.cells[index])
 
     if "," in first and "." in first:
         later = max(",.", key=lambda kind: first[kind][0].line)
         other = ",."[later == ","]
-        text = f"{cell(later)!r} and {cell(other)!r} (line {first[other][0].line}) have different decimal signs"
+        text = f"{shown(later)!r} and {shown(other)!r} (line {first[other][0].line}) have different decimal signs"
         raise refused(later, f"{text}; save the table with decimal points")
     for weak, strong in ((",?", ","), (".?", ".")):
         doubtful = weak in first and strong not in first and (weak == ",?" or "," in first)
         if doubtful:
-            text = cell(weak)
+            text = shown(weak)
             mark = weak[0]
             one, all_digits = text.replace(mark, "."), text.replace(mark, "")
             raise refused(weak, f"{text!r} may be {one} or {all_digits}; write one of these")
@@ -467,7 +467,7 @@ def _find_decimals(table: SavedTable) -> None:
         table.decimal_comma = True
         table.assumed.append("decimal commas")
     if "spaced" in first:
-        table.assumed.append(f"{cell('spaced')!r} as one number")
+        table.assumed.append(f"{shown('spaced')!r} as one number")
 
 
 def _decimals_of(text: str) -> str:
