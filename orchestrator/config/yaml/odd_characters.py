@@ -17,7 +17,8 @@ OPENING, CLOSING = "“”„«‘‚‹", "“”»’‘›"
 _ENDS = re.compile(rf"^[{SPACES}{HIDDEN}\u200c\u200d]|[{SPACES}{HIDDEN}\u200c\u200d]$")
 _HIDDEN = re.compile(rf"[{HIDDEN}]")
 _AFTER_SIGN = re.compile(rf"^(?:[\w.-]+:|-)([{SPACES}])")
-_QUOTED = re.compile(rf"[{OPENING}].*[{CLOSING}]", re.DOTALL)
+_QUOTED = re.compile(rf"[{OPENING}](.*[{CLOSING}]|[^{CLOSING}]*)", re.DOTALL)
+"""A text in curly quotes, or the part before its first comma in a list."""
 _WIDE_COLON = re.compile(r"^[\w.-]+(：)")
 
 _IN_LINE = re.compile(
@@ -59,7 +60,8 @@ def _is_text(before: str) -> bool:
 
 
 def _message(character: str) -> str:
-    name = f"a {unicodedata.name(character, 'control character').lower()} (U+{ord(character):04X})"
+    name = unicodedata.name(character, "control character").lower()
+    name = f"{'an' if name[0] in 'aeio' else 'a'} {name} (U+{ord(character):04X})"
     if character == "\t":
         return "a tab after the colon; write a space"
     if character in OPENING + CLOSING:

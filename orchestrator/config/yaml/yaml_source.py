@@ -181,7 +181,7 @@ class Document:
             table[key] = self._plain(value_node, here, active)
         return table
 
-    def _entries(self, node: MappingNode, loc: Loc, active: frozenset[int]) -> Iterator[tuple[ScalarNode, Node]]:
+    def _entries(self, node: MappingNode, loc: Loc, active: frozenset[int]) -> Iterator[tuple[ScalarNode, Any]]:
         """Keys and values of a mapping: its own, then those that it merges and does not have itself.
 
         Source: https://yaml.org/type/merge.html; the first of several merged mappings has priority.
