@@ -65,7 +65,7 @@ def simulate(
         Path | None,
         typer.Option(
             "--from",
-            help="CSV file of weighed pours, as for a calibration: predict all of them and score the predictions.",
+            help="Table of weighed pours (CSV, .xlsx), as for a calibration: predict all of them and score the predictions.",
             show_default=False,
         ),
     ] = None,
