@@ -65,7 +65,7 @@ def simulate(
         Path | None,
         typer.Option(
             "--from",
-            help="Table of weighed pours (CSV, .xlsx), as for a calibration: predict all of them and score the predictions.",
+            help="Table of weighed pours (CSV, .xlsx), as for a calibration: predict and score all of them.",
             show_default=False,
         ),
     ] = None,
