@@ -32,8 +32,8 @@ from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.physics_command import kept_records
 from orchestrator.config import campaign_file as campaign
 from orchestrator.config import vessel_file as vessel
+from orchestrator.config.pour_table import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.scene_builder import DEFAULTS, NEEDED
-from orchestrator.config.weighed_pours import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySettings

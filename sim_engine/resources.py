@@ -160,6 +160,7 @@ EXTRAS = {
     "skimage": "vessels",
     "pandas": "tables",
     "pyarrow": "tables",
+    "openpyxl": "excel",
     "unitelabs": "sila",
 }
 """Importable name → extra."""

@@ -38,7 +38,7 @@ from orchestrator.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from orchestrator.config.weighed_pours import RecordTable
+    from orchestrator.config.pour_table import RecordTable
     from orchestrator.results.prediction_scores import ScoredRow
     from orchestrator.strategies.campaign_plan import CampaignPlan, RecordedPour, RecordSet
     from sim_engine.action import Action
@@ -65,7 +65,7 @@ def simulate(
         Path | None,
         typer.Option(
             "--from",
-            help="CSV file of weighed pours, as for a calibration: predict all of them and score the predictions.",
+            help="Table of weighed pours (CSV, .xlsx), as for a calibration: predict and score all of them.",
             show_default=False,
         ),
     ] = None,
@@ -402,7 +402,7 @@ def _pours(scene: Scene, records: RecordSet | None, source: Path) -> tuple[Recor
     Raises:
         RefusalError: the table has problems; lists them by line and column (exit code 2).
     """
-    from orchestrator.config.weighed_pours import read_records
+    from orchestrator.config.pour_table import read_records
     from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
     from sim_engine.vessel.shapes import ProfileShape
 
@@ -416,6 +416,8 @@ def _pours(scene: Scene, records: RecordSet | None, source: Path) -> tuple[Recor
         columns=None if records is None else records.columns,
         split="test",
     )
+    if table.assumed:
+        print_note(f"note: {table.assumed}")
     problems = list(table.problems)
     pours: list[RecordedPour] = []
     for row in () if problems else table.rows:

@@ -84,8 +84,8 @@ def vessel(
         str | None, typer.Option(help="Unit of points, mesh or depths: m, cm, mm, in; default for depths: mm.")
     ] = None,
     up: Annotated[str, typer.Option(help="Axis of points or mesh that points out of the opening.")] = "z",
-    fill: Annotated[Path | None, typer.Option(help="CSV of levels and masses: level_mm, mass_g.")] = None,
-    tilt: Annotated[Path | None, typer.Option(help="CSV of tilts and retained masses: tilt_deg, mass_g.")] = None,
+    fill: Annotated[Path | None, typer.Option(help="Table of levels and masses: level_mm, mass_g.")] = None,
+    tilt: Annotated[Path | None, typer.Option(help="Table of tilts and retained masses: tilt_deg, mass_g.")] = None,
     brimful: Annotated[str | None, typer.Option(help="Weighed mass when full to the brim: '322 g'; a check.")] = None,
     density: Annotated[str, typer.Option(help="Density of the weighed liquid.")] = "998 kg/m^3",
     wall: Annotated[str | None, typer.Option(help="Thickness of the wall: '3 mm'.")] = None,

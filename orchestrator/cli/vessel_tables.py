@@ -5,13 +5,13 @@ Every reader reports invalid input as a `RefusalError` with file and line.
 
 from __future__ import annotations
 
-import csv
 import math
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused
+from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_note
+from orchestrator.config.table_columns import KnownColumn, columns_of
 from sim_engine.settings.quantity import QuantityError, parse_quantity
 
 if TYPE_CHECKING:
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 LARGEST_FILE = 200_000_000
 """Largest file that is read [bytes]."""
 
+LARGEST_TABLE = 2_000_000
+"""Largest file of a table [bytes]."""
+
 MOST_ROWS = 10_000
 
 FEWEST_ROWS = 3
@@ -33,6 +36,16 @@ NARROWEST_MM, WIDEST_MM = 4.0, 1000.0
 """Limits of the mean inner diameter of vessels [mm]."""
 
 MOST_PIXELS = 60_000_000
+
+COLUMNS = {
+    one.standard: one
+    for one in (
+        KnownColumn("level", "m", "mm", ("height", "fill_level")),
+        KnownColumn("tilt", "rad", "deg", ("angle", "tilt_angle")),
+        KnownColumn("mass", "kg", "g", ("weight",)),
+    )
+}
+"""Columns of tables: levels above the inner floor, tilts from upright, masses of the liquid."""
 
 
 def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
@@ -139,26 +152,40 @@ def _monotonic(
 
 def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, float, float]]:
     """Read line number, value of a column and mass [g] of each row; see `read_fill_table`."""
-    _check_size(path)
+    from orchestrator.config.saved_table import read_saved_table
+    from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
+
+    wanted = (COLUMNS[column], COLUMNS["mass_g"])
+    problems: list[Problem] = []
+    with Refused(ConfigError):
+        table = read_saved_table(path, limit=LARGEST_TABLE)
+        columns = columns_of(table, wanted, {}, problems)
+        if problems:
+            raise ConfigError(problems)
+    names = [one.standard for one in columns if one is not None]
+    missing = [one.standard for one in wanted if one.standard not in names]
+    if missing:
+        raise RefusalError(f"{path}:1: the column '{missing[0]}' is missing; write '{column},mass_g'", BAD_INPUT)
+    if table.note:
+        print_note(f"note: {table.note}")
     found: list[tuple[int, float, float]] = []
-    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-        rows = csv.DictReader(file)
-        missing = [name for name in (column, "mass_g") if name not in (rows.fieldnames or ())]
-        if missing:
-            raise RefusalError(f"{path}:1: the column '{missing[0]}' is missing; write '{column},mass_g'", BAD_INPUT)
-        for row in rows:
-            at = f"{path}:{rows.line_num}"
-            try:
-                value, mass = float(row[column]), float(row["mass_g"])
-            except (TypeError, ValueError):
-                raise RefusalError(f"{at}: should be two numbers, {column} and mass_g", BAD_INPUT) from None
-            if not 0.0 < value <= upper * (1.0 + 1e-9):
-                raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}", BAD_INPUT)
-            if not 0.0 <= mass < 1e5:
-                raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0", BAD_INPUT)
-            found.append((rows.line_num, value, mass))
-            if len(found) > MOST_ROWS:
-                raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows", BAD_INPUT)
+    for row in table.rows:
+        at = f"{path}:{row.line}"
+        try:
+            numbers = [table.number(cell) for cell in row.cells]
+        except ValueError:
+            numbers = []
+        if len(numbers) != len(names):
+            raise RefusalError(f"{at}: should be two numbers, {column} and mass_g", BAD_INPUT)
+        values = {one.standard: n * one.factor for one, n in zip(columns, numbers, strict=True) if one is not None}
+        value, mass = values[column], values["mass_g"]
+        if not 0.0 < value <= upper * (1.0 + 1e-9):
+            raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}", BAD_INPUT)
+        if not 0.0 <= mass < 1e5:
+            raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0", BAD_INPUT)
+        found.append((row.line, value, mass))
+        if len(found) > MOST_ROWS:
+            raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows", BAD_INPUT)
     if len(found) < FEWEST_ROWS:
         raise RefusalError(
             f"{path}: has {len(found)} row(s); at least {FEWEST_ROWS} say something about a shape", BAD_INPUT

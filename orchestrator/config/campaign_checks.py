@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -428,6 +428,16 @@ class _Checker:
                 return
 
 
+def _assumed(plan: CampaignPlan) -> Iterator[tuple[Loc, str]]:
+    """What was assumed about the files of weighed pours, with the keys that name them."""
+    if plan.calibration is not None and plan.calibration.records is not None:
+        yield ("calibration", "pours", "from"), plan.calibration.records.assumed
+    if plan.calibration is not None and plan.calibration.transfer is not None:
+        yield ("calibration", "pours", "transfer", "from"), plan.calibration.transfer.assumed
+    if plan.deployment is not None and plan.deployment.data is not None:
+        yield ("deployment", "data", "from"), plan.deployment.data.assumed
+
+
 def check_campaign(
     plan: CampaignPlan,
     *,
@@ -462,6 +472,9 @@ def check_campaign(
     at: Loc
     if (problem := why_not_writable(plan.outputs.folder)) is not None:
         checker.add((("outputs", "directory"),), problem)
+    for at, assumed in _assumed(plan):
+        if assumed:
+            warn(checker.problem((at,), assumed))
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)
         if calibration.records is None:

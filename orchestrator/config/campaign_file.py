@@ -46,16 +46,16 @@ from sim_engine.settings.quantity import Quantity
 
 
 class PoursFromFile(Settings):
-    """Weighed pours in a CSV file."""
+    """Weighed pours in a file."""
 
     source: FilePath | None = Field(default=None, alias="from")
-    """CSV file of weighed pours, with a column `split`."""
+    """Table of weighed pours (CSV or .xlsx), with a column `split`."""
 
     lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
-    """The pourer's inner radius at the lip, if the CSV has lip_to_receiver_axis_mm instead of x_offset_mm."""
+    """The pourer's inner radius at the lip, if the file has lip_to_receiver_axis_mm instead of x_offset_mm."""
 
     columns: dict[Text, Text] = Field(default_factory=dict)
-    """Columns that have another name in the CSV: {Decant's name: name in the file}."""
+    """Columns that have another name in the file: {Decant's name: name in the file}."""
 
     def check_exclusive(self, problems: Problems, keys: Sequence[str], text: str) -> None:
         """Refuse keys that have a value."""
@@ -68,7 +68,7 @@ class TransferSettings(Settings):
     """Weighed pours in another scene, used only to evaluate the calibration."""
 
     source: Annotated[FilePath, Example("transfer.csv")] = Field(alias="from")
-    """CSV file."""
+    """Table of weighed pours (CSV or .xlsx)."""
 
     receiver: Annotated[PathOr[VesselFile], Example("cone.yaml")]
     """Receiver of these pours."""
@@ -170,16 +170,16 @@ class CalibrationSection(StageSettings):
 
 
 class DataSettings(PoursFromFile):
-    """Pours from before the campaign that deployment uses as data: from a CSV file, or from a previous run."""
+    """Pours from before the campaign that deployment uses as data: from a file, or from a previous run."""
 
     source: FilePath | None = Field(default=None, alias="from")
-    """CSV file of weighed pours, with the columns of calibration's `pours`; `split` may be left out."""
+    """Table of weighed pours (CSV or .xlsx), with the columns of calibration's `pours`; `split` may be left out."""
 
     run: FilePath | None = None
     """Folder of a previous run: its weighed pours in the same scenes, from any stage."""
 
     receiver: Text | None = None
-    """Name of the receiver of the CSV file's pours, if there are several receivers."""
+    """Name of the receiver of the file's pours, if there are several receivers."""
 
     counts: Switch = False
     """Whether these pours count against the budget."""

@@ -191,6 +191,7 @@ def resolve_calibration(
         receivers[0] if receivers else None,
         recorded=pours.source is not None or pours.from_run is not None,
         constants={} if table is None else table.constants(),
+        unread=table is None and (pours.source is not None or report.is_broken(at.at("from"))),
     )
     further = [
         ground.scene(f"calibration-{other.name}", other)

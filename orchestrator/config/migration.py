@@ -6,6 +6,7 @@ Only these places of the text are replaced, so that comments and layout are kept
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -65,7 +66,7 @@ def migrate_file(path: Path, load: Callable[[Path], object]) -> Migration:
 
 def _replaced(text: str, problems: Iterable[Problem]) -> tuple[str, list[tuple[int, str, str]]]:
     """The text with the new names, and what was replaced."""
-    lines, done = text.splitlines(keepends=True), []
+    lines, done = list(io.StringIO(text, newline="")), []  # the line breaks that the parser counts
     for problem in sorted(problems, key=lambda one: (one.line, one.column), reverse=True):
         assert problem.renamed is not None
         old, new = problem.renamed

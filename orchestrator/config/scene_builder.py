@@ -60,14 +60,14 @@ class SceneBuilder:
         own = actions is not None
         used = actions if own else self.file.actions
         if used is None:
-            if not self._hidden_by_problems(place, "actions"):
+            if not self.hidden_by_problems(place, "actions"):
                 message = "searches nothing; add for example 'actions: {angular_velocity: [15 deg/s, 120 deg/s]}'"
                 self.report.add(place, message, key=True)
             return None
         at = (place if own else self.root).at("actions")
         space: Space | None = used.space()
         if space is None:
-            if not self._hidden_by_problems(place, "actions"):
+            if not self.hidden_by_problems(place, "actions"):
                 self.report.add(at, "names no dimension; add for example 'angular_velocity: [15 deg/s, 120 deg/s]'")
             return None
         beside = [(motion, place.at("motion"))] + ([] if own else [(self.file.motion, self.root.at("motion"))])
@@ -137,6 +137,7 @@ class SceneBuilder:
         recorded: bool = False,
         constants: Mapping[str, float] | None = None,
         constants_win: bool = False,
+        unread: bool = False,
     ) -> Scene | None:
         """A scene.
 
@@ -151,6 +152,7 @@ class SceneBuilder:
             constants: values that the whole record has; a different value in `motion` is an error, unless
                 `constants_win`.
             constants_win: the record's scene only inherits the motion, so that its constants have priority.
+            unread: the record could not be read, so that dimensions that it may give are not missed.
         """
         fixed: dict[str, float | None] = {k: v for k, v in DEFAULTS.items() if k not in NEEDED}
         pivot, max_hold_time = Pivot(), 5.0
@@ -176,7 +178,7 @@ class SceneBuilder:
         for dimension in NEEDED:
             if dimension not in fixed and dimension not in searched:
                 ok = False
-                if not self._hidden_by_problems(place, dimension):
+                if not unread and not self.hidden_by_problems(place, dimension):
                     self.report.add(place, self._needs(dimension, place), key=True)
         for dimension in ("angular_acceleration", "return_velocity"):
             if not recorded and dimension in fixed and fixed[dimension] is None:
@@ -226,7 +228,7 @@ class SceneBuilder:
         default = self.file.value(role)
         if default is not None:
             return self.references.vessel(default, self.root.at(role))
-        if not self._hidden_by_problems(place, role) and not self._hidden_by_problems(self.root, role):
+        if not self.hidden_by_problems(place, role) and not self.hidden_by_problems(self.root, role):
             message = f"has no {role}; add for example '{role}: ../vessels/{_SAMPLE[role]}.yaml' here or at the top"
             self.report.add(place, message, key=True)
         return None
@@ -239,7 +241,7 @@ class SceneBuilder:
             f"or search it under {dotted(place.at('actions').loc)} ('{dimension}: [{low} {unit}, {high} {unit}]')"
         )
 
-    def _hidden_by_problems(self, place: Place, word: str) -> bool:
+    def hidden_by_problems(self, place: Place, word: str) -> bool:
         """Whether a reported problem may explain that a word has no value: one cause, one message."""
         return any(
             path == place.document.path and (word in loc or (loc and loc[-1] in ("motion", "actions")))

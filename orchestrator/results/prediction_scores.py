@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.config.weighed_pours import column_name
+from orchestrator.config.pour_table import column_name
 from orchestrator.results import figure_style as style
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.prediction_band import PredictionInterval, SampleStatistics

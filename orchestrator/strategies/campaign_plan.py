@@ -274,6 +274,7 @@ class RecordSet:
         lip_radius: radius used to convert the file's lip_to_receiver_axis_mm to x_offset [m]; None if the file has
             x_offset_mm.
         columns: renamed columns, {Decant's name: name in the file}.
+        assumed: one sentence on how the file was read, if it is not in the plain form.
     """
 
     scene: Scene
@@ -281,6 +282,7 @@ class RecordSet:
     path: Annotated[Path, NOT_IN_FINGERPRINT]
     lip_radius: float | None = None
     columns: dict[str, str] = field(default_factory=dict)
+    assumed: Annotated[str, NOT_IN_FINGERPRINT] = ""
 
     @property
     def training_pours(self) -> int:
@@ -297,7 +299,7 @@ class ExistingPours:
         path: the CSV file, or the journal of the run that made the pours.
         counts: whether the pours count against the pour budget.
         left_out: reasons why other pours of the file or run are not used, one text each.
-        lip_radius, columns: as in `RecordSet`.
+        lip_radius, columns, assumed: as in `RecordSet`.
     """
 
     pours: dict[str, tuple[RecordedPour, ...]]
@@ -306,6 +308,7 @@ class ExistingPours:
     left_out: tuple[str, ...] = ()
     lip_radius: float | None = None
     columns: dict[str, str] = field(default_factory=dict)
+    assumed: Annotated[str, NOT_IN_FINGERPRINT] = ""
 
 
 @dataclass(frozen=True)

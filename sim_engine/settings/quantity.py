@@ -45,14 +45,22 @@ newton = kilogram * meter / second ** 2 = N
 pascal = newton / meter ** 2 = Pa
 poise = 0.1 * pascal * second = P
 inch = 0.0254 * meter = in
+pound = 0.45359237 * kilogram = lb
+ounce = pound / 16 = oz
+fluid_ounce = 2.95735295625e-5 * meter ** 3 = floz
 liter = 1e-3 * meter ** 3 = l = L
 percent = 0.01 = %
 """
-"""Units of a pouring laboratory; a short list loads in milliseconds and has no unexpected members."""
+"""Units of a pouring laboratory; a short list loads in milliseconds and has no unexpected members.
+
+Pound and ounce are avoirdupois, the fluid ounce is that of the United States (NIST Handbook 44, appendix C)."""
+
+_FLUID_OUNCE = re.compile(r"\bfl(?:uid|\.)?\s*(?:ounces?\b|oz\b\.?)")
+"""Spellings with a space, which the parser would read as a product."""
 
 FAMILIAR_UNITS = ("mm", "cm", "m", "in", "deg", "rad", "deg/s", "rad/s", "rpm", "deg/s^2", "rad/s^2", "s", "min", "ms",
-                  "mL", "g", "kg", "mg", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "Pa*s", "mPa*s", "cP", "1/s", "Hz",
-                  "degC", "MB")  # fmt: skip
+                  "mL", "fl oz", "g", "kg", "mg", "oz", "lb", "g/s", "kg/m^3", "g/cm^3", "N/m", "mN/m", "Pa*s", "mPa*s",
+                  "cP", "1/s", "Hz", "degC", "MB")  # fmt: skip
 
 KINDS = {
     "m": "a length",
@@ -79,7 +87,7 @@ KINDS = {
 LONGEST = 80
 """Longest text of a quantity [characters]: longer texts are not parsed."""
 
-_QUANTITY = re.compile(r"\s*([-+−]?(?:[0-9][0-9_]*\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*\Z", re.DOTALL)
+_QUANTITY = re.compile(r"\s*([-+−–]?(?:[0-9][0-9_]*\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*\Z", re.DOTALL)
 
 _TERM = r"(?:[^\W\d_]+|[°%]|1)(?:\s*(?:\^|\*\*)\s*-?\d)?"
 _UNIT = re.compile(rf"{_TERM}(?:\s*[*/·\s]\s*{_TERM})*")
@@ -120,7 +128,7 @@ def parse_quantity(value: Any, unit: str, example: str) -> float:
     match = _QUANTITY.match(value) if isinstance(value, str) else None
     if isinstance(value, str) and match is None:
         raise QuantityError(f"{value!r} is not a quantity; should be {kind}, for example '{example}'")
-    number = float(match[1].replace("−", "-").replace("_", "")) if match else float(value)
+    number = float(match[1].replace("−", "-").replace("–", "-").replace("_", "")) if match else float(value)
     text = match[2] if match else ""
     if not math.isfinite(number):
         raise QuantityError(f"{value} is not finite; should be {kind}, for example '{example}'")
@@ -132,17 +140,42 @@ def parse_quantity(value: Any, unit: str, example: str) -> float:
         return number
     if re.match(r",\d", text):
         raise QuantityError(f"{value!r} has a decimal comma; write '{str(value).replace(',', '.', 1)}'")
-    source = _unit(text, kind, example)
-    if source.dimensionality != registry().parse_units(unit if unit != "1" else "").dimensionality:
-        raise QuantityError(f"{value!r} is {_kind_of(source)}; should be {kind}, for example '{example}'")
-    return float(registry().convert(number, source, registry().parse_units(unit if unit != "1" else "")))
+    return _converted(number, text, repr(value), unit, example)
+
+
+def parse_unit(text: str, unit: str, example: str) -> float:
+    """Value of a unit, such as one in the header of a table, in the SI unit of its kind.
+
+    Args:
+        text: the unit as written, for example 'rad/s'.
+        unit: SI unit of the result.
+        example: a valid quantity, for messages.
+
+    Raises:
+        QuantityError: an unknown unit, or one of another dimension.
+    """
+    if len(text) > LONGEST:
+        raise QuantityError(f"a text of {len(text)} characters is not a unit")
+    return _converted(1.0, text, f"the unit '{text}'", unit, example)
+
+
+def _converted(number: float, text: str, what: str, unit: str, example: str) -> float:
+    """A number of a unit in another one; `what` begins the message about another dimension."""
+    kind = KINDS.get(unit, f"a quantity in {unit}")
+    source, target = _unit(text, kind, example), registry().parse_units(unit if unit != "1" else "")
+    if source.dimensionality != target.dimensionality:
+        found = _kind_of(source)
+        ounces = "; a fluid ounce is written 'fl oz'" if (found, unit) == ("a mass", "m^3") and "oz" in text else ""
+        raise QuantityError(f"{what} is {found}; should be {kind}, for example '{example}'{ounces}")
+    return float(registry().convert(number, source, target))
 
 
 def _unit(text: str, kind: str, example: str) -> Any:
     try:
-        if not _UNIT.fullmatch(text.replace("(", "").replace(")", "")):
+        plain = _FLUID_OUNCE.sub("floz", text)
+        if not _UNIT.fullmatch(plain.replace("(", "").replace(")", "")):
             raise ValueError(text)
-        return registry().parse_units(text)
+        return registry().parse_units(plain)
     except Exception:  # the parser evaluates units as Python expressions, and raises any of their errors
         guess = did_you_mean(text, FAMILIAR_UNITS)
         meant = f"did you mean '{guess}'?" if guess else f"should be {kind}, for example '{example}'"

@@ -119,16 +119,15 @@ def why_not_writable(directory: Path) -> str | None:
     return None
 
 
-def read_text(path: Path, *, encoding: str = "utf-8", limit: int = SIZE_LIMIT) -> str:
-    """The text of a file.
+def read_bytes(path: Path, *, limit: int = SIZE_LIMIT) -> bytes:
+    """The content of a file.
 
     Args:
         path: the file.
-        encoding: 'utf-8', or 'utf-8-sig' if a byte order mark may come first.
         limit: maximum size [bytes].
 
     Raises:
-        UnreadableError: it does not exist, is not a file, is too large, or is not text.
+        UnreadableError: it does not exist, is not a file, or is too large.
     """
     if (why := why_unreadable(path)) is not None:
         hint = similar(path) if why == "no such file" else None
@@ -143,7 +142,16 @@ def read_text(path: Path, *, encoding: str = "utf-8", limit: int = SIZE_LIMIT) -
         raise UnreadableError(
             f"is too large: {size / 1e6:.3g} MB, and {limit / 1e6:g} MB are read at most. Is it the right file?"
         )
+    return content
+
+
+def read_text(path: Path, *, limit: int = SIZE_LIMIT) -> str:
+    """The text of a file in UTF-8.
+
+    Raises:
+        UnreadableError: as `read_bytes`, or it is not text in UTF-8.
+    """
     try:
-        return content.decode(encoding)
+        return read_bytes(path, limit=limit).decode("utf-8")
     except UnicodeDecodeError as error:
         raise UnreadableError(f"is not text in UTF-8 (byte {error.start}); save it as UTF-8") from None

@@ -3,12 +3,14 @@
 `Document` is a parsed file, `Place` a location in it, `Report` collects problems. `kind_of` recognises the kind of a
 file by its keys, so that a file of another kind gives one error instead of one per key.
 
-The parser's node graph is converted to plain data here instead of by its constructor, so that all duplicate keys, tags
-and merges are reported together with their places.
+The parser's node graph is converted to plain data here instead of by its constructor, so that all duplicate keys and
+tags are reported together with their places. The keys of a merge (`<<: *base`) keep the places where they are written.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +23,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from orchestrator.config.yaml.file_access import UnreadableError, read_text
+from orchestrator.config.yaml.odd_characters import before_error, in_plain_text
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem, dotted
 from sim_engine.vessel.shapes import VESSELS
 
@@ -32,6 +35,10 @@ exceed it."""
 
 DEPTH_LIMIT = 30
 """Maximum nesting of mappings and lists: a campaign has eight levels."""
+
+
+_LINE_BREAK = re.compile(r"\r\n|\r|\n")
+"""Line breaks that the parser counts."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,8 @@ class Document:
         lines: its text, to display source lines.
         data: plain dicts, lists, strings, numbers, booleans and None.
         marks: place of every value in `data`.
-        problems: problems that do not prevent reading (duplicate keys, tags, merges).
+        problems: problems that do not prevent reading (duplicate keys, tags).
+        _refused: problems after which nothing else is reported, as after a syntax error.
     """
 
     path: Path
@@ -67,6 +75,7 @@ class Document:
     marks: dict[Loc, SourcePosition] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     _nodes: int = 0
+    _refused: list[Problem] = field(default_factory=list)
 
     @classmethod
     def read(cls, path: Path) -> Document:
@@ -87,7 +96,7 @@ class Document:
         Raises:
             ConfigError: it is not YAML, or is empty.
         """
-        document = cls(path, text.splitlines())
+        document = cls(path, _LINE_BREAK.split(text))
         try:
             root = _parser().compose(text)
         except MaxDepthExceededError as error:
@@ -108,6 +117,8 @@ class Document:
             raise ConfigError([Problem(path, 1, 1, "", "the file is empty", document.line(1))])
         document.marks[()] = SourcePosition((1, 1), _start(root), False)
         document.data = document._plain(root, ())
+        if document._refused:
+            raise ConfigError(dict.fromkeys(document._refused))
         return document
 
     def line(self, number: int) -> str:
@@ -142,10 +153,7 @@ class Document:
         if self._nodes > NODE_LIMIT:
             raise ConfigError([self._too_many(_start(node), loc)])
         if id(node) in active:
-            line, column = _start(node)
-            raise ConfigError(
-                [Problem(self.path, line, column, dotted(loc), "an anchor that contains itself", self.line(line))]
-            )
+            raise ConfigError([self._contains_itself(node, loc)])
         inside = active | {id(node)}
         match node:
             case MappingNode():
@@ -157,26 +165,76 @@ class Document:
                     items.append(self._plain(child, (*loc, i), inside))
                 return items
             case _:
+                if isinstance(node, ScalarNode):
+                    self._check_characters(node, loc)
                 return self._scalar(node, loc)
 
     def _mapping(self, node: MappingNode, loc: Loc, active: frozenset[int]) -> dict[str, Any]:
         table: dict[str, Any] = {}
-        for key_node, value_node in node.value:
-            line, column = _start(key_node)
-            if not isinstance(key_node, ScalarNode) or str(key_node.tag).endswith(":merge"):
-                self._add(line, column, loc, "keys are plain words; merges (<<) and composed keys are not supported")
-                continue
-            key = str(key_node.value)
+        for key_node, value_node in self._entries(node, loc, active):
+            (line, column), key = _start(key_node), str(key_node.value)
+            self._check_characters(key_node, loc, key=True)
             here: Loc = (*loc, key)
-            if key in table:
-                first = self.marks[here].key[0]
-                self._add(line, column, here, f"duplicate key; it stands in line {first} already, keep one of them")
-                continue
             inline = isinstance(value_node, ScalarNode) or bool(value_node.flow_style)
             value_place = _start(value_node) if not _is_empty(value_node) else (line, column)
             self.marks[here] = SourcePosition((line, column), value_place, inline)
             table[key] = self._plain(value_node, here, active)
         return table
+
+    def _entries(self, node: MappingNode, loc: Loc, active: frozenset[int]) -> Iterator[tuple[ScalarNode, Any]]:
+        """Keys and values of a mapping: its own, then those that it merges and does not have itself.
+
+        Source: https://yaml.org/type/merge.html; the first of several merged mappings has priority.
+        """
+        own: dict[str, ScalarNode] = {}
+        merged: ScalarNode | None = None
+        sources: list[Node] = []
+        for key_node, value_node in node.value:
+            line, column = _start(key_node)
+            if not isinstance(key_node, ScalarNode):
+                self._add(line, column, loc, "keys are plain words; composed keys are not supported")
+            elif str(key_node.tag).endswith(":merge"):
+                if merged is not None:
+                    text = f"'<<' stands in line {_start(merged)[0]} already; write one list: '<<: [*first, *second]'"
+                    self._refused.append(Problem(self.path, line, column, dotted(loc), text, self.line(line)))
+                    continue
+                merged = key_node
+                sources = value_node.value if isinstance(value_node, SequenceNode) else [value_node]
+            elif (key := str(key_node.value)) in own:
+                text = f"duplicate key; it stands in line {_start(own[key])[0]} already, keep one of them"
+                self._add(line, column, (*loc, key), text)
+            else:
+                own[key] = key_node
+                yield key_node, value_node
+        have = set(own)
+        for source in sources:
+            line, column = _start(source)
+            if not isinstance(source, MappingNode):
+                text = "'<<' needs a mapping or a list of mappings, for example '<<: *base'"
+                self._refused.append(Problem(self.path, line, column, dotted(loc), text, self.line(line)))
+                continue
+            if id(source) in active:
+                raise ConfigError([self._contains_itself(source, loc)])
+            for key_node, value_node in self._entries(source, loc, active | {id(source)}):
+                self._nodes += 1
+                if self._nodes > NODE_LIMIT:
+                    raise ConfigError([self._too_many((line, column), loc)])
+                if str(key_node.value) not in have:
+                    have.add(str(key_node.value))
+                    yield key_node, value_node
+
+    def _contains_itself(self, node: Node, loc: Loc) -> Problem:
+        line, column = _start(node)
+        return Problem(self.path, line, column, dotted(loc), "an anchor that contains itself", self.line(line))
+
+    def _check_characters(self, node: ScalarNode, loc: Loc, *, key: bool = False) -> None:
+        """Note a character in a text without quotes that looks like a space or a quote."""
+        if node.style is not None or (found := in_plain_text(str(node.value), key=key)) is None:
+            return
+        (line, column), (index, message) = _start(node), found
+        character, source = str(node.value)[index], self.line(line)
+        at = source.find(character, column - 1)
+        self._refused.append(Problem(self.path, line, at + 1 if at >= 0 else column, dotted(loc), message, source))
 
     def _scalar(self, node: Node, loc: Loc) -> Any:
         tag, text = str(node.tag), str(node.value)
@@ -214,6 +272,8 @@ class Document:
     def _syntax_problem(self, error: MarkedYAMLError) -> Problem:
         mark = error.problem_mark or error.context_mark
         line, column = (mark.line + 1, mark.column + 1) if mark is not None else (1, 1)
+        if (odd := before_error(self.lines, line)) is not None:
+            return Problem(self.path, odd[0], odd[1], "", f"not YAML: {odd[2]}", self.line(odd[0]))
         what = (error.problem or "unreadable").replace("<", "").replace(">", "")
         source = self.line(line)
         if "another document" in what:
@@ -282,8 +342,12 @@ class Report:
         if not self.problems:
             return
         order = {problem.path: i for i, problem in reversed(list(enumerate(self.problems)))}
-        unique = dict.fromkeys(self.problems)
-        raise ConfigError(sorted(unique, key=lambda p: (order[p.path], p.line, p.column)))
+        unique: dict[object, Problem] = {}
+        for problem in self.problems:  # what an alias or a merge repeats is written once
+            place = (problem.path, problem.line, problem.column, problem.message) if problem.line else problem
+            if place not in unique or len(problem.where) < len(unique[place].where):
+                unique[place] = problem
+        raise ConfigError(sorted(unique.values(), key=lambda p: (order[p.path], p.line, p.column)))
 
 
 class _TooManyNodesError(MarkedYAMLError):

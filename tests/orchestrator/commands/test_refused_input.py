@@ -42,7 +42,7 @@ BAD: dict[str, str] = {
     "calibrate number-csv.yaml": "number.csv:3:9: poured_g: '9x5' is not a number",
     "calibrate column-csv.yaml": "column.csv:1:1: column 'spilled_g' is missing",
     "calibrate mass-csv.yaml": "poured 90 g + retained 90 g = 180 g, but 100 g were loaded",
-    "calibrate nothing-csv.yaml": "nothing.csv: is empty; it needs a header and a line for each pour",
+    "calibrate nothing-csv.yaml": "nothing.csv: is empty; it needs a header and a line for each row",
     "simulate small.yaml --from number.csv": "number.csv:3:9: poured_g: '9x5' is not a number",
     "simulate small.yaml --from gone.csv": "gone.csv: no such file",
     "simulate small.yaml --from pours.csv --scene narrow": "pours.csv:2:1: makes no action of scene 'deployment-n",

@@ -13,7 +13,7 @@ from PIL import ExifTags, Image
 
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.vessel_command import vessel
-from orchestrator.cli.vessel_tables import read_photograph
+from orchestrator.cli.vessel_tables import read_fill_table, read_photograph
 from orchestrator.config.file_loading import load_vessel
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
@@ -260,7 +260,12 @@ def written(text: str) -> Door:
         (lambda of, folder: {"depth": of.photo(folder / "p.png"), "focal": FOCAL, "wall": "3 mm"}, r"16 bits"),
         (steep, r"no table is seen"),
         (lambda of, folder: {"mesh": folder / "x.stl", "tilt": folder / "t.csv"}, r"--tilt goes with turned vessels"),
-        (written("level,mass\n1,2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
+        (written("mass_g\n2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
+        (written("level,mass\n1,2\n"), r"fill.csv:1:1: level: has no unit; write 'level_mm' or 'level \[mm\]'"),
+        (
+            written("level [g],mass [g]\n1,2\n"),
+            r"fill.csv:1:1: level \[g\]: the unit 'g' is a mass; should be a length",
+        ),
         (written("level_mm,mass_g\n10,20\n20,x\n"), r"fill.csv:3: should be two numbers"),
         (written("level_mm,mass_g\n10,20\n200,30\n"), r"fill.csv:3: level_mm is 200; should be .* at most 100"),
         (written("level_mm,mass_g\n10,20\n"), r"at least 3"),
@@ -297,3 +302,18 @@ def test_a_file_that_is_called_a_number_can_be_read(tmp_path: Path, name: str) -
     out = tmp_path / f"{name}.yaml"
     vessel(out, **callipers(bench("tumbler"), tmp_path))
     assert load_vessel(out).name == name
+
+
+def test_fill_tables_are_read_in_the_forms_that_spreadsheets_save(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def table(text: str) -> list[list[float]]:
+        (tmp_path / "fill.csv").write_text(text, encoding="utf-8")
+        found = read_fill_table(tmp_path / "fill.csv", height=100.0, density=1e-3, ruler=0.5, balance=0.1)
+        return [column.tolist() for column in found]
+
+    plain = table("level_mm,mass_g\n10,30.5\n20,61\n30.5,92.25\n")
+    assert capsys.readouterr().err == ""
+    european = table("# cup 7\n;Level [cm];mass (oz)\n" + "0;1,0;1,0758\n1;2,0;2,15169\n2;3,05;3,25402\n")
+    assert european == [pytest.approx(column, rel=1e-3) for column in plain]
+    assert "semicolons between cells, 1 comment line left out" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from orchestrator.config.action_assignments import assigned_action, set_action
 from orchestrator.config.file_loading import load_campaign, load_parameters
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
-from sim_engine.settings.quantity import format_quantity, parse_quantity
+from sim_engine.settings.quantity import QuantityError, format_quantity, parse_quantity
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -33,10 +33,27 @@ CONFIGS = Path(__file__).parents[3] / "configs"
         ("-5 mm", "m", -0.005),
         ("1e2 mm", "m", 0.1),
         ("−5 °", "rad", -5.0 * DEG),
+        ("–5 mm", "m", -0.005),  # a dash, as word processors write
+        ("8 oz", "kg", 0.226796185),
+        ("1 lb", "kg", 0.45359237),
+        ("2 lbs", "kg", 0.90718474),
+        ("8 fl oz", "m^3", 236.5882365e-6),  # of the United States; the imperial one has 28.4131 mL
+        ("8 fl. oz.", "m^3", 236.5882365e-6),
+        ("8 floz", "m^3", 236.5882365e-6),
+        ("2 fluid ounces", "m^3", 59.147059125e-6),
     ],
 )
 def test_quantity_means(text: str, unit: str, value: float) -> None:
     assert parse_quantity(text, unit, "1 mm") == pytest.approx(value, rel=1e-12)
+
+
+def test_an_ounce_is_a_mass_and_a_fluid_ounce_a_volume() -> None:
+    with pytest.raises(QuantityError, match=r"'8 oz' is a mass; should be a volume.* a fluid ounce is written 'fl oz'"):
+        parse_quantity("8 oz", "m^3", "200 mL")
+    with pytest.raises(QuantityError, match="'8 fl oz' is a volume; should be a mass, for example '200 g'"):
+        parse_quantity("8 fl oz", "kg", "200 g")
+    with pytest.raises(QuantityError, match="unknown unit 'OZ'; did you mean 'oz'"):
+        parse_quantity("8 OZ", "kg", "200 g")
 
 
 def test_formatted_quantity_reads_back_to_the_same_float() -> None:

@@ -132,7 +132,7 @@ BAD_TABLES = {
         "pours.csv:2:11: spilled_g: -0.4 g is less than nothing, by more than a balance's noise of 0.3 g",
     ),
     "underscores": (CSV.replace("180,4,20", "1_80.0,4,20"), "poured_g: '1_80.0' is not a number; write it like 12.5"),
-    "semicolons": (CSV.replace(",", ";"), "pours.csv:1:23: cells are separated by semicolons; save it with commas"),
+    "underscores in the header": (CSV.replace("poured_g", "poured__g"), "poured__g: unknown unit"),
 }
 
 
