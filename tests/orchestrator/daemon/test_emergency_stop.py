@@ -54,13 +54,18 @@ class Arm:
 
 
 @contextlib.contextmanager
-def tilting(lab: OnPort) -> Iterator[Arm]:
-    """An arm that tilts; afterwards the stop is cleared."""
-    worker, arm = lab.served.daemon.workers[NO_RIG], Arm()
-    worker.running = arm  # type: ignore[assignment]
-    yield arm
-    worker.running = None
-    lab.do(lab.served.post("/emergency-stop/clear", role=Role.ADMIN))
+def tilting(lab: OnPort) -> Iterator[list[Arm]]:
+    """Arms of all rigs, which tilt; afterwards the stops are cleared."""
+    workers = lab.served.daemon.workers
+    before = {name: worker for name, worker in workers.items() if name != NO_RIG}
+    arms = [Arm() for _ in before]
+    for (name, worker), arm in zip(before.items(), arms, strict=True):
+        stub = SimpleNamespace(rig=worker.rig, running=arm, latched=False, arm=None, wake=asyncio.Event())
+        workers[name] = stub  # type: ignore[assignment]
+    yield arms
+    workers |= before
+    for name in ("", *lab.served.daemon.rig_names):
+        lab.do(lab.served.post("/emergency-stop/clear", {"rig": name}, role=Role.ADMIN))
 
 
 def stopped(lab: OnPort, arm: Arm) -> None:
@@ -70,7 +75,7 @@ def stopped(lab: OnPort, arm: Arm) -> None:
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_valid_token_stops_the_arm_whatever_the_body(lab: OnPort, case: StopCase) -> None:
-    with tilting(lab) as arm:
+    with tilting(lab) as (arm,):
         found = stopped_by(lab.url, lab.served.tokens[Role.VIEWER], case, lambda: stopped(lab, arm))
         assert found["emergency"]["by"] == "viewer"
         assert arm.arm_stops == 1
@@ -96,7 +101,7 @@ async def audit(lab: OnPort, count: int) -> list[dict[str, Any]]:
 
 def test_a_client_that_leaves_after_the_head_has_stopped_the_arm(lab: OnPort) -> None:
     case = StopCase("left", b"", ("Content-Length: 19",))
-    with tilting(lab) as arm:
+    with tilting(lab) as (arm,):
         with sent(lab.url, lab.served.tokens[Role.VIEWER], case):
             pass
         stopped(lab, arm)
@@ -181,6 +186,13 @@ def two_rigs(folder: Path) -> tuple[Rig, ...]:
     return tuple(Rig(name, path, load_laboratory(path)) for name in ("left", "right"))
 
 
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OnPort]:
+    folder = tmp_path_factory.mktemp("pair")
+    with on_port(folder, rigs=two_rigs(folder)) as found:
+        yield found
+
+
 @pytest.mark.parametrize(
     ("case", "rigs"),
     [
@@ -196,39 +208,19 @@ def two_rigs(folder: Path) -> tuple[Rig, ...]:
     ids=lambda value: getattr(value, "name", ""),
 )
 def test_one_of_several_rigs_is_stopped_if_it_is_named_in_time_and_all_otherwise(
-    tmp_path: Path, case: StopCase, rigs: list[str]
+    pair: OnPort, case: StopCase, rigs: list[str]
 ) -> None:
-    with on_port(tmp_path, rigs=two_rigs(tmp_path)) as lab:
-        keys = {name: lab.do(lab.served.submit(rig=name)) for name in ("left", "right")}
-        for key in keys.values():
-            lab.do(lab.served.until(key, "running"))
-
-        async def moving() -> None:
-            async with asyncio.timeout(PATIENCE):
-                while len(lab.served.laboratories) < 2:
-                    await asyncio.sleep(0.005)
-                for one in lab.served.laboratories:
-                    await one.bench.begun.wait()
-
-        lab.do(moving())
-
-        async def given() -> None:
-            async with asyncio.timeout(PATIENCE):
-                while sum(one.arm_stops for one in lab.served.laboratories) < 1:
-                    await asyncio.sleep(0.005)
-
-        with sent(lab.url, lab.served.tokens[Role.VIEWER], case) as connection:
-            lab.do(given())
+    with tilting(pair) as arms:
+        with sent(pair.url, pair.served.tokens[Role.VIEWER], case) as connection:
+            stopped(pair, arms[0])
             connection.sendall(case.rest)
             status, found = response(connection)
         assert status == 200
-        assert sum(one.arm_stops for one in lab.served.laboratories) == len(rigs)
+        assert [arm.arm_stops for arm in arms] == [1, len(rigs) - 1]
         assert (found["emergency"] is not None) == (len(rigs) == 2)
-        for name in rigs:
-            lab.do(lab.served.until(keys[name], "unknown"))
         if len(rigs) == 1:
             assert next(rig["emergency"] for rig in found["rigs"] if rig["name"] == "left")["by"] == "viewer"
-            assert lab.do(lab.served.get(f"/campaigns/{keys['right']}"))["state"] == "running"
+            assert not pair.served.daemon.workers["right"].latched
 
 
 def test_the_only_arm_is_stopped_before_the_rig_is_read_and_its_own_stop_is_latched(tmp_path: Path) -> None:
@@ -298,18 +290,14 @@ def test_a_disk_that_cannot_be_used_prevents_no_stop(tmp_path: Path, monkeypatch
 
 @pytest.mark.parametrize("reason", ["x" * 10_000, "\ud800\x00", None, 5, {1, 2}, [[]] * 3])
 @pytest.mark.parametrize("rig", ["", "Nothing", None])
-def test_the_supervisor_stops_for_any_reason_and_rig(tmp_path: Path, reason: Any, rig: Any) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, held) as served:
-            await served.submit()
-            laboratory = await served.pouring()
-            notes = await served.daemon.emergency_stop("library", reason, rig)
-            assert laboratory.arm_stops == 1
-            assert ("there is no rig" in "".join(notes)) == (rig != "")
-            assert served.daemon.emergency is not None
-            assert len(served.daemon.emergency["reason"]) <= 500
-
-    run(work())
+def test_the_supervisor_stops_for_any_reason_and_rig(lab: OnPort, reason: Any, rig: Any) -> None:
+    with tilting(lab) as (arm,):
+        notes = lab.do(lab.served.daemon.emergency_stop("library", reason, rig))
+        assert arm.arm_stops == 1
+        assert ("there is no rig" in "".join(notes)) == (rig != "")
+        record = lab.do(lab.served.get("/status"))["emergency"]
+        assert record["by"] == "library"
+        assert len(record["reason"]) <= 500
 
 
 def test_the_madsci_node_stops_with_any_body_and_a_trailing_slash(tmp_path: Path) -> None:
@@ -346,7 +334,7 @@ def estop(lab: OnPort, *options: str | bytes) -> subprocess.CompletedProcess[str
 def test_the_command_line_stops_whatever_comes_with_it(
     lab: OnPort, options: list[str | bytes], reason: str, said: str
 ) -> None:
-    with tilting(lab) as arm:
+    with tilting(lab) as (arm,):
         done = estop(lab, *options)
         assert arm.arm_stops == 1, done.stderr
         assert done.returncode == 0
