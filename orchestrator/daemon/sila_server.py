@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 from urllib.parse import quote
 
-from sila import ValidationError
+from sila import UndefinedExecutionError, ValidationError
 from unitelabs.cdk import Connector, ConnectorBaseConfig, Logger, SiLAServerConfig, run, sila
 
 from orchestrator.daemon.daemon_client import Client, DaemonError
@@ -137,7 +137,7 @@ class _StopCommand(sila.UnobservableCommand):  # type: ignore[misc]
             async def executed(request: bytes = b"", metadata: dict[str, bytes] | None = None) -> bytes:
                 try:
                     found: bytes = await execute(request, metadata)
-                except ValidationError:
+                except (ValidationError, UndefinedExecutionError):  # the latter if the call is no protobuf at all
                     found = await execute(_EMPTY_TEXT, metadata)
                 return found
 

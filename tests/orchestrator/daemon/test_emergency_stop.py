@@ -24,11 +24,12 @@ from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.daemon_settings import NO_RIG, Rig
 from orchestrator.daemon.daemon_store import StoreError
 from tests.orchestrator.daemon.test_madsci_node import node
+from tests.orchestrator.daemon.test_sila_server import needs_cdk, sila
 from tests.support.browser import OnPort, on_port
 from tests.support.hypothesis_examples import examples
 from tests.support.stop_requests import CASES, PATH, StopCase, response, sent, stopped_by
 from tests.support.toy_daemon import held, run, serving
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, wait_for
 
 DECANT = [sys.executable, "-c", "from orchestrator.cli.app import main; main()"]
 
@@ -62,10 +63,12 @@ def tilting(lab: OnPort) -> Iterator[list[Arm]]:
     for (name, worker), arm in zip(before.items(), arms, strict=True):
         stub = SimpleNamespace(rig=worker.rig, running=arm, latched=False, arm=None, wake=asyncio.Event())
         workers[name] = stub  # type: ignore[assignment]
-    yield arms
-    workers |= before
-    for name in ("", *lab.served.daemon.rig_names):
-        lab.do(lab.served.post("/emergency-stop/clear", {"rig": name}, role=Role.ADMIN))
+    try:
+        yield arms
+    finally:
+        workers |= before
+        for name in ("", *lab.served.daemon.rig_names):
+            lab.do(lab.served.post("/emergency-stop/clear", {"rig": name}, role=Role.ADMIN))
 
 
 def stopped(lab: OnPort, arm: Arm) -> None:
@@ -102,9 +105,11 @@ async def audit(lab: OnPort, count: int) -> list[dict[str, Any]]:
 def test_a_client_that_leaves_after_the_head_has_stopped_the_arm(lab: OnPort) -> None:
     case = StopCase("left", b"", ("Content-Length: 19",))
     with tilting(lab) as (arm,):
+        before = len(lab.do(audit(lab, 1000)))
         with sent(lab.url, lab.served.tokens[Role.VIEWER], case):
             pass
         stopped(lab, arm)
+        wait_for(lambda: len(lab.do(audit(lab, 1000))) > before, "the stop's audit entry")
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -300,17 +305,46 @@ def test_the_supervisor_stops_for_any_reason_and_rig(lab: OnPort, reason: Any, r
         assert len(record["reason"]) <= 500
 
 
-def test_the_madsci_node_stops_with_any_body_and_a_trailing_slash(tmp_path: Path) -> None:
-    async def work() -> None:
-        async with serving(tmp_path, held) as served, node(served) as http:
-            await served.submit()
-            laboratory = await served.pouring()
-            for count, path in enumerate(("safety_stop", "safety_stop/", "AdminCommands.SAFETY_STOP"), start=1):
-                answer = await http.post(f"/admin/{path}", content=b'{"reason": \xff')
-                assert answer.json()["success"], path
-                assert laboratory.arm_stops == count
+@pytest.mark.parametrize("command", ["safety_stop", "safety_stop/", "AdminCommands.SAFETY_STOP"])
+def test_the_madsci_node_stops_with_any_body_and_a_trailing_slash(lab: OnPort, command: str) -> None:
+    async def ask() -> Any:
+        async with node(lab.served) as http:
+            return (await http.post(f"/admin/{command}", content=b'{"reason": \xff')).json()
 
-    run(work())
+    with tilting(lab) as (arm,):
+        assert lab.do(ask())["success"]
+        assert arm.arm_stops == 1
+
+
+def length(number: int) -> bytes:
+    """A length as protobuf encodes it."""
+    return bytes([number]) if number < 128 else bytes([number & 127 | 128]) + length(number >> 7)
+
+
+def parameters(reason: bytes) -> bytes:
+    """The parameters of `EmergencyStop` as protobuf encodes them: a message with one string."""
+    text = b"\x0a" + length(len(reason)) + reason
+    return b"\x0a" + length(len(text)) + text
+
+
+@needs_cdk
+def test_sila_stops_for_any_reason(lab: OnPort) -> None:
+    import grpc
+
+    call = "/sila2.org.decant.station.pouringstation.v1.PouringStation/EmergencyStop"
+    folder = lab.served.daemon.settings.state.parent
+    requests = {
+        "501": parameters(b"x" * 501),
+        "too long for SiLA": parameters(b"x" * (2**21 + 1)),
+        "not UTF-8": parameters(b"Gl\xe4s"),
+        "no parameter": b"",
+        "not protobuf": b"\xff\xff\xff",
+    }
+    with sila(folder, lab.url) as (host, port), grpc.insecure_channel(f"{host}:{port}") as channel:
+        for name, request in requests.items():
+            with tilting(lab) as (arm,):
+                assert channel.unary_unary(call)(request, timeout=PATIENCE) == b"", name
+                assert arm.arm_stops == 1, name
 
 
 def estop(lab: OnPort, *options: str | bytes) -> subprocess.CompletedProcess[str]:
