@@ -361,7 +361,7 @@ def abort(key: CampaignId, url: Url = None, state: State = None) -> None:
 
 
 def estop(
-    words: Annotated[list[str] | None, typer.Argument(metavar="[WORDS]...", hidden=True)] = None,
+    words: Annotated[list[str] | None, typer.Argument(metavar="WORDS", hidden=True)] = None,
     clear: Annotated[bool, typer.Option("--clear", help="Clear the emergency stop, after the cell is safe.")] = False,
     rig: Annotated[
         str, typer.Option("--rig", help="This rig alone; without it all rigs. An unknown rig stops all.")
