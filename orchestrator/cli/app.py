@@ -83,7 +83,13 @@ def _group(name: str, text: str, *shown: str) -> typer.Typer:
     return group
 
 
-def _add(work: Callable[..., None], *shown: str, name: str | None = None, to: typer.Typer = app) -> None:
+def _add(
+    work: Callable[..., None],
+    *shown: str,
+    name: str | None = None,
+    to: typer.Typer = app,
+    unknown_options: bool = False,
+) -> None:
     """Add a command.
 
     Args:
@@ -91,8 +97,11 @@ def _add(work: Callable[..., None], *shown: str, name: str | None = None, to: ty
         shown: examples.
         name: name of the command; None: that of the function.
         to: the group that it belongs to.
+        unknown_options: whether unknown options are taken as words instead of being refused.
     """
-    to.command(name or work.__name__, cls=Command, epilog=examples(*shown))(command(work))
+    settings = {"ignore_unknown_options": unknown_options}
+    add = to.command(name or work.__name__, cls=Command, context_settings=settings, epilog=examples(*shown))
+    add(command(work))
 
 
 _add(
@@ -324,7 +333,9 @@ _add(
     queue_commands.estop,
     "decant estop",
     "decant estop --rig left",
+    "decant estop --reason 'glass on the table'",
     "decant estop --clear   # accept work again",
+    unknown_options=True,
 )
 
 

@@ -361,23 +361,36 @@ def abort(key: CampaignId, url: Url = None, state: State = None) -> None:
 
 
 def estop(
+    words: Annotated[list[str] | None, typer.Argument(metavar="WORDS", hidden=True)] = None,
     clear: Annotated[bool, typer.Option("--clear", help="Clear the emergency stop, after the cell is safe.")] = False,
-    rig: Annotated[str | None, typer.Option("--rig", help="This rig alone; without it all rigs.")] = None,
+    rig: Annotated[
+        str, typer.Option("--rig", help="This rig alone; without it all rigs. An unknown rig stops all.")
+    ] = "",
+    reason: Annotated[str, typer.Option("--reason", help="Reason for the records, of any length.")] = "",
     url: Url = None,
     state: State = None,
 ) -> None:
     """Emergency stop: stop every arm of the server, and give up all work until --clear.
 
+    Further words are added to the reason: they never prevent the stop.
     A software stop is not a safety function: keep the robot's own emergency stop within reach.
     """
+    reason = " ".join(filter(None, (reason, *(words or ()))))
+    if clear and reason:
+        raise RefusalError("--clear takes only --rig, --url and --state: nothing was cleared", BAD_INPUT)
     with connected_client(url, state) as client:
-        client.post("/emergency-stop/clear" if clear else "/emergency-stop", {"rig": rig or ""})
-    of = f" of {rig}" if rig else ""
-    option = f" --rig {rig}" if rig else ""
-    if clear:
-        print(f"emergency stop{of} cleared: abandoned campaigns wait until they are resumed")
-    else:
-        print(f"EMERGENCY STOP{of}: the work is abandoned; nothing starts there before 'decant estop --clear{option}'")
+        if clear:
+            client.post("/emergency-stop/clear", {"rig": rig})
+            print(
+                f"emergency stop{f' of {rig}' if rig else ''} cleared: abandoned campaigns wait until they are resumed"
+            )
+            return
+        found = client.emergency_stop(reason, rig)
+    one = any(known["name"] == rig and known["mode"] != "none" for known in found.get("rigs", ()))
+    of, option = (f" of {rig}", f" --rig {rig}") if one else ("", "")
+    print(f"EMERGENCY STOP{of}: the work is abandoned; nothing starts there before 'decant estop --clear{option}'")
+    for note in found["notes"]:
+        print_message(f"note: {note}")
 
 
 def answer(

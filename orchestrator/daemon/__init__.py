@@ -2,3 +2,6 @@
 
 PORT = 8377
 """TCP port of the API, unless the settings give another one."""
+
+PHYSICAL = "press the physical emergency stop: the red mushroom button on the teach pendant"
+"""What to do if the daemon can't stop an arm."""

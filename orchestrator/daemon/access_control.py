@@ -10,17 +10,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request
+from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
+from orchestrator.daemon import PHYSICAL
 from orchestrator.daemon.access_tokens import Person, Role, Tokens, TooManyFailuresError
 from orchestrator.daemon.daemon_settings import LOOPBACK
+from orchestrator.daemon.stop_request import stop_path
 from orchestrator.daemon.supervisor import Supervisor
 
-Message = dict[str, Any]
+Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 
@@ -39,7 +42,8 @@ class RequestGuard:
     """ASGI middleware that refuses requests that are too large or use a foreign host name.
 
     The host name is checked because of DNS rebinding: a page of another site could reach the API through a name that
-    resolves to this machine.
+    resolves to this machine. A request that stops an arm may have any size, and other spellings of its path reach the
+    route, too.
 
     Args:
         app: application to protect.
@@ -58,11 +62,17 @@ class RequestGuard:
             return
         headers = {name.lower(): value for name, value in scope["headers"]}
         expects = b"100-continue" in headers.get(b"expect", b"").lower()
-        host = headers.get(b"host", b"").decode("latin-1")
+        host = headers.get(b"host", b"").decode("latin-1").lower()
         name = host if host.startswith("[") and host.endswith("]") else host.rpartition(":")[0] or host
+        stop = stop_path(scope["path"]) if scope["method"] == "POST" else None
         if self._names is not None and name not in self._names:
             text = "this daemon is reached as 127.0.0.1 or localhost, and not by another name"
+            if stop is not None:
+                text = f"NOTHING WAS STOPPED: {text}. Repeat the call with the right name, or {PHYSICAL}"
             await _refuse(receive, send, 421, text, drain=not expects)
+            return
+        if stop is not None:
+            await self._app({**scope, "path": stop}, receive, send)
             return
         length = headers.get(b"content-length", b"0")
         if length.isdigit() and int(length) > self._limit:
@@ -98,16 +108,21 @@ class RequestGuard:
 
 
 async def _refuse(receive: Receive, send: Send, status: int, detail: str, *, drain: bool = True) -> None:
-    """Send an error response, then read and drop the rest of the body.
-
-    If the connection were closed with unread data, the client would get a reset and no response.
+    """Send an error response before the request's end.
 
     Args:
-        drain: whether a rest follows; a client that expects 100-continue sends none after a refusal.
+        drain: whether the rest of the body follows; a client that expects 100-continue sends none after a refusal.
     """
     from orchestrator.daemon.event_feed import text
 
-    body = text({"detail": detail}).encode()
+    await respond_early(receive, send, status, text({"detail": detail}).encode(), drain=drain)
+
+
+async def respond_early(receive: Receive, send: Send, status: int, body: bytes, *, drain: bool = True) -> None:
+    """Send a response in JSON before the request's body has ended; then read and drop the rest of the body.
+
+    If the connection were closed with unread data, the client would get a reset and no response.
+    """
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode()),
                (b"connection", b"close")]  # fmt: skip
     await send({"type": "http.response.start", "status": status, "headers": headers})
@@ -120,8 +135,21 @@ async def _refuse(receive: Receive, send: Send, status: int, detail: str, *, dra
     await send({"type": "http.response.body", "body": b""})
 
 
-def needs(role: Role) -> Callable[..., Awaitable[Person]]:
-    """Make a dependency that returns the token's holder if its role is sufficient."""
+class EarlyResponse(JSONResponse):
+    """A response that is sent before the request's body has ended."""
+
+    async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
+        """Send it, then read and drop the rest of the body."""
+        await respond_early(receive, send, self.status_code, bytes(self.body))
+
+
+def needs(role: Role, advice: str = "") -> Callable[..., Awaitable[Person]]:
+    """Make a dependency that returns the token's holder if its role is sufficient.
+
+    Args:
+        role: lowest role that is sufficient.
+        advice: end of the texts of refusals.
+    """
 
     async def person(
         request: Request, shown: Annotated[HTTPAuthorizationCredentials | None, Depends(BEARER)]
@@ -129,13 +157,14 @@ def needs(role: Role) -> Callable[..., Awaitable[Person]]:
         tokens: Tokens = request.app.state.tokens
         address = request.client.host if request.client is not None else ""
         if shown is None:
-            raise HTTPException(401, "a token is needed: 'Authorization: Bearer TOKEN'", {"WWW-Authenticate": "Bearer"})
+            text = f"a token is needed: 'Authorization: Bearer TOKEN'{advice}"
+            raise HTTPException(401, text, {"WWW-Authenticate": "Bearer"})
         try:
-            found = tokens.person(shown.credentials, address)
+            found = tokens.person(shown.credentials.strip(), address)
         except TooManyFailuresError as error:
-            raise HTTPException(429, str(error), {"Retry-After": str(int(error.wait) + 1)}) from None
+            raise HTTPException(429, f"{error}{advice}", {"Retry-After": str(int(error.wait) + 1)}) from None
         if found is None:
-            raise HTTPException(401, "this token is not known", {"WWW-Authenticate": "Bearer"})
+            raise HTTPException(401, f"this token is not known{advice}", {"WWW-Authenticate": "Bearer"})
         if found.role < role:
             raise HTTPException(403, f"{found.name} is a {found.role.name.lower()}; this takes {role.name.lower()}")
         return found
@@ -143,13 +172,17 @@ def needs(role: Role) -> Callable[..., Awaitable[Person]]:
     return person
 
 
-def the_daemon(request: Request) -> Supervisor:
-    """Return the daemon that the application serves."""
+async def the_daemon(request: Request) -> Supervisor:
+    """Return the daemon that the application serves. Asynchronous: a stop must not wait for a free thread."""
     found: Supervisor = request.app.state.daemon
     return found
 
 
 Daemon = Annotated[Supervisor, Depends(the_daemon)]
 Viewer = Annotated[Person, Depends(needs(Role.VIEWER))]
+Stopping = Annotated[
+    Person,
+    Depends(needs(Role.VIEWER, f". NOTHING WAS STOPPED: repeat the call with a token of any role, or {PHYSICAL}")),
+]
 Operator = Annotated[Person, Depends(needs(Role.OPERATOR))]
 Admin = Annotated[Person, Depends(needs(Role.ADMIN))]

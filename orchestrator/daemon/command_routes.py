@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import shutil
 from collections.abc import Callable, Iterator
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import APIRouter, HTTPException, Path, Request
+from fastapi import APIRouter, HTTPException, Path, Request, Response
+from fastapi.responses import JSONResponse
 
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.access_control import Admin, Daemon, Operator, Viewer
+from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Stopping
 from orchestrator.daemon.daemon_store import ENDED, QueueItem
 from orchestrator.daemon.query_routes import campaign_out, found_item, status
 from orchestrator.daemon.remote_operator import AnswerError, question_json
@@ -29,13 +31,17 @@ from orchestrator.daemon.schemas import (
     MoveIn,
     QuestionOut,
     StatusOut,
+    StoppedOut,
     SubmissionIn,
     WhatMovesOut,
 )
+from orchestrator.daemon.stop_request import ALL_STOPPED, BODY_TIME, RIG_TIME, StopBody, read_stop
 from orchestrator.daemon.submissions import Submission, SubmissionError, prepare, run_request
-from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
+from orchestrator.daemon.supervisor import UNSTORED, ArmStops, RequestRefusedError, Supervisor
 from orchestrator.run_errors import RunError
 from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count, required_checksum
+
+_log = logging.getLogger(__name__)
 
 
 class MotionNotEnabledError(RunError):
@@ -206,18 +212,57 @@ async def resume_queue(request: Request, daemon: Daemon, person: Operator) -> St
     return await status(request, daemon, person)
 
 
-@router.post("/emergency-stop", operation_id="emergency_stop")
-async def emergency_stop(
-    request: Request, daemon: Daemon, person: Viewer, body: EmergencyIn | None = None
-) -> StatusOut:
+@router.post(
+    "/emergency-stop",
+    operation_id="emergency_stop",
+    response_model=StoppedOut,
+    openapi_extra={
+        "parameters": [
+            {
+                "name": "rig",
+                "in": "query",
+                "schema": {"type": "string", "default": ""},
+                "description": "Stop only this rig; '' for all. A rig that does not exist stops all.",
+            }
+        ],
+        "requestBody": {"content": {"application/json": {"schema": EmergencyIn.model_json_schema()}}},
+    },
+)
+async def emergency_stop(request: Request, daemon: Daemon, person: Stopping) -> Response:
     """Stop every arm, or the arm of one rig, and give up its work. The rig takes no new work until the stop is cleared.
 
-    A viewer's token is sufficient.
+    A viewer's token is sufficient. The stop is given before the body is read, and nothing in the body prevents it:
+    what can't be used is shortened, replaced or ignored, and `notes` report it. The body is read for at most 0.5 s.
+    Name the rig in the query: if there are several rigs and the query names none, the stop waits for the body for at
+    most 0.05 s, and then stops all.
     """
-    body = body or EmergencyIn()
-    with _known_rig(body.rig):
-        await daemon.emergency_stop(person.name, body.reason, body.rig)
-    return await status(request, daemon, person)
+    body = StopBody(request.receive)
+    named = list(dict.fromkeys(request.query_params.getlist("rig")))
+    rig: object = named[0] if len(named) == 1 else named
+    stops: ArmStops = {}
+    if not named:
+        if len(daemon.rig_names) < 2:  # the only arm is meant in any case
+            await daemon.stop_arms("".join(daemon.rig_names), stops)
+        await body.read(RIG_TIME)
+        rig = read_stop(body.content).rig if body.complete else ""
+    scope, notes = daemon.stop_scope(rig)
+    await daemon.stop_arms(scope, stops)
+    daemon.latch_stop(person.name, "", scope)
+    await body.read(BODY_TIME)
+    said = read_stop(body.content)
+    if said.rig not in ("", rig):
+        notes.append(("the query names another rig than the body" if named else "the rig came too late") + ALL_STOPPED)
+        scope = ""
+    notes += [*body.notes(malformed=bool(request.scope.get("state", {}).get("malformed"))), *said.notes]
+    notes = await daemon.emergency_stop(person.name, said.reason, scope, stops=stops, notes=notes)
+    try:
+        found: dict[str, Any] = (await status(request, daemon, person)).model_dump(mode="json")
+    except UNSTORED as error:
+        _log.error("the state can't be read after an emergency stop: %s", error)
+        found = {}
+        notes.append("the state of the daemon can't be read: see its log")
+    response = JSONResponse if body.complete else EarlyResponse
+    return response({**found, "notes": notes})
 
 
 @router.post("/emergency-stop/clear", operation_id="clear")

@@ -21,7 +21,7 @@ from urllib.parse import quote
 import httpx
 
 from orchestrator.catalogue.run_registry import state_directory
-from orchestrator.daemon import PORT
+from orchestrator.daemon import PHYSICAL, PORT
 from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.run_errors import RunError
 
@@ -30,6 +30,11 @@ if TYPE_CHECKING:  # a command that only asks the daemon reads no run
 
 V1 = "/api/v1"
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
+STOP_TIMEOUT = httpx.Timeout(8.0, connect=5.0)
+"""Of an emergency stop: longer than the daemon waits for an arm that does not confirm it."""
+
+LONGEST_SENT = 2000
+"""Characters of a reason that are sent with an emergency stop; the daemon records fewer."""
 
 
 class DaemonError(RunError):
@@ -92,6 +97,28 @@ class Client:
     def post(self, path: str, body: Any = None) -> Any:
         """Send a command with POST."""
         return self._call("POST", path, json=body).json()
+
+    def emergency_stop(self, reason: str = "", rig: str = "") -> Any:
+        """Stop every arm, or that of one rig. Neither reason nor rig prevents the stop; the server reports in notes.
+
+        Args:
+            reason: text for the records, of any length.
+            rig: name of the rig; '' for all. A rig that does not exist stops all.
+
+        Raises:
+            DaemonError: the stop was not confirmed; the message names the physical emergency stop.
+        """
+        sent = json.dumps({"reason": reason[:LONGEST_SENT]}).encode()  # ASCII, whatever the characters
+        where = {"rig": rig.encode("utf-8", "replace").decode()}
+        headers = {"Content-Type": "application/json"}
+        try:
+            found = self._call(
+                "POST", "/emergency-stop", params=where, content=sent, headers=headers, timeout=STOP_TIMEOUT
+            )
+        except DaemonError as error:
+            text = f"THE STOP WAS NOT CONFIRMED: {PHYSICAL}. {error}"
+            raise DaemonError(text, error.exit_code, unreachable=error.unreachable) from None
+        return found.json()
 
     def _call(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         try:

@@ -333,7 +333,6 @@ class MadsciNode:
     async def command(self, name: str) -> dict[str, Any]:
         """Execute an admin command; return `AdminCommandResponse`."""
         daemon = self._daemon
-        own = [item for item in daemon.store.items() if item.by == PERSON]
         match name:
             case "safety_stop":
                 await daemon.emergency_stop(PERSON, "safety_stop")
@@ -342,8 +341,8 @@ class MadsciNode:
             case "resume":
                 daemon.pause_queue(False, PERSON)
             case "cancel":
-                for item in own:
-                    if item.state not in ("finished", "stopped", "withdrawn", "unknown", "failed"):
+                for item in daemon.store.items():
+                    if item.by == PERSON and item.state not in _CAMPAIGN_STATUS:
                         daemon.stop(item.id, PERSON)
             case "lock" | "unlock":
                 daemon.store.set_flag(LOCKED, {"time": time.time()} if name == "lock" else None)
@@ -404,6 +403,7 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
         return {"success": False}
 
     @app.post("/admin/{command}")
+    @app.post("/admin/{command}/")
     async def admin(command: str) -> Any:
         # From Python 3.11 on, the client writes 'AdminCommands.PAUSE' where it means 'pause'.
         return await node.command(command.rpartition(".")[2].lower())

@@ -64,11 +64,15 @@ class EnableIn(_In):
 
 
 class EmergencyIn(_In):
-    """An emergency stop of one rig or of all rigs."""
+    """Optional body of an emergency stop. Anything else is accepted, too: nothing in a body prevents the stop."""
 
-    reason: str = Field(default="", max_length=500)
-    rig: str = Field(default="", max_length=60)
-    """Stop only this rig; '' for all."""
+    model_config = ConfigDict(extra="allow")
+
+    reason: str = ""
+    """Text for the records; its first 500 characters are kept."""
+
+    rig: str = ""
+    """Stop only this rig; '' for all. A rig that does not exist stops all. Better named in the query."""
 
 
 class ClearIn(_In):
@@ -206,11 +210,16 @@ class QuestionOut(_Out):
 
 
 class EmergencyOut(_Out):
-    """Author, time and reason of an emergency stop."""
+    """Authors, time and reasons of an emergency stop."""
 
     by: str
+    """User who stopped; several are separated by commas, the first one first."""
+
     time: float
+    """Time of the first stop."""
+
     reason: str
+    """Reasons, separated by semicolons."""
 
 
 class ArmStatusOut(_Out):
@@ -280,3 +289,10 @@ class StatusOut(_Out):
 
     last_event: int
     live: str | None
+
+
+class StoppedOut(StatusOut):
+    """State of the daemon after an emergency stop."""
+
+    notes: list[str]
+    """What was shortened, replaced or ignored in the request; the stop was given in any case."""

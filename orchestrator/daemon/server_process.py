@@ -35,6 +35,7 @@ from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
 from orchestrator.daemon.madsci_node import create_node
 from orchestrator.daemon.notifications import OCCASIONS, Notifier, NotifyError, pass_on
+from orchestrator.daemon.stop_request import StopProtocol
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.run_errors import RunError
@@ -253,6 +254,8 @@ async def _serve_with(
     server = _Server(
         uvicorn.Config(
             app,
+            http=StopProtocol,
+            ws="none",
             log_config=None,
             access_log=False,
             server_header=False,
@@ -340,7 +343,8 @@ def _node_server(daemon: Supervisor, app: FastAPI, settings: MadsciSettings) -> 
     """The server of the MADSci node, with its listening socket; the orders are those of the API."""
     listening = _socket(settings.host, settings.port, "madsci: port")
     node = create_node(daemon, app.state.ordering, settings)
-    return _Server(uvicorn.Config(node, log_config=None, access_log=False, lifespan="off")), listening
+    config = uvicorn.Config(node, http=StopProtocol, ws="none", log_config=None, access_log=False, lifespan="off")
+    return _Server(config), listening
 
 
 def _url(settings: DaemonSettings, listening: socket.socket) -> str:

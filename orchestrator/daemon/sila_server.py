@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 from urllib.parse import quote
 
+from sila import UndefinedExecutionError, ValidationError
 from unitelabs.cdk import Connector, ConnectorBaseConfig, Logger, SiLAServerConfig, run, sila
 
 from orchestrator.daemon.daemon_client import Client, DaemonError
@@ -48,6 +49,9 @@ SERVER_INITIATED = "org.silastandard/core/ConnectionConfigurationService/v1"
 
 CALLS = 64
 """Largest number of simultaneous calls to the daemon."""
+
+LONGEST_MESSAGE = 16_000_000
+"""Bytes of a call that are read: a text of SiLA has up to 2²¹ characters. Longer calls are refused, a stop, too."""
 
 Grams = Annotated[
     float, sila.constraints.Unit(label="g", components=[sila.constraints.Unit.Component("Kilogram")], factor=1e-3)
@@ -118,6 +122,31 @@ class VesselContent:
     liquid: str
     mass: Grams
     deviation: Grams
+
+
+class _StopCommand(sila.UnobservableCommand):  # type: ignore[misc]
+    """A command with one text that is executed with an empty one if the text can't be decoded or is too long."""
+
+    def attach(self, feature: sila.Feature) -> bool:
+        """See `sila.UnobservableCommand`."""
+        attached: bool = super().attach(feature)
+        handler = self._handler
+        if attached and handler is not None:
+            execute = handler.execute
+
+            async def executed(request: bytes = b"", metadata: dict[str, bytes] | None = None) -> bytes:
+                try:
+                    found: bytes = await execute(request, metadata)
+                except (ValidationError, UndefinedExecutionError):  # the latter if the call is no protobuf at all
+                    found = await execute(_EMPTY_TEXT, metadata)
+                return found
+
+            handler.execute = executed
+        return attached
+
+
+_EMPTY_TEXT = b"\x0a\x00"
+"""Parameters of a command in protobuf's encoding: one string, which is empty."""
 
 
 class PouringStation(sila.Feature):  # type: ignore[misc]
@@ -296,18 +325,18 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
         """
         await self._post(f"{await self._path_of(order_id)}/resume")
 
-    @sila.UnobservableCommand(errors=CALL)
+    @_StopCommand(errors=CALL)
     async def emergency_stop(self, reason: str) -> None:
         """
         Stop every arm by software. An administrator clears it. It does not replace the robot's emergency stop button.
 
         Args:
-          Reason: Text for the records, or empty.
+          Reason: Text for the records, or empty. Its first 500 characters are kept.
         """
         # Threads of its own: calls that wait for the daemon must not delay it.
         loop = asyncio.get_running_loop()
         try:
-            await loop.run_in_executor(self._stopping, self._client.post, "/emergency-stop", {"reason": reason})
+            await loop.run_in_executor(self._stopping, self._client.emergency_stop, reason)
         except DaemonError as error:
             _refuse(error)
 
@@ -580,7 +609,10 @@ async def serve(
             root_certificates=clients,
             certificate_chain=certificate,
             private_key=key,
-            options={"grpc.so_reuseport": 0},  # else two servers share one port without an error
+            options={
+                "grpc.so_reuseport": 0,  # else two servers share one port without an error
+                "grpc.max_receive_message_length": LONGEST_MESSAGE,
+            },
             uuid=str(uuid.uuid5(uuid.NAMESPACE_URL, client.url)),
             name="Decant",
             type="PouringStation",

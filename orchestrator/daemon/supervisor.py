@@ -12,6 +12,7 @@ import contextlib
 import logging
 import secrets
 import shutil
+import sqlite3
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -28,6 +29,7 @@ from orchestrator.daemon.pour_orders import POUR, OrderBook
 from orchestrator.daemon.remote_operator import Asking
 from orchestrator.daemon.rig_worker import RigWorker, Running, SharedServices, settle
 from orchestrator.daemon.run_readout import Pours
+from orchestrator.daemon.stop_request import later_stop, recorded_reason, unknown_rig
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.run_errors import RunError
 
@@ -35,6 +37,15 @@ LEAVING = 10.0
 """Time for campaigns to stop after Ray has died [s]; then campaigns that don't pour are given up."""
 
 PAUSED, EMERGENCY = "paused", "emergency"
+
+UNSTORED = (RunError, OSError, sqlite3.Error)
+"""Errors of a store that can't be used: none of them prevents a stop."""
+
+LEAVING_STEPS = 4
+"""Turns of the event loop in which the orders to stop leave the process, before the disk is written."""
+
+ArmStops = dict[str, asyncio.Task[None]]
+"""Stops that are under way, by rig."""
 
 _log = logging.getLogger(__name__)
 
@@ -410,30 +421,73 @@ class Supervisor:
 
     # ---- all of them
 
-    async def emergency_stop(self, by: str, reason: str, rig: str = "") -> None:
+    async def stop_arms(self, rig: str, stops: ArmStops) -> None:
+        """Begin to stop the arm of a rig, or ('') every arm, and let nothing start there. Part of `emergency_stop`.
+
+        Args:
+            rig: an existing rig, or ''.
+            stops: stops that the same request has begun; each arm is stopped once. Those that begin are added.
+        """
+        for worker in self._stops(rig)[1]:
+            worker.latched = True
+            if worker.running is not None and worker.rig.name not in stops:
+                stops[worker.rig.name] = asyncio.create_task(worker.running.emergency())
+        for _ in range(LEAVING_STEPS):
+            await asyncio.sleep(0)
+
+    def latch_stop(self, by: str, reason: str, rig: str = "") -> None:
+        """Store an emergency stop, so that it holds after a restart. Authors and reasons of several are kept."""
+        flag, workers = self._stops(rig)
+        with contextlib.suppress(*UNSTORED):
+            self.store.set_flag(flag, later_stop(self.store.flag(flag), by, reason, time.time()))
+            for worker in workers:
+                if worker.running is not None:
+                    self.store.change(worker.running.item.id, desired_state=str(DesiredState.ABORT))
+
+    async def emergency_stop(
+        self,
+        by: str,
+        reason: object = "",
+        rig: object = "",
+        *,
+        stops: ArmStops | None = None,
+        notes: Sequence[str] = (),
+    ) -> list[str]:
         """Stop every arm, give all work up, and accept nothing new until `clear`. The arms are stopped first.
 
         Args:
             by: user who triggers the stop.
-            reason: reason, if given.
+            reason: reason, if given; its first 500 printable characters are recorded.
             rig: stop only this rig; '' for all. The stop of all rigs and that of one are set and cleared separately.
+                A rig that does not exist stops all.
+            stops: stops that the same request has begun before; see `stop_arms`.
+            notes: what was changed or ignored in the request.
 
-        Raises:
-            KeyError: the rig does not exist.
+        Returns:
+            These notes, and others on reason and rig. The audit entry has them, too.
         """
-        flag, workers = self._stops(rig)
-        stops = [asyncio.create_task(worker.running.emergency()) for worker in workers if worker.running]
-        for worker in workers:
-            worker.latched = True
-        await asyncio.sleep(0)
-        with contextlib.suppress(RunError):  # a full disk must not prevent the stop
-            self.store.set_flag(flag, {"by": by, "time": time.time(), "reason": reason})
-            for worker in workers:
-                if worker.running is not None:
-                    self.store.change(worker.running.item.id, desired_state=str(DesiredState.ABORT))
-            where = f"rig {rig}" if rig else ""
-            self.note(by, "emergency stop", detail=": ".join(filter(None, (where, reason))))
-        await asyncio.gather(*stops, return_exceptions=True)
+        scope, found = self.stop_scope(rig)
+        stops = {} if stops is None else stops
+        await self.stop_arms(scope, stops)
+        text, changes = recorded_reason(reason)
+        self.latch_stop(by, text, scope)
+        found = [*notes, *found, *changes]
+        with contextlib.suppress(*UNSTORED):
+            detail = ": ".join(filter(None, (f"rig {scope}" if scope else "", text)))
+            self.note(by, "emergency stop", detail=f"{detail} ({'; '.join(found)})".lstrip() if found else detail)
+        await asyncio.gather(*stops.values(), return_exceptions=True)
+        return found
+
+    def stop_scope(self, rig: object) -> tuple[str, list[str]]:
+        """Return the rig that a stop is for, '' for all, and a note if the wanted rig does not exist."""
+        if isinstance(rig, str) and (not rig or rig in self.rig_names):
+            return rig, []
+        return "", [unknown_rig(rig)]
+
+    @property
+    def rig_names(self) -> list[str]:
+        """Names of the rigs, in the order of the settings."""
+        return [rig.name for rig in self.settings.rigs]
 
     def clear(self, by: str, rig: str = "") -> None:
         """Accept work again. Work that was given up rests until an operator resumes it.
@@ -456,7 +510,7 @@ class Supervisor:
         """Return the flag of an emergency stop and the rig workers it affects. Raises KeyError."""
         if not rig:
             return EMERGENCY, list(self.workers.values())
-        if rig not in {one.name for one in self.settings.rigs}:
+        if rig not in self.rig_names:
             raise KeyError(rig)
         return _emergency_of(rig), [self.workers[rig]]
 

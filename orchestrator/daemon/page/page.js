@@ -16,14 +16,17 @@ let wanted = 0, busy = false, begun = false, joined = false;
 // ---- what is known
 
 async function refresh() {
+  if (away()) return;
   if (busy) { wanted = 1; return; }
   busy = true;
   try {
     const [status, campaigns, questions] = await Promise.all([call("status"), call("campaigns?limit=60"), call("questions")]);
+    if (away()) return;
     Object.assign(now, { status, campaigns, questions, seen: Date.now() });
     const running = campaigns.filter((one) => RUNNING.includes(one.state) && one.run);
     const shown = running.length ? running : campaigns.filter((one) => one.run).slice(0, 1);
     const details = await Promise.all(shown.map((one) => call(`campaigns/${encodeURIComponent(one.id)}`)));
+    if (away()) return;
     now.pours = details.flatMap((one) => one.pours_made.map((pour) => ({ ...pour, campaign: one.name })))
       .filter((pour) => pour.state !== "asked").sort((one, other) => other.time - one.time).slice(0, 8);
     show();
@@ -38,6 +41,9 @@ async function refresh() {
   }
 }
 
+/** Whether nobody is signed in: what was known then is not shown. */
+const away = () => !$("login").hidden;
+
 let timer = 0, due = Infinity;
 
 /** Look again after so long [ms], or earlier where that is planned: news that never pause postpone nothing. */
@@ -49,6 +55,7 @@ function soon(delay) {
 }
 
 function told(type, data) {
+  if (away()) return;
   if (type === "QuestionAsked") announce("call", `A question: ${data.question.text}`);
   if (type === "Announced") announce("call", `In ${Math.round(data.seconds)} seconds: ${data.text}`);
   if (type === "CampaignRests") announce("say", `${data.campaign}: ${data.state}`);
@@ -79,7 +86,7 @@ function beat() {
 
 async function beats() {
   for (;;) {
-    if ($("login").hidden) await beat();
+    if (!away()) await beat();
     await new Promise((go) => setTimeout(go, BEAT));
   }
 }
@@ -91,7 +98,7 @@ function doubt() {
 }
 
 function link(up) {
-  if (!$("login").hidden) return;
+  if (away()) return;
   if (up) now.heard = Date.now();
   const changed = up !== now.up;
   now.up = up;
@@ -217,7 +224,7 @@ async function doing(what, work) {
 /** An emergency stop, of one rig or ('') of all. One that is not confirmed is not missed. */
 async function stop(rig) {
   const what = rig ? `STOP ${rig}` : "EMERGENCY STOP";
-  const done = await doing(what, () => call("emergency-stop", { reason: "from the page", rig }, { timeout: 8000 }));
+  const done = await doing(what, () => call(`emergency-stop?rig=${encodeURIComponent(rig)}`, { reason: "from the page" }, { timeout: 8000 }));
   if (!done) alarm(`${what} was not confirmed: ${PHYSICAL}.`);
 }
 
@@ -266,7 +273,7 @@ async function enter() {
   }
   $("login").hidden = true;
   $("rest").hidden = false;
-  $("bar").hidden = false;
+  showBar(true);
   await refresh();
   if (!begun) {
     begun = true;
@@ -279,17 +286,29 @@ async function enter() {
   }
 }
 
+/** The bar with the stop, or what to do without it. */
+function showBar(shown) {
+  $("bar").hidden = !shown;
+  $("no-stop").hidden = shown;
+}
+
 function leave(why = "") {
   useToken("");
   $("refused").textContent = why;
   $("login").hidden = false;
   $("rest").hidden = true;
-  $("bar").hidden = true;
+  showBar(false);
   $("questions").replaceChildren();
-  draw($("mode"), null, () => []);
-  draw($("asked"), 0, () => []);
+  for (const section of [...["mode", "asked", "cells", "emergency"].map($), ...["rigs", "pours", "queue", "ended"].map(body)]) {
+    draw(section, null, () => []);
+  }
   $("lost").hidden = true;
-  now.up = null;
+  $("told").textContent = "";
+  $("stop-all").disabled = true;
+  document.title = "Decant";
+  document.body.classList.remove("real", "stale");
+  Object.assign(now, { status: null, campaigns: [], questions: [], pours: [], up: null, clearing: null });
+  latched = "";
   $("link").textContent = "not signed in";
   $("token").focus({ preventScroll: true });
 }

@@ -189,6 +189,49 @@ def test_the_emergency_stop_is_one_press_and_is_latched_until_it_is_cleared(page
         assert lab.do(lab.served.get("/status"))["emergency"] is None
 
 
+PHYSICAL = "To stop the arm, press the physical emergency stop: the red mushroom button on the teach pendant."
+
+
+def test_signed_out_the_page_claims_no_stop_and_names_the_physical_one(page: Any, tmp_path: Path) -> None:
+    """The token is no longer valid while a stop is latched; then the stop is cleared elsewhere."""
+    with on_port(tmp_path) as lab:
+        page.goto(lab.url)
+        page.get_by_label("Token").wait_for()
+        assert page.locator("#no-stop").is_visible()
+        page.goto(lab.address())
+        page.get_by_role("button", name="EMERGENCY STOP").click()
+        page.get_by_role("heading", name="Emergency stop").wait_for()
+        page.locator("header").get_by_text("STOPPED").wait_for()
+        assert not page.locator("#no-stop").is_visible()
+        assert page.title().startswith("STOPPED")
+
+        unknown = {"detail": "this token is not known"}
+        page.route("**/api/v1/**", lambda route: route.fulfill(status=401, json=unknown))
+        page.get_by_label("Token").wait_for()
+        lab.do(lab.served.post("/emergency-stop/clear", role=Role.ADMIN))
+        shown = page.locator("body").inner_text()
+        assert "All arms were told to stop" not in shown
+        assert "STOPPED" not in shown
+        assert page.title() == "Decant"
+        assert not page.get_by_role("button", name="EMERGENCY STOP").is_visible()
+        assert PHYSICAL in " ".join(shown.split())
+        assert in_view(page.locator("#no-stop"))
+
+        page.unroute("**/api/v1/**")
+        page.get_by_label("Token").fill(lab.served.tokens[Role.ADMIN])
+        page.keyboard.press("Enter")
+        page.get_by_text("Nothing runs here.").wait_for()
+        assert page.get_by_role("heading", name="Emergency stop").count() == 0
+        assert page.get_by_role("button", name="EMERGENCY STOP").is_enabled()
+
+
+def test_a_page_whose_script_does_not_start_names_the_physical_stop(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path) as lab:
+        page.route("**/page.js", lambda route: route.abort())
+        page.goto(lab.url)
+        assert PHYSICAL in " ".join(page.locator("#no-stop").inner_text().split())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "act", ["Enter", *(pytest.param(act, marks=pytest.mark.slow) for act in ("Escape", "second press"))]
@@ -425,7 +468,7 @@ def test_a_stop_that_is_pressed_in_vain_is_not_missed(page: Any, tmp_path: Path)
     with on_port(tmp_path) as lab:
         page.goto(lab.address())
         page.get_by_text("Nothing runs here.").wait_for()
-        page.route("**/emergency-stop", lambda route: route.abort())
+        page.route("**/emergency-stop?*", lambda route: route.abort())
         page.get_by_role("button", name="EMERGENCY STOP").click()
         alert = page.get_by_role("alert").filter(has_text="EMERGENCY STOP was not confirmed: press the physical")
         alert.wait_for()
