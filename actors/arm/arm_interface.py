@@ -174,8 +174,9 @@ class Executed(Protocol):
 
     @property
     def tracking(self) -> Mapping[str, float]:
-        """Measures of how closely the plan was followed, as far as the arm reports them. 'slider' is the lowest fraction
-        of the programmed speed; below `FULL_SPEED`, the user is warned that the pour was slowed.
+        """Measures of how closely the plan was followed, as far as the arm reports them.
+
+        'slider' is the lowest fraction of the programmed speed; below `FULL_SPEED`, the user is warned.
         """
         ...
 

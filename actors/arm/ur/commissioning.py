@@ -14,6 +14,7 @@ from typing import Any
 
 from actors.arm.arm_geometry import JOINT_NAMES, Pose
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSettings
+from actors.arm.ur import primary_interface as primary
 from actors.arm.ur.controller_readout import (
     PORTS,
     SCRIPTS,
@@ -26,7 +27,6 @@ from actors.arm.ur.controller_readout import (
     read_status,
     recorded_findings,
 )
-from actors.arm.ur import primary_interface as primary
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.robot_comparison import payload_check, robot_checks
 from actors.arm.ur.robot_models import same_robot
@@ -271,8 +271,8 @@ def _ports(found: Findings) -> list[DeviceCheck]:
     if None not in reasons:
         everything = "all ports that Decant uses are closed" if reasons == {"refused"} else "no port answers"
         advice = (
-            "the machine is there, but refuses connections: on PolyScope 5.10 or later look at Settings, Security, both at "
-            "Services and at the inbound access of this computer's network; while booting, wait"
+            "the machine is there, but refuses connections: on PolyScope 5.10 or later look at Settings, Security, "
+            "both at Services and at the inbound access of this computer's network; while booting, wait"
             if reasons == {"refused"}
             else "is it switched on, its cable plugged in, this computer in the same network, no firewall between?"
         )

@@ -59,8 +59,8 @@ OVERTIME = 10.0
 """Longest delay of a path beyond its planned duration [s of controller time], besides that of a lowered slider."""
 
 HELD_TIME = 2.0
-"""Longest standstill within a motion because the slider is at 0 [s of controller time]. The heartbeat continues, so that
-no watchdog ends the program; a tilted cup pours on."""
+"""Longest standstill within a motion because the slider is at 0 [s of controller time]. The heartbeat continues, so
+that no watchdog ends the program; a tilted cup pours on."""
 
 BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
 FORCE_INTERVAL = 0.1
@@ -373,8 +373,8 @@ def _slowed(reading: DataPackage) -> str:
 
 def _held(reading: DataPackage) -> str:
     return (
-        f"the arm stood still for {HELD_TIME:g} s, and a tilted cup pours on: {_speed(reading)}. The program was ended, "
-        "so that nothing moves when the slider is raised; raise it before you let the arm return"
+        f"the arm stood still for {HELD_TIME:g} s, and a tilted cup pours on: {_speed(reading)}. The program was "
+        "ended, so that nothing moves when the slider is raised; raise it before you let the arm return"
     )
 
 

@@ -24,8 +24,8 @@ PORT = 30004
 
 CLOSED = (
     "closed the connection: the controller is booting or shutting down, was just switched between local and remote "
-    "control, or does not admit this computer (PolyScope 5.10 or later: Settings, Security, Services, and inbound access "
-    "under General). Wait a minute and try again; if it repeats, restart the controller"
+    "control, or does not admit this computer (PolyScope 5.10 or later: Settings, Security, Services, and inbound "
+    "access under General). Wait a minute and try again; if it repeats, restart the controller"
 )
 """What it means if a port of the controller accepts a connection and closes it, as part of a message; with the remedy.
 

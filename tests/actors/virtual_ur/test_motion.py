@@ -252,7 +252,7 @@ def test_the_speed_slider_stretches_a_path_of_servo_commands(bench: Bench, slide
 def test_a_spline_of_speed_commands_reaches_its_end_at_any_slider(bench: Bench, slider: float) -> None:
     """As the manufacturer's own program does, which reads no slider (external_control.urscript, issue 194)."""
     bench.robot.mover.slider = slider
-    bench.run(f"""
+    bench.run("""
 t = 0.0
 last = 0.0
 while t < 2.0:
