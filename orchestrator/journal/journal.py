@@ -332,7 +332,7 @@ class Journal(JournalReader):
         except (sqlite3.OperationalError, OSError) as error:
             raise JournalError(
                 f"{self.path}: can't be written ({error}; {free_space(self.path) / MB:.1f} MB are free on its disk); "
-                "what is in it is safe. Mend that and resume the run"
+                "what is in it is safe. Fix that and resume the run"
             ) from error
         if durable:
             checkpoint(self._connection)

@@ -429,7 +429,7 @@ def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_chang
         require_accepted(None, "22C99AA2", "robot")
     with pytest.raises(NotAcceptedError, match="have changed: checksum DEADBEEF, accepted was 22C99AA2"):
         require_accepted("22C99AA2", "DEADBEEF", "robot")
-    with pytest.raises(NotAcceptedError, match="tells no safety checksum"):
+    with pytest.raises(NotAcceptedError, match="reports no safety checksum"):
         require_accepted("22C99AA2", None, "robot")
 
 
