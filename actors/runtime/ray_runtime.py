@@ -92,8 +92,11 @@ _PRIVATE_SETTINGS = {
 _KEPT_SETTINGS = re.compile(r"RAY_(memory_|memory_monitor_|BACKEND_LOG_LEVEL)")
 """Variables of the user's that a private Ray gets all the same: when it ends workers for lack of memory; logging."""
 
-_CONNECTION_SETTINGS = ("RAY_grpc_enable_http_proxy", "RAY_USE_TLS", "RAY_TLS_SERVER_CERT", "RAY_TLS_SERVER_KEY")
-_CONNECTION_SETTINGS += ("RAY_TLS_CA_CERT", "RAY_REDIS_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN_PATH")
+_CONNECTION_SETTINGS = (
+    "RAY_grpc_enable_http_proxy",
+    *("RAY_USE_TLS", "RAY_TLS_SERVER_CERT", "RAY_TLS_SERVER_KEY", "RAY_TLS_CA_CERT"),
+    *("RAY_REDIS_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN_PATH"),
+)
 """Variables that have to be the same for all programs of a cluster.
 
 Sources: ray-project/ray pull request 23526 (gRPC follows the proxy variables if the first is set; they then also apply

@@ -353,7 +353,8 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
         if axis.name in posterior.open:
             unknown.append(f"{words} ({searched})")
         else:
-            known.append(f"{words} {style.display_interval(axis.name, *posterior.region[axis.name])} (searched {searched})")
+            found = style.display_interval(axis.name, *posterior.region[axis.name])
+            known.append(f"{words} {found} (searched {searched})")
     lines = []
     if known:
         lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")

@@ -179,7 +179,7 @@ class UrDiagnostics(ArmDiagnostics):
         assert self.spec is not None
         assert self.found is not None
         if self.found.state is None:
-            raise ReadoutError("; ".join(self.found.problems) or f"the controller at {self.spec.address} reports nothing")
+            raise ReadoutError("; ".join(self.found.problems) or f"{self.spec.address} reports nothing")
         return home_check(self.spec, self.found.state)
 
 
