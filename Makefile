@@ -31,7 +31,7 @@ install: $(READY)
 
 demo: $(READY)
 	@bench=; $(BIN)/python -c 'import rtde_receive' 2>/dev/null || { bench="--laboratory configs/laboratories/twin.yaml"; \
-		echo "ur-rtde has no wheel for this Python: the demo runs on the bench of numbers ($$bench)"; }; \
+		echo "ur-rtde has no wheel for this Python: the demo runs on the simulated bench ($$bench)"; }; \
 	$(BIN)/decant run configs/campaigns/quickstart.yaml $$bench
 
 test: lint unit

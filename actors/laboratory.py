@@ -279,12 +279,14 @@ class _OpenLaboratory:
 
     async def _close_all(self) -> None:
         opened, self._opened = self._opened, None
-        if opened is not None:
-            await opened.close()
-        open_now: list[WorkerPool | Device] = [*self._own_pools, *self._devices]
-        await asyncio.gather(*(each.close() for each in open_now), return_exceptions=True)
-        self._pool = self._optimizer = None
-        self._own_pools, self._devices = [], []
+        try:
+            if opened is not None:
+                await opened.close()
+        finally:  # a bench that can't be closed must not leave simulators behind
+            open_now: list[WorkerPool | Device] = [*self._own_pools, *self._devices]
+            await asyncio.gather(*(each.close() for each in open_now), return_exceptions=True)
+            self._pool = self._optimizer = None
+            self._own_pools, self._devices = [], []
 
 
 def _local(name: str, cls: type[Any], *args: Any) -> Device:

@@ -1,4 +1,4 @@
-"""Measure what an ideal player loses on the benches with steep walls: a reference for the means of `mismatch.py`.
+"""Measure the loss of an ideal player on the benches with steep walls: a reference for the means of `mismatch.py`.
 
     python benchmarks/ideal_player.py [--levels 'cliff, moderate' ...] [--first 8120] [--seeds 20] [--write]
 

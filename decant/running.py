@@ -12,7 +12,6 @@ import csv
 import html
 import json
 import tempfile
-import time
 import warnings
 from collections.abc import Coroutine, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -30,6 +29,7 @@ from orchestrator.live_view.live_server import recorder_of
 from orchestrator.progress.progress_state import ProgressState
 from orchestrator.results.publishing import not_simulated
 from orchestrator.results.stage_views import evaluation_of
+from orchestrator.run_clock import run_time
 from orchestrator.run_service import (
     PREDICTION_SEEDS,
     CheckReport,
@@ -188,7 +188,7 @@ class RunningCampaign:
     @property
     def seconds_left(self) -> float | None:
         """Expected time until it ends [s]; None if unknown."""
-        return self._progress.forecast.left(time.time())
+        return self._progress.forecast.left(run_time())
 
     def __str__(self) -> str:
         """Progress in one line."""

@@ -207,7 +207,7 @@ def _thin_stream(course: FlowCourse, liquid: Liquid, spacing: float) -> NotCover
         share,
         f"{_percent(share)} of what is poured falls in a stream of fewer than {PARTICLES_ACROSS:g} particles across "
         f"({median / spacing:.1f} in the median, {1e3 * spacing:.1f} mm each, at the receiver's rim). Where it lands "
-        f"is told roughly; {_rounded_up(enough)} particles would resolve half of it",
+        f"is approximate; {_rounded_up(enough)} particles would resolve half of it",
     )
 
 

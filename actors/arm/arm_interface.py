@@ -24,6 +24,9 @@ from actors.interfaces import LaboratoryError
 
 FloatArray = NDArray[np.float64]
 
+FULL_SPEED = 0.99
+"""Fraction of the programmed speed below which a pour is slowed."""
+
 
 @dataclass(frozen=True)
 class ArmState:
@@ -171,7 +174,10 @@ class Executed(Protocol):
 
     @property
     def tracking(self) -> Mapping[str, float]:
-        """Measures of how closely the plan was followed, as far as the arm reports them."""
+        """Measures of how closely the plan was followed, as far as the arm reports them.
+
+        'slider' is the lowest fraction of the programmed speed; below `FULL_SPEED`, the user is warned.
+        """
         ...
 
     def record(self) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from sim_engine.outcome import PourMeasurement
 MENDABLE = (NotStableError, OutOfRangeError, CommandError, UnitError)
 """Errors that the operator can fix at the balance before a retry; no data is lost."""
 
-AGAIN = "The balance can't be used as it is. Mend it, and leave what is on it. Is it mended, to be tried again?"
+AGAIN = "The balance can't be used as it is. Fix it, and leave what is on it. Is it fixed, to be tried again?"
 
 
 AskOperator = Callable[[OperatorQuestion], Awaitable[str]]

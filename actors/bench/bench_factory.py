@@ -255,7 +255,7 @@ async def open_bench(
     try:
         if operator is None and spec.needs_person:
             raise LaboratoryError(
-                f"laboratory {spec.name} needs a person beside it who answers questions, and nobody is here to be asked"
+                f"laboratory {spec.name} needs a person next to it who answers questions, and there is none to ask"
             )
         if spec.pump is not None:
             return _open_pump(spec, spec.pump, opening, operator, tell)

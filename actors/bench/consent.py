@@ -67,7 +67,7 @@ def stopped_question(error: Exception, problem: str, *, begun: bool) -> Operator
     stands = f" The pourer stands at {math.degrees(tilt):.0f}°." if tilt is not None else ""
     poured = "" if begun else " Nothing was poured."
     return OperatorQuestion(
-        f"The arm was stopped, and holds still.{stands}{poured} Find out why, and mend it. Shall the robot be made "
+        f"The arm was stopped, and holds still.{stands}{poured} Find out why, and fix it. Shall the robot be made "
         "ready again? It doesn't move yet; 'no' leaves everything as it is.",
         "yes or no",
         problem,

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from actors.arm.arm_interface import (
+    FULL_SPEED,
     ArmFacts,
     ArmLostError,
     ArmRefusedError,
@@ -269,6 +270,8 @@ class PourProcedure:
         except _BROKEN_OFF as error:
             self._broken, self._executed = error, getattr(error, "executed", None)
             await self._consent.bring_upright(error)
+        else:
+            self._report_slowing(self._executed)
         await setup.ground_truth.note()
         try:
             if self._broken is not None:
@@ -277,6 +280,19 @@ class PourProcedure:
         except STUCK as error:
             await self._consent.bring_home(error, begun=self._begun)
         await self._let_it_land()
+
+    def _report_slowing(self, executed: Executed) -> None:
+        """Warn if the arm's controller slowed the pour: it was another one than planned."""
+        speed = executed.tracking.get("slider", 1.0)
+        if speed < FULL_SPEED:
+            self._setup.tell(
+                Notice(
+                    "warning",
+                    f"the controller slowed the pour to {100.0 * speed:.0f} % of its speed: it took "
+                    f"{executed.times[-1]:.1f} s instead of {self._path.pour_time:.1f} s. The motion as executed is "
+                    "recorded with the weights; set the speed slider to 100 %",
+                )
+            )
 
     async def _after(self) -> PourMeasurement:
         await self._consent.make_safe()

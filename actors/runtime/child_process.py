@@ -62,20 +62,29 @@ def child_environment(changes: Mapping[str, str | None] | None = None) -> dict[s
 
 
 @contextlib.contextmanager
-def own_environment(**values: str) -> Iterator[None]:
-    """Set environment variables for a library in this process. Children that `ChildProcess` starts do not get them."""
+def own_environment(**values: str | None) -> Iterator[None]:
+    """Set environment variables for a library in this process. Children that `ChildProcess` starts do not get them.
+
+    Args:
+        values: by name; None removes a variable.
+    """
     before = {name: os.environ.get(name) for name in values}
     _hidden.update(before)
-    os.environ.update(values)
+    _set_environment(values)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        _set_environment(before)
+        for name in before:
             del _hidden[name]
+
+
+def _set_environment(values: Mapping[str, str | None]) -> None:
+    for name, value in values.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
 
 
 def python_module(module: str, *arguments: str) -> list[str]:

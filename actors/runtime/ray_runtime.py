@@ -3,6 +3,9 @@
 A private Ray leaves nothing behind. It runs:
 
 - with a stated amount of memory, and without dashboard, autoscaler or usage statistics.
+- without the user's variables `RAY_…`, which are meant for another Ray: with `RAY_grpc_enable_http_proxy=1` or
+  `RAY_USE_TLS=1` the processes do not find each other and wait for 100 s, with `RAY_REDIS_ADDRESS` this process is
+  ended.
 - on the loopback interface only, with its own token.
 - in a short private folder that is removed at the end. `actors.runtime.ray_cleanup` removes it after this program was
   killed. Folders of programs that have ended are also removed at the next start.
@@ -85,6 +88,20 @@ _PRIVATE_SETTINGS = {
     "RAY_ROTATION_MAX_BYTES": "2000000",
     "RAY_ROTATION_BACKUP_COUNT": "1",
 }
+
+_KEPT_SETTINGS = re.compile(r"RAY_(memory_|memory_monitor_|BACKEND_LOG_LEVEL)")
+"""Variables of the user's that a private Ray gets all the same: when it ends workers for lack of memory; logging."""
+
+_CONNECTION_SETTINGS = (
+    "RAY_grpc_enable_http_proxy",
+    *("RAY_USE_TLS", "RAY_TLS_SERVER_CERT", "RAY_TLS_SERVER_KEY", "RAY_TLS_CA_CERT"),
+    *("RAY_REDIS_ADDRESS", "RAY_AUTH_MODE", "RAY_AUTH_TOKEN_PATH"),
+)
+"""Variables that have to be the same for all programs of a cluster.
+
+Sources: ray-project/ray pull request 23526 (gRPC follows the proxy variables if the first is set; they then also apply
+to connections on this machine), issue 39191 (TLS without certificates: the start waits, then fails).
+"""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -296,9 +313,11 @@ def _start_keeper(session: _Session, spec: LaboratorySettings) -> None:
     session.keeper = threading.Thread(target=_keep, args=(session, spec), name="ray-keeper", daemon=True)
     session.keeper.start()
     if not session.ready.wait(START_DEADLINE):
+        set_here = [] if session.private else [name for name in _CONNECTION_SETTINGS if os.environ.get(name)]
+        hint = f" Set for the connection are {', '.join(set_here)}: are they so on the cluster?" if set_here else ""
         raise LaboratoryError(
             f"Ray did not start within {START_DEADLINE:.0f} s; is this machine busy, or short of memory? Try again, or "
-            "do without Ray (--in-process)"
+            f"do without Ray (--in-process).{hint}"
         )
     if session.failure is not None:
         raise session.failure
@@ -306,9 +325,14 @@ def _start_keeper(session: _Session, spec: LaboratorySettings) -> None:
 
 def _keep(session: _Session, spec: LaboratorySettings) -> None:
     exit_message: ChildProcess | None = None
-    settings = dict(_JOIN_SETTINGS)
+    settings: dict[str, str | None] = {**_JOIN_SETTINGS}
     if (private := session.private) is not None:
-        settings = {**_PRIVATE_SETTINGS, "RAY_AUTH_TOKEN_PATH": str(private.folder / "token")}
+        foreign = [name for name in os.environ if name.startswith("RAY_") and not _KEPT_SETTINGS.match(name)]
+        settings = {
+            **dict.fromkeys(foreign),
+            **_PRIVATE_SETTINGS,
+            "RAY_AUTH_TOKEN_PATH": str(private.folder / "token"),
+        }
     with own_environment(**settings):
         try:
             with _ray_internals(helpers=private is None):
@@ -441,8 +465,10 @@ def _start_private(private: _PrivateRay, spec: LaboratorySettings) -> None:
     address = ray.util.get_node_ip_address()
     if address != "127.0.0.1":
         raise LaboratoryError(f"Ray listens on {address} instead of this machine only; was it imported too early?")
-    children = [p for p in psutil.Process().children() if p.environ().get(MARK) == str(private.folder)]
-    private.processes = {p.name(): p for p in children}
+    for child in psutil.Process().children():
+        with contextlib.suppress(psutil.Error):  # a child of the user's program that has ended, for example
+            if child.environ().get(MARK) == str(private.folder):
+                private.processes[child.name()] = child
     private.membership = placement_group([{_PROGRAM: 1.0}])
 
 

@@ -368,7 +368,10 @@ class WorkerPool:
             patience = 0.0
         for member in members:
             self._end(member, 0.0 if member.greeting is None and self._separate else patience)
-        await asyncio.gather(*self._ending, return_exceptions=True)
+        starting = [member.started for member in members if not member.started.done()]
+        for started in starting:
+            started.cancel()
+        await asyncio.gather(*self._ending, *starting, return_exceptions=True)
 
     # ---- workers
 
@@ -379,28 +382,39 @@ class WorkerPool:
     def _add(self) -> None:
         if self._closed:
             return
-        worker = self._make_worker()
+        try:
+            worker = self._make_worker()
+        except Exception as error:  # as while memory is short
+            self._postpone(f"a simulator can't be started: {error}")
+            return
         member = _Member(worker, asyncio.ensure_future(worker.start()))
         self._members.append(member)
         member.started.add_done_callback(partial(self._started, member))
 
     def _started(self, member: _Member, started: asyncio.Task[Greeting]) -> None:
         """A worker is up, or does not start."""
-        error = None if started.cancelled() else started.exception()
-        if error is None and not started.cancelled():
+        if started.cancelled():  # the event loop ends, or the pool: what would begin now would never run
+            return
+        error = started.exception()
+        if error is None:
             member.greeting = started.result()
         if member not in self._members:
             return
-        if isinstance(error, WorkerUnusableError):
-            self._refuse(member, str(error))
-        elif member.greeting is None:
+        if isinstance(error, WorkerLostError):
             self._lose(member)
+        elif error is not None:
+            unusable = isinstance(error, WorkerUnusableError)
+            self._refuse(member, str(error) if unusable else f"a simulator can't be started: {error}")
         self._dispatch()
 
     def _refuse(self, member: _Member, problem: str) -> None:
         """Reject a worker that would fail again or return different results; start another one later."""
         self._members.remove(member)
         self._end(member, 0.0)
+        self._postpone(problem)
+
+    def _postpone(self, problem: str) -> None:
+        """Start a worker later, because one could not be started or used now."""
         if problem != self._problem:
             self._problem = problem
             self._report(problem)

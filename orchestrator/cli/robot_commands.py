@@ -202,7 +202,7 @@ def _accept(path: Path, look: ArmDiagnostics) -> SafetyRecord:
 
     if not look.checksum or not look.serial:
         raise RefusalError(
-            "the controller doesn't tell its safety checksum and serial number, so nothing can be accepted; run "
+            "the controller does not report its safety checksum and serial number, so nothing can be accepted; run "
             f"'decant robot check {path}' without --accept-safety to see why",
             FAILED,
         )

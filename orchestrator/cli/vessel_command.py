@@ -448,7 +448,7 @@ def _from_mesh(out: Path, name: str, sources: Sources) -> Made:
     from sim_engine.resources import require
     from sim_engine.vessel_acquisition.mesh_repair import mended
 
-    require("manifold3d", "mending a mesh")
+    require("manifold3d", "the repair of a mesh")
     others = {
         "--diameters": sources.diameters,
         "--photo": sources.photo,

@@ -284,7 +284,7 @@ class _Collector:
             "decant_simulators": ("Simulators in the pool.", daemon.warm.size),
             "decant_events_last": ("Number of the newest event.", daemon.feed.last),
             "decant_readers": ("Readers of events.", daemon.feed.readers),
-            "decant_problems": ("Things that people should mend.", len(daemon.problems)),
+            "decant_problems": ("Problems that people should solve.", len(daemon.problems)),
             "decant_disk_free_bytes": ("Room on the state directory's disk.", free_space(daemon.settings.state)),
             "decant_threads": ("Threads of the daemon's process.", threading.active_count()),
             "decant_open_files": ("Open files of the daemon's process.", _open_files()),

@@ -32,6 +32,7 @@ from orchestrator.live_view.live_server import LiveView, recorder_of
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
 from orchestrator.results.publishing import not_simulated
+from orchestrator.run_clock import run_time
 from orchestrator.run_errors import RunError
 from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService
 from orchestrator.runs.events import CampaignStateChanged, StageOpened
@@ -260,7 +261,7 @@ class Running:
             "checkpoint": self.checkpoint,
             "checkpoint_words": CHECKPOINT_WORDS.get(self.checkpoint, ""),
             "fraction": pour.progress.fraction if pour is not None and pour.progress is not None else None,
-            "seconds_left": progress.forecast.left(time.time()),
+            "seconds_left": progress.forecast.left(run_time()),
         }
 
     @property

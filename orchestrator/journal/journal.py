@@ -16,7 +16,6 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -55,6 +54,7 @@ from orchestrator.journal.journal_file import (
     take_lock,
 )
 from orchestrator.journal.upgrade import upgraded_fingerprint
+from orchestrator.run_clock import begin_run, end_run, run_time
 from orchestrator.states import State
 
 JOURNAL_NAME = "journal.sqlite"
@@ -228,6 +228,7 @@ class Journal(JournalReader):
         self._last = _last_of_chain(connection)
         self._unwritten: list[LedgerLine] = []
         self._ledger: PourLedger
+        self._runs = False
 
     @classmethod
     def create(cls, path: Path, header: Header) -> Journal:
@@ -254,7 +255,7 @@ class Journal(JournalReader):
             journal = cls(path, lock, connection)
             journal._ledger = journal._open_ledger()
             opened.pop_all()
-            return journal
+            return journal._begun()
 
     @classmethod
     def resume(cls, path: Path, header: Header) -> Journal:
@@ -278,7 +279,7 @@ class Journal(JournalReader):
             journal._check_same_campaign(header)
             journal._ledger = journal._open_ledger()
             opened.pop_all()
-            return journal
+            return journal._begun()
 
     def reserve_space(self) -> None:
         """Reserve disk space for a pour's records, until the journal is closed.
@@ -310,7 +311,7 @@ class Journal(JournalReader):
         if durable != self._durable:
             self._connection.execute(f"pragma synchronous = {'full' if durable else 'normal'}")
             self._durable = durable
-        now, (seq, digest) = time.time(), self._last
+        now, (seq, digest) = run_time(), self._last
         rows: list[EventRow] = []
         links: list[tuple[int, bytes]] = []
         lines: list[LedgerLine] = []
@@ -331,7 +332,7 @@ class Journal(JournalReader):
         except (sqlite3.OperationalError, OSError) as error:
             raise JournalError(
                 f"{self.path}: can't be written ({error}; {free_space(self.path) / MB:.1f} MB are free on its disk); "
-                "what is in it is safe. Mend that and resume the run"
+                "what is in it is safe. Fix that and resume the run"
             ) from error
         if durable:
             checkpoint(self._connection)
@@ -391,6 +392,15 @@ class Journal(JournalReader):
         self._connection.close()
         self._ledger.close()
         self._lock.close()
+        if self._runs:
+            self._runs = False
+            end_run()
+
+    def _begun(self) -> Self:
+        """From now on, times of the run do not jump with the system's clock; see `orchestrator.run_clock`."""
+        self._runs = True
+        begin_run()
+        return self
 
     def _check_same_campaign(self, header: Header) -> None:
         if digest(self.header.fingerprint) == digest(header.fingerprint):

@@ -6,7 +6,6 @@ afterwards, it adds a playback of the pour to the queue.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from orchestrator.live_view.recording_sink import Moment, Playback, PlaybackQueu
 from orchestrator.live_view.simulation_view import MAXIMUM_RATE
 from orchestrator.requests import Pour
 from orchestrator.results import figure_style as style
+from orchestrator.run_clock import run_time
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.outcome import ParticleState, PourMeasurement, RecordedFrames
 from sim_engine.scene import Scene
@@ -87,7 +87,7 @@ class CellScene:
             low, high = np.minimum(base, 0.0) - 0.3, np.maximum(base, 0.0) + 0.3
             middle, half = 0.5 * (low + high), 0.5 * (high - low)
             # The initial pose of the arm; its appearance is static.
-            self._sink.times(wall=time.time(), step=0, sim_time=0.0)
+            self._sink.times(wall=run_time(), step=0, sim_time=0.0)
             self._sink.log(f"{PLACE}/arm", shapes.bars(self._figure, home), static=True)
             self._sink.rows(f"{PLACE}/arm", [self._sink.now], shapes.stances(home[None]))
         self._sink.log(

@@ -10,7 +10,6 @@ timelines:
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +23,7 @@ from orchestrator.live_view.simulation_view import SimulatedStage
 from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
 from orchestrator.results.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
 from orchestrator.results.stage_views import receiver_names
+from orchestrator.run_clock import run_time
 from orchestrator.runs.events import (
     CampaignClosed,
     CampaignOpened,
@@ -87,12 +87,12 @@ class CampaignRecording:
     def wait(self) -> float | None:
         """Time until `play` has work to do [s]; None if it must wait for events."""
         film = self._films.next_due
-        waits = (None if film is None else max(film - time.time(), 0.0), self._sink.wait)
+        waits = (None if film is None else max(film - run_time(), 0.0), self._sink.wait)
         return min((each for each in waits if each is not None), default=None)
 
     def play(self) -> None:
         """Write everything that is due. Call it about every half second rather than after each event."""
-        self._films.play(time.time())
+        self._films.play(run_time())
         self._cell.show()
         self._sink.send()
 

@@ -8,7 +8,6 @@ the task that simulates it again, with any number of particles.
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.blueprints import simulation_blueprint
 from orchestrator.live_view.recording_sink import Playback, PlaybackQueue, RecordingSink, Track, columns_of
 from orchestrator.results import figure_style as style
+from orchestrator.run_clock import run_time
 from orchestrator.runs.stages import scenes_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import SimulationParameters
@@ -131,7 +131,7 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
     sink.keep(simulation_blueprint())
     sink.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     films = PlaybackQueue(sink)
-    now = time.time()
+    now = run_time()
     sink.times(wall=now, step=0, sim_time=0.0)
     SimulatedStage(sink, films).film(result.frames, scene, title, now=now, step=0)
     films.play(float("inf"))

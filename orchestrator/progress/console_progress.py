@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState, StageProgressState
 from orchestrator.requests import Pour
+from orchestrator.run_clock import run_time
 from orchestrator.runs.events import (
     CampaignClosed,
     CampaignOpened,
@@ -178,7 +179,7 @@ class ProgressDisplay:
             if pour is not None and not pour.result:
                 rows.append(Text(state.pour_line() or "", style="bold"))
                 rows.append(self._pour_bar())
-            left = state.forecast.left(time.time())
+            left = state.forecast.left(run_time())
             eta = f" · about {_duration(left)} left in all" if left is not None else ""
             rows.append(Text(f"  {state.pool_line()}{eta}", style="dim"))
             return Group(*rows)
@@ -205,7 +206,7 @@ class ProgressDisplay:
     def _stage_note(self, stage: StageProgressState) -> str:
         if stage.closed_at is not None:
             return "done"
-        now = time.time()
+        now = run_time()
         left = self._progress_state.forecast.stage_left(stage.name, now)
         about = "" if left is None else f"about {_duration(left)}"
         if stage.opened_at is None:
@@ -222,7 +223,7 @@ class ProgressDisplay:
         assert pour is not None
         progress = pour.progress
         fraction = 0.0 if progress is None else progress.fraction
-        note = [f"{100 * fraction:3.0f} %", f"{max(time.time() - pour.started_at, 0.0):.1f} s"]
+        note = [f"{100 * fraction:3.0f} %", f"{max(run_time() - pour.started_at, 0.0):.1f} s"]
         if progress is not None and progress.tilt is not None:
             note.append(f"tilt {math.degrees(progress.tilt):.0f} deg")
         if (dose := self._progress_state.dose_line()) is not None:

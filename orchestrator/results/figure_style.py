@@ -82,6 +82,12 @@ def display_value(name: str, value: float | None) -> str:
     return f"{value / display_factor(name):.3g} {display_unit(name)}".rstrip()
 
 
+def display_interval(name: str, low: float | None, high: float | None) -> str:
+    """An interval in the quantity's display unit, from SI values: '0.31 … 0.74 N/m'."""
+    unit = display_unit(name)
+    return f"{display_value(name, low).removesuffix(unit).rstrip()} … {display_value(name, high)}"
+
+
 def display_values(values: Mapping[str, float | None]) -> str:
     """Several named quantities in one line, from SI values: 'angular velocity 41.2 deg/s, x offset 104 mm'."""
     return ", ".join(f"{name.replace('_', ' ')} {display_value(name, value)}" for name, value in values.items())

@@ -334,13 +334,14 @@ def _parameters(calibration: CalibrationPlan | None, found: CalibratedTheta) -> 
         axis, region = axes.get(name), "—"
         if posterior is not None and name in posterior.region:
             low, high = posterior.region[name]
-            region = f"{low:.3g} … {high:.3g}" + (", not determined" if name in posterior.open else "")
+            open_end = ", not determined" if name in posterior.open else ""
+            region = style.display_interval(name, low, high) + open_end
         rows.append(
             ParameterSummary(
                 name=style.PARAMETER_NAMES.get(name, name.replace("_", " ")),
                 value=style.display_value(name, value),
                 region=region,
-                searched="not searched" if axis is None else f"{style.number(axis.lower)} … {style.number(axis.upper)}",
+                searched="not searched" if axis is None else style.display_interval(name, axis.lower, axis.upper),
             )
         )
     return tuple(rows)

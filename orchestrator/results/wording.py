@@ -349,11 +349,12 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
     """
     known, unknown = [], []
     for axis in space.axes:
-        words, searched = axis.name.replace("_", " "), _interval(axis.name, axis.lower, axis.upper)
+        words, searched = axis.name.replace("_", " "), style.display_interval(axis.name, axis.lower, axis.upper)
         if axis.name in posterior.open:
             unknown.append(f"{words} ({searched})")
         else:
-            known.append(f"{words} {_interval(axis.name, *posterior.region[axis.name])} (searched {searched})")
+            found = style.display_interval(axis.name, *posterior.region[axis.name])
+            known.append(f"{words} {found} (searched {searched})")
     lines = []
     if known:
         lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
@@ -362,11 +363,6 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
             f"the pours do not determine {', '.join(unknown)}: nearly the whole searched range fits them as well as θ*"
         )
     return [*lines, *posterior.directions]
-
-
-def _interval(name: str, low: float, high: float) -> str:
-    """'0.31 … 0.74 N/m'."""
-    return f"{_bare(name, low)} … {style.display_value(name, high)}"
 
 
 def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -> list[str]:

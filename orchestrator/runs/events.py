@@ -8,7 +8,6 @@ subscriber is removed. The run never waits for a subscriber and never depends on
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Literal
 from actors.interfaces import PourProgress
 from orchestrator.journal.codec import Results
 from orchestrator.requests import Decision, Outcome, Request
+from orchestrator.run_clock import run_time
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Progress
 from sim_engine.outcome import RecordedFrames
@@ -29,12 +29,12 @@ class Event:
     """Base of all events.
 
     Attributes:
-        time: when it happened (seconds since 1970); for replayed events, the time of the original event.
+        time: when it happened, by `orchestrator.run_clock` [s since 1970]; of a replayed event, when the original did.
         stage: name of the stage that it belongs to; empty outside stages.
         replayed: read from the journal of an interrupted run, not happening now.
     """
 
-    time: float = field(default_factory=time.time)
+    time: float = field(default_factory=run_time)
     stage: str = ""
     replayed: bool = False
 

@@ -113,7 +113,7 @@ def required_checksum(plan: CampaignPlan) -> str:
     checksum = accepted_checksum(laboratory)
     if checksum is None:
         raise SafetyRecordError(
-            f"laboratory {plan.laboratory.name}: nobody has accepted the controller's safety settings. Run "
+            f"laboratory {plan.laboratory.name}: the controller's safety settings have not been accepted. Run "
             f"'decant robot check {shown_path(laboratory)}' first; it says how"
         )
     return checksum

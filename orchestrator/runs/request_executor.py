@@ -371,7 +371,7 @@ class RequestExecutor:
                         times = "once" if attempt == 1 else f"{attempt} times"
                         raise RequestExecutorError(
                             f"the optimiser was asked the same question {times} and failed each time ({reason})",
-                            "; nothing is lost: mend the cause and resume the run",
+                            "; nothing is lost: fix the cause and resume the run",
                         ) from error
                     retrying(f"the optimiser failed ({reason}); it is asked again, for the {_ORDINAL[attempt]} time")
         raise AssertionError("unreachable")

@@ -58,8 +58,21 @@ asyncio.run(main(*sys.argv[1:]))
 """
 
 
-def start(how: str, home: Path) -> tuple[subprocess.Popen[str], dict[str, list[int] | str]]:
-    environment = {**os.environ, "HOME": str(home)}
+FOREIGN = {
+    "RAY_grpc_enable_http_proxy": "1",
+    "http_proxy": "http://127.0.0.1:9",
+    "https_proxy": "http://127.0.0.1:9",
+    "RAY_USE_TLS": "1",
+    "RAY_TLS_SERVER_CERT": "/nonexistent/server.crt",
+    "RAY_REDIS_ADDRESS": "192.0.2.1:6379",
+    "RAY_ADDRESS": "192.0.2.1:6379",
+    "RAY_NAMESPACE": "elsewhere",
+}
+"""Settings for another Ray (ray-project/ray #23526, #39191, #37757). A private one that got them would not start."""
+
+
+def start(how: str, home: Path, **variables: str) -> tuple[subprocess.Popen[str], dict[str, list[int] | str]]:
+    environment = {**os.environ, "HOME": str(home), **variables}
     environment.pop("TMPDIR", None)
     program = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, how, str(PATIENCE)],
@@ -130,7 +143,7 @@ def test_sigterm_ends_in_order_without_a_frightening_stack(tmp_path):
 
 @pytest.mark.realtime
 def test_a_normal_end_leaves_nothing_was_closed_to_the_network_and_kept_the_loops_own_signal_handler(tmp_path):
-    program, facts = start("own handler", tmp_path)
+    program, facts = start("own handler", tmp_path, **FOREIGN)  # with settings for another Ray, which do not reach it
     program.terminate()
     output, errors = program.communicate(timeout=PATIENCE)
     assert errors == ""

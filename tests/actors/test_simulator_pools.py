@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import errno
+import gc
 import multiprocessing
 import os
 import signal
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +18,15 @@ import pytest
 
 from actors.arm.simulated_arm import SimulatedArm, SimulatedArmSettings
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
+from actors.laboratory import InProcessLaboratory
+from actors.laboratory_settings import LaboratorySettings
+from actors.runtime.child_process import ConnectedProcess
 from actors.runtime.ray_cluster import versions
 from actors.runtime.remote_object import RayDevice
+from actors.simulators import local_worker
 from actors.simulators import pool as pools
 from actors.simulators.local_worker import process_pool, thread_pool
+from actors.simulators.pool import WorkerPool
 from actors.simulators.ray_worker import ray_pool
 from tests.support.waiting import PATIENCE, alive
 
@@ -47,6 +55,86 @@ def make_pool(request):
     if request.param == "processes":
         return lambda make: process_pool(1, make=make)
     return lambda make: thread_pool(make=make)
+
+
+def test_a_loop_that_ends_before_its_simulators_are_up_leaves_no_task_behind(fake, caplog, recwarn):
+    """As when a run ends for lack of memory while workers are being replaced."""
+
+    class Starting(local_worker.ProcessWorker):
+        async def start(self):
+            await asyncio.Event().wait()
+
+    async def play():
+        WorkerPool(2, partial(Starting, fake())).open()
+        await asyncio.sleep(0)
+
+    asyncio.run(play())
+    gc.collect()
+    assert "Task was destroyed" not in caplog.text
+    assert not [str(w.message) for w in recwarn if "never awaited" in str(w.message)]
+
+
+def test_while_no_process_can_be_started_simulations_fail_with_the_reason_and_nothing_spins(fake, task, monkeypatch):
+    attempts = []
+
+    class NoMemory(ConnectedProcess):
+        def __init__(self, *args):
+            attempts.append(args)
+            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    monkeypatch.setattr(local_worker, "ConnectedProcess", NoMemory)
+    reported = []
+
+    async def play():
+        pool = WorkerPool(2, partial(local_worker.ProcessWorker, fake()), tell=reported.append)
+        with pytest.raises(LaboratoryError, match=r"a simulator can't be started: .*Cannot allocate memory"):
+            await pool.simulate(task())
+        await pool.close()
+
+    asyncio.run(play())
+    assert len(attempts) == 2
+    assert len(reported) == 1
+
+
+def test_a_process_killed_while_the_pool_closes_leaves_no_task_behind(fake, task, tmp_path, caplog, recwarn):
+    log = tmp_path / "log"
+
+    async def play():
+        pool = process_pool(2, make=fake(60.0, log))
+        jobs = [asyncio.create_task(pool.simulate(task(seed=s))) for s in (1, 2)]
+        await until(lambda: count(log, "begin") == 2)
+        closing = asyncio.create_task(pool.close())
+        await asyncio.sleep(0)
+        for line in lines(log):
+            if line.startswith("made"):
+                os.kill(int(line.split()[1]), signal.SIGKILL)
+        await closing
+        await asyncio.gather(*jobs, return_exceptions=True)
+
+    asyncio.run(play())
+    gc.collect()
+    assert "Task was destroyed" not in caplog.text
+    assert not [str(w.message) for w in recwarn if "never awaited" in str(w.message)]
+    assert not any(alive(int(line.split()[1])) for line in lines(log))
+
+
+def test_simulators_end_although_the_bench_can_not_be_closed(fake):
+    class Broken:
+        async def close(self):
+            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    async def play():
+        laboratory = InProcessLaboratory(LaboratorySettings(name="test"), fake(), processes=1)
+        await laboratory.__aenter__()
+        pids = await laboratory.simulators.pids()
+        laboratory._opened = Broken()
+        with pytest.raises(OSError, match="Cannot allocate memory"):
+            await laboratory.__aexit__()
+        return pids, [pid for pid in pids if alive(pid)]
+
+    pids, left = asyncio.run(play())
+    assert pids
+    assert left == []
 
 
 @pytest.mark.slow

@@ -19,6 +19,10 @@ import pytest
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.journal.journal_file import JournalError, JournalLockedError
+from orchestrator.journal.run_record import read_record
+from orchestrator.progress.progress_state import ProgressState
+from orchestrator.requests import Pour
+from orchestrator.run_clock import run_time
 from orchestrator.runs.events import Event, RequestFinished, StageClosed
 from orchestrator.runs.resume import ReplayError
 from orchestrator.runs.stages import StageDefinition
@@ -46,6 +50,35 @@ def test_killed_at_any_point_it_makes_the_requests_it_would_have_made(tmp_path: 
         assert logical_record(directory) == expected, f"killed at write {point}"
         assert set(finished_times(directory).values()) == {1}, f"killed at write {point}, something was done twice"
     assert point > 60
+
+
+@pytest.mark.parametrize("jump", [86400.0, -86400.0])
+def test_a_system_clock_that_is_set_during_a_run_changes_no_duration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump: float
+) -> None:
+    """Times of a run are its begin's plus what has passed; a resumed run begins with the system's time again."""
+    real, set_by, left = time.time, 0.0, []
+    monkeypatch.setattr(time, "time", lambda: real() + set_by)
+    progress = ProgressState(toy_plan(tmp_path))
+
+    def follow(event: Event) -> None:
+        nonlocal set_by
+        progress(event)
+        if isinstance(event, RequestFinished) and isinstance(event.request, Pour):
+            set_by = jump
+            left.append(progress.forecast.left(run_time()))
+
+    began = real()
+    asyncio.run(toy_campaign.run_toy(tmp_path, subscribers=[follow]))
+    took = real() - began
+    with JournalReader(tmp_path / JOURNAL_NAME) as journal:
+        times = [entry.t for entry in journal.entries()]
+    assert set_by == jump
+    assert times == sorted(times)
+    assert times[-1] - times[0] <= took
+    assert read_record(tmp_path).at_work_s <= took
+    assert all(seconds is None or seconds < 3600.0 for seconds in left)
+    assert run_time() == pytest.approx(real() + jump, abs=5.0)  # no run goes on: the system's time
 
 
 @pytest.mark.slow

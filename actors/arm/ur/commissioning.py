@@ -8,12 +8,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from actors.arm.arm_geometry import JOINT_NAMES, Pose
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, UrArmSettings
+from actors.arm.ur import primary_interface as primary
 from actors.arm.ur.controller_readout import (
     PORTS,
     SCRIPTS,
@@ -66,7 +67,10 @@ def mount_check(spec: UrArmSettings, state: RobotState, exchange: Exchange) -> D
     strength = math.hypot(*felt) if felt is not None else 0.0
     if felt is None or not state.pose or not 0.5 * GRAVITY < strength < 1.5 * GRAVITY:
         return DeviceCheck(
-            "mount", "warn", "where up is, the tool doesn't tell", "compare 'mount' with the teach pendant yourself"
+            "mount",
+            "warn",
+            "the tool does not report which way is up",
+            "compare 'mount' with the teach pendant yourself",
         )
     up = Rotation.from_rotvec(state.pose[3:]).apply([a / strength for a in felt])
     away = math.acos(max(-1.0, min(1.0, sum(a * b for a, b in zip(up, spec.mount.up, strict=True)))))
@@ -77,9 +81,9 @@ def mount_check(spec: UrArmSettings, state: RobotState, exchange: Exchange) -> D
     return DeviceCheck(
         "mount",
         "fail",
-        f"the tool feels up {math.degrees(away):.0f} deg away from where the file has it: tilt {tilt:.0f} deg, turn "
+        f"the tool measures up {math.degrees(away):.0f} deg away from where the file has it: tilt {tilt:.0f} deg, turn "
         f"{turn:.0f} deg would agree with it",
-        "correct 'mount' in the file and the mounting in the installation on the teach pendant: pours would go astray",
+        "correct 'mount' in the file and the mounting in the installation on the teach pendant: pours would miss",
     )
 
 
@@ -175,7 +179,7 @@ class UrDiagnostics(ArmDiagnostics):
         assert self.spec is not None
         assert self.found is not None
         if self.found.state is None:
-            raise ReadoutError("; ".join(self.found.problems) or f"the controller at {self.spec.address} tells nothing")
+            raise ReadoutError("; ".join(self.found.problems) or f"{self.spec.address} reports nothing")
         return home_check(self.spec, self.found.state)
 
 
@@ -220,7 +224,7 @@ def judge(
     if found.exchange is not None:
         exchange = found.exchange
         payload = payload_check(spec, exchange.payload, exchange.payload_centre)
-        checks += [payload, *_motion(exchange), _network(exchange)]
+        checks += [payload, _unless_blocked(_motion(exchange), checks), _network(exchange)]
     return checks
 
 
@@ -232,8 +236,8 @@ def readiness(spec: UrArmSettings) -> DeviceCheck:
     found = read_status(spec.address)
     unreached = [check for check in _connection(spec, found) if check.state == "fail"]
     if unreached or found.exchange is None:
-        return replace(unreached[0], name="motion") if unreached else DeviceCheck("motion", "warn", "not told")
-    (motion,) = _motion(found.exchange)
+        return replace(unreached[0], name="motion") if unreached else DeviceCheck("motion", "warn", "not reported")
+    motion = _motion(found.exchange)
     states = {check.name: check for check in _dashboard(spec, found, found.dashboard or {})}
     if motion.state == "fail":
         remedies = (states[name].advice for name in ("safety", "arm", "program"))
@@ -254,7 +258,7 @@ def _connection(spec: UrArmSettings, found: Findings) -> list[DeviceCheck]:
             DeviceCheck(
                 "address",
                 "fail",
-                f"'{spec.address}' stands for no machine: {found.problems[0]}",
+                f"'{spec.address}' is the name of no machine: {found.problems[0]}",
                 "write the controller's IP address into the file (teach pendant: Settings, System, Network)",
             )
         ]
@@ -267,8 +271,8 @@ def _ports(found: Findings) -> list[DeviceCheck]:
     if None not in reasons:
         everything = "all ports that Decant uses are closed" if reasons == {"refused"} else "no port answers"
         advice = (
-            "the machine is there, but lets nobody in: on PolyScope 5.10 or later look at Settings, Security, both at "
-            "Services and at the inbound access of this computer's network; while booting, wait"
+            "the machine is there, but refuses connections: on PolyScope 5.10 or later look at Settings, Security, "
+            "both at Services and at the inbound access of this computer's network; while booting, wait"
             if reasons == {"refused"}
             else "is it switched on, its cable plugged in, this computer in the same network, no firewall between?"
         )
@@ -341,7 +345,7 @@ def _dashboard(spec: UrArmSettings, found: Findings, responses: dict[str, str]) 
     program = responses.get("programState", "").split(" ")[0]
     idle = program in ("STOPPED", "")
     advice = "" if idle else "stop it on the teach pendant, unless Decant runs there now"
-    checks.append(DeviceCheck("program", "ok" if idle else "fail", f"{program.lower() or 'not told'}", advice))
+    checks.append(DeviceCheck("program", "ok" if idle else "fail", f"{program.lower() or 'not reported'}", advice))
     return checks
 
 
@@ -355,18 +359,18 @@ def _robot_mode(mode: str) -> DeviceCheck:
         "IDLE": "power is on and the brakes hold: press START (release the brakes) on the teach pendant",
         "POWER_OFF": "switch the arm on and release the brakes on the teach pendant",
         "BOOTING": "wait until it has booted",
-        "CONFIRM_SAFETY": "somebody has to look at the safety settings on the teach pendant and confirm them",
+        "CONFIRM_SAFETY": "look at the safety settings on the teach pendant and confirm them",
         "BACKDRIVE": "free drive is on: end it on the teach pendant",
     }.get(mode, "look at the teach pendant; the arm has to be in normal operation")
     return DeviceCheck(
-        "arm", "ok" if mode == "RUNNING" else "fail", mode.lower().replace("_", " ") or "not told", advice
+        "arm", "ok" if mode == "RUNNING" else "fail", mode.lower().replace("_", " ") or "not reported", advice
     )
 
 
 def _safety_mode(word: str) -> DeviceCheck:
     mode = next((mode for mode in SAFETY_MODES.values() if mode.word == word), safety_mode(0))
     state: State = "ok" if word == "NORMAL" else "fail"
-    return DeviceCheck("safety", state, word.lower().replace("_", " ") or "not told", mode.advice)
+    return DeviceCheck("safety", state, word.lower().replace("_", " ") or "not reported", mode.advice)
 
 
 def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virtual: bool) -> DeviceCheck:
@@ -376,16 +380,16 @@ def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virt
         return DeviceCheck(
             "safety checksum",
             "fail",
-            "the controller tells none",
+            "the controller reports none",
             "no safety configuration is applied: set and confirm one on the teach pendant",
         )
     if virtual:
-        return DeviceCheck("safety checksum", "ok", f"{checksum}; of a virtual controller, nobody has to accept it")
+        return DeviceCheck("safety checksum", "ok", f"{checksum}; of a virtual controller, which needs no acceptance")
     if record is None:
         return DeviceCheck(
             "safety checksum",
             "fail",
-            f"{checksum}, accepted by nobody",
+            f"{checksum}, not accepted yet",
             f"compare it with the teach pendant, read the safety settings there, then: {accept}",
         )
     if record.serial != found.serial:
@@ -405,17 +409,31 @@ def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virt
     return DeviceCheck("safety checksum", "ok", f"{checksum}, accepted on {record.date} by {record.accepted_by}")
 
 
-def _motion(exchange: Exchange) -> list[DeviceCheck]:
+BLOCKING = ("answers", f"port {primary.PORT}", "software", "remote control", "arm", "safety", "program", "model")
+"""Checks without which the controller accepts no program, or the driver sends none. Safety settings that nobody has
+accepted prevent motions, too, but are a property of the laboratory and not of the arm's state."""
+
+
+def _unless_blocked(motion: DeviceCheck, checks: Sequence[DeviceCheck]) -> DeviceCheck:
+    """The check of the motion, which RTDE's values alone do not decide: they say nothing about remote control."""
+    blocking = next((check for check in checks if check.state == "fail" and check.name in BLOCKING), None)
+    if motion.state == "fail" or blocking is None:
+        return motion
+    advice = blocking.advice or f"solve '{blocking.name}' first"
+    return DeviceCheck("motion", "fail", f"nothing would move: {blocking.name}: {blocking.found}", advice)
+
+
+def _motion(exchange: Exchange) -> DeviceCheck:
     """Whether a motion could begin now, by the driver's own decision."""
     values = [exchange.values.get(name) for name in ("robot_mode", "safety_mode", "runtime_state", SLIDER)]
     if any(value is None for value in values):
-        return [DeviceCheck("motion", "warn", "not told", "look at the teach pendant whether the arm is ready")]
+        return DeviceCheck("motion", "warn", "not reported", "look at the teach pendant whether the arm is ready")
     robot, safety, runtime, slider = (value[0] for value in values if value is not None)
     (status,) = exchange.values.get("robot_status_bits", (0,))
     why = why_not_ready(int(robot), int(safety), int(runtime), slider, int(status))
     if not why:
-        return [DeviceCheck("motion", "ok", "the arm is ready to move")]
-    return [DeviceCheck("motion", "fail", why, "mend that first: no motion begins before")]
+        return DeviceCheck("motion", "ok", "the arm is ready to move")
+    return DeviceCheck("motion", "fail", why, "fix that first: no motion begins before")
 
 
 def _network(exchange: Exchange) -> DeviceCheck:

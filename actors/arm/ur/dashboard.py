@@ -9,6 +9,7 @@ import socket
 
 from actors.arm.ur.primary_interface import PrimaryError, send_command
 from actors.arm.ur.robot_api import RobotApi, RobotApiError
+from actors.arm.ur.rtde import CLOSED
 
 PORT = 29999
 PATIENCE = 1.5
@@ -34,10 +35,11 @@ class Dashboard:
 
     def __init__(self, address: str, patience: float = PATIENCE) -> None:
         self._api: RobotApi | None = None
+        self._address, self._patience = address, patience
         try:
             self._socket = socket.create_connection((address, PORT), timeout=patience)
             self._lines = self._socket.makefile("rb")
-            self._lines.readline()
+            self._read("its greeting")
         except ConnectionRefusedError as error:
             try:
                 self._api = RobotApi(address, patience)
@@ -61,13 +63,30 @@ class Dashboard:
             if self._api is not None:
                 return self._api.ask(line)
             self._socket.sendall(line.encode() + b"\n")
-            answer = self._lines.readline()
         except RobotApiError as error:
             raise DashboardError(str(error)) from error
         except OSError as error:
-            raise DashboardError(f"dashboard: no answer to '{line}': {error}") from error
+            raise DashboardError(f"the dashboard at {self._address}:{PORT} {CLOSED} ({error})") from error
+        return self._read(f"its answer to '{line}'")
+
+    def _read(self, what: str) -> str:
+        """The next line.
+
+        Args:
+            what: is read, for messages.
+        """
+        where = f"the dashboard at {self._address}:{PORT}"
+        try:
+            answer = self._lines.readline()
+        except TimeoutError:
+            raise DashboardError(
+                f"{where} accepts connections, but did not send {what} within {self._patience:g} s: the controller is "
+                "booting, or hangs. Wait a minute and try again; if it repeats, restart the controller"
+            ) from None
+        except OSError as error:
+            raise DashboardError(f"{where} {CLOSED} ({error}, before {what})") from error
         if not answer:
-            raise DashboardError(f"dashboard: hung up at '{line}'")
+            raise DashboardError(f"{where} {CLOSED} (before {what})")
         return answer.decode("utf-8", "replace").strip()
 
     def demand(self, line: str, expected: str) -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from actors.arm.arm_interface import FULL_SPEED
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
 from actors.arm.planning.kinematics import cell_transforms, forward, pourer_motion
@@ -30,17 +31,18 @@ def executed_path(
     slider: float = 1.0,
     forces: Sequence[ForceSample] = (),
 ) -> ExecutedPath:
-    """The readings on the path's own clock.
+    """The readings from the path's start on, in the controller's time.
 
     The controller's program sends its time on the path in every package. Both clocks are therefore related without the
-    arrival times of packages.
+    arrival times of packages. They run alike unless the controller slowed the motion; then the two are compared at the
+    program's time, and the readings keep the controller's.
 
     Args:
         samples: in the order of their times.
         path: the planned path.
         spec: of the arm.
         completed: False if it was stopped before its end.
-        slider: lowest position of the speed slider.
+        slider: lowest fraction of the programmed speed.
         forces: readings on the path.
     """
     stamps = np.array([t for t, _, _ in samples])
@@ -51,14 +53,19 @@ def executed_path(
         running = clocks > 0.0
     if not np.any(running):
         return ExecutedPath(np.zeros(0), np.zeros((0, 6)), False, {})
-    times = stamps - float(np.median(stamps[running] - clocks[running]))
+    slowed, offsets = slider < FULL_SPEED, stamps[running] - clocks[running]
+    times = stamps - float(offsets.min() if slowed else np.median(offsets))
     first = max(int(np.searchsorted(times, 0.0, side="right")) - 1, 0)
-    times, joints = times[first:], joints[first:]
+    times, joints, clocks = times[first:], joints[first:], clocks[first:]
     times[0] = max(times[0], 0.0) if len(times) > 1 else 0.0
     if times[0] > 0.0:
         times, joints = np.concatenate([[0.0], times]), np.vstack([path.joints[0], joints])
-    followed = np.ones(len(times), dtype=bool) if completed else times <= clocks.max()
-    tracking = _tracking(times[followed], joints[followed], path, spec) if np.any(followed) else {}
+        clocks = np.concatenate([[0.0], clocks])
+    planned = clocks if slowed else times
+    followed = np.ones(len(times), dtype=bool) if completed else planned <= clocks.max()
+    tracking = _tracking(planned[followed], joints[followed], path, spec) if np.any(followed) else {}
+    if tracking and slowed:
+        tracking["longest_gap"] = float(np.diff(times).max())
     poses = pourer_motion(joints, times, spec).poses if len(times) > 1 else np.zeros((0, 7))
     return ExecutedPath(times, joints, completed, tracking | {"slider": slider}, poses, _forces(forces))
 

@@ -13,13 +13,14 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from actors.arm.arm_geometry import JOINT_NAMES
+from actors.arm.arm_interface import FULL_SPEED
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
 from actors.arm.ur.primary_interface import Primary, PrimaryError
 from actors.arm.ur.rtde_client import AT_REST, RtdeClient
 from actors.arm.ur.worker_messages import (
     DONE,
     FREEDRIVE,
-    FULL_SPEED,
+    LEAST_SPEED,
     PLAYING,
     READY,
     ROBOT_MODES,
@@ -55,7 +56,11 @@ UPLOAD_TIME, STANDING_TIME = 5.0, 3.0
 """Longest wait for a program to report that it is ready, and for the arm to stand still [s of the clock]."""
 
 OVERTIME = 10.0
-"""Longest delay of a path beyond its planned duration [s of controller time]."""
+"""Longest delay of a path beyond its planned duration [s of controller time], besides that of a lowered slider."""
+
+HELD_TIME = 2.0
+"""Longest standstill within a motion because the slider is at 0 [s of controller time]. The heartbeat continues, so
+that no watchdog ends the program; a tilted cup pours on."""
 
 BEAT_INTERVAL, TELL_INTERVAL, LOOK_INTERVAL = 0.02, 0.05, 0.002
 FORCE_INTERVAL = 0.1
@@ -90,6 +95,7 @@ class MotionMonitor:
         self._samples: list[Sample] = []
         self._forces: list[ForceSample] = []
         self._clock, self._slider = 0.0, 1.0
+        self._delay = self._held = 0.0
         self._joints: tuple[float, ...] = motion.start
         self._began = 0.0
         self._went = False
@@ -230,7 +236,9 @@ class MotionMonitor:
                     return self._broken_off("program ended", "the arm does not come to rest at the path's end")
             elif reading.runtime != PLAYING and reading.time > self._began:
                 return self._stopped_by_program(primary)
-            if reading.time - self._began > motion.duration + OVERTIME + STANDING_TIME:
+            elif self._held > HELD_TIME:
+                return self._broken_off("program ended", _held(reading))
+            if reading.time - self._began > motion.duration + self._delay + OVERTIME + STANDING_TIME:
                 return self._broken_off("program ended", "the motion takes far longer than planned")
             if time.monotonic() - self._owner_seen() > OWNER_SILENCE and not motion.tilts:
                 self.order_stop()
@@ -314,6 +322,10 @@ class MotionMonitor:
             self._slider = min(self._slider, reading.speed)
             if reading.number == self._motion.number:
                 self._clock = reading.clock
+            if self._samples:
+                passed = max(reading.time - self._samples[-1][0], 0.0)
+                self._delay += passed * max(1.0 - reading.speed, 0.0)
+                self._held = self._held + passed if reading.speed < LEAST_SPEED else 0.0
             if not self._samples or reading.time > self._samples[-1][0]:
                 self._samples.append((reading.time, reading.joints, reading.clock))
                 if not self._forces or reading.clock - self._forces[-1][0] >= FORCE_INTERVAL:
@@ -356,10 +368,20 @@ def _slowed(reading: DataPackage) -> str:
     """Why the program, which runs and waits, would be slower than planned; '' if it would not."""
     if reading.speed >= FULL_SPEED:
         return ""
+    return f"{_speed(reading)}; a pour needs 100 %. Decant does not raise the slider, since a person lowered it"
+
+
+def _held(reading: DataPackage) -> str:
+    return (
+        f"the arm stood still for {HELD_TIME:g} s, and a tilted cup pours on: {_speed(reading)}. The program was "
+        "ended, so that nothing moves when the slider is raised; raise it before you let the arm return"
+    )
+
+
+def _speed(reading: DataPackage) -> str:
     return (
         f"the controller runs programs at {100.0 * reading.speed:.0f} % of their speed (slider "
-        f"{100.0 * reading.slider:.0f} %, its own slowing {100.0 * reading.scaling:.0f} %); a pour needs 100 %. Decant "
-        "does not raise the slider, since a person lowered it"
+        f"{100.0 * reading.slider:.0f} %, its own slowing {100.0 * reading.scaling:.0f} %)"
     )
 
 

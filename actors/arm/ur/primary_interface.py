@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from actors.arm.ur.robot_models import Calibration
+from actors.arm.ur.rtde import CLOSED
 
 PORT = 30001
 PATIENCE = 2.0
@@ -216,10 +217,10 @@ class Primary:
             end = time.monotonic() + PATIENCE
             while not self._take(self._socket.recv(65536)):
                 if time.monotonic() > end:
-                    raise PrimaryError(f"{address}:{PORT} sends no robot state")
+                    raise PrimaryError("it sends no robot state")
             self._socket.settimeout(None)
-        except OSError as error:
-            raise PrimaryError(f"{address}:{PORT}: {error}") from error
+        except (OSError, PrimaryError) as error:
+            raise PrimaryError(f"the primary interface at {address}:{PORT}: {error}") from error
         threading.Thread(target=self._read, name="primary", daemon=True).start()
 
     def upload(self, program: str) -> None:
@@ -247,7 +248,7 @@ class Primary:
     def _take(self, data: bytes) -> bool:
         """Store the contents of messages; returns whether a robot state was among them."""
         if not data:
-            raise PrimaryError("hung up")
+            raise PrimaryError(f"it {CLOSED}")
         packages, self._rest = split(self._rest + data)
         for kind, body in packages:
             if kind == _MESSAGE:

@@ -67,7 +67,9 @@ def robot_checks(
 def payload_check(spec: UrArmSettings, payload: float | None, centre: Sequence[float] | None) -> DeviceCheck:
     """Compare the controller's payload [kg] and its centre [m] with the file's; None if they are not reported."""
     if payload is None or centre is None:
-        return DeviceCheck("payload", "warn", "not told", "compare payload and centre with the teach pendant yourself")
+        return DeviceCheck(
+            "payload", "warn", "not reported", "compare payload and centre with the teach pendant yourself"
+        )
     away = math.dist(centre, spec.payload_centre.vector)
     text = f"{payload:.2f} kg"
     if abs(payload - spec.payload) <= PAYLOAD_TOLERANCE and away <= CENTRE_TOLERANCE:

@@ -22,6 +22,18 @@ PAUSE = ord("P")
 
 PORT = 30004
 
+CLOSED = (
+    "closed the connection: the controller is booting or shutting down, was just switched between local and remote "
+    "control, or does not admit this computer (PolyScope 5.10 or later: Settings, Security, Services, and inbound "
+    "access under General). Wait a minute and try again; if it repeats, restart the controller"
+)
+"""What it means if a port of the controller accepts a connection and closes it, as part of a message; with the remedy.
+
+Source: reports to the manufacturer's drivers. The dashboard of a restarted robot closes the first connection, and those
+from before a switch to remote control (Universal_Robots_ROS_Driver #262, #258); services are enabled one by one
+(Universal_Robots_ROS2_Driver #1224).
+"""
+
 HEADER = struct.Struct(">HB")
 
 FORMATS: dict[str, tuple[str, int]] = {
@@ -94,7 +106,7 @@ class Requests:
         while not self._waiting:
             data = self._connection.recv(65536)
             if not data:
-                raise OSError("it hung up")
+                raise OSError(f"it {CLOSED}")
             self._waiting.extend(self._packages.feed(data))
         return self._waiting.pop(0)
 

@@ -505,12 +505,12 @@ def require_accepted(accepted: str | None, found: str | None, controller: str) -
     """
     if accepted is None:
         raise NotAcceptedError(
-            f"arm at {controller}: nobody has accepted its safety settings (checksum {found or 'unknown'}) for this "
+            f"arm at {controller}: its safety settings (checksum {found or 'unknown'}) have not been accepted for this "
             "laboratory. Run 'decant robot check' on the laboratory's file first; it says how"
         )
     if found is None:
         raise NotAcceptedError(
-            f"arm at {controller}: the controller tells no safety checksum, which it leaves out while no safety "
+            f"arm at {controller}: the controller reports no safety checksum, which it leaves out while no safety "
             f"configuration is applied; {accepted} was accepted. Confirm the settings on the teach pendant"
         )
     if found.upper() != accepted.upper():

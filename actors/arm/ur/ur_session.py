@@ -134,7 +134,8 @@ class WorkerProcess:
         Args:
             method: of `actors.arm.ur.rtde_worker.Worker`.
             arguments: plain values.
-            deadline: longest wait [s]; a worker that misses it is ended.
+            deadline: longest wait [s], also for the next progress report of a motion, which a slider may stretch
+                without limit; a worker that misses it is ended.
 
         Raises:
             ArmRefusedError: refused before anything moved.
@@ -148,12 +149,14 @@ class WorkerProcess:
         if not self.alive:
             raise ArmLostError(self._obituary(method))
         self._send(("call", number, method, arguments))
-        end = time.monotonic() + deadline
+        end, reported = time.monotonic() + deadline, self.progress
         while time.monotonic() < end:
             try:
                 return future.result(timeout=SIGN_OF_LIFE)
             except FutureTimeoutError:
                 self._send(("alive",))
+                if self.progress is not reported:
+                    end, reported = time.monotonic() + deadline, self.progress
             except TroubleError as trouble:
                 if trouble.kind == "refused":
                     raise ArmRefusedError(trouble.text) from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from actors.arm.arm_interface import FULL_SPEED
 from actors.arm.ur.primary_interface import RobotState
 
 STOP_ORDER, HEARTBEAT, GO = 0, 1, 2
@@ -115,8 +116,8 @@ FREEDRIVE = 1 << 2
 STOPPED_PROGRAM, PLAYING = 1, 2
 
 
-FULL_SPEED, LEAST_SPEED = 0.99, 0.01
-"""Smallest fractions of the programmed speed while liquid moves, and for any motion."""
+LEAST_SPEED = 0.01
+"""Smallest fraction of the programmed speed for any motion."""
 
 
 def why_not_ready(

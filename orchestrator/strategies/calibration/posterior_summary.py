@@ -167,7 +167,7 @@ def central(posterior: Posterior) -> Point:
 
 def left_open(posterior: Posterior, names: tuple[str, ...]) -> list[str]:
     """Parameters that the pours leave undetermined, as text: 'the pours leave friction open', 'cohesion and friction
-    make up …'.
+    compensate each other: …'.
 
     Args:
         posterior: draws in the unit cube.
@@ -189,7 +189,7 @@ def _ties(points: Array, names: tuple[str, ...]) -> list[str]:
             if abs(correlation[i, j]) > TIED:
                 way = "more" if correlation[i, j] > 0.0 else "less"
                 found.append(
-                    f"{names[i]} and {names[j]} make up for each other: more of one, {way} of the other "
+                    f"{names[i]} and {names[j]} compensate each other: more of one, {way} of the other "
                     f"(correlation {correlation[i, j]:+.2f})"
                 )
     return found

@@ -276,8 +276,8 @@ class SimulatorMonitor:
             self._accepted = answer == GO_ON
         else:
             self._followed = answer
-        self.decisions.append(Decision(f"somebody decided: {answer}", urgent=True))
-        return "somebody decided to stop" if answer == STOP else ""
+        self.decisions.append(Decision(f"the operator decided: {answer}", urgent=True))
+        return "the operator decided to stop" if answer == STOP else ""
 
     def _by(self, policy: Fallback, why: str, then: str, *, limit: bool = False) -> Verdict:
         if policy == "ask":
@@ -293,7 +293,7 @@ class SimulatorMonitor:
 
     def _saved(self, left: int, why: str) -> Verdict:
         end = f"{why}; {left} pour{'s' * (left != 1)} saved"
-        self.decisions.append(Decision(f"the end: {end}", {"saved": float(left)}, urgent=True))
+        self.decisions.append(Decision(f"stopped: {end}", {"saved": float(left)}, urgent=True))
         return Verdict(end=end)
 
     def _share(self, loss: float) -> str:

@@ -10,6 +10,7 @@ import pytest
 
 from actors.arm.arm_interface import ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.ur.ur_driver import AcceptedArm
+from actors.arm.ur.urscript_writer import SETTLING
 from actors.arm.ur.worker_messages import may_move, safety_mode
 from tests.support.ur_pours import HOME, START, pour_path
 from tests.support.waiting import wait_for
@@ -220,6 +221,31 @@ def test_a_slider_moved_during_a_pour_is_told_with_what_was_executed(make_rig: M
     executed = rig.pouring().result()
     assert executed.completed
     assert executed.tracking["slider"] == 0.5
+    # the part behind the place takes twice as long, and the arm follows the path all the same
+    planned = rig.path.pour.duration + SETTLING
+    lowered = float(rig.path.pour.times[int(np.argmax(rig.path.pour.joints[:, 5] > START[5] + 0.6))])
+    assert executed.times[-1] == pytest.approx(lowered + 2.0 * (planned - lowered), abs=0.6)
+    assert executed.tracking["max_angle"] < 2.0 * DEG
+
+
+@pytest.mark.realtime
+def test_a_slider_at_0_in_mid_pour_ends_the_program_so_that_nothing_moves_when_it_is_raised(make_rig: Make) -> None:
+    rig = make_rig(LONG_HOLD)
+    rig.fault("slider", fraction=0.0, joint=5, above=START[5] + 0.6)
+    error = stopped(rig.pouring())
+    assert (error.kind, error.phase) == ("program ended", "tilt")
+    assert "at 0 % of their speed (slider 0 %, its own slowing 100 %)" in error.text
+    assert "raise it before" in error.text
+    assert 0.5 < error.tilt < 1.0
+    rig.arm.release()
+    with pytest.raises(ArmRefusedError, match="slider is at 0 %; nothing would move"):
+        rig.arm.untilt(rig.path)
+    began = rig.now
+    rig.fault("slider", fraction=1.0)
+    rig.await_rest()
+    assert rig.moved(began) == 0.0
+    holds_until_released(rig)
+    comes_home(rig)
 
 
 @pytest.mark.realtime

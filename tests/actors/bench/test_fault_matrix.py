@@ -79,6 +79,7 @@ ARM: dict[str, Fault] = {
     "refuse": Fault(controller("refuse"), controller("clear")),
     "reboot": Fault(controller("reboot", seconds=1.0)),
     "worker killed": Fault(kill_worker),
+    "slider at 0": Fault(controller("slider", fraction=0.0), controller("slider", fraction=1.0)),
 }
 
 BALANCE: dict[str, Fault] = {
@@ -259,6 +260,19 @@ def test_a_fault_of_the_arm(open_stage, name, phase):
         assert key in str(outcome)
     loaded = stage.contents.in_receiver + stage.contents.on_tray + stage.contents.in_pourer
     assert f"{1e3 * loaded:.1f}"[:4] in str(outcome)
+
+
+@pytest.mark.realtime
+def test_a_pour_that_a_person_slowed_is_weighed_and_the_user_is_told(open_stage):
+    fault = Fault(controller("slider", fraction=0.5))
+    tale = asyncio.run(tell_tale(open_stage, "tilt", fault, mend=set()))
+    assert isinstance(tale.outcome, PourMeasurement), tale.outcome
+    planned = SPEC.arm.plan(SCENE, SLOWLY).pour_time
+    took = tale.outcome.notes["executed_s"]
+    assert 1.2 * planned < took < 2.2 * planned
+    assert tale.outcome.notes["executed"]["tracking"]["slider"] == pytest.approx(0.5)
+    text = f"the controller slowed the pour to 50 % of its speed: it took {took:.1f} s instead of {planned:.1f} s"
+    assert text in tale.stage.said("warning")
 
 
 @pytest.mark.slow

@@ -220,6 +220,69 @@ def test_moving_the_slider_during_a_move_makes_no_jump_in_speed(bench: Bench) ->
     assert np.abs(np.diff(bench.speeds[:, 0])).max() < 2.5 * DT
 
 
+def servo_along(turn: float, seconds: float) -> str:
+    """A program that turns joint 0 at a constant speed, a target for every cycle."""
+    return f"""
+q = {list(HOME)}
+t = 0.0
+while t < {seconds}:
+  t = t + get_steptime()
+  q[0] = {HOME[0]} + {turn} * t / {seconds}
+  servoj(q, 0, 0, get_steptime(), 0.03, 300)
+end
+t = 0.0
+while t < 0.3:
+  t = t + get_steptime()
+  servoj(q, 0, 0, get_steptime(), 0.03, 300)
+end
+stopj(6)
+"""
+
+
+@pytest.mark.parametrize("slider", [1.0, 0.5, 0.25])
+def test_the_speed_slider_stretches_a_path_of_servo_commands(bench: Bench, slider: float) -> None:
+    """A controller at 0.5 covers half of the way to a target in the target's time (ros2_controllers, speed scaling)."""
+    bench.robot.mover.slider = slider
+    assert bench.run(servo_along(0.6, 2.0)) == pytest.approx(2.3 / slider, rel=0.01)
+    assert bench.joints[-1][0] == pytest.approx(HOME[0] + 0.6, abs=1e-4)
+    assert np.abs(bench.speeds[:, 0]).max() == pytest.approx(0.3 * slider, rel=0.05)
+
+
+@pytest.mark.parametrize("slider", [1.0, 0.5])
+def test_a_spline_of_speed_commands_reaches_its_end_at_any_slider(bench: Bench, slider: float) -> None:
+    """As the manufacturer's own program does, which reads no slider (external_control.urscript, issue 194)."""
+    bench.robot.mover.slider = slider
+    bench.run("""
+t = 0.0
+last = 0.0
+while t < 2.0:
+  t = t + get_steptime()
+  v = 0.6 * 3.0 * t / 2.0 * (1.0 - t / 2.0)
+  speedj([v, 0, 0, 0, 0, 0], norm(v - last) / get_steptime(), get_steptime())
+  last = v
+end
+""")
+    assert bench.joints[-1][0] == pytest.approx(HOME[0] + 0.6, abs=2e-3)
+
+
+def test_with_the_slider_at_0_the_arm_stands_while_its_program_plays(bench: Bench) -> None:
+    """Reported of a real controller: Universal_Robots_ROS_Driver, issue 737."""
+    bench.start(servo_along(0.6, 2.0))
+    bench.tick(1.0)
+    bench.robot.mover.slider = 0.0
+    bench.tick(1.0)
+    stands = bench.joints[-1]
+    bench.tick(30.0)
+    assert bench.joints[-1] == stands
+    assert bench.controller.runtime is RuntimeState.PLAYING
+    assert bench.robot.mover.scaling * bench.robot.mover.slider == 0.0
+    bench.robot.mover.slider = 1.0
+    bench.tick(3.0)
+    assert bench.controller.runtime is RuntimeState.STOPPED
+    assert bench.joints[-1][0] == pytest.approx(HOME[0] + 0.6, abs=1e-4)
+    assert np.abs(np.diff(bench.speeds[:, 0])).max() < 0.02  # neither stop nor start is a jump
+
+
 def test_a_safety_plane_ends_the_move_before_it_is_far_beyond(bench: Bench) -> None:
     own = SafetyConfiguration.of(bench.controller.model)
     y = bench.robot.pose[1]

@@ -85,7 +85,7 @@ def test_settings_that_nobody_has_accepted_can_t_be_armed(campaign: Path) -> Non
     record_path(campaign.with_name("rig.yaml")).unlink()
     result = decant("run", str(campaign), "--enable-motion")
     assert result.exit_code == 2
-    assert "nobody has accepted" in result.stderr
+    assert "have not been accepted" in result.stderr
     assert "decant robot check" in result.stderr
 
 
@@ -95,7 +95,8 @@ def test_the_record_that_counts_is_that_of_the_laboratory_in_use(campaign: Path)
     other.write_text(campaign.with_name("rig.yaml").read_text().replace("name: rig", "name: other"))
     result = decant("run", str(campaign), "--enable-motion", "--laboratory", str(other))
     assert result.exit_code == 2
-    assert "laboratory other: nobody has accepted" in result.stderr  # for rig.yaml, which the campaign names, somebody
+    # for rig.yaml, which the campaign names, they have
+    assert "laboratory other: the controller's safety settings have not been accepted" in result.stderr
     assert "other.yaml" in result.stderr
     write_record(other, SafetyRecord("0A0B0C0D", "2016300123", "ur10", "3.15.8", "2030-01-31", "a person"))
     assert required_checksum(load_campaign(campaign, other)) == "0A0B0C0D"

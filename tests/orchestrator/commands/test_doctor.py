@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import socket
+import socketserver
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from functools import partial
 from math import degrees, radians
@@ -91,7 +93,7 @@ def test_a_bench_that_is_ready_has_its_settings_accepted_once_and_is_told_so(
     before = controller.fault("state")
     refused = doctor(path)
     assert refused.exit_code == 1
-    assert "accepted by nobody" in refused.stdout
+    assert "not accepted yet" in refused.stdout
     assert f"decant robot check {path} --accept-safety" in refused.stdout
     accepted = when_not_overloaded(path, "--accept-safety")
     assert accepted.exit_code == 0, accepted.output
@@ -118,8 +120,8 @@ def test_a_program_gets_the_report_that_the_command_prints(laboratory: Path) -> 
     ]  # a busy machine changes the connection's line
     assert {**found, "checks": []} == {**printed, "checks": []}
     assert not report.ready  # nobody has accepted its safety settings
-    assert "accepted by nobody" in str(report)
-    assert "accepted by nobody" in report._repr_html_()
+    assert "not accepted yet" in str(report)
+    assert "not accepted yet" in report._repr_html_()
     with pytest.raises(decant.InvalidArgumentError, match="has neither 'arm' nor 'pump'"):
         decant.doctor("configs/laboratories/planning.yaml")
 
@@ -129,7 +131,7 @@ def test_virtual_laboratory_is_started_looked_at_and_called_virtual() -> None:
     result = doctor(Path("configs/laboratories/virtual.yaml"))
     assert result.exit_code == 0, result.output
     assert "virtual: no robot, no balance" in result.stderr
-    assert "of a virtual controller, nobody has to accept it" in result.stdout
+    assert "of a virtual controller, which needs no acceptance" in result.stdout
 
 
 def test_a_bench_of_numbers_and_a_bad_file_are_refused_with_exit_code_2(tmp_path: Path) -> None:
@@ -153,7 +155,7 @@ def test_nobody_at_the_address(tmp_path: Path) -> None:
     assert "closed" in network["found"]
     assert "Services" in network["advice"]
     path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", "no-such-robot.invalid")
-    assert "stands for no machine" in checked(path)["address"]["found"]
+    assert "is the name of no machine" in checked(path)["address"]["found"]
 
 
 @pytest.mark.realtime
@@ -192,6 +194,49 @@ def test_a_controller_that_was_started_otherwise(
     assert line["state"] == ("warn" if name == "position" else "fail")
     assert found in line["found"]
     assert advice in line["advice"]
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [({"local": True}, "remote control: off"), ({"polyscope_x": True, "local": True}, "remote control: off")],
+    ids=["e-Series", "PolyScope X"],
+)
+def test_an_arm_in_local_control_is_not_called_ready(tmp_path: Path, options: dict[str, Any], why: str) -> None:
+    with VirtualController.start(free_address(), "ur10e", joints=JOINTS, **options) as started:
+        path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", started.address)
+        path.write_text(path.read_text().replace("model: ur10", "model: ur10e"))
+        motion = checked(path)["motion"]
+    assert motion["state"] == "fail"
+    assert why in motion["found"]
+    assert "switch from Local to Remote" in motion["advice"]
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("greets", [True, False], ids=["at the first question", "before its greeting"])
+def test_a_dashboard_that_closes_the_connection_is_told_with_what_to_do(tmp_path: Path, greets: bool) -> None:
+    """As after a restart, where the first connection is closed (Universal_Robots_ROS_Driver #262)."""
+
+    class Closing(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            if greets:
+                self.request.sendall(b"Connected: Universal Robots Dashboard Server\n")
+                self.request.recv(100)
+
+    address = free_address()
+    server = socketserver.ThreadingTCPServer((address, 29999), Closing)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    path = hardware_laboratory.write_laboratory(tmp_path / "rig.yaml", address)
+    try:
+        line = checked(path)["answers"]
+    finally:
+        server.shutdown()
+        server.server_close()
+    assert line["state"] == "fail"
+    assert f"the dashboard at {address}:29999 closed the connection" in line["found"]
+    assert "PolyscopeVersion" in line["found"] if greets else "before its greeting" in line["found"]
+    for remedy in ("booting", "local and remote", "Settings, Security", "try again", "restart the controller"):
+        assert remedy in line["found"]
 
 
 @pytest.mark.realtime
@@ -384,7 +429,7 @@ def test_nothing_is_poured_with_settings_that_nobody_accepted_or_that_have_chang
         require_accepted(None, "22C99AA2", "robot")
     with pytest.raises(NotAcceptedError, match="have changed: checksum DEADBEEF, accepted was 22C99AA2"):
         require_accepted("22C99AA2", "DEADBEEF", "robot")
-    with pytest.raises(NotAcceptedError, match="tells no safety checksum"):
+    with pytest.raises(NotAcceptedError, match="reports no safety checksum"):
         require_accepted("22C99AA2", None, "robot")
 
 

@@ -96,7 +96,7 @@ def test_who_has_no_token_is_asked_for_one_and_it_stays_in_the_tab(page: Any, tm
     with on_port(tmp_path) as lab:
         page.goto(lab.url)
         page.get_by_label("Token").fill("a wrong one, but long enough")
-        page.get_by_role("button", name="Come in").click()
+        page.get_by_role("button", name="Sign in").click()
         page.get_by_text("this token is not known").wait_for()
         page.get_by_label("Token").fill(lab.served.tokens[Role.VIEWER])
         page.keyboard.press("Enter")
@@ -590,7 +590,7 @@ def test_a_screen_reader_finds_its_way(page: Any, tmp_path: Path) -> None:
         page.get_by_role("button", name="Done").wait_for()
         for role in ("banner", "main"):
             assert page.get_by_role(role).count() == 1
-        for name in ("Questions", "Now", "Last pours", "Queue", "At rest", "Previous runs", "Stop"):
+        for name in ("Questions", "Now", "Last pours", "Queue", "Finished", "Previous runs", "Stop"):
             assert page.get_by_role("region", name=name, exact=True).count() == 1
         assert page.get_by_role("article", name="Fill the pourer").count() == 1
         assert page.evaluate("document.documentElement.lang") == "en"

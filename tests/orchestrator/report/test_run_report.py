@@ -123,6 +123,18 @@ def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> 
     assert "5 begun, 5 weighed" in said
 
 
+def test_ranges_of_theta_have_the_unit_of_their_value(made: Made) -> None:
+    searched = [one for one in made.published.summary.parameters if one.searched != "not searched"]
+    assert searched
+    for one in searched:
+        _, _, unit = one.value.partition(" ")
+        assert one.searched.endswith(unit)
+        assert one.region == "—" or one.region.removesuffix(", not determined").endswith(unit)
+        assert f"{one.name} {one.value} {one.region} {one.searched}" in texts(made.page)
+    assert {"cohesion": "N/m"}.items() <= {one.name: one.value.split(" ")[-1] for one in searched}.items()
+    assert style.display_interval("receiver_x", -0.0244, -0.00273) == "-24.4 … -2.73 mm"
+
+
 def test_every_pour_stands_in_a_table_with_its_grams(made: Made) -> None:
     pours = read_record(made.result.directory).pours
     assert len(pours) == 5

@@ -116,7 +116,7 @@ class MoveCommands:
     def servoj(
         self, q: Any, a: Any = 0, v: Any = 0, t: Any = 0.002, lookahead_time: Any = 0.1, gain: Any = 300
     ) -> Steps:
-        """Move towards joint positions for a time; to be called in every cycle."""
+        """Move towards joint positions for a time, which the slider stretches; to be called again at its end."""
         target = six(q)
         lookahead = min(max(positive(lookahead_time, "lookahead_time"), 0.03), 0.2)  # limits of the manual
         strength = min(max(positive(gain, "gain"), 100.0), 2000.0)
@@ -145,20 +145,22 @@ class MoveCommands:
         return self._hold(
             self._cycles(t),
             lambda: self._mover.joint_speeds(target, acceleration),
-            lambda: max(abs(x - y) for x, y in zip(self._mover.qd, target, strict=True)) < 1e-6,
+            lambda: max(abs(x - self._mover.rate * y) for x, y in zip(self._mover.qd, target, strict=True)) < 1e-6,
         )
 
     def speedl(self, xd: Any, a: Any = 1.2, t: Any = None, aRot: Any = None) -> Steps:
         """Hold a tool velocity for a time; without a time, until it is reached."""
         target, acceleration = six(xd), rate(a, "acceleration")
         turning = acceleration if aRot is None else rate(aRot, "aRot")
+
+        def reached() -> bool:
+            speed, scaled = self._robot.target_tool_speed, [self._mover.rate * x for x in target]
+            return distance(speed, scaled) < 1e-4 and distance(speed[3:], scaled[3:]) < 1e-4
+
         return self._hold(
             self._cycles(t),
             lambda: self._mover.tool_speed(self._robot.arm, target, acceleration, turning),
-            lambda: (
-                distance(self._robot.target_tool_speed, target) < 1e-4
-                and distance(self._robot.target_tool_speed[3:], target[3:]) < 1e-4
-            ),
+            reached,
         )
 
     def _cycles(self, t: Any) -> int:
@@ -168,12 +170,12 @@ class MoveCommands:
         thread = self._take()
         done = False
         try:
-            passed = 0
+            passed = 0.0
             while True:
                 command()
                 yield
-                passed += 1
-                if passed >= cycles and (cycles or reached()):
+                passed += self._mover.rate
+                if passed >= cycles - 1e-6 and self._mover.rate > 0.0 and (cycles or reached()):
                     break
             done = True
         finally:

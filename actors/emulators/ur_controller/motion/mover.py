@@ -2,6 +2,20 @@
 
 `Mover` generates target positions and velocities without jumps. A violation (a joint too fast or out of its range, a
 point out of the workspace) ends the action with a `ViolationError` and a stop.
+
+The speed slider, and the controller's own slowing, scale the time of every motion but a stop: that of a path, and that
+of servo and speed commands, which return when their time has passed on this slower clock. At 0 the arm stands still
+within its command, while the program counts as playing. No document of the manufacturer says so for a program on the
+controller; it follows from public code and reports:
+
+- A robot at 0.5 covers half of the way to a target of `servoj` within the target's time (ros2_controllers,
+  `joint_trajectory_controller/doc/speed_scaling.rst`).
+- The manufacturer's own program on the controller (Universal_Robots_Client_Library, `external_control.urscript`)
+  integrates a spline by one `speedj(qd, a, timestep)` per step and never reads the slider. It reaches its points at any
+  slider, so that a step must take as many more cycles; issue 194 reports only that the target speed is a smaller one.
+- The slider at 0 pauses the motion and not the program (Universal_Robots_ROS_Driver 737).
+
+Not emulated: a controller may make a protective stop when the slider leaves 0 (Universal_Robots_Client_Library 58).
 """
 
 from __future__ import annotations
@@ -47,7 +61,7 @@ class Mover:
 
     Attributes:
         q, qd, qdd: targets [rad], [rad/s], [rad/s²].
-        slider: requested speed fraction of paths, 0 … 1.
+        slider: requested speed fraction, 0 … 1.
         slowing: the controller's own speed fraction, as near a limit.
         rate: effective speed fraction.
         joint_speed, joint_range: limits; a safety configuration may narrow the model's.
@@ -74,7 +88,7 @@ class Mover:
     @property
     def scaling(self) -> float:
         """Effective speed as a fraction of the slider's, as RTDE reports it."""
-        if not isinstance(self._action, Path) or self.slider == 0.0:
+        if self._action is None or _is_stop(self._action) or self.slider == 0.0:
             return self.slowing
         return min(1.0, self.rate / self.slider)
 
@@ -131,14 +145,19 @@ class Mover:
         if prelude is None or not isinstance(prelude, Path) or not prelude.released:
             prelude = self._braking() if any(abs(v) > STILL for v in self.qd) else None
         path = Path(line, speed, acceleration, self.joint_speed, duration=duration, radius=radius, prelude=prelude)
-        if not any(abs(v) > STILL for v in self.qd):
-            self.rate = self._wanted_rate
+        self._set_out()
         self._action = path
         return path
+
+    def _set_out(self) -> None:
+        """From standstill, the effective speed needs no ramp."""
+        if not any(abs(v) > STILL for v in self.qd) and (self._action is None or _is_stop(self._action)):
+            self.rate = self._wanted_rate
 
     def servo(self, target: Joints, lookahead: float, gain: float) -> None:
         """Execute one servo command."""
         if not isinstance(self._action, Servo):
+            self._set_out()
             self._action = Servo()
         self._action.aim(target, lookahead, gain)
         self._idle = 0
@@ -148,6 +167,7 @@ class Mover:
         if isinstance(self._action, JointSpeed):
             self._action.aim(target, acceleration)
         else:
+            self._set_out()
             self._action = JointSpeed(target, acceleration)
         self._idle = 0
 
@@ -156,6 +176,7 @@ class Mover:
         if isinstance(self._action, ToolSpeed):
             self._action.aim(target, acceleration, turning)
         else:
+            self._set_out()
             self._action = ToolSpeed(arm, target, acceleration, turning)
         self._idle = 0
 
@@ -209,14 +230,19 @@ class Mover:
             if self.qd != _ZERO or self.qdd != _ZERO:
                 self.qd = self.qdd = _ZERO
             return
-        if isinstance(action, Path):
-            self._ramp(dt)
-        elif not _is_stop(action):
+        before = self.rate
+        if not isinstance(action, Path) and not _is_stop(action):
             self._idle += 1
             if self._idle > _GRACE:
                 self._action = action = self._braking()
+        if not _is_stop(action):
+            self._ramp(dt)
         try:
-            q = action.step(self.q, self.qd, dt * self.rate if isinstance(action, Path) else dt)
+            if _is_stop(action):
+                q = action.step(self.q, self.qd, dt)
+            else:
+                speeds = [v / before for v in self.qd] if before > 0.0 else _ZERO
+                q = action.step(self.q, (*speeds,), dt * self.rate)  # on the scaled clock
             self._check(q, dt)
         except (UnreachableError, ViolationError) as error:
             # Out of the workspace, near a singularity or out of range: the arm brakes in joint space. A stop needs no

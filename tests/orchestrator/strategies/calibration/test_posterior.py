@@ -97,7 +97,7 @@ def test_regions_of_nine_tenths_mostly_hold_the_truth() -> None:
 def test_parameters_that_make_up_for_each_other_are_named(tied: Any) -> None:
     posterior = tied.found.posterior
     said = " ".join(posterior.directions)
-    assert "cohesion and friction make up for each other: more of one, less of the other" in said
+    assert "cohesion and friction compensate each other: more of one, less of the other" in said
     sums = [0.5 * (t["cohesion"] / 0.1 + t["friction"] / 0.5) for t in posterior.thetas]
     low, high = np.quantile(sums, [0.05, 0.95])
     assert low <= 0.5 <= high
@@ -112,7 +112,7 @@ def test_open_directions_are_put_into_words() -> None:
     assert left_open(drawn(free), names) == ["the pours leave friction open"]
     u = rng.random(500)
     ridge = drawn(np.column_stack([u, u + 0.02 * rng.standard_normal(500)]))
-    assert "friction and cohesion make up for each other: more of one, more of the other" in " ".join(
+    assert "friction and cohesion compensate each other: more of one, more of the other" in " ".join(
         left_open(ridge, names)
     )
     assert left_open(drawn(0.5 + 0.01 * rng.standard_normal((500, 2))), names) == []
