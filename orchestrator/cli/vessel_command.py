@@ -191,9 +191,12 @@ def _volume(sources: Sources, mass: float) -> float:
 
 def _turned(out: Path, name: str, sources: Sources) -> Made:
     """Make a surface of revolution from all measurements."""
+    import numpy as np
+
     from sim_engine.vessel.shapes import VesselSpec
     from sim_engine.vessel.vessel import build_vessel
     from sim_engine.vessel_acquisition.outline_fit import find_outline
+    from sim_engine.vessel_acquisition.wall_thickening import RESERVE, fits_grid, least_wall
 
     notes: list[str] = []
     wall = _quantity(sources.wall, "--wall", "m", "3 mm")
@@ -223,6 +226,15 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
         )
     evidence += _measured(sources, height)
     outline = find_outline(height, evidence, wall, floor, height_deviation=off)
+    width = 2.0 * (float(outline.radii.max()) + wall)
+    extent = np.array([width, width, height + floor])
+    if not fits_grid(extent, min(wall, floor)):
+        least = RESERVE * least_wall(extent)
+        notes.append(
+            f"a wall of {1e3 * wall:.2g} mm and a floor of {1e3 * floor:.2g} mm are too thin for the simulator's grid; "
+            f"they were thickened outwards to {1e3 * max(wall, least):.2g} and {1e3 * max(floor, least):.2g} mm"
+        )
+        outline = replace(outline, wall=max(wall, least), floor=max(floor, least))
     spec = VesselSpec(name=name, shape=outline.shape())
     build_vessel(spec)
     doubts = _doubts(outline, sources)
@@ -515,8 +527,8 @@ def _written_mesh(
     doubts = list(doubts)
     if (tilt := math.degrees(rim_tilt(built))) > LEVEL:
         doubts.append(
-            f"its rim is {tilt:.1f}° off level, and the capacity is that to its lowest point: turn the mesh so that the "
-            "vessel stands upright"
+            f"its rim is {tilt:.1f}° off level, and the capacity is that to its lowest point: turn the mesh so that "
+            "the vessel stands upright"
         )
     brimful = _quantity(sources.brimful, "--brimful", "kg", "322 g")
     deviation = 0.01 * built.capacity

@@ -149,7 +149,7 @@ def _brim(found: CavityFill, corners: Floats, layout: GridLayout, solid: Flags) 
         labels, _ = ndimage.label(plane)
         joined = np.intersect1d(labels[pool & plane], labels[outside & plane])
         low, high = (low, z) if joined.any() else (z, high)
-    return 0.5 * (low + high)
+    return float(0.5 * (low + high))
 
 
 def _volume(pool: Flags, lowest: Floats, highest: Floats, layout: GridLayout, brim: float) -> float:

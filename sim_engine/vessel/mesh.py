@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +101,8 @@ def _check_closed(mesh: object, path: Path) -> None:
         trimesh.repair.fix_winding(mesh)
         if not _edges_cancel(mesh.edges):
             raise VesselError(
-                f"{path.name}: its faces don't agree which side is out, and can't be made to; 'decant vessel' repairs it: decant vessel NEW.yaml --mesh {path.name}"
+                f"{path.name}: its faces don't agree which side is out, and can't be made to; repair it: "
+                f"decant vessel NEW.yaml --mesh {path.name}"
             )
     if mesh.volume < 0.0:
         mesh.invert()
@@ -116,7 +118,8 @@ def _edges_cancel(edges: Integers) -> bool:
 def rim_tilt(vessel: Vessel) -> float:
     """Angle of the rim from level [rad]: of the plane that the lip's points are closest to, spouts aside."""
     crest = vessel.meridians[:, -1]
-    plane, away = np.zeros(3), np.ones(len(crest))
+    plane: NDArray[Any] = np.zeros(3)
+    away: Floats = np.ones(len(crest))
     design = np.column_stack([crest[:, :2], np.ones(len(crest))])
     for _ in range(30):  # least absolute deviations, so that a spout or a notch does not turn the plane
         weight = 1.0 / np.sqrt(np.maximum(away, 1e-5))

@@ -1,7 +1,7 @@
 """Repairs a mesh from a scanner or a CAD program, so that it is the closed solid that a vessel has to be.
 
-It determines the unit, drops small loose parts, closes holes, joins parts that cross each other, and thickens outwards a
-sheet without thickness and walls that are too thin for the grid. Triangles that do not close are repaired in
+It determines the unit, drops small loose parts, closes holes, joins parts that cross each other, and thickens a sheet
+without thickness and walls that are too thin for the grid, both outwards. Triangles that do not close are repaired in
 `surface_repair`. Several vessels in one file are refused. A closed mesh of one part with thick walls stays as it is.
 
 Steps that may change the cavity compare its volume before and after (`exact_cavity`).
@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from sim_engine.resources import MissingExtraError, installed
 from sim_engine.settings.plugin_registry import DISTRIBUTION
-from sim_engine.vessel.distance_grid import choose_spacing
 from sim_engine.vessel.exact_cavity import exact_cavity
 from sim_engine.vessel.mesh import (
     FORMATS,
@@ -39,11 +38,12 @@ from sim_engine.vessel_acquisition.surface_repair import (
     holes_filled,
     is_closed,
     oriented,
+    outwards,
     rebuilt,
     welded,
     without_redundant,
 )
-from sim_engine.vessel_acquisition.wall_thickening import thickened
+from sim_engine.vessel_acquisition.wall_thickening import fits_grid, thickened
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -59,7 +59,7 @@ HOLE = 0.6
 """For a sheet: share of the longest boundary below which a boundary is a hole to be closed."""
 
 LARGE_HOLE = 0.01
-"""Share of the surface from which a closed hole is a warning."""
+"""Share of the surface from which a closed hole, or an open surface that is dropped, is a warning."""
 
 CHANGED = 0.01
 """Relative change of the cavity from which a repair is a warning."""
@@ -151,9 +151,9 @@ def mended(
         mesh = _closed(mesh, wall, log)
     else:
         mesh = _one_body(mesh, path, log.notes)
-    trimesh.repair.fix_normals(mesh)
-    if mesh.volume < 0.0:
-        mesh.invert()
+        trimesh.repair.fix_normals(mesh)
+        if mesh.volume < 0.0:
+            mesh.invert()
     vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
     faces = _without_fillers(vertices, faces, drop_bodies, log)
     joined = _joined(vertices, faces, log)
@@ -167,7 +167,8 @@ def mended(
 def _require_igl() -> None:
     if not installed("igl"):
         raise MissingExtraError(
-            f"mending this mesh needs the package 'libigl', which is not installed: pip install '{DISTRIBUTION}[vessels]'"
+            "mending this mesh needs the package 'libigl', which is not installed: "
+            f"pip install '{DISTRIBUTION}[vessels]'"
         )
 
 
@@ -247,15 +248,22 @@ def _closed(mesh: Any, wall: float | None, log: _Log) -> Any:
     bottom = float(upright[faces.ravel(), 2].min())
     faces, removed = without_redundant(upright, faces)
     if removed.within:
-        log.notes.append(f"{removed.within} face(s) within its wall were removed")
+        log.notes.append(f"{removed.within} inner face(s), which bound no solid, were removed")
+    corners = vertices[faces]
+    whole = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    small = [sheet for sheet in removed.sheets if sheet[2] < LARGE_HOLE * whole]
+    if small:
+        area = 1e4 * sum(sheet[2] for sheet in small)
+        log.notes.append(f"{len(small)} small open surface(s), which bound no solid, of {area:.2g} cm² were dropped")
     for low, high, area in removed.sheets:
+        if area < LARGE_HOLE * whole:
+            continue
         log.warnings.append(
-            f"an open surface of {1e4 * area:.3g} cm², {1e3 * (low - bottom):.3g} to {1e3 * (high - bottom):.3g} mm above "
-            "the underside, was dropped: it bounds no solid (the surface of a liquid?)"
+            f"an open surface of {1e4 * area:.3g} cm², {1e3 * (low - bottom):.3g} to {1e3 * (high - bottom):.3g} mm "
+            "above the underside, was dropped: it bounds no solid (the surface of a liquid?)"
         )
     vertices, faces = _without_holes(vertices, faces, wall, log)
-    faces, _ = oriented(faces)
-    return _mesh(vertices, faces)
+    return _mesh(vertices, outwards(vertices, faces))
 
 
 def _mesh(vertices: Floats, faces: Integers) -> Any:
@@ -290,8 +298,14 @@ def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _
     lengths = np.array([_length(vertices, loop) for loop in loops])
     # an opening is at least as long as a circle with a third of the mesh's width as its diameter
     width = np.sort(np.ptp(vertices[faces.ravel()], axis=0))[1]
-    opening = bool(lengths.max() > np.pi * width / 3.0 and _is_sheet(vertices @ log.turn.T, faces))
-    small = [loop for loop, length in zip(loops, lengths, strict=True) if not opening or length < HOLE * lengths.max()]
+    upright = vertices @ log.turn.T
+    opening = bool(lengths.max() > np.pi * width / 3.0 and _is_sheet(upright, faces))
+    if opening:
+        small = [loop for loop, length in zip(loops, lengths, strict=True) if length < HOLE * lengths.max()]
+    else:
+        # an inner and an outer surface without a rim between them: closed each by itself, they would hold nothing
+        around = [bool(np.ptp(upright[loop, :2], axis=0).min() > 0.5 * width) for loop in loops]
+        small = [loop for loop, each in zip(loops, around, strict=True) if sum(around) < 2 or not each]
     if small:
         vertices, faces, areas = holes_filled(vertices, faces, small)
         longest = 1e3 * max(_length(vertices, loop) for loop in small)
@@ -308,8 +322,8 @@ def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _
         return vertices, faces
     if wall is None:
         raise VesselError(
-            f"{log.path.name}: a sheet without thickness (its opening is one edge of {1e3 * lengths.max():.0f} mm); say "
-            "how thick its wall is, for example --wall 3mm, and it is thickened outwards"
+            f"{log.path.name}: a sheet without thickness (its opening is one edge of {1e3 * lengths.max():.0f} mm); "
+            "say how thick its wall is, for example --wall 3mm, and it is thickened outwards"
         )
     log.notes.append(f"the sheet was thickened outwards by {1e3 * wall:g} mm")
     thick = _thickened(_mesh(vertices, faces), wall)
@@ -323,8 +337,8 @@ def _is_sheet(vertices: Floats, faces: Integers) -> bool:
     middle = (vertices[faces.ravel(), :2].min(axis=0) + vertices[faces.ravel(), :2].max(axis=0)) / 2.0
     radial = corners.mean(axis=1)[:, :2] - middle
     facing = np.einsum("ij,ij->i", radial, normal) / np.maximum(np.linalg.norm(radial, axis=1), 1e-12)
-    outwards = float(np.maximum(facing, 0.0).sum() / max(np.abs(facing).sum(), 1e-30))
-    return not 0.25 < outwards < 0.75
+    away = float(np.maximum(facing, 0.0).sum() / max(np.abs(facing).sum(), 1e-30))
+    return not 0.25 < away < 0.75
 
 
 def _length(vertices: Floats, loop: Integers) -> float:
@@ -446,10 +460,10 @@ def _thick_enough(vertices: Floats, faces: Integers, log: _Log) -> Floats:
     """
     upright = vertices @ log.turn.T
     extent = np.ptp(upright, axis=0)
-    if _fits(extent, wall_thickness(upright, faces)):
+    if fits_grid(extent, wall_thickness(upright, faces)):
         return vertices
     wall = typical_wall(upright, faces)
-    if _fits(extent, wall):
+    if fits_grid(extent, wall):
         log.notes.append(f"its surface is noisy; the thinnest part of its walls has about {1e3 * wall:.2g} mm")
         return vertices
     cavity = exact_cavity(upright, faces)
@@ -470,11 +484,3 @@ def _thick_enough(vertices: Floats, faces: Integers, log: _Log) -> Floats:
     )
     result: Floats = moved @ log.turn
     return result
-
-
-def _fits(extent: Floats, wall: float) -> bool:
-    try:
-        choose_spacing(extent, wall)
-    except VesselError:
-        return False
-    return True

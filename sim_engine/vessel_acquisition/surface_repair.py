@@ -47,7 +47,10 @@ JUDGED = 200
 LONGEST_LOOP = 150
 """Corners of the longest hole that is closed by the smallest surface; longer ones by a fan."""
 
-GRID_NODES = 1_000_000
+RAYS = 20_000
+"""Number of rays that find the visible sides of patches."""
+
+GRID_NODES = 400_000
 """Nodes of the grid of `rebuilt`."""
 
 
@@ -136,6 +139,15 @@ def oriented(faces: Integers) -> tuple[Integers, Integers]:
     agree = np.bincount(patch, weights=np.where(same, 1.0, -1.0) * np.ones(len(faces)))
     flip = agree[patch] < 0.0
     return np.where(flip[:, None], turned[:, ::-1], turned), patch
+
+
+def outwards(vertices: Floats, faces: Integers) -> Integers:
+    """Faces with normals outwards: each connected part encloses a positive volume, if it is closed."""
+    faces, _ = oriented(faces)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    part = components(faces)
+    volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)))
+    return np.where((volume[part] < 0.0)[:, None], faces[:, ::-1], faces)
 
 
 def _even(a: Integers, b: Integers) -> bool:
@@ -334,10 +346,10 @@ def rebuilt(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, float]
     axes = [o + spacing * np.arange(n) for o, n in zip(origin, counts, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     turned = _most_decided(vertices, faces, nodes)
-    inside = winding_numbers(vertices, turned, nodes) > 0.5
+    inside = _inside(vertices, turned, nodes, counts, spacing)
     if not inside.any():
         return vertices, np.zeros((0, 3), dtype=np.int64), spacing
-    corners, triangles, _, _ = marching_cubes(inside.reshape(counts).astype(np.float32), 0.5, spacing=(spacing,) * 3)
+    corners, triangles, _, _ = marching_cubes(inside.astype(np.float32), 0.5, spacing=(spacing,) * 3)
     found = np.asarray(triangles, dtype=np.int64)
     points = np.asarray(corners, dtype=float) + origin
     # half a spacing off at most, except next to gaps
@@ -350,13 +362,44 @@ def rebuilt(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, float]
     return points, found, spacing
 
 
+def _inside(vertices: Floats, faces: Integers, nodes: Floats, counts: Integers, spacing: float) -> Flags:
+    """Whether the winding number of nodes is above one half, shape `counts`.
+
+    It is computed near the surface only, and at one node of each region without surface.
+    """
+    from scipy.ndimage import binary_dilation, label
+
+    low = nodes[0]
+    surface = np.zeros(counts, dtype=bool)
+    corners = vertices[faces]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    steps = np.ceil(longest / (0.5 * spacing)).astype(np.int64)
+    for count in np.unique(steps):
+        i, j = np.meshgrid(np.arange(count + 1), np.arange(count + 1), indexing="ij")
+        weights = np.stack([i, j, count - i - j], axis=-1)[(i + j) <= count] / count
+        points = np.einsum("wc,fcd->fwd", weights, corners[steps == count]).reshape(-1, 3)
+        surface[tuple(np.rint((points - low) / spacing).astype(np.int64).T)] = True
+    near = binary_dilation(surface, np.ones((3, 3, 3), dtype=bool))
+    regions, _ = label(~near)
+    flat = regions.ravel()
+    _, first = np.unique(flat, return_index=True)
+    chosen = np.concatenate([np.flatnonzero(near.ravel()), first[1:] if near.any() else first])
+    found = winding_numbers(vertices, faces, nodes[chosen]) > 0.5
+    inside = np.zeros(len(nodes), dtype=bool)
+    beside = int(np.count_nonzero(near))
+    inside[chosen[:beside]] = found[:beside]
+    whole = np.concatenate([[False], found[beside:]])
+    inside |= whole[flat]
+    return inside.reshape(counts)
+
+
 def _most_decided(vertices: Floats, faces: Integers, nodes: Floats) -> Integers:
     """The orientation of the patches, as in the file or by visibility, with winding numbers closest to 0 and 1."""
     import igl.embree
 
-    few = nodes[np.random.default_rng(0).choice(len(nodes), min(4_000, len(nodes)), replace=False)]
+    few = nodes[np.random.default_rng(0).choice(len(nodes), min(2_000, len(nodes)), replace=False)]
     as_given, _ = oriented(faces)
-    flipped, _ = igl.embree.reorient_facets_raycast(vertices, as_given)
+    flipped, _ = igl.embree.reorient_facets_raycast(vertices, as_given, RAYS)
     seen = np.where(np.asarray(flipped, dtype=bool)[:, None], as_given[:, ::-1], as_given)
 
     def undecided(turned: Integers) -> float:

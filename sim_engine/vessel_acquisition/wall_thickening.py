@@ -9,9 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.vessel.distance_grid import MARGIN, MAXIMUM_NODES, THINNEST_WALL
+from sim_engine.vessel.distance_grid import MARGIN, MAXIMUM_NODES, THINNEST_WALL, choose_spacing
 from sim_engine.vessel.exact_cavity import ExactCavity
 from sim_engine.vessel.mesh_surface import normals_and_areas
+from sim_engine.vessel.shapes import VesselError
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -44,6 +45,15 @@ def least_wall(extent: Floats) -> float:
     while np.prod(np.ceil(box / spacing) + 2.0) > MAXIMUM_NODES:
         spacing *= 1.02
     return spacing / THINNEST_WALL
+
+
+def fits_grid(extent: Floats, wall: float) -> bool:
+    """Whether the grid of a vessel of some size resolves walls of a thickness [m]; see `choose_spacing`."""
+    try:
+        choose_spacing(extent, wall)
+    except VesselError:
+        return False
+    return True
 
 
 def thickened(vertices: Floats, faces: Integers, wall: float, cavity: ExactCavity) -> tuple[Floats, float]:
