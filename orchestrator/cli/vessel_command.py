@@ -7,6 +7,7 @@ Turned vessels are fitted to all given measurements; a mesh is repaired and used
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from orchestrator.cli.console import BAD_INPUT, RefusalError, print_json, print_
 if TYPE_CHECKING:
     from sim_engine.vessel.shapes import LengthUnit
     from sim_engine.vessel_acquisition.measurements import Radii
+    from sim_engine.vessel_acquisition.mesh_repair import Axis
     from sim_engine.vessel_acquisition.outline_fit import Evidence, FittedOutline
     from sim_engine.vessel_acquisition.point_cloud import Scan
 
@@ -34,6 +36,9 @@ RULER, BALANCE, ANGLE = 5e-4, 5e-4, 0.005
 
 DOUBTFUL = 3.0
 """Number of standard deviations above which a check fails."""
+
+LEVEL = 2.0
+"""Angle of a rim from which it counts as not level [deg]."""
 
 BAND = 2.0
 """Standard deviations that the band shows to either side."""
@@ -55,6 +60,7 @@ class Sources:
     mesh: Path | None = None
     unit: str | None = None
     up: str = "z"
+    drop_bodies: bool = False
     fill: Path | None = None
     tilt: Path | None = None
     brimful: str | None = None
@@ -73,7 +79,9 @@ def vessel(
     photo: Annotated[Path | None, typer.Option(help="Photograph from the side, on a plain background.")] = None,
     known_height: Annotated[str | None, typer.Option(help="Outer height, for the scale of the photograph.")] = None,
     known_width: Annotated[str | None, typer.Option(help="Largest outer width, for the scale.")] = None,
-    points: Annotated[Path | None, typer.Option(help="Points of the surface: PLY, XYZ, or CSV with x, y, z.")] = None,
+    points: Annotated[
+        Path | None, typer.Option(help="Points of the surface: PLY, PCD, XYZ, or CSV with x, y, z.")
+    ] = None,
     depth: Annotated[Path | None, typer.Option(help="Depth image from the side: PNG of 16 bits, or NPY.")] = None,
     focal: Annotated[float | None, typer.Option(help="Focal length of the depth camera [pixels].", min=1.0)] = None,
     centre: Annotated[
@@ -84,6 +92,9 @@ def vessel(
         str | None, typer.Option(help="Unit of points, mesh or depths: m, cm, mm, in; default for depths: mm.")
     ] = None,
     up: Annotated[str, typer.Option(help="Axis of points or mesh that points out of the opening.")] = "z",
+    drop_bodies: Annotated[
+        bool, typer.Option("--drop-bodies", help="Leave out separate bodies in a mesh's cavity, such as its liquid.")
+    ] = False,
     fill: Annotated[Path | None, typer.Option(help="Table of levels and masses: level_mm, mass_g.")] = None,
     tilt: Annotated[Path | None, typer.Option(help="Table of tilts and retained masses: tilt_deg, mass_g.")] = None,
     brimful: Annotated[str | None, typer.Option(help="Weighed mass when full to the brim: '322 g'; a check.")] = None,
@@ -104,7 +115,7 @@ def vessel(
 
     sources = Sources(
         height, diameters, photo, known_height, known_width, points, depth, focal, centre, mesh, unit, up,
-        fill, tilt, brimful, density, wall, floor,
+        drop_bodies, fill, tilt, brimful, density, wall, floor,
     )  # fmt: skip
     called = name or out.stem
     if out.suffix not in (".yaml", ".yml"):
@@ -180,9 +191,12 @@ def _volume(sources: Sources, mass: float) -> float:
 
 def _turned(out: Path, name: str, sources: Sources) -> Made:
     """Make a surface of revolution from all measurements."""
+    import numpy as np
+
     from sim_engine.vessel.shapes import VesselSpec
     from sim_engine.vessel.vessel import build_vessel
     from sim_engine.vessel_acquisition.outline_fit import find_outline
+    from sim_engine.vessel_acquisition.wall_thickening import RESERVE, fits_grid, least_wall
 
     notes: list[str] = []
     wall = _quantity(sources.wall, "--wall", "m", "3 mm")
@@ -212,6 +226,15 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
         )
     evidence += _measured(sources, height)
     outline = find_outline(height, evidence, wall, floor, height_deviation=off)
+    width = 2.0 * (float(outline.radii.max()) + wall)
+    extent = np.array([width, width, height + floor])
+    if not fits_grid(extent, min(wall, floor)):
+        least = RESERVE * least_wall(extent)
+        notes.append(
+            f"a wall of {1e3 * wall:.2g} mm and a floor of {1e3 * floor:.2g} mm are too thin for the simulator's grid; "
+            f"they were thickened outwards to {1e3 * max(wall, least):.2g} and {1e3 * max(floor, least):.2g} mm"
+        )
+        outline = replace(outline, wall=max(wall, least), floor=max(floor, least))
     spec = VesselSpec(name=name, shape=outline.shape())
     build_vessel(spec)
     doubts = _doubts(outline, sources)
@@ -289,7 +312,7 @@ class _Uneven:
 def _points(sources: Sources, wall: float | None, floor: float | None, notes: list[str]) -> _Seen | _Uneven:
     from sim_engine.vessel_acquisition.point_cloud import mesh_of, radii_of, wall_between
 
-    scan, pixel = _scanned(sources)
+    scan, pixel = _scanned(sources, notes)
     between = wall_between(scan)
     thick = wall or between
     surfaces = {"both": "both surfaces", "inner": "the inner surface", "outer": "the outer surface"}[scan.seen]
@@ -312,7 +335,7 @@ def _points(sources: Sources, wall: float | None, floor: float | None, notes: li
     return _Seen(radii, scan.height - (0.0 if scan.seen == "inner" else below), between, pixel)
 
 
-def _scanned(sources: Sources) -> tuple[Scan, float]:
+def _scanned(sources: Sources, notes: list[str]) -> tuple[Scan, float]:
     """Return the scan, and the size of a depth image's pixel on it [m]; 0 for points."""
     from orchestrator.cli.vessel_tables import read_depth, read_points
     from sim_engine.vessel_acquisition.point_cloud import points_on_table, scan_of
@@ -320,7 +343,7 @@ def _scanned(sources: Sources) -> tuple[Scan, float]:
     if sources.points is not None and sources.depth is not None:
         raise RefusalError("--depth goes without --points: give one of them", BAD_INPUT)
     if sources.points is not None:
-        return scan_of(read_points(sources.points, _unit(sources), sources.up)), 0.0
+        return scan_of(read_points(sources.points, _unit(sources), _up(sources), notes)), 0.0
     assert sources.depth is not None
     if sources.focal is None:
         raise RefusalError(
@@ -370,6 +393,12 @@ def _unit(sources: Sources) -> LengthUnit | None:
     if sources.unit not in ("m", "cm", "mm", "in"):
         raise RefusalError(f"--unit {sources.unit!r}: should be m, cm, mm or in", BAD_INPUT)
     return cast("LengthUnit", sources.unit)
+
+
+def _up(sources: Sources) -> Axis:
+    if sources.up not in ("x", "y", "z", "-x", "-y", "-z"):
+        raise RefusalError(f"--up {sources.up!r}: should be x, y or z, or one of them with a minus", BAD_INPUT)
+    return cast("Axis", sources.up)
 
 
 def _profile_file(name: str, outline: FittedOutline, used: Sequence[str], doubts: Sequence[str]) -> str:
@@ -460,18 +489,29 @@ def _from_mesh(out: Path, name: str, sources: Sources) -> Made:
         raise RefusalError(f"{given[0]} goes with turned vessels; a mesh says all of its shape itself", BAD_INPUT)
     assert sources.mesh is not None
     wall = _quantity(sources.wall, "--wall", "m", "3 mm")
-    result = mended(sources.mesh, unit=_unit(sources), wall=wall)
-    return _written_mesh(out, name, result.vertices, result.faces, sources, list(result.notes), up=sources.up)
+    up = _up(sources)
+    result = mended(sources.mesh, unit=_unit(sources), wall=wall, up=up, drop_bodies=sources.drop_bodies)
+    notes, doubts = list(result.notes), list(result.warnings)
+    return _written_mesh(out, name, result.vertices, result.faces, sources, notes, doubts, up=up)
 
 
 def _written_mesh(
-    out: Path, name: str, vertices: Any, faces: Any, sources: Sources, notes: list[str], *, up: str = "z"
+    out: Path,
+    name: str,
+    vertices: Any,
+    faces: Any,
+    sources: Sources,
+    notes: list[str],
+    doubts: Sequence[str] = (),
+    *,
+    up: Axis = "z",
 ) -> Made:
     """Write a mesh in millimetres next to the vessel's file, after checking that it holds liquid."""
     import trimesh
 
     from orchestrator.results import figure_style
     from orchestrator.results.pour_figures import draw_solid
+    from sim_engine.vessel.mesh import rim_tilt
     from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
     from sim_engine.vessel.vessel import build_vessel
 
@@ -480,11 +520,16 @@ def _written_mesh(
         raise RefusalError(f"{path}: exists already; choose another name, or remove it first", BAD_INPUT)
     trimesh.Trimesh(1e3 * vertices, faces, process=False).export(path)
     try:
-        built = build_vessel(VesselSpec(name=name, shape=MeshShape(path=path, unit="mm", up=cast(Any, up))))
+        built = build_vessel(VesselSpec(name=name, shape=MeshShape(path=path, unit="mm", up=up)))
     except VesselError:
         path.unlink()
         raise
-    doubts = []
+    doubts = list(doubts)
+    if (tilt := math.degrees(rim_tilt(built))) > LEVEL:
+        doubts.append(
+            f"its rim is {tilt:.1f}° off level, and the capacity is that to its lowest point: turn the mesh so that "
+            "the vessel stands upright"
+        )
     brimful = _quantity(sources.brimful, "--brimful", "kg", "322 g")
     deviation = 0.01 * built.capacity
     if brimful is not None and abs(_volume(sources, brimful) - built.capacity) > DOUBTFUL * deviation:

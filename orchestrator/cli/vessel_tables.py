@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from sim_engine.vessel.shapes import LengthUnit
+    from sim_engine.vessel_acquisition.mesh_repair import Axis
 
     Floats = NDArray[np.float64]
 
@@ -193,30 +194,46 @@ def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, floa
     return found
 
 
-def read_points(path: Path, unit: LengthUnit | None, up: str) -> Floats:
+def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str]) -> Floats:
     """Read points of a surface, z up, shape (n, 3) [m].
+
+    Args:
+        path: PLY, PCD, NPY, or text with x, y, z in each row.
+        unit: of its numbers; None: determined by their extent.
+        up: axis that points out of the opening.
+        notes: a note of points that are left out is appended.
 
     Raises:
         RefusalError: they can't be read, or their unit is not clear (exit code 2).
     """
     import numpy as np
 
-    from sim_engine.vessel.mesh import UNITS, to_z
-    from sim_engine.vessel.shapes import VesselError
+    from sim_engine.vessel.mesh import UNITS, scale_of, to_z
+    from sim_engine.vessel.shapes import MeshShape, VesselError
     from sim_engine.vessel_acquisition.mesh_repair import likely_unit
 
     _check_size(path)
-    if up not in ("x", "y", "z", "-x", "-y", "-z"):
-        raise RefusalError(f"--up {up!r}: should be x, y or z, or one of them with a minus", BAD_INPUT)
     try:
         points = _loaded(path)
+    except VesselError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
     except Exception as error:  # readers raise arbitrary errors for damaged files
         raise RefusalError(f"{path}: can't be read as points ({error})", BAD_INPUT) from None
-    if points.ndim != 2 or points.shape[1] < 3 or not np.isfinite(points[:, :3]).all():
-        raise RefusalError(f"{path}: should have x, y, z in each row, all of them finite numbers", BAD_INPUT)
+    if points.ndim != 2 or points.shape[1] < 3:
+        raise RefusalError(f"{path}: should have x, y, z in each row", BAD_INPUT)
     points = points[:, :3]
+    # depth cameras write pixels without a measurement as NaN, or as the camera's own position
+    measured = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
+    if not measured.any():
+        raise RefusalError(f"{path}: none of its {len(points):,} points has finite x, y and z", BAD_INPUT)
+    if missing := len(points) - int(measured.sum()):
+        notes.append(
+            f"{missing:,} of {len(points):,} points without a measurement (not a number, or 0, 0, 0) were left out"
+        )
+    points = points[measured]
+    extent = float(np.ptp(points, axis=0).max())
     with Refused(VesselError):
-        scale = UNITS[unit or likely_unit(float(np.ptp(points, axis=0).max()), path)]
+        scale = UNITS[likely_unit(extent, path)] if unit is None else scale_of(extent, MeshShape(path=path, unit=unit))
     result: Floats = points @ to_z(up).T * scale
     return result
 
@@ -227,13 +244,18 @@ def _loaded(path: Path) -> Any:
     if path.suffix.lower() == ".ply":
         import trimesh
 
-        return np.asarray(trimesh.load(path, process=False).vertices, dtype=float)
+        # without materials: textures are often missing, and the reader would print the traceback of its search
+        return np.asarray(trimesh.load(path, process=False, skip_materials=True).vertices, dtype=float)
+    if path.suffix.lower() == ".pcd":
+        from sim_engine.vessel_acquisition.pcd_file import read_pcd
+
+        return read_pcd(path)
     if path.suffix.lower() == ".npy":
         return np.load(path, allow_pickle=False).astype(float)
     text = path.read_text(encoding="utf-8-sig", errors="replace")
     first = text.lstrip().split("\n", 1)[0]
     comma = "," in first
-    header = any(character.isalpha() for character in first.replace("e", "").replace("E", ""))
+    header = any(character.isalpha() for character in first.lower().replace("nan", "").replace("e", ""))
     return np.loadtxt(text.splitlines(), delimiter="," if comma else None, skiprows=int(header), ndmin=2)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
+from collections import defaultdict
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -64,7 +65,8 @@ def section(vertices: Floats, faces: NDArray[np.integer[Any]]) -> list[Floats]:
     """
     above = vertices[:, 1] >= 0.0
     count = above[faces].sum(axis=1)
-    follows: dict[tuple[int, int], tuple[int, int]] = {}
+    # an edge at which two bodies touch is passed once for each of them
+    follows: dict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
     for face in faces[(count > 0) & (count < 3)]:
         enter = leave = None
         for i in range(3):
@@ -77,16 +79,23 @@ def section(vertices: Floats, faces: NDArray[np.integer[Any]]) -> list[Floats]:
                     leave = edge
         assert enter is not None
         assert leave is not None
-        follows[enter] = leave
+        follows[enter].append(leave)
     loops = []
     while follows:
-        start, edge = follows.popitem()
+        start, after = follows.popitem()
+        edge = after.pop()
+        if after:
+            follows[start] = after
         loop = [start]
         while edge != start:
             loop.append(edge)
             if edge not in follows:
                 raise ValueError("the mesh is open: its section by the plane y = 0 has a loose end")
-            edge = follows.pop(edge)
+            after = follows.pop(edge)
+            following = after.pop()
+            if after:
+                follows[edge] = after
+            edge = following
         ends = np.array(loop)
         a, b = vertices[ends[:, 0]], vertices[ends[:, 1]]
         t = (a[:, 1] / (a[:, 1] - b[:, 1]))[:, None]

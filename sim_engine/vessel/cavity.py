@@ -46,11 +46,12 @@ class CavityFill:
     drain: int
 
 
-def flood(free: NDArray[np.bool_]) -> CavityFill:
+def flood(free: NDArray[np.bool_], sealed: NDArray[np.bool_] | None = None) -> CavityFill:
     """Find the largest pool.
 
     Args:
         free: nodes without solid; the grid's outermost ones are free, shape (nx, ny, nz).
+        sealed: free nodes that are not connected to the node above them, shape of `free`; None: all are connected.
     """
     from scipy import ndimage
 
@@ -69,6 +70,8 @@ def flood(free: NDArray[np.bool_]) -> CavityFill:
         if k:
             below = labels[:, :, k - 1]
             both = (layer > 0) & (below > 0)
+            if sealed is not None:
+                both &= ~sealed[:, :, k - 1]
             for upper, lower in np.unique(np.column_stack([layer[both], below[both]]), axis=0).tolist():
                 neighbours[(k, upper)].add((k - 1, lower))
                 neighbours[(k - 1, lower)].add((k, upper))

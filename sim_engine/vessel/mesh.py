@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from sim_engine import resources as cache
 from sim_engine.vessel.cavity import CavityFill, brim_height, flood, floor_height
 from sim_engine.vessel.distance_grid import SignedDistanceGrid, choose_spacing
+from sim_engine.vessel.exact_cavity import ExactCavity, exact_cavity
 from sim_engine.vessel.mesh_distance import GridLayout, cast_rays, crossings, layout_around, signed_distance
 from sim_engine.vessel.mesh_surface import measure_opening, normals_and_areas, trace_meridians
 from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
@@ -63,7 +65,7 @@ def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
         raise VesselError(f"{shape.path.name}: '{kind}' is not a mesh format known here; use {', '.join(FORMATS)}")
     content = shape.path.read_bytes()
     try:
-        loaded = trimesh.load(io.BytesIO(content), file_type=kind, process=True)
+        loaded = trimesh.load(io.BytesIO(content), file_type=kind, process=True, skip_materials=True)
     except Exception as problem:  # trimesh's readers raise various errors for damaged files
         raise VesselError(f"{shape.path.name}: not a readable {kind.upper()} file ({problem})") from problem
     if isinstance(loaded, trimesh.Scene):
@@ -77,7 +79,7 @@ def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
     loaded.update_faces(loaded.nondegenerate_faces())
     _check_closed(loaded, shape.path)
-    scale = _scale(float(np.max(loaded.extents)), shape)
+    scale = scale_of(float(np.max(loaded.extents)), shape)
     vertices = np.asarray(loaded.vertices, dtype=float) @ to_z(shape.up).T * scale
     return vertices, np.asarray(loaded.faces, dtype=np.int64)
 
@@ -92,12 +94,16 @@ def _check_closed(mesh: object, path: Path) -> None:
         open_edges = int(np.count_nonzero(uses % 2))
         raise VesselError(
             f"{path.name}: not watertight: {open_edges} edge(s) belong to an odd number of faces; "
-            "close the holes (a vessel is a solid with walls, not a sheet)"
+            "close the holes (a vessel is a solid with walls, not a sheet), or let 'decant vessel' repair it: "
+            f"decant vessel NEW.yaml --mesh {path.name}"
         )
     if not _edges_cancel(mesh.edges):
         trimesh.repair.fix_winding(mesh)
         if not _edges_cancel(mesh.edges):
-            raise VesselError(f"{path.name}: its faces don't agree which side is out, and can't be made to; repair it")
+            raise VesselError(
+                f"{path.name}: its faces don't agree which side is out, and can't be made to; repair it: "
+                f"decant vessel NEW.yaml --mesh {path.name}"
+            )
     if mesh.volume < 0.0:
         mesh.invert()
     if not mesh.volume > 0.0:
@@ -109,7 +115,29 @@ def _edges_cancel(edges: Integers) -> bool:
     return bool(np.array_equal(edges[forth], edges[back][:, ::-1]))
 
 
-def _scale(extent: float, shape: MeshShape) -> float:
+def rim_tilt(vessel: Vessel) -> float:
+    """Angle of the rim from level [rad]: of the plane that the lip's points are closest to, spouts aside."""
+    crest = vessel.meridians[:, -1]
+    plane: NDArray[Any] = np.zeros(3)
+    away: Floats = np.ones(len(crest))
+    design = np.column_stack([crest[:, :2], np.ones(len(crest))])
+    for _ in range(30):  # least absolute deviations, so that a spout or a notch does not turn the plane
+        weight = 1.0 / np.sqrt(np.maximum(away, 1e-5))
+        plane = np.linalg.lstsq(design * weight[:, None], crest[:, 2] * weight, rcond=None)[0]
+        away = np.abs(design @ plane - crest[:, 2])
+    return float(np.arctan(np.hypot(plane[0], plane[1])))
+
+
+def scale_of(extent: float, shape: MeshShape) -> float:
+    """Metres in the unit of a file's numbers.
+
+    Args:
+        extent: largest extent of the vessel, in this unit.
+        shape: states the unit, or none for metres.
+
+    Raises:
+        VesselError: in this unit it is not a vessel's size; the text states a likely one.
+    """
     if shape.unit is not None:
         size = extent * UNITS[shape.unit]
         if not SMALLEST / 4.0 <= size <= 2.0 * LARGEST:
@@ -145,6 +173,12 @@ FORMAT_VERSION = 2
 
 SMALLEST_SHARE = 0.03
 """Smallest cavity as a share of the bounding box: less is a dent."""
+
+NEIGHBOURS = 15
+"""Rays whose median is a thickness in `typical_wall`."""
+
+SAME_CAVITY = 0.03
+"""Largest relative difference of a cavity by its nodes from that of the mesh; a leak costs more."""
 
 SCALARS = ("spacing", "inner_floor", "rim_height", "opening_radius", "outer_radius", "capacity", "wall_thickness")
 
@@ -199,11 +233,13 @@ def _unpack(spec: VesselSpec, stored: dict[str, NDArray[np.generic]]) -> Vessel:
 def _measure(spec: VesselSpec, shape: MeshShape) -> Vessel:
     vertices, faces = read_mesh(shape)
     vertices -= [*(vertices[:, :2].min(axis=0) + vertices[:, :2].max(axis=0)) / 2.0, vertices[:, 2].min()]
-    wall = wall_thickness(vertices, faces)
-    layout = layout_around(vertices, choose_spacing(np.ptp(vertices, axis=0), wall))
+    wall, spacing, refusal = _spacing(vertices, faces)
+    layout = layout_around(vertices, spacing)
     hits, inside = crossings(vertices, faces, layout)
     _check_one_body(vertices, faces, inside, layout, shape)
     found = flood(~inside)
+    if refusal is not None:
+        _check_walls(found, layout, exact_cavity(vertices, faces), refusal)
     _check_cavity(found, shape, layout.spacing, vertices, layout.origin[2])
     rim = brim_height(found, ~inside, layout, hits)
     floor = floor_height(found, layout, hits)
@@ -235,16 +271,69 @@ def _measure(spec: VesselSpec, shape: MeshShape) -> Vessel:
     )
 
 
+def _spacing(vertices: Floats, faces: Integers) -> tuple[float, float, VesselError | None]:
+    """Thickness of the walls [m] and spacing of the grid [m].
+
+    If the grid cannot resolve the smallest thickness, as on a noisy scan, the typical one counts, and the refusal that
+    holds if the grid has another cavity than the mesh is returned too.
+    """
+    extent = np.ptp(vertices, axis=0)
+    wall = wall_thickness(vertices, faces)
+    try:
+        return wall, choose_spacing(extent, wall), None
+    except VesselError as error:
+        refusal = VesselError(
+            f"{error}, or let 'decant vessel' thicken them outwards: decant vessel NEW.yaml --mesh FILE"
+        )
+    wall = typical_wall(vertices, faces)
+    try:
+        return wall, choose_spacing(extent, wall), refusal
+    except VesselError:
+        raise refusal from None
+
+
+def _check_walls(found: CavityFill, layout: GridLayout, cavity: ExactCavity, refusal: VesselError) -> None:
+    """Refuse walls with gaps on the grid: the cavity drains there, or is lower than the mesh's."""
+    held = float(np.count_nonzero(found.pool)) * layout.spacing**3
+    if abs(held - cavity.volume) > SAME_CAVITY * cavity.volume:
+        raise refusal
+
+
 def wall_thickness(vertices: Floats, faces: Integers) -> float:
     """Smallest thickness of the solid's walls [m].
 
     Rays go inwards from points spread over the surface. Rays that leave through a face roughly parallel to their entry
-    face have crossed a wall. The second percentile of their lengths ignores single slivers.
+    face have crossed a wall. The second percentile of their lengths ignores single slivers, but not noise.
 
     Args:
         vertices: shape (V, 3) [m].
         faces: normals outwards, shape (F, 3).
     """
+    _, length = _wall_samples(vertices, faces)
+    return float(np.percentile(length, 2.0)) if len(length) else float(np.ptp(vertices, axis=0).min())
+
+
+def typical_wall(vertices: Floats, faces: Integers) -> float:
+    """Thickness of the thinnest part of the walls, without the noise of a scanner [m].
+
+    Each thickness is the median of its neighbours', so that single spikes do not count. The fifth percentile is a part
+    of the vessel that is thinner than the rest, such as the upper half of a wall.
+
+    Args:
+        vertices: shape (V, 3) [m].
+        faces: normals outwards, shape (F, 3).
+    """
+    from scipy.spatial import cKDTree
+
+    middle, length = _wall_samples(vertices, faces)
+    if not len(length):
+        return float(np.ptp(vertices, axis=0).min())
+    _, near = cKDTree(middle).query(middle, k=min(NEIGHBOURS, len(length)))
+    return float(np.percentile(np.median(length[near.reshape(len(length), -1)], axis=1), 5.0))
+
+
+def _wall_samples(vertices: Floats, faces: Integers) -> tuple[Floats, Floats]:
+    """Middles (n, 3) [m] and lengths (n,) [m] of rays across walls."""
     normal, area = normals_and_areas(vertices, faces)
     count = int(np.clip(4_000_000 // len(faces), 100, 1_000))
     chosen = np.searchsorted(np.cumsum(area), (np.arange(count) + 0.5) / count * area.sum())
@@ -254,9 +343,8 @@ def wall_thickness(vertices: Floats, faces: Integers) -> float:
     start = np.einsum("nk,nkd->nd", weights, corners[chosen])
     length, other = cast_rays(start, -normal[chosen], corners)
     parallel = np.isfinite(length) & (np.einsum("ij,ij->i", normal[chosen], normal[other]) < -0.7) & (length > 1e-6)
-    if not parallel.any():
-        return float(np.ptp(vertices, axis=0).min())
-    return float(np.percentile(length[parallel], 2.0))
+    across = length[parallel]
+    return start[parallel] - 0.5 * across[:, None] * normal[chosen][parallel], across
 
 
 def _check_one_body(

@@ -1,25 +1,53 @@
 """Repairs a mesh from a scanner or a CAD program, so that it is the closed solid that a vessel has to be.
 
-It determines the unit, drops small loose parts, closes holes, thickens a sheet without thickness outwards, and joins
-parts that cross each other. Several vessels in one file are refused.
+It determines the unit, drops small loose parts, closes holes, joins parts that cross each other, and thickens a sheet
+without thickness and walls that are too thin for the grid, both outwards. Triangles that do not close are repaired in
+`surface_repair`. Several vessels in one file are refused. A closed mesh of one part with thick walls stays as it is.
+
+Steps that may change the cavity compare its volume before and after (`exact_cavity`).
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.vessel.mesh import FORMATS, MOST_FACES, UNITS, check_size
+from sim_engine.resources import MissingExtraError, installed
+from sim_engine.settings.plugin_registry import DISTRIBUTION
+from sim_engine.vessel.exact_cavity import exact_cavity
+from sim_engine.vessel.mesh import (
+    FORMATS,
+    MOST_FACES,
+    UNITS,
+    check_size,
+    scale_of,
+    to_z,
+    typical_wall,
+    wall_thickness,
+)
 from sim_engine.vessel.shapes import LengthUnit, MeshShape, VesselError
+from sim_engine.vessel_acquisition.surface_repair import (
+    boundary_loops,
+    components,
+    distinct,
+    holes_filled,
+    is_closed,
+    oriented,
+    outwards,
+    rebuilt,
+    welded,
+    without_redundant,
+)
+from sim_engine.vessel_acquisition.wall_thickening import fits_grid, thickened
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 SMALLEST, LARGEST = 0.030, 0.400
 """Smallest and largest plausible extent of vessels on a bench [m]."""
@@ -29,6 +57,18 @@ CRUMB = 0.02
 
 HOLE = 0.6
 """For a sheet: share of the longest boundary below which a boundary is a hole to be closed."""
+
+LARGE_HOLE = 0.01
+"""Share of the surface from which a closed hole, or an open surface that is dropped, is a warning."""
+
+CHANGED = 0.01
+"""Relative change of the cavity from which a repair is a warning."""
+
+MOST_BODIES = 30
+"""Number of separate bodies that are examined."""
+
+FLATNESS = 0.02
+"""Largest deviation of a simplified surface [mm]."""
 
 
 @dataclass(frozen=True)
@@ -40,26 +80,99 @@ class RepairedMesh:
         faces: normals outwards, (F, 3).
         unit: of the file's numbers.
         notes: descriptions of the repairs.
+        warnings: what the user has to look at.
     """
 
     vertices: Floats
     faces: Integers
     unit: LengthUnit
     notes: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
-def mended(path: Path, *, unit: LengthUnit | None, wall: float | None) -> RepairedMesh:
+@dataclass
+class _Log:
+    """File and axis for messages, and the messages."""
+
+    path: Path
+    turn: Floats
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def capacity(self, vertices: Floats, faces: Integers) -> float | None:
+        """Volume of the cavity [m³]; None if the surface is not closed."""
+        try:
+            return exact_cavity(vertices @ self.turn.T, faces).volume
+        except VesselError:
+            return None
+
+    def compare(self, what: str, before: float | None, after: float | None) -> None:
+        """Add a note of a repair, or a warning with both capacities if it changed the cavity."""
+        if before is None or after is None or abs(after - before) <= CHANGED * max(before, after):
+            self.notes.append(what)
+        else:
+            self.warnings.append(f"{what}: that changed the cavity from {1e6 * before:.0f} to {1e6 * after:.0f} mL")
+
+
+def mended(
+    path: Path, *, unit: LengthUnit | None, wall: float | None, up: Axis = "z", drop_bodies: bool = False
+) -> RepairedMesh:
     """Read a mesh and repair it.
 
     Args:
         path: STL, OBJ, PLY or GLB.
         unit: of its numbers; None: determined by its size.
         wall: thickness given to a sheet [m].
+        up: axis of the mesh that points out of the opening.
+        drop_bodies: leave out separate bodies that fill a part of the cavity.
 
     Raises:
         VesselError: it cannot be made a solid; the text gives a remedy.
+        MissingExtraError: it needs a package that is not installed.
         OSError: the file cannot be read.
     """
+    import trimesh
+
+    log = _Log(path, to_z(up))
+    mesh = _read(path)
+    extent = float(np.max(mesh.extents))
+    if unit is not None:
+        scale_of(extent, MeshShape(path=path, unit=unit))
+    found = unit or likely_unit(extent, path)
+    if unit is None:
+        log.notes.append(f"its numbers are taken for {found}: it is {1e3 * UNITS[found] * extent:.0f} mm large")
+    mesh.apply_scale(UNITS[found])
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    if not len(mesh.faces):
+        raise VesselError(f"{path.name}: all of its triangles are without area")
+    if not mesh.is_watertight:
+        _require_igl()
+        mesh = _closed(mesh, wall, log)
+    else:
+        mesh = _one_body(mesh, path, log.notes)
+        trimesh.repair.fix_normals(mesh)
+        if mesh.volume < 0.0:
+            mesh.invert()
+    vertices, faces = np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64)
+    faces = _without_fillers(vertices, faces, drop_bodies, log)
+    joined = _joined(vertices, faces, log)
+    if joined is None:
+        _require_igl()
+        joined = _remade(vertices, faces, log)
+    vertices, faces = joined
+    return RepairedMesh(_thick_enough(vertices, faces, log), faces, found, tuple(log.notes), tuple(log.warnings))
+
+
+def _require_igl() -> None:
+    if not installed("igl"):
+        raise MissingExtraError(
+            "mending this mesh needs the package 'libigl', which is not installed: "
+            f"pip install '{DISTRIBUTION}[vessels]'"
+        )
+
+
+def _read(path: Path) -> Any:
     import trimesh
 
     kind = path.suffix.lower().lstrip(".")
@@ -67,32 +180,22 @@ def mended(path: Path, *, unit: LengthUnit | None, wall: float | None) -> Repair
         raise VesselError(f"{path.name}: '{kind}' is not a mesh format known here; use {', '.join(FORMATS)}")
     check_size(MeshShape(path=path))
     try:
-        mesh = trimesh.load(io.BytesIO(path.read_bytes()), file_type=kind, force="mesh", process=True)
+        # without materials: textures are often missing, and the reader would print the traceback of its search
+        mesh = trimesh.load(
+            io.BytesIO(path.read_bytes()), file_type=kind, force="mesh", process=True, skip_materials=True
+        )
     except Exception as problem:  # trimesh's readers raise various errors for damaged files
         raise VesselError(f"{path.name}: not a readable {kind.upper()} file ({problem})") from problem
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise VesselError(f"{path.name}: no triangles in it; if it has points only, use --points")
     if len(mesh.faces) > MOST_FACES:
         raise VesselError(f"{path.name}: {len(mesh.faces):,} triangles; simplify it to at most {MOST_FACES:,}")
-    notes: list[str] = []
-    found = unit or likely_unit(float(np.max(mesh.extents)), path)
-    if unit is None:
-        notes.append(
-            f"its numbers are taken for {found}: it is {1e3 * UNITS[found] * np.max(mesh.extents):.0f} mm large"
-        )
-    mesh.apply_scale(UNITS[found])
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
-    mesh = _one_body(mesh, path, notes)
-    if not mesh.is_watertight:
-        mesh = _closed(mesh, path, wall, notes)
-    trimesh.repair.fix_normals(mesh)
-    if mesh.volume < 0.0:
-        mesh.invert()
-    vertices, faces = _joined(
-        np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces, dtype=np.int64), path, notes
-    )
-    return RepairedMesh(vertices, faces, found, tuple(notes))
+    if not np.all(np.isfinite(mesh.vertices)):
+        mesh.update_faces(np.isfinite(mesh.vertices).all(axis=1)[mesh.faces].all(axis=1))
+        mesh.remove_unreferenced_vertices()
+        if not len(mesh.faces):
+            raise VesselError(f"{path.name}: its vertices are not finite numbers")
+    return mesh
 
 
 def likely_unit(extent: float, path: Path) -> LengthUnit:
@@ -135,88 +238,112 @@ def _boxes_meet(a: Floats, b: Floats) -> bool:
     return bool(np.all(a[0] <= b[1] + 1e-4) and np.all(b[0] <= a[1] + 1e-4))
 
 
-def _closed(mesh: Any, path: Path, wall: float | None, notes: list[str]) -> Any:
-    """Fill holes; if one boundary is as long as an opening, the mesh is a sheet, and is thickened."""
+def _closed(mesh: Any, wall: float | None, log: _Log) -> Any:
+    """A closed surface from triangles that are open, doubled, or crossed by others."""
+    vertices, faces, tolerance = welded(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64))
+    if tolerance:
+        log.notes.append(f"corners less than {1e6 * tolerance:g} µm apart were joined")
+    faces = _without_crumbs(vertices, distinct(faces), log)
+    upright = vertices @ log.turn.T
+    bottom = float(upright[faces.ravel(), 2].min())
+    faces, removed = without_redundant(upright, faces)
+    if removed.within:
+        log.notes.append(f"{removed.within} inner face(s), which bound no solid, were removed")
+    corners = vertices[faces]
+    whole = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    small = [sheet for sheet in removed.sheets if sheet[2] < LARGE_HOLE * whole]
+    if small:
+        area = 1e4 * sum(sheet[2] for sheet in small)
+        log.notes.append(f"{len(small)} small open surface(s), which bound no solid, of {area:.2g} cm² were dropped")
+    for low, high, area in removed.sheets:
+        if area < LARGE_HOLE * whole:
+            continue
+        log.warnings.append(
+            f"an open surface of {1e4 * area:.3g} cm², {1e3 * (low - bottom):.3g} to {1e3 * (high - bottom):.3g} mm "
+            "above the underside, was dropped: it bounds no solid (the surface of a liquid?)"
+        )
+    vertices, faces = _without_holes(vertices, faces, wall, log)
+    return _mesh(vertices, outwards(vertices, faces))
+
+
+def _mesh(vertices: Floats, faces: Integers) -> Any:
     import trimesh
 
-    before = len(mesh.faces)
-    if trimesh.repair.fill_holes(mesh):
-        notes.append(f"holes closed with {len(mesh.faces) - before} triangle(s)")
-        return mesh
-    loops = _boundaries(mesh)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    mesh.remove_unreferenced_vertices()
+    return mesh
+
+
+def _without_crumbs(vertices: Floats, faces: Integers, log: _Log) -> Integers:
+    part = components(faces)
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    share = np.bincount(part, area) / area.sum()
+    large = np.flatnonzero(share >= min(CRUMB, share.max()))
+    bounds = [(corners[part == k].min(axis=(0, 1)), corners[part == k].max(axis=(0, 1))) for k in large]
+    largest = bounds[int(np.argmax(share[large]))]
+    if any(not _boxes_meet(np.array(each), np.array(largest)) for each in bounds):
+        sizes = ", ".join(" × ".join(f"{1e3 * x:.0f}" for x in high - low) + " mm" for low, high in bounds[:4])
+        raise VesselError(f"{log.path.name}: {len(large)} bodies ({sizes}); a vessel is one: save it alone")
+    if len(large) < len(share):
+        log.notes.append(f"{len(share) - len(large)} loose crumb(s) dropped")
+    return faces[np.isin(part, large)]
+
+
+def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _Log) -> tuple[Floats, Integers]:
+    """Close holes; if one boundary is the opening of a sheet, thicken the sheet."""
+    loops = boundary_loops(faces)
     if not loops:
-        raise VesselError(f"{path.name}: some edges belong to more than two faces; repair it with a mesh program")
-    lengths = np.array([_length(mesh.vertices, loop) for loop in loops])
+        return vertices, faces
+    lengths = np.array([_length(vertices, loop) for loop in loops])
     # an opening is at least as long as a circle with a third of the mesh's width as its diameter
-    opening = lengths.max() > np.pi * np.sort(mesh.extents)[1] / 3.0 and not _is_solid_with_hole(mesh, loops)
-    small = [loop for loop, length in zip(loops, lengths, strict=True) if not opening or length < HOLE * lengths.max()]
-    mesh = _filled(mesh, small)
+    width = np.sort(np.ptp(vertices[faces.ravel()], axis=0))[1]
+    upright = vertices @ log.turn.T
+    opening = bool(lengths.max() > np.pi * width / 3.0 and _is_sheet(upright, faces))
+    if opening:
+        small = [loop for loop, length in zip(loops, lengths, strict=True) if length < HOLE * lengths.max()]
+    else:
+        # an inner and an outer surface without a rim between them: closed each by itself, they would hold nothing
+        around = [bool(np.ptp(upright[loop, :2], axis=0).min() > 0.5 * width) for loop in loops]
+        small = [loop for loop, each in zip(loops, around, strict=True) if sum(around) < 2 or not each]
     if small:
-        longest = 1e3 * max(_length(mesh.vertices, loop) for loop in small)
-        notes.append(f"{len(small)} hole(s) closed, the longest {longest:.0f} mm around")
+        vertices, faces, areas = holes_filled(vertices, faces, small)
+        longest = 1e3 * max(_length(vertices, loop) for loop in small)
+        text = f"{len(small)} hole(s) closed, the longest {longest:.0f} mm around"
+        corners = vertices[faces]
+        whole = (
+            0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+        )
+        if areas.max() > LARGE_HOLE * whole:
+            log.warnings.append(f"{text}; the largest has {1e4 * areas.max():.3g} cm²: check the shape there")
+        else:
+            log.notes.append(text)
     if not opening:
-        return mesh
+        return vertices, faces
     if wall is None:
         raise VesselError(
-            f"{path.name}: a sheet without thickness (its opening is one edge of {1e3 * lengths.max():.0f} mm); say "
-            "how thick its wall is, for example --wall 3mm, and it is thickened outwards"
+            f"{log.path.name}: a sheet without thickness (its opening is one edge of {1e3 * lengths.max():.0f} mm); "
+            "say how thick its wall is, for example --wall 3mm, and it is thickened outwards"
         )
-    notes.append(f"the sheet was thickened outwards by {1e3 * wall:g} mm")
-    return _thickened(mesh, wall)
+    log.notes.append(f"the sheet was thickened outwards by {1e3 * wall:g} mm")
+    thick = _thickened(_mesh(vertices, faces), wall)
+    return np.asarray(thick.vertices, dtype=float), np.asarray(thick.faces, dtype=np.int64)
 
 
-def _is_solid_with_hole(mesh: Any, loops: Sequence[Integers]) -> bool:
-    """Whether a large hole is a missing piece of a solid: its faces point both towards and away from the axis."""
-    centre = mesh.bounds.mean(axis=0)
-    across = mesh.triangles_center[:, :] - centre
-    axis = int(np.argmax(np.abs([np.ptp(mesh.vertices[np.concatenate(list(loops))], axis=0)]).min(axis=0) < 0))
-    radial = np.delete(across, axis if len(loops) > 1 else 2, axis=1)
-    facing = np.einsum("ij,ij->i", radial, np.delete(mesh.face_normals, axis if len(loops) > 1 else 2, axis=1))
-    outwards = float(mesh.area_faces[facing > 0.0].sum() / mesh.area)
-    return 0.25 < outwards < 0.75
-
-
-def _boundaries(mesh: Any) -> list[Integers]:
-    """Closed boundaries as loops of vertices."""
-    edges = mesh.edges_sorted
-    unique, uses = np.unique(edges, axis=0, return_counts=True)
-    single = {tuple(edge) for edge in unique[uses == 1].tolist()}
-    onward: dict[int, int] = {}
-    for a, b in mesh.edges.tolist():
-        if (min(a, b), max(a, b)) in single:
-            onward[b] = a  # opposite to the faces' own order, so that the filling faces the same side
-    loops = []
-    while onward:
-        first, then = onward.popitem()
-        loop = [first]
-        while then != first:
-            loop.append(then)
-            if then not in onward:
-                break
-            then = onward.pop(then)
-        else:
-            loops.append(np.array(loop))
-    return [loop for loop in loops if len(loop) >= 3]
+def _is_sheet(vertices: Floats, faces: Integers) -> bool:
+    """Whether the walls face the axis on one side only: a solid has as much surface towards it as away from it."""
+    corners = vertices[oriented(faces)[0]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, :2]
+    middle = (vertices[faces.ravel(), :2].min(axis=0) + vertices[faces.ravel(), :2].max(axis=0)) / 2.0
+    radial = corners.mean(axis=1)[:, :2] - middle
+    facing = np.einsum("ij,ij->i", radial, normal) / np.maximum(np.linalg.norm(radial, axis=1), 1e-12)
+    away = float(np.maximum(facing, 0.0).sum() / max(np.abs(facing).sum(), 1e-30))
+    return not 0.25 < away < 0.75
 
 
 def _length(vertices: Floats, loop: Integers) -> float:
     corners = vertices[loop]
     return float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1).sum())
-
-
-def _filled(mesh: Any, loops: Sequence[Integers]) -> Any:
-    """Close each loop by a fan about its middle."""
-    import trimesh
-
-    if not loops:
-        return mesh
-    vertices, faces = [np.asarray(mesh.vertices)], [np.asarray(mesh.faces)]
-    count = len(mesh.vertices)
-    for loop in loops:
-        vertices.append(mesh.vertices[loop].mean(axis=0)[None])
-        faces.append(np.column_stack([loop, np.roll(loop, -1), np.full(len(loop), count)]))
-        count += 1
-    return trimesh.Trimesh(np.vstack(vertices), np.vstack(faces), process=False)
 
 
 def _thickened(mesh: Any, wall: float) -> Any:
@@ -232,33 +359,128 @@ def _thickened(mesh: Any, wall: float) -> Any:
     outer = inner + wall * np.asarray(mesh.vertex_normals)
     count = len(inner)
     faces = [np.asarray(mesh.faces)[:, ::-1], np.asarray(mesh.faces) + count]
-    for loop in _boundaries(mesh):
+    for loop in boundary_loops(np.asarray(mesh.faces, dtype=np.int64)):
         after = np.roll(loop, -1)
         faces += [np.column_stack([after, loop, loop + count]), np.column_stack([after, loop + count, after + count])]
     return trimesh.Trimesh(np.vstack([inner, outer]), np.vstack(faces), process=False)
 
 
-def _joined(vertices: Floats, faces: Integers, path: Path, notes: list[str]) -> tuple[Floats, Integers]:
-    """One manifold solid of parts that may cross each other.
+def _without_fillers(vertices: Floats, faces: Integers, drop: bool, log: _Log) -> Integers:
+    """Find separate bodies that fill a part of the cavity, and leave them out if that is wanted."""
+    part = components(faces)
+    bodies = np.unique(part)
+    if not 1 < len(bodies) <= MOST_BODIES:
+        return faces
+    whole = log.capacity(vertices, faces)
+    for body in bodies:
+        chosen = part == body
+        corners, others = vertices[faces[chosen]], vertices[faces[~chosen]]
+        within = np.all(corners.min(axis=(0, 1)) >= others.min(axis=(0, 1))) and np.all(
+            corners.max(axis=(0, 1)) <= others.max(axis=(0, 1))
+        )
+        if not within or whole is None:
+            continue
+        without = log.capacity(vertices, faces[~chosen])
+        if without is None or without <= (1.0 + CHANGED) * whole:
+            continue
+        size = " × ".join(f"{1e3 * x:.0f}" for x in np.ptp(corners.reshape(-1, 3), axis=0))
+        both = f"it holds {1e6 * whole:.0f} mL with it and {1e6 * without:.0f} mL without it"
+        if drop:
+            log.notes.append(f"a separate body of {size} mm in the cavity was left out: {both}")
+            faces, part, whole = faces[~chosen], part[~chosen], without
+        else:
+            log.warnings.append(
+                f"a separate body of {size} mm fills a part of the cavity and counts as solid: {both}. If it is the "
+                "liquid, leave it out with --drop-bodies"
+            )
+    return faces
+
+
+def _solid(vertices: Floats, faces: Integers) -> Any:
+    import manifold3d
+
+    welded_mesh = manifold3d.Mesh(
+        vert_properties=np.asarray(vertices * 1e3, dtype=np.float32), tri_verts=np.asarray(faces, dtype=np.uint32)
+    )
+    welded_mesh.merge()
+    return manifold3d.Manifold(welded_mesh)
+
+
+def _arrays(solid: Any) -> tuple[Floats, Integers]:
+    result = solid.to_mesh()
+    return np.asarray(result.vert_properties[:, :3], dtype=float) / 1e3, np.asarray(result.tri_verts, dtype=np.int64)
+
+
+def _joined(vertices: Floats, faces: Integers, log: _Log) -> tuple[Floats, Integers] | None:
+    """One manifold solid of parts that may cross each other; None if the surface is not closed."""
+    import manifold3d
+
+    solid = _solid(vertices, faces)
+    if solid.status() != manifold3d.Error.NoError:
+        return None
+    parts = solid.decompose()
+    if len(parts) == 1:
+        return _arrays(solid)
+    joined = _arrays(manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add))
+    log.compare(f"{len(parts)} parts that touch were joined", log.capacity(vertices, faces), log.capacity(*joined))
+    return joined
+
+
+def _remade(vertices: Floats, faces: Integers, log: _Log) -> tuple[Floats, Integers]:
+    """A new surface for triangles that do not close.
 
     Raises:
-        VesselError: it is still not a solid.
+        VesselError: it cannot be made.
     """
     import manifold3d
 
-    welded = manifold3d.Mesh(
-        vert_properties=np.asarray(vertices * 1e3, dtype=np.float32), tri_verts=np.asarray(faces, dtype=np.uint32)
-    )
-    welded.merge()
-    solid = manifold3d.Manifold(welded)
-    if solid.status() != manifold3d.Error.NoError:
-        reason = str(solid.status()).rpartition(".")[2]
+    points, triangles, spacing = rebuilt(vertices, faces)
+    solid = _solid(points, triangles) if len(triangles) else None
+    if solid is None or solid.status() != manifold3d.Error.NoError or solid.is_empty():
         raise VesselError(
-            f"{path.name}: is still not a closed solid after mending ({reason}); repair it with a mesh program"
+            f"{log.path.name}: its triangles enclose no solid; is it a sheet without thickness? Save the vessel as one "
+            "closed body, with its wall"
         )
-    parts = solid.decompose()
-    if len(parts) > 1:
-        solid = manifold3d.Manifold.batch_boolean(parts, manifold3d.OpType.Add)
-        notes.append(f"{len(parts)} parts that touch were joined")
-    result = solid.to_mesh()
-    return np.asarray(result.vert_properties[:, :3], dtype=float) / 1e3, np.asarray(result.tri_verts, dtype=np.int64)
+    remade = _arrays(solid.simplify(FLATNESS))
+    before = log.capacity(vertices, faces) if is_closed(faces) else None
+    what = f"its triangles do not close: a new surface was made on a grid of {1e3 * spacing:.2g} mm"
+    after = log.capacity(*remade)
+    if before is None and after:
+        log.warnings.append(f"{what}; it holds {1e6 * after:.0f} mL: compare that with the vessel (--brimful)")
+    else:
+        log.compare(what, before, after)
+    return remade
+
+
+def _thick_enough(vertices: Floats, faces: Integers, log: _Log) -> Floats:
+    """The vertices, displaced outwards if the walls are too thin for the simulator's grid.
+
+    Raises:
+        VesselError: that would change the cavity.
+    """
+    upright = vertices @ log.turn.T
+    extent = np.ptp(upright, axis=0)
+    if fits_grid(extent, wall_thickness(upright, faces)):
+        return vertices
+    wall = typical_wall(upright, faces)
+    if fits_grid(extent, wall):
+        log.notes.append(f"its surface is noisy; the thinnest part of its walls has about {1e3 * wall:.2g} mm")
+        return vertices
+    cavity = exact_cavity(upright, faces)
+    if not cavity.volume:
+        return vertices  # what builds the vessel gives the reason
+    _require_igl()
+    moved, thick = thickened(upright, faces, wall, cavity)
+    after = exact_cavity(moved, faces).volume
+    if abs(after - cavity.volume) > CHANGED * cavity.volume:
+        raise VesselError(
+            f"{log.path.name}: walls of {1e3 * wall:.2g} mm are too thin for the simulator's grid, and thickening them "
+            f"outwards to {1e3 * thick:.2g} mm would change the cavity from {1e6 * cavity.volume:.0f} to "
+            f"{1e6 * after:.0f} mL; give it thicker walls, or describe its inner shape by --height and --diameters"
+        )
+    log.notes.append(
+        f"walls of {1e3 * wall:.2g} mm are too thin for the simulator's grid; they were thickened outwards to "
+        f"{1e3 * thick:.2g} mm, and the cavity keeps its {1e6 * after:.0f} mL"
+    )
+    result: Floats = moved @ log.turn
+    return result
