@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from decimal import Decimal
 
 import pytest
@@ -200,7 +201,7 @@ def test_a_line_that_lost_its_beginning_is_never_a_smaller_weight(dialect, value
         reply = dialect.decode(line[cut:])
     except LineError:
         return
-    assert reply == dialect.decode(line)  # only what carries nothing may be lost: the identification before a weight
+    assert replace(reply, mark=None) == replace(dialect.decode(line), mark=None)  # only its identification may be lost
 
 
 @pytest.mark.parametrize("dialect", [KERN_SWT, SBI, A_AND_D, OHAUS, RADWAG], ids=lambda d: d.name)
