@@ -105,11 +105,14 @@ class DialectFit:
     states: Counter[str] = field(default_factory=Counter)
     others: Counter[str] = field(default_factory=Counter)
     refused: dict[bytes, tuple[str, int]] = field(default_factory=dict)
+    _replies: dict[bytes, object] = field(default_factory=dict, repr=False)
 
     def add(self, line: bytes) -> None:
         """Decode a line."""
         self.total += 1
-        reply = _decoded(self.dialect, line)
+        if line not in self._replies:  # most lines of a long capture are repeated
+            self._replies[line] = _decoded(self.dialect, line)
+        reply = self._replies[line]
         if isinstance(reply, LineError) and not isinstance(reply, OtherQuantityError):
             self.refused[line] = (str(reply), self.refused.get(line, ("", 0))[1] + 1)
             return

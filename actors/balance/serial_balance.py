@@ -622,10 +622,13 @@ class SerialBalance:
     def _check_mark(self, reading: Reading, *, needed: bool) -> bool:
         """Return whether a reading is the same weight, net or gross, as at the tare; several others are an error.
 
-        A balance whose tare is cleared by its key shows the gross weight from then on, and marks it so.
+        A balance whose tare is cleared by its key shows the gross weight from then on, and marks it so. Lines that are
+        not stable may lack the mark.
         """
-        if reading.value is None or not needed:
-            self._seen_mark = reading.mark if reading.value is not None else self._seen_mark
+        if reading.status is not ReadingStatus.STABLE:
+            return True
+        if not needed:
+            self._seen_mark = reading.mark
             return True
         same = not self._tared or reading.mark is self._mark
         self._strange_marks = 0 if same else self._strange_marks + 1

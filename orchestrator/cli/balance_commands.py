@@ -209,7 +209,7 @@ def _print_fits(file: Path, capture: Capture, fits: Sequence[DialectFit]) -> Non
     from rich.text import Text
 
     different = len(set(capture.lines))
-    print(f"{file}: lines {len(capture.lines)}, different {different}")
+    print(f"{file}: number of lines {len(capture.lines)}, of different lines {different}")
     for note in capture.notes:
         print(f"note: {note}")
     table = Table(box=None, pad_edge=False, header_style="", padding=(0, 2, 0, 0))

@@ -207,6 +207,16 @@ def test_the_recorder_says_why_it_can_not(tmp_path):
     assert "/dev/no-balance): there is no such port" in result.stderr
 
 
+@pytest.mark.realtime
+def test_what_came_from_an_unknown_balance_is_kept_and_explained(virtual, tmp_path):
+    far = virtual("mt-sics")
+    path = tmp_path / "unknown.jsonl"
+    result = record(far.port, path, "--set", "dialect=ohaus", "--set", "baud=2400")
+    assert result.exit_code == 1
+    assert f"'decant balance explain {path}' shows it" in result.stderr
+    assert "ES" in explain(path).stdout
+
+
 def test_an_existing_recording_is_not_overwritten(tmp_path):
     path = tmp_path / "kept.jsonl"
     path.write_text("kept")
