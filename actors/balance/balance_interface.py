@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass
 from typing import Protocol
 
-from actors.balance.readings import Reading, ReadingStatus, kilograms
+from actors.balance.readings import OTHER_UNITS, Reading, ReadingStatus, kilograms
 from actors.interfaces import LaboratoryError
 
 
@@ -25,7 +25,8 @@ class Weight:
         stable: whether the balance reports it as stable; only stable weights count as measurements.
         time: of the reading [s]: bench time for a simulated balance in this process, `time.monotonic` for a serial
             balance.
-        status: 'stable', 'unstable', 'over range', 'under range', 'busy', 'error', 'silent' or 'lost'.
+        status: 'stable', 'unstable', 'over range', 'under range', 'busy', 'error', 'silent', 'not understood' or
+            'lost'.
         step: of the display [kg]; 0 if unknown.
         shown: as the balance sent it, e.g. '12.34 g'.
     """
@@ -177,6 +178,9 @@ def unsettled(seen: Reading, shown: str, within: float, damaged: int) -> tuple[t
             return BalanceFaultError, f"it reports a fault{detail}; look it up in its manual"
         case ReadingStatus.BUSY if seen.detail.startswith(REFUSED):
             return CommandError, f"{seen.detail}. Does it speak this dialect? Set 'dialect: auto' to find out"
+        case ReadingStatus.UNREADABLE:
+            text = f"it answers, but no weight came within {within:g} s. Its last line was {seen.detail}"
+            return UnknownDialectError, text
         case ReadingStatus.SILENT:
             return (
                 NoConnectionError,
@@ -189,6 +193,9 @@ def unsettled(seen: Reading, shown: str, within: float, damaged: int) -> tuple[t
         "tray, is it still dripping, is there a draught? Then weigh again; if it never rests, set a slower filter in "
         f"its menu, or allow more 'steps' in the laboratory's file.{cable}",
     )
+
+
+_WITHOUT_LINE = (ReadingStatus.SILENT, ReadingStatus.UNREADABLE)
 
 
 class BalanceDisplay:
@@ -213,7 +220,7 @@ class BalanceDisplay:
             reading: as the balance sent it.
             moment: time of the reading [s].
         """
-        if kilograms(reading.unit) is not None:
+        if kilograms(reading.unit) is not None or reading.unit.lower() in OTHER_UNITS:
             self._unit = reading.unit
         step = reading.step(self._unit)
         if self._given is None and step is not None:
@@ -226,7 +233,7 @@ class BalanceDisplay:
             moment,
             str(reading.status),
             self.step,
-            shown or (self.last.shown if reading.status is ReadingStatus.SILENT else str(reading)),
+            shown or (self.last.shown if reading.status in _WITHOUT_LINE else str(reading)),
         )
 
     def lose(self) -> None:

@@ -302,6 +302,9 @@ class SerialBalanceSettings(BalanceSettings):
     rts: Annotated[bool, NOT_IN_FINGERPRINT] = True
     """Whether the wire RTS is on; some balances stay silent without it. With handshake 'hardware' it follows the handshake."""  # noqa: E501
 
+    weight: Annotated[Literal["net", "gross"], NOT_IN_FINGERPRINT] = "net"
+    """Weight that counts if the balance marks its lines as net or gross. With 'gross' no tare is sent: the driver subtracts the weight at the tare. Lines without a mark always count, and gross lines count as net until there is a tare."""  # noqa: E501
+
     step: PositiveMass | None = None
     """Step of the display, if it is not one unit of the last digit."""
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 from actors.balance.balance_interface import LineSettingsError, UnknownDialectError
 from actors.balance.dialects.dialect import Dialect, LineSettings
+from actors.balance.line_explanation import explain_line, is_text, most_telling, shown_bytes
 from actors.balance.readings import LineError, Reading
 from actors.balance.serial_port import Wire
 
@@ -26,7 +27,6 @@ LISTING = 5.0
 """Longest time of an answer of many lines [s], such as the list of all commands."""
 
 _LONGEST_ANSWER = 48
-_SHOWN = 60
 
 
 @dataclass
@@ -59,8 +59,10 @@ class Attempt:
     def __str__(self) -> str:
         if not self.possible:
             return f"{self.line}: the port can't be set so"
-        parts = [f"unasked came {_shown(self.heard)}"] if self.heard else []
-        parts += [f"{_shown(sent)} → {_shown(came)}" for sent, came in self.answers.items()]
+        parts = [f"unasked came {shown_bytes(self.heard)}"] if self.heard else []
+        parts += [
+            f"{shown_bytes(sent)} → {shown_bytes(came) if came else 'nothing'}" for sent, came in self.answers.items()
+        ]
         return f"{self.line}: {', '.join(parts)}"
 
 
@@ -270,13 +272,6 @@ def _lines(
     return [*lines, rest] if rest else lines
 
 
-def _shown(data: bytes) -> str:
-    if not data:
-        return "nothing"
-    text = repr(data[:_SHOWN])[1:]
-    return text if len(data) <= _SHOWN else f"{text}… ({len(data)} bytes)"
-
-
 def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect]) -> str:
     """Error text: the attempts, the received bytes, and advice."""
     came = [data for attempt in attempts for data in (attempt.heard, *attempt.answers.values()) if data]
@@ -289,7 +284,7 @@ def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect])
             "these protocols, is it the right port and the right cable (some need a crossed one)? Some stay silent "
             "without a handshake ('handshake: hardware'), others with DTR or RTS on ('dtr: false', 'rts: false')."
         )
-    elif sum(not 0x20 <= byte < 0x7F and byte not in b"\r\n" for byte in everything) * 5 > len(everything):
+    elif not is_text(everything):
         advice = (
             "What came is not text: speed or parity differ; read them in the balance's menu, and set 'baud' and "
             "'format'."
@@ -298,6 +293,8 @@ def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect])
         advice = "Its lines end with CR alone; choose CR LF as their end in its menu."
     else:
         advice = "It answers, but not in this way; choose another protocol in its menu, or name its dialect."
+        if (line := most_telling(everything.splitlines(), allowed)) is not None:
+            advice += f" It sent {explain_line(line, allowed)}."
     titles = ", ".join(dialect.title for dialect in allowed)
     tried = "\n  ".join(map(str, attempts))
     return f"{port}: no balance recognised (looked for {titles}). {advice} Sent, and received:\n  {tried}"

@@ -1,11 +1,14 @@
 """Recordings of a serial line: raw bytes with their times, in a readable file that tests can replay.
 
-`LineRecording` reads and writes such files; `Recorder` writes one during a connection.
+`LineRecording` reads and writes such files; `Recorder` writes one during a connection. `Capture` holds the lines of any
+file with a balance's traffic: a recording, the log of a terminal program, hexadecimal digits, or printed Python bytes.
 """
 
 from __future__ import annotations
 
+import ast
 import json
+import re
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -80,13 +83,17 @@ class LineRecording:
             raise ValueError(f"{path}:{number + 1}: not a recording of a serial line ({error})") from error
         return cls(source, tuple(events), head)
 
+    @property
+    def received(self) -> bytes:
+        """All bytes from the balance."""
+        return b"".join(event.data for event in self.events if event.direction == "in")
+
     def weights(self, dialect: Dialect) -> list[str]:
         """The stable weights in it as a dialect reads them, each as long as it stays: ['0.0 g', '200.0 g']."""
-        received = b"".join(event.data for event in self.events if event.direction == "in")
         found: list[str] = []
-        for line in received.split(b"\n"):
+        for line in split_lines(self.received):
             try:
-                reading = dialect.decode(line.removesuffix(b"\r"))
+                reading = dialect.decode(line)
             except LineError:
                 continue
             if isinstance(reading, Reading) and reading.status is ReadingStatus.STABLE and reading.value is not None:
@@ -129,6 +136,88 @@ class Recorder:
         """Add metadata that was not known at the start."""
         self._file.write(json.dumps({"about": about}, ensure_ascii=False) + "\n")
         self._file.flush()
+
+
+LARGEST_CAPTURE = 4 << 20
+"""Bytes of a foreign file that are read; hours of traffic."""
+
+_HEX_LINE = re.compile(rb"\s*(?:[0-9A-Fa-f]{2}[ :,]?)*[0-9A-Fa-f]{2}\s*")
+_BYTES_LINE = re.compile(rb"\s*b(['\"]).*\1\s*")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The lines that a balance sent, from a file of any program.
+
+    Attributes:
+        lines: without their ends; empty lines are left out.
+        about: metadata of a recording; empty for a foreign file.
+        notes: how the file was read, if that was not plain.
+    """
+
+    lines: tuple[bytes, ...]
+    about: dict[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def load(cls, path: Path) -> Capture:
+        """Read a recording, or any other file with lines as they came.
+
+        Raises:
+            ValueError: it can't be read, is no file, is empty, or is a damaged recording; the text names the file.
+        """
+        try:
+            if path.exists() and not path.is_file():
+                raise ValueError(f"{path}: not a file")
+            with path.open("rb") as file:
+                data = file.read(LARGEST_CAPTURE + 1)
+        except OSError as error:
+            raise ValueError(f"{path}: {error.strerror or error}") from error
+        if not data.strip():
+            raise ValueError(f"{path}: the file is empty")
+        if b'"decant_serial_recording"' in data.partition(b"\n")[0]:
+            try:
+                recording = LineRecording.load(path)
+            except UnicodeDecodeError as error:
+                raise ValueError(f"{path}: not a recording of a serial line ({error})") from error
+            return cls._of(recording.received, recording.about, [])
+        notes = [f"only the first {LARGEST_CAPTURE >> 20} MiB were read"] if len(data) > LARGEST_CAPTURE else []
+        return cls._of(_unwrapped(data[:LARGEST_CAPTURE], notes), {}, notes)
+
+    @classmethod
+    def _of(cls, data: bytes, about: dict[str, Any], notes: list[str]) -> Capture:
+        if b"\r" in data and b"\n" not in data:
+            notes = [*notes, "the lines end with CR alone; choose CR LF as their end in the balance's menu"]
+        return cls(tuple(line for line in split_lines(data) if line.strip()), about, tuple(notes))
+
+
+def split_lines(data: bytes) -> list[bytes]:
+    """Return the lines of received bytes, without their ends (CR LF, LF, or CR alone), the unfinished last one too."""
+    if b"\n" not in data:
+        return data.split(b"\r")
+    return [line.removesuffix(b"\r") for line in data.split(b"\n")]
+
+
+def _unwrapped(data: bytes, notes: list[str]) -> bytes:
+    """Return the bytes that a foreign file shows, and note its form."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        notes.append("read as UTF-16")
+        data = data.decode("utf-16", "replace").encode("utf-8")
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    lines = [line for line in data.splitlines() if line.strip()]
+    if all(_BYTES_LINE.fullmatch(line) for line in lines):
+        try:
+            shown = [ast.literal_eval(line.strip().decode("ascii")) for line in lines]
+        except (ValueError, SyntaxError):
+            return data
+        notes.append("read as printed Python bytes")
+        return b"".join(one if one.endswith((b"\n", b"\r")) else one + b"\n" for one in shown)
+    if all(_HEX_LINE.fullmatch(line) for line in lines):
+        plain = bytes.fromhex(re.sub(rb"[^0-9A-Fa-f]", b"", data).decode("ascii"))
+        if plain.rstrip().count(b"\r") or plain.endswith((b"\r", b"\n")):
+            notes.append("read as hexadecimal digits")
+            return plain
+    return data
 
 
 def header(source: Source, about: dict[str, Any]) -> str:

@@ -1,7 +1,8 @@
 """One line of a balance as a value, units of mass, and typed weights.
 
-`Reading` and `Acknowledgement` are the two kinds of lines. `kilograms` converts units, and `typed_weight` parses '12.34
-g'. The meaning of a reading for a pour belongs to `weighing_plan`.
+A line is a `Reading` or an `Acknowledgement`. For any other line, a decoder raises `OtherQuantityError` (a valid line
+without the weight, such as a tare or a limit) or another `LineError`. `kilograms` converts units, and `typed_weight`
+parses '12.34 g'. The meaning of a reading for a pour belongs to `weighing_plan`.
 """
 
 from __future__ import annotations
@@ -37,8 +38,32 @@ def kilograms(unit: str) -> float | None:
     return KILOGRAMS.get(unit.lower().replace("µ", "u"))
 
 
+OTHER_UNITS = {
+    **dict.fromkeys(("pcs", "pc", "stk"), "pieces"),
+    **dict.fromkeys(("%", "pct"), "per cent"),
+    **dict.fromkeys(("ds", "g/cm3"), "a density"),
+    "/lb": "pieces per pound",
+    "ml": "a volume",
+}
+"""Units of numbers that are no mass, in lower case, and what they count. No unit of mass that lost a letter is one of
+them."""
+
+
 class LineError(ValueError):
     """Bytes that are not a line of the dialect: damaged, incomplete, or from another dialect."""
+
+
+class OtherQuantityError(LineError):
+    """A valid line that does not carry the weight. A driver ignores it.
+
+    Args:
+        what: its content, for messages: 'the tare', 'the upper limit of check weighing'.
+        remedy: how to get the weight instead, if it is known.
+    """
+
+    def __init__(self, what: str, remedy: str = "") -> None:
+        super().__init__(f"{what}, not a weight")
+        self.what, self.remedy = what, remedy
 
 
 class ReadingStatus(StrEnum):
@@ -57,8 +82,18 @@ class ReadingStatus(StrEnum):
     SILENT = "silent"
     """No reply came; set by the driver, never by a line."""
 
+    UNREADABLE = "not understood"
+    """Lines came, but none with a weight; set by the driver, never by a line."""
+
     LOST = "lost"
     """No connection; set by the driver, never by a line."""
+
+
+class WeightMark(StrEnum):
+    """Which weight a line carries, if it says so."""
+
+    NET = "net"
+    GROSS = "gross"
 
 
 @dataclass(frozen=True)
@@ -70,12 +105,14 @@ class Reading:
         value: number as sent, decimals kept; None if none was sent.
         unit: as sent, '' if none was sent (some dialects leave it out while unstable).
         detail: further content of the line, e.g. an error's number.
+        mark: whether the line is marked as net or gross; None if it is not marked.
     """
 
     status: ReadingStatus
     value: Decimal | None = None
     unit: str = ""
     detail: str = ""
+    mark: WeightMark | None = None
 
     def mass(self, unit: str = "") -> float | None:
         """The weight [kg]; None without a number, or if its unit is not a mass.
@@ -100,7 +137,7 @@ class Reading:
 
     def __str__(self) -> str:
         shown = "" if self.value is None else f"{self.value} {self.unit}".strip()
-        return ", ".join(part for part in (shown, str(self.status), self.detail) if part)
+        return ", ".join(part for part in (shown, self.mark or "", str(self.status), self.detail) if part)
 
 
 class ReadingReply(StrEnum):

@@ -15,7 +15,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from actors.balance.balance_interface import (
     LOST_REFERENCE,
@@ -34,7 +34,18 @@ from actors.balance.balance_interface import (
 from actors.balance.balance_settings import SerialBalanceSettings, Settled, Settling
 from actors.balance.dialect_detection import Detected, detect
 from actors.balance.dialects.dialect import Dialect, LineSettings
-from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingReply, ReadingStatus, Reply
+from actors.balance.line_explanation import explain_line, shown_bytes
+from actors.balance.readings import (
+    OTHER_UNITS,
+    Acknowledgement,
+    LineError,
+    OtherQuantityError,
+    Reading,
+    ReadingReply,
+    ReadingStatus,
+    Reply,
+    WeightMark,
+)
 from actors.balance.serial_port import Counters, PortLostError, Tap, Wire
 
 _REOPEN_INTERVAL = 0.2
@@ -55,6 +66,8 @@ class Conversation:
         self.counters = Counters()
         self.found: Detected | None = None
         """The detected balance; kept when the port vanishes."""
+        self.refused: bytes | None = None
+        """The last line without a weight since the last query."""
         self._wire: Wire | None = None
         self._asked_at = -math.inf
 
@@ -125,22 +138,36 @@ class Conversation:
         """Request the display's current weight.
 
         Returns:
-            The reading (status 'silent' if no reply came) and its time [s of `time.monotonic`].
+            The reading and its time [s of `time.monotonic`]. Its status is 'silent' if nothing came, and 'not
+            understood' if lines came, but none with the weight that the settings name.
 
         Raises:
             NoConnectionError: the port vanished, or cannot be opened.
         """
+        self.refused = None
         with self._wire_at_rest() as wire:
             wire.send(self.dialect.query)
             end = time.monotonic() + self._spec.answer_time
+            held: tuple[Reading, float] | None = None
             while (line := self._line(wire, end)) is not None:
                 reply = self._decoded(line)
-                if isinstance(reply, Reading):
+                if isinstance(reply, Reading) and reply.mark in (None, self._spec.weight):
                     return reply, time.monotonic()
+                if isinstance(reply, Reading):
+                    if self._spec.weight == "gross":
+                        self.refused = line
+                    elif held is None:  # without a tare, gross is net; a balance that sends both sends net soon
+                        held = reply, time.monotonic()
+                        end = min(end, max(self._asked_at + self.interval, held[1]))
+                    continue
                 if isinstance(reply, Acknowledgement) and not reply.command and reply.answer is ReadingReply.REFUSED:
                     return Reading(ReadingStatus.BUSY, detail=f"{REFUSED}: {reply.text}"), time.monotonic()
+        if held is not None:
+            return held
         self.counters.unanswered += 1
-        return Reading(ReadingStatus.SILENT), time.monotonic()
+        if self.refused is None:
+            return Reading(ReadingStatus.SILENT), time.monotonic()
+        return Reading(ReadingStatus.UNREADABLE, detail=self._explained(self.refused)), time.monotonic()
 
     def command(self, data: bytes, patience: float) -> Acknowledgement | None:
         """Send tare or zero, and wait for the reply if the dialect has one.
@@ -215,11 +242,23 @@ class Conversation:
     def _decoded(self, line: bytes) -> Reply | None:
         try:
             reply = self.dialect.decode(line)
-        except LineError:
-            self.counters.damaged += 1
+        except LineError as error:
+            if isinstance(error, OtherQuantityError):
+                self.counters.other += 1
+            else:
+                self.counters.damaged += 1
+            self.refused = line
             return None
         self.counters.lines += 1
         return reply
+
+    def _explained(self, line: bytes) -> str:
+        """Return what a line without the weight is, and the remedy."""
+        try:
+            self.dialect.decode(line)
+        except LineError:
+            return explain_line(line, [self.dialect])
+        return f"{shown_bytes(line)}: the net weight, and 'weight: gross' is set. Set its print-out to gross"
 
     def _open_wire(self, line: LineSettings) -> Wire:
         spec = self._spec
@@ -241,7 +280,8 @@ COMMAND_TIME = 3.0
 _RETRY_INTERVAL = 0.5
 
 STRANGE_UNITS = 3
-"""Number of consecutive readings in a unit that is not a mass before it is an error."""
+"""Number of consecutive readings in a unit that is not a mass, or with another mark than at the tare, before it is an
+error."""
 
 LOSSES = 3
 """Number of lost connections allowed during one weighing."""
@@ -269,6 +309,10 @@ class SerialBalance:
         self._conversation = Conversation(spec, self._interrupted, tap)
         self._display = BalanceDisplay(spec.step)
         self._tared = self._reference_lost = False
+        self._mark: WeightMark | None = None
+        self._seen_mark: WeightMark | None = None
+        self._strange_marks = 0
+        self._kept_tare = 0.0
         self._losses = self._strange_units = 0
         self._silent_since: float | None = None
 
@@ -286,8 +330,15 @@ class SerialBalance:
         return self.describe()
 
     def tare(self) -> None:
-        """See `BalanceDriver.tare`; a tare that is refused or has no effect is an error, too."""
+        """See `BalanceDriver.tare`; a tare that is refused or has no effect is an error, too.
+
+        With 'weight: gross' nothing is sent: the driver subtracts the present weight from now on.
+        """
         self._open()
+        if self._spec.weight == "gross":
+            self._kept_tare = self._settle().mass
+            self._note_reference()
+            return
         self._set_reference("tare", self._conversation.dialect.tare)
 
     def zero(self) -> None:
@@ -301,24 +352,26 @@ class SerialBalance:
         if dialect.zero is None:
             raise self._error(CommandError, f"{dialect.title} has no command for zero; use its key, or tare instead")
         self._set_reference("zero", dialect.zero)
+        self._kept_tare = 0.0
 
     def weigh(self) -> Weight:
         """See `BalanceDriver.weigh`; waits until the weight has settled."""
         settled, seen = self._settle(reference_needed=True), self._display
-        return Weight(settled.mass, True, settled.time, str(ReadingStatus.STABLE), seen.step, seen.last.shown)
+        mass = settled.mass - self._kept_tare
+        return Weight(mass, True, settled.time, str(ReadingStatus.STABLE), seen.step, seen.last.shown)
 
     # Observation.
 
     def read(self) -> Weight:
         """See `BalanceDriver.read`; returns the last reading while another call waits for a reply."""
-        if not self._lock.acquire(timeout=self._spec.answer_time / 4.0):
-            return self._display.last
-        try:
-            if time.monotonic() - self._display.last.time >= 0.9 * self._conversation.interval:
-                self._read_once()
-            return self._display.last
-        finally:
-            self._lock.release()
+        if self._lock.acquire(timeout=self._spec.answer_time / 4.0):
+            try:
+                if time.monotonic() - self._display.last.time >= 0.9 * self._conversation.interval:
+                    self._read_once()
+            finally:
+                self._lock.release()
+        last = self._display.last
+        return replace(last, mass=last.mass - self._kept_tare) if self._kept_tare else last
 
     def stream(self, interval: float = 0.15) -> Iterator[Weight]:
         """Yield the display's weight until `interrupt`.
@@ -394,10 +447,19 @@ class SerialBalance:
                 continue
             settled = self._near_zero()
             if settled is None:
-                self._tared, self._reference_lost = True, False
+                self._note_reference()
                 return
             said = f"it still shows {self._display.in_grams(settled.mass)}, stable"
+            if self._seen_mark is WeightMark.GROSS:
+                said += (
+                    ", and that is the gross weight, which a tare does not change: set its print-out to net, or "
+                    "'weight: gross' in the laboratory's file"
+                )
         raise self._error(CommandError, WITHOUT_EFFECT.format(name=name, times=COMMAND_ATTEMPTS, said=said))
+
+    def _note_reference(self) -> None:
+        """Record that the display's present mark and zero are those of the tare."""
+        self._tared, self._reference_lost, self._mark = True, False, self._seen_mark
 
     def _send(self, name: str, data: bytes) -> str:
         """Send a command; return '' if it was accepted or has no reply, otherwise the reason for a retry."""
@@ -448,13 +510,14 @@ class SerialBalance:
             reading, moment = exchanged
             seen = reading if reading.status is not ReadingStatus.SILENT else seen
             self._check_unit(reading)
+            of_tare = self._check_mark(reading, needed=reference_needed)
             if reading.status in (ReadingStatus.OVER, ReadingStatus.UNDER, ReadingStatus.ERROR):
                 outside_since = outside_since or moment
                 if moment - outside_since > OUT_OF_RANGE_TIME / self._spec.time_scale:
                     break
             else:
                 outside_since = None
-            stable = reading.status is ReadingStatus.STABLE
+            stable = reading.status is ReadingStatus.STABLE and of_tare
             settled = settling.feed(reading.mass() if stable else None, moment, self._display.step)
             if settled is not None:
                 self._losses = 0
@@ -548,12 +611,36 @@ class SerialBalance:
         self._strange_units = self._strange_units + 1 if strange else 0
         if self._strange_units >= STRANGE_UNITS:
             self._strange_units = 0
+            what = OTHER_UNITS.get(reading.unit.lower(), "not a mass that is understood")
             wrong = (
-                f"it shows {reading.value} {reading.unit}, and that is not a mass that is understood; switch it to g"
+                f"it shows {reading.value} {reading.unit}, and that is {what}; switch it to g"
                 if reading.unit
                 else f"it sends {reading.value} without a unit; switch on the unit in the print settings of its menu"
             )
             raise self._error(UnitError, wrong)
+
+    def _check_mark(self, reading: Reading, *, needed: bool) -> bool:
+        """Return whether a reading is the same weight, net or gross, as at the tare; several others are an error.
+
+        A balance whose tare is cleared by its key shows the gross weight from then on, and marks it so. Lines that are
+        not stable may lack the mark.
+        """
+        if reading.status is not ReadingStatus.STABLE:
+            return True
+        if not needed:
+            self._seen_mark = reading.mark
+            return True
+        same = not self._tared or reading.mark is self._mark
+        self._strange_marks = 0 if same else self._strange_marks + 1
+        if self._strange_marks >= STRANGE_UNITS:
+            self._strange_marks = 0
+            shown, was = reading.mark or "unmarked", self._mark or "unmarked"
+            text = (
+                f"it shows the {shown} weight, {reading.value} {reading.unit}, but showed the {was} weight after the "
+                "last tare: the tare was cleared or changed at the balance. Tare it again"
+            )
+            raise self._error(CommandError, text)
+        return same
 
     @contextlib.contextmanager
     def _exclusive(self) -> Iterator[None]:

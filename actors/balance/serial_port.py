@@ -52,6 +52,7 @@ class Counters:
 
     Attributes:
         lines: valid lines.
+        other: valid lines with another quantity than the weight, such as a tare.
         damaged: invalid lines.
         stale: unread lines that were discarded before a new query.
         unanswered: queries without a reply.
@@ -59,6 +60,7 @@ class Counters:
     """
 
     lines: int = 0
+    other: int = 0
     damaged: int = 0
     stale: int = 0
     unanswered: int = 0

@@ -36,7 +36,15 @@ if TYPE_CHECKING:
     from actors.balance.balance_interface import BalanceDriver, ReferenceLostError, Weight
     from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, SerialBalanceSettings
     from actors.balance.dialects.dialect import Dialect, LineSettings
-    from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingStatus, Reply
+    from actors.balance.readings import (
+        Acknowledgement,
+        LineError,
+        OtherQuantityError,
+        Reading,
+        ReadingStatus,
+        Reply,
+        WeightMark,
+    )
     from actors.balance.scale_model import Load
     from actors.balance.serial_balance import SerialBalance
     from actors.bench.pour_feasibility import plan_pour
@@ -181,6 +189,7 @@ __all__ = [
     "Objective",
     "Objectives",
     "OptimizerQueries",
+    "OtherQuantityError",
     "Outcome",
     "PathReport",
     "PlannedPour",
@@ -240,6 +249,7 @@ __all__ = [
     "VesselError",
     "VesselSpec",
     "Weight",
+    "WeightMark",
     "build_vessel",
     "cylinder",
     "load_arrays",
@@ -319,7 +329,15 @@ _SOURCES = {
     "actors.balance.balance_interface": ("BalanceDriver", "ReferenceLostError", "Weight"),
     "actors.balance.balance_settings": ("BalanceSettings", "BalanceEmulator", "SerialBalanceSettings"),
     "actors.balance.dialects.dialect": ("Dialect", "LineSettings"),
-    "actors.balance.readings": ("Acknowledgement", "LineError", "Reading", "ReadingStatus", "Reply"),
+    "actors.balance.readings": (
+        "Acknowledgement",
+        "LineError",
+        "OtherQuantityError",
+        "Reading",
+        "ReadingStatus",
+        "Reply",
+        "WeightMark",
+    ),
     "actors.balance.serial_balance": ("SerialBalance",),
     "actors.balance.scale_model": ("Load",),
     # Arms

@@ -222,7 +222,7 @@ _add(
 
 _balance = _group(
     "balance",
-    "Check a balance before the first pour, and record its raw traffic.",
+    "Check a balance before the first pour; record its raw traffic and explain it.",
     "decant balance check configs/laboratories/ur10-kern.yaml",
     "decant balance check /dev/serial/by-id/usb-FTDI_FT232R-if00-port0   # no laboratory file yet",
 )
@@ -236,6 +236,12 @@ _add(
 _add(
     balance_commands.record,
     "decant balance record rig.yaml --to kern.jsonl --remarks 'Kern PCB 3500-2; 200 g put on after 10 s'",
+    to=_balance,
+)
+_add(
+    balance_commands.explain,
+    "decant balance explain kern.jsonl      # a recording",
+    "decant balance explain terminal.log    # the lines as another program saved them",
     to=_balance,
 )
 

@@ -14,6 +14,8 @@ from actors.balance.readings import Reading, Reply
 NUMBER = re.compile(r"[+-]?[0-9]{1,10}(?:\.[0-9]{1,9})?")
 """A weight in digits: no exponent, no comma, and a digit on both sides of the point."""
 
+_SIGNED = re.compile(r" *(?P<sign>[+-]?) *(?P<digits>[0-9][0-9.,]*) *")
+
 
 @dataclass(frozen=True)
 class LineSettings:
@@ -84,7 +86,11 @@ class Dialect(ABC):
         Args:
             line: without its CR LF.
 
+        Returns:
+            A `Reading` only for the weight itself, or for a status instead of it.
+
         Raises:
+            OtherQuantityError: it carries a tare, a limit, a sum, or another quantity with a mark of its own.
             LineError: it is not a line of this dialect.
         """
 
@@ -130,3 +136,19 @@ def text_of(line: bytes) -> str | None:
 def number_in(text: str) -> Decimal | None:
     """Return the number that makes up the whole text; None for any other text."""
     return Decimal(text) if NUMBER.fullmatch(text) else None
+
+
+def signed_number(text: str, *, comma: bool = False) -> Decimal | None:
+    """Return the number in a field of a line; None for any other text.
+
+    The sign is at the left end of the field or next to the digits, because balances of one protocol differ in it.
+
+    Args:
+        text: sign, blanks and digits.
+        comma: whether a decimal comma is allowed.
+    """
+    match = _SIGNED.fullmatch(text)
+    if match is None:
+        return None
+    digits = match["digits"].replace(",", ".") if comma else match["digits"]
+    return number_in(match["sign"] + digits)

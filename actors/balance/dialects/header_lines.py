@@ -9,13 +9,16 @@ Many makers use such lines. `decode` accepts all of them:
 | `ST,G,   1.000kg`         | Kern GAB-N                                                      |
 | `ST,NT,+  4.876kg`        | indicators of A&D, T-Scale, Jadever and their copies            |
 
-`ST` is stable and `US` unstable. The second header is `GS` or `G` (gross), `NT` or `N` (net), or `TR` or `T` (the tare,
-which is no weight). `A_AND_D` and `KERN_CONTINUOUS` differ in their commands.
+`ST` is stable and `US` unstable. The second header is `GS` or `G` (gross), `NT` or `N` (net), or the result of a
+comparison (`HI`, `OK`, `LO`, `--`). Lines with any other header are other quantities: `TR`, `T`, `TW` (tare), `PT`
+(preset tare), `UW` (unit weight), and so on (`OTHERS`). `QT` is a count. `A_AND_D` and `KERN_CONTINUOUS` differ in
+their commands.
 
 Sources: A&D's command tables (`Q` and `SI` at once, `S` once stable, `SIR` repeated, `C` cancels, `R` or `Z` re-zero,
-`T` tare; with 'error code' on, `AK` and `EC,E01`); Kern's KFB-TM, KFN-TM and GAB-N operating instructions (`S`, `W`,
-`T`, `Z`, `P`). Factory settings: A&D 2400 baud 7E1, Kern 9600 baud 8N1. No source was found for the end of Kern's
-commands; the driver sends CR LF.
+`T` tare; with 'error code' on, `AK` and `EC,E01`); A&D EK-L p. 28 (units, `OL` with a unit), GC p. 51 (comparison),
+MC-10K p. 36 (tare, date, data number), AD-4406 p. 47 (`TR`), Kern's KFB-TM, KFN-TM and GAB-N operating instructions
+(`S`, `W`, `T`, `Z`, `P`; `TW`, `NO`, `TOTAL`), Tiger TI-02-P p. 21 (comma before the unit). Factory settings: A&D 2400
+baud 7E1, Kern 9600 baud 8N1. No source was found for the end of Kern's commands; the driver sends CR LF.
 
 Limitations: the lines carry no checksum and, except for A&D's, no fixed width. A line that lost a digit on the way is
 another weight; only the agreement of several readings protects from it. No line reports a fault.
@@ -27,7 +30,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from actors.balance.dialects.dialect import Dialect, LineSettings, number_in, text_of
+from actors.balance.dialects.dialect import Dialect, LineSettings, signed_number, text_of
 from actors.balance.dialects.protocol_encoder import (
     Cancel,
     CommandEncoder,
@@ -40,13 +43,25 @@ from actors.balance.dialects.protocol_encoder import (
     silently,
     weight_line,
 )
-from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingReply, ReadingStatus, Reply
+from actors.balance.readings import (
+    Acknowledgement,
+    LineError,
+    OtherQuantityError,
+    Reading,
+    ReadingReply,
+    ReadingStatus,
+    Reply,
+    WeightMark,
+    kilograms,
+)
 
 _LINE = re.compile(
-    r"(?P<state>ST|US|QT) *, *(?:(?P<load>GS|NT|TR|G|N|T)(?![A-Z]) *,? *)?"
-    r"(?P<sign>[+-]?) *(?P<number>[0-9.]+) *(?P<unit>[A-Za-z%]{0,4}) *"
+    r"(?P<state>ST|US|QT) *, *(?:(?P<load>[A-Z]{1,3}|--)(?![A-Za-z]) *,? *)?"
+    r"(?P<number>[+-]? *[0-9]+(?:[.,][0-9]+)?)(?: *, *(?=[A-Za-z%]))? *(?P<unit>[A-Za-z%]{0,4}) *"
 )
-_OUTSIDE = re.compile(r"OL *,[ A-Z0-9.,+-]*")
+_OUTSIDE = re.compile(r"OL *,[ A-Za-z%0-9.,+-]*")
+_HEADED = re.compile(r"(?P<name>[A-Z]{1,5}) *[,:] *\S.*")
+_MARKED = re.compile(rb"..,[GN]")
 _FAILED = re.compile(r"EC *, *E(?P<number>[0-9]{1,3})")
 
 ACKNOWLEDGED = b"\x06"
@@ -55,6 +70,32 @@ ACKNOWLEDGED = b"\x06"
 _FAILURES = {1: "it does not know the command", 4: "too many characters", 6: "a format error", 7: "a wrong parameter"}
 _NOT_NOW = (2, 3, 11)
 """Errors of A&D that may end by themselves: not ready, timed out, not stable."""
+
+COMPARISONS = ("HI", "OK", "LO", "--")
+"""Second headers with the result of a comparison."""
+
+MARKS: dict[str | None, WeightMark | None] = {
+    **dict.fromkeys(("GS", "G", "GW"), WeightMark.GROSS),
+    **dict.fromkeys(("NT", "N", "NW"), WeightMark.NET),
+    None: None,
+    **dict.fromkeys(COMPARISONS),
+}
+"""Second headers of a weight; None for a line without one."""
+
+OTHERS = {
+    **dict.fromkeys(("TR", "T", "TW", "TA"), "the tare"),
+    "PT": "the preset tare",
+    "UW": "the unit weight of a count",
+    **dict.fromkeys(("AQ", "TQ"), "a total count"),
+    **dict.fromkeys(("AN", "NO"), "the number of weighings"),
+    **dict.fromkeys(("TOTAL", "SUM", "TL"), "a total"),
+    **dict.fromkeys(("MAX", "MIN", "AVE", "SD", "CV", "R"), "a statistical value"),
+    **dict.fromkeys(("ID", "SN", "TN", "FN"), "an identification"),
+    "MR": "a memory",
+    "DT": "a date",
+    "TM": "a time",
+}
+"""Headers of other quantities."""
 
 WIDTH = 15
 """Narrowest line of A&D's; a narrower one has lost characters."""
@@ -67,7 +108,7 @@ def decode(line: bytes) -> Reply:
         line: without its CR LF.
 
     Raises:
-        LineError: it is not such a line, or reports the tare.
+        LineError: it is not such a line.
     """
     if line == ACKNOWLEDGED:
         return Acknowledgement("", ReadingReply.DONE)
@@ -82,13 +123,17 @@ def decode(line: bytes) -> Reply:
         answer = ReadingReply.BUSY if number in _NOT_NOW else ReadingReply.REFUSED
         return Acknowledgement("", answer, f"{text} ({_FAILURES.get(number, 'see its manual')})")
     match = _LINE.fullmatch(text)
-    value = number_in(match["sign"] + match["number"]) if match is not None else None
+    value = signed_number(match["number"], comma=True) if match is not None else None
     if match is None or value is None:
+        if (headed := _HEADED.fullmatch(text)) is not None and headed["name"] in OTHERS:
+            raise OtherQuantityError(f"{OTHERS[headed['name']]} ('{headed['name']}')")
         raise LineError("neither a weight nor an answer to a command")
-    if match["load"] in ("TR", "T"):
-        raise LineError("the tare, not a weight")
+    if match["load"] not in MARKS:
+        raise OtherQuantityError(f"{OTHERS.get(match['load'], 'an unknown quantity')} ('{match['load']}')")
+    if match["state"] == "QT" and kilograms(match["unit"]) is not None:
+        raise OtherQuantityError("a number of pieces ('QT')", "Switch its counting mode off")
     status = ReadingStatus.UNSTABLE if match["state"] == "US" else ReadingStatus.STABLE
-    return Reading(status, value, match["unit"])
+    return Reading(status, value, match["unit"], mark=MARKS[match["load"]])
 
 
 _HEADERS = {ReadingStatus.STABLE: "ST", ReadingStatus.UNSTABLE: "US"}
@@ -117,8 +162,9 @@ class AAndD(Dialect):
     def decode(self, line: bytes) -> Reply:
         """See `Dialect.decode`; lines with a second header belong to `KernContinuous`."""
         reply = decode(line)
-        if isinstance(reply, Reading) and (len(line) < WIDTH or line[3:4].isalpha()):
-            raise LineError(f"{len(line)} characters, or gross and net; a weight has at least {WIDTH} and neither")
+        width = WIDTH + 3 * (text_of(line[3:5]) in COMPARISONS)
+        if isinstance(reply, Reading) and (len(line) < width or _MARKED.match(line)):
+            raise LineError(f"{len(line)} characters, or gross and net; a weight has at least {width} and neither")
         return reply
 
     def encode(self, reading: Reading) -> bytes:

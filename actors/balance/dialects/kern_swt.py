@@ -8,8 +8,10 @@
 
 The widths include CR LF. The drawings of the second column can also be read as one byte more (19 and 16), so these
 widths are accepted too. A line of any other width has lost characters, and a lost digit would give a wrong weight; such
-a line is invalid. A stable line has a unit and an unstable one has none; the unit is the only difference. `=Overload=`
-may appear instead of a value. Such balances must be set to remote control ('rE Cr').
+a line is invalid. The sign is in its column or next to the digits (`     -29.186 g  ` was captured from a balance). A
+stable line has a unit and an unstable one has none; the unit is the only difference. `=Overload=` may appear instead of
+a value. Counts and percentages have the same lines with the units `Pcs` and `%`, which are no mass. Such balances must
+be set to remote control ('rE Cr').
 
 Limitations: there is no command for zero, and a tare is not acknowledged.
 """
@@ -20,7 +22,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from actors.balance.dialects.dialect import Dialect, LineSettings, number_in, text_of
+from actors.balance.dialects.dialect import Dialect, LineSettings, signed_number, text_of
 from actors.balance.dialects.protocol_encoder import (
     END,
     EncoderDisplay,
@@ -41,7 +43,7 @@ UNSTABLE_WIDTHS = (13, 14, 16, 17)
 FAULT_WIDTHS = (12, 16)
 """Widths of a fault line without CR LF."""
 
-_LINE = re.compile(r"[ M]?(?P<sign>[ -]?) *(?P<value>[0-9.]+) (?P<unit>[A-Za-z%]{0,4}) *")
+_LINE = re.compile(r"[ M]?(?P<value> *-? *[0-9.]+) (?P<unit>[A-Za-z%]{0,4}) *")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,7 +72,7 @@ class KernSwt(Dialect):
         if text.strip() == "=Overload=":
             return Reading(ReadingStatus.OVER)
         match = _LINE.fullmatch(text)
-        value = number_in(match["sign"].strip() + match["value"]) if match is not None else None
+        value = signed_number(match["value"]) if match is not None else None
         if match is None or value is None:
             raise LineError("not a weight")
         widths = STABLE_WIDTHS if match["unit"] else UNSTABLE_WIDTHS

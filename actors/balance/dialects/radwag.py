@@ -4,14 +4,15 @@
 |---------|-------------------------------------------------------------------------------------|
 | 1–3     | the command: `SI`, `S`, `SU` or `SUI`                                               |
 | 5       | blank: stable, `?`: unstable, `^`: over range, `v`: under range                     |
-| 7       | blank or `-`                                                                        |
+| 7       | blank or `-`; the `-` may also be next to the digits                                |
 | 8–16    | number, right-aligned                                                               |
 | 18–20   | unit, left-aligned                                                                  |
 
-Columns 4, 6 and 17 are blank. A line of another width has lost characters and is invalid. `T` and `Z` are answered
-by `T A` (understood) and then `T D` (done), `T ^`, `T v`, or `T E` (not at rest in time); `T I` means not now, and `ES`
-an unknown command. Source: communication protocol in Radwag's PS, PS R2, AS R2 and WTC manuals. Factory setting of
-most: 9600 baud 8N1.
+Columns 4, 6 and 17 are blank. A line of another width has lost characters and is invalid. Lines that begin with another
+command are other quantities (`OTHERS`): `OT` is the tare, `ODH` and `OUH` are limits. `T` and `Z` are answered by `T A`
+(understood) and then `T D` (done), `T ^`, `T v`, or `T E` (not at rest in time); `T I` means not now, and `ES` an
+unknown command. Source: communication protocol in Radwag's PS, PS R2, AS R2, WTC and PUE C41H manuals. Factory setting
+of most: 9600 baud 8N1.
 
 Limitations: no line reports a fault.
 """
@@ -23,7 +24,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
-from actors.balance.dialects.dialect import Dialect, number_in, text_of
+from actors.balance.dialects.dialect import Dialect, signed_number, text_of
 from actors.balance.dialects.protocol_encoder import (
     Cancel,
     CommandEncoder,
@@ -35,12 +36,35 @@ from actors.balance.dialects.protocol_encoder import (
     line_of,
     weight_line,
 )
-from actors.balance.readings import Acknowledgement, LineError, Reading, ReadingReply, ReadingStatus, Reply
+from actors.balance.readings import (
+    Acknowledgement,
+    LineError,
+    OtherQuantityError,
+    Reading,
+    ReadingReply,
+    ReadingStatus,
+    Reply,
+)
 
 WIDTH = 20
 _LINE = re.compile(
-    r"(?:SI |S  |SU |SUI) (?P<state>[ ?^v]) (?P<sign>[ -])(?P<value>[ 0-9.]{9}) (?P<unit>[A-Za-z%]{0,3}) *"
+    r"(?:SI |S  |SU |SUI) (?P<state>[ ?^v]) (?P<sign>[ -])(?P<value>[ 0-9.-]{8}[0-9]) (?P<unit>[A-Za-z%]{0,3}) *"
 )
+_OTHER = re.compile(r"(?P<command>[A-Z]{2,3}) +\S")
+OTHERS = {
+    **dict.fromkeys(("OT", "UT"), "the tare"),
+    **dict.fromkeys(("ODH", "DH"), "the lower limit of check weighing"),
+    **dict.fromkeys(("OUH", "UH"), "the upper limit of check weighing"),
+    "SIA": "a line for several platforms",
+    "SM": "the mass of a piece",
+    "TV": "a target",
+    "RM": "a reference",
+    "BN": "the type",
+    "FS": "the capacity",
+    "RV": "the version of the program",
+}
+"""First words of lines with other quantities."""
+
 _STATES = {
     " ": ReadingStatus.STABLE,
     "?": ReadingStatus.UNSTABLE,
@@ -91,13 +115,15 @@ class Radwag(Dialect):
             if answer["command"].startswith("S") and (status := _READINGS.get(answer["answer"])) is not None:
                 return Reading(status)
             return Acknowledgement(answer["command"], _ANSWERS[answer["answer"]], answer["text"] or "")
+        if (other := _OTHER.match(text)) is not None and other["command"] in OTHERS:
+            raise OtherQuantityError(f"{OTHERS[other['command']]} ('{other['command']}')")
         match = _LINE.fullmatch(text) if len(text) == WIDTH else None
         if match is None:
             raise LineError("neither a weight nor an answer to a command")
         status = _STATES[match["state"]]
         if status in (ReadingStatus.OVER, ReadingStatus.UNDER):
             return Reading(status)
-        value = number_in(match["sign"].strip() + match["value"].lstrip())
+        value = signed_number(match["sign"] + match["value"])
         if value is None:
             raise LineError("not a weight")
         return Reading(status, value, match["unit"])

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
-from actors.balance.dialects.dialect import Dialect, number_in, text_of
+from actors.balance.dialects.dialect import Dialect, number_in, signed_number, text_of
 from actors.balance.dialects.protocol_encoder import (
     END,
     Cancel,
@@ -32,6 +32,7 @@ from actors.balance.readings import (
     KILOGRAMS,
     Acknowledgement,
     LineError,
+    OtherQuantityError,
     Reading,
     ReadingReply,
     ReadingStatus,
@@ -63,6 +64,24 @@ REFUSALS = {
     "EL": "logical error: it can't carry the command out",
 }
 
+OTHERS = {
+    "A01": "the reference of percent weighing",
+    "A10": "the target of a check",
+    "C4": "the date of the adjustment",
+    "DAT": "the date",
+    "M19": "the adjustment weight",
+    "PW": "the weight of a piece",
+    "REF": "the number of reference pieces",
+    "SM1": "the result of dynamic weighing",
+    "SM2": "the result of dynamic weighing",
+    "SM3": "the result of dynamic weighing",
+    **dict.fromkeys(("SX", "SXI", "SXIR"), "a record of several weights"),
+    "TIM": "the time",
+}
+"""Replies with a quantity of their own. The replies to T, TI and TA, which state the tare, are acknowledgements."""
+
+_REPLIED = ("A", "B", "S", "D")
+
 UNIT = re.compile(r"[A-Za-z%µ]{1,5}")
 COMMAND = re.compile(r"(?:T|TI|TA|TAC|Z|ZI|I[0-9]{1,2}|@|MM|U)")
 
@@ -86,6 +105,8 @@ def decode(line: bytes) -> Reply:
         return Acknowledgement("", ReadingReply.REFUSED, REFUSALS[words[0]])
     if words[0] == "S":
         return _weight(words)
+    if len(words) > 1 and words[0] in OTHERS and words[1] in _REPLIED:
+        raise OtherQuantityError(f"{OTHERS[words[0]]} ('{words[0]}')")
     if not COMMAND.fullmatch(words[0]) or len(words) < 2 or (words[1] not in ANSWERS and words[1] != "B"):
         raise LineError("neither a weight nor an answer to a command")
     if words[1] in WEIGHTS and len(words) > 2 and (len(words) != 4 or number_in(words[2]) is None):
@@ -99,10 +120,12 @@ def _weight(words: list[str]) -> Reading:
             return Reading(STATES[state], detail="it can't carry out the question" if state == "L" else "")
         case ["S", "S" | "D", "Error", number]:
             return Reading(ReadingStatus.ERROR, detail=f"error {number}")
-        case ["S", state, value, unit] if state in WEIGHTS:
-            weight = number_in(value)
+        case ["S", state, *signs, value, unit] if state in WEIGHTS:
+            weight = signed_number("".join((*signs, value))) if len(signs) < 2 else None
             if weight is not None and UNIT.fullmatch(unit):
                 return Reading(WEIGHTS[state], weight, unit)
+            if unit == "lb:oz":
+                raise LineError("pounds and ounces in two numbers; switch its unit to g")
     raise LineError("not a weight")
 
 

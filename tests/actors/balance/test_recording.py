@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 
@@ -206,11 +207,121 @@ def test_the_recorder_says_why_it_can_not(tmp_path):
     assert "/dev/no-balance): there is no such port" in result.stderr
 
 
+@pytest.mark.realtime
+def test_what_came_from_an_unknown_balance_is_kept_and_explained(virtual, tmp_path):
+    far = virtual("mt-sics")
+    path = tmp_path / "unknown.jsonl"
+    result = record(far.port, path, "--set", "dialect=ohaus", "--set", "baud=2400")
+    assert result.exit_code == 1
+    assert f"'decant balance explain {path}' shows it" in result.stderr
+    assert "ES" in explain(path).stdout
+
+
 def test_an_existing_recording_is_not_overwritten(tmp_path):
     path = tmp_path / "kept.jsonl"
     path.write_text("kept")
     assert record("/dev/no-balance", path).exit_code == 2
     assert path.read_text() == "kept"
+
+
+def explain(path: Path, *options: str) -> Result:
+    """Run `decant balance explain`."""
+    return CliRunner().invoke(app, ["balance", "explain", str(path), *options])
+
+
+def test_a_recording_is_explained_in_all_dialects(tmp_path):
+    path = tmp_path / "kern.jsonl"
+    KERN_TYPED.save(path)
+    result = explain(path)
+    assert result.exit_code == 0
+    rows = {row.split()[0]: row.split()[1:] for row in result.stdout.splitlines() if row.strip()}
+    assert rows["kern-swt"] == ["3", "3", "12.34", "g,", "0.00", "g"]
+    assert "best fit: kern-swt (3 weights in 3 lines)" in result.stdout
+    assert (
+        "a-and-d: refuses all 3 lines, the first '        12.30    ': neither a weight nor an answer" in result.stdout
+    )
+    found = json.loads(explain(path, "--json").stdout.splitlines()[-1])
+    assert found["best"] == ["kern-swt"]
+    assert found["recorded"] == KERN_TYPED.about
+    assert {one["dialect"] for one in found["dialects"]} == set(dialects())
+    assert next(one for one in found["dialects"] if one["dialect"] == "kern-swt")["reads"] == ["12.34 g", "0.00 g"]
+
+
+SARTORIUS = b"G#    +   213.56 g  \r\nT     +    90.00 g  \r\nN     +   123.56 g  \r\nStat     ERR 054    \r\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "note"),
+    [
+        (SARTORIUS, None),
+        (SARTORIUS.replace(b"\r\n", b"\n"), None),
+        (SARTORIUS.replace(b"\r\n", b"\r"), "end with CR alone"),
+        (b"\xef\xbb\xbf" + SARTORIUS, None),
+        (SARTORIUS.decode().encode("utf-16"), "read as UTF-16"),
+        (SARTORIUS.hex(" ").encode(), "read as hexadecimal digits"),
+        ("".join(f"{line!r}\n" for line in SARTORIUS.splitlines(keepends=True)).encode(), "printed Python bytes"),
+        (b"=~=~= PuTTY log 2026.05.04 10:11:12 =~=~=\r\n" + SARTORIUS + b"N     +   12", None),
+    ],
+)
+def test_the_files_of_other_programs_are_explained(tmp_path, content, note):
+    path = tmp_path / "capture.txt"
+    path.write_bytes(content)
+    result = explain(path)
+    assert result.exit_code == 0, result.stderr
+    assert "best fit: sbi (2 weights in " in result.stdout
+    assert "sbi: 1 × the application tare memory 1 ('T'), not a weight" in result.stdout
+    assert "sbi: 1 × error, error 054" in result.stdout
+    assert "weight: net   # or gross; it sends both" in result.stdout
+    assert note is None or note in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (bytes(range(128, 256)) * 20, "They are not text: speed or parity differ"),
+        (b"12 pcs\r\n", "Set the balance to print the weight in g with its unit"),
+        (b"S S 12 PCS\r\n", "no dialect reads a weight"),
+        (b"dear colleague,\nthe balance does not work\n", "no dialect reads a weight"),
+    ],
+)
+def test_lines_without_any_weight_fit_no_dialect(tmp_path, content, said):
+    path = tmp_path / "capture.txt"
+    path.write_bytes(content)
+    result = explain(path)
+    assert result.exit_code == 1
+    assert said in result.stderr
+    assert "best fit" not in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "No such file or directory"),
+        (b"", "the file is empty"),
+        (b"\r\n \r\n", "the file is empty"),
+        (b'{"decant_serial_recording": 1, "source": "typed"}\n{"t": 0, "dir"', ":2: not a recording of a serial line"),
+        (b'{"decant_serial_recording": 1, "source": "typed"}\n\xff\n', "not a recording of a serial line"),
+    ],
+)
+def test_a_file_that_can_not_be_read_is_one_error(tmp_path, content, said):
+    path = tmp_path / "capture.jsonl"
+    if content is not None:
+        path.write_bytes(content)
+    result = explain(path)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert str(path) in result.stderr
+    assert said in result.stderr
+    assert explain(tmp_path).exit_code == 2, "a folder"
+
+
+def test_a_recording_of_a_silent_balance_says_that_nothing_came(tmp_path):
+    path = tmp_path / "silent.jsonl"
+    LineRecording("hardware", (LineEvent(0.0, "out", b"SI\r\n"),)).save(path)
+    result = explain(path)
+    assert result.exit_code == 1
+    assert "the balance sent nothing" in result.stderr
 
 
 DAYS = sorted((Path(__file__).parents[2] / "data" / "balances").glob("*.jsonl"))
