@@ -4,8 +4,9 @@
 
 The deviations of `GaussianProcess.predict` belong to one set of hyperparameters, the most likely one. With ten
 observations many others explain them as well, some with shorter lengthscales or more noise, and intervals from these
-deviations contain too few observations, most of all at corners. Here the prediction is averaged over the hyperparameters'
-posterior, and the constant prior mean is uncertain as well. Decisions use `predict`; the intervals are for the user.
+deviations contain too few observations, most of all at corners. Here the prediction is averaged over the posterior of
+the hyperparameters, and the constant prior mean is uncertain as well. Decisions use `predict`; the intervals are for
+the user.
 
 Source: averaging over hyperparameters: Rasmussen & Williams, Gaussian Processes for Machine Learning, section 5.2, and
 BoTorch's fully Bayesian models (Eriksson & Jankowiak, High-dimensional Bayesian optimization with sparse axis-aligned
@@ -13,7 +14,8 @@ subspaces, UAI 2021), which draw with a Markov chain. Too narrow plug-in interva
 Bertoncello & Garnier, Robust prediction interval estimation for Gaussian processes by cross-validation method, 2023.
 Uncertain mean: section 2.7 of Rasmussen & Williams. Coverage on recorded transfers: docs/evidence/real-recordings.md.
 
-Limitations: kernel and priors are those of the surrogate. A step of the cost between observations stays outside.
+Limitations: kernel and priors are those of the surrogate. A cost that is larger at a corner than all observations
+suggest stays outside.
 """
 
 from __future__ import annotations

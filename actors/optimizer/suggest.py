@@ -58,7 +58,7 @@ WORST = 8
 """Number of worst disturbances of a request in an answer."""
 
 MOST_AVERAGED = 100
-"""Largest number of observations with intervals averaged over hyperparameters; more determine these, at a higher cost."""
+"""Largest number of observations with intervals averaged over hyperparameters; more determine them well."""
 
 
 def describe(
