@@ -2,17 +2,17 @@
 
     python benchmarks/recorded_transfers.py [--json]
 
-Each of 205 settings of 20 campaigns (tests/data/real/liq_transfer) is predicted from the other settings of its campaign. The
-cost is the mean |error| over three volumes; the axes are the aspiration and the dispense rate, linear or logarithmic between
-the campaign's extremes. The first five settings of a campaign are both rates at 80 % of the largest, and the four corners of
-the range, which are extrapolated from the others.
+Each of 205 settings of 20 campaigns (tests/data/real/liq_transfer) is predicted from the other settings of its
+campaign. The cost is the mean |error| over three volumes; the axes are the aspiration and the dispense rate, linear or
+logarithmic between the campaign's extremes. The first five settings of a campaign are both rates at 80 % of the
+largest, and the four corners of the range, which are extrapolated from the others.
 
 `plug-in` is the interval from the mean and the deviations of one set of hyperparameters, the most likely one.
 `averaged` is that of `actors.optimizer.prediction_intervals`, which D2 and D3 report for their pours.
 
-Questions, fixed before the Sartorius campaigns were predicted with `averaged`: are 85 to 95 % of all settings and at least
-80 % of the first five inside, and is the interval score no worse than that of `plug-in`? The method and its constants were
-chosen with the eight Opentrons campaigns; the twelve Sartorius campaigns answer.
+Questions, fixed before the Sartorius campaigns were predicted with `averaged`: are 85 to 95 % of all settings and at
+least 80 % of the first five inside, and is the interval score no worse than that of `plug-in`? The method and its
+constants were chosen with the eight Opentrons campaigns; the twelve Sartorius campaigns answer.
 """
 
 from __future__ import annotations
@@ -132,10 +132,8 @@ def main() -> None:
         for axes in ("linear", "log"):
             for name, one in figures(campaigns(robot), axes).items():
                 rows.append({"robot": robot, "axes": axes, "interval": name} | one)
-                say(
-                    f"{robot}, {axes} axes, {name}: {one['settings']} settings, {100 * one['inside']:.1f} % inside, of the first "
-                    f"five {100 * one['first']:.1f} %, score {one['score']:.2f} %"
-                )
+                shares = f"{100 * one['inside']:.1f} % inside, of the first five {100 * one['first']:.1f} %"
+                say(f"{robot}, {axes} axes, {name}: {shares}, interval score {one['score']:.2f} %")
     show({"rows": rows, "machine": describe()}, options.json)
 
 

@@ -1,4 +1,4 @@
-"""Surrogates predict recorded transfers of viscous liquids that no simulator made, with intervals that keep their word."""
+"""Surrogates predict recorded transfers of viscous liquids, which no simulator made, with 90 % intervals."""
 
 from __future__ import annotations
 
