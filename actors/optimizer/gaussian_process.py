@@ -393,7 +393,7 @@ def simulated_mean_process(
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3); Kennedy & O'Hagan 2000 with ρ = 1.
     """
     scale = max(simulated.scale, 1e-9)
-    terms = {"known": simulated, "unit": scale}
+    terms: dict[str, Any] = {"known": simulated, "unit": scale}
     process = _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, search, **terms)
     process.simulated_noise = simulated.noise
     return process

@@ -106,6 +106,7 @@ def _proposed(covariance: Covariance, residuals: Array, best: Array) -> tuple[Ar
     widths = 1.0 / np.sqrt(np.maximum(values, 1.0))  # never wider than the prior
     rows = qmc.Sobol(p + 1, scramble=True, rng=np.random.default_rng(0)).random(DRAWS)
     rows = np.clip(rows, 1e-6, 1.0 - 1e-6)
+    rows[FROM_PRIOR, :p] = 0.5  # the most likely ones themselves, whose covariance can be factorised
     z = ndtri(rows[:, :p])
     chi_squared = 2.0 * gammaincinv(0.5 * TAILS, rows[FROM_PRIOR:, p])
     z[FROM_PRIOR:] = z_best + np.sqrt(TAILS / chi_squared)[:, None] * (z[FROM_PRIOR:] * widths) @ axes.T
@@ -117,7 +118,7 @@ def _proposed(covariance: Covariance, residuals: Array, best: Array) -> tuple[Ar
     proposal = np.logaddexp(math.log(share) + prior, math.log(1.0 - share) + around)
     thetas = covariance.centre + covariance.deviation * z
     low, high = covariance.bounds.T
-    inside = np.all((low <= thetas) & (thetas <= high), axis=1)
+    inside = np.all((low - 1e-9 <= thetas) & (thetas <= high + 1e-9), axis=1)
     return thetas[inside], (prior - proposal)[inside]
 
 

@@ -99,7 +99,7 @@ def describe(
     }
     if model.averaged is not None and len(points):
         description["bands"] = tuples(model.averaged.bands(points, LEVEL))
-    elif _announces_pours(query) and len(points) and len(arrays.points) <= MOST_AVERAGED:
+    elif _announces_pours(query) and len(points) and len(process.points) <= MOST_AVERAGED:
         description["bands"] = tuples(observation_intervals(model.process, points, LEVEL))
     if query.predict_at:
         predictions, spreads = model.surrogate.predict(
