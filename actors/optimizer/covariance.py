@@ -11,6 +11,7 @@ shears, M_ℓ is a function of T x instead of x; T has ones on its diagonal, and
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -75,6 +76,19 @@ class PriorCovariance(Protocol):
     def predict(self, points: Array) -> tuple[Array, Array]:
         """Means (m,) and standard deviations (m,) at points (m, d), in the cost's unit."""
         ...
+
+
+@dataclass(frozen=True)
+class _UncertainConstant:
+    """Covariance of a constant: see `PriorCovariance`."""
+
+    deviation: float
+
+    def covariance(self, first: Array, second: Array) -> Array:
+        return np.full((len(first), len(second)), self.deviation**2)
+
+    def predict(self, points: Array) -> tuple[Array, Array]:
+        return np.zeros(len(points)), np.full(len(points), self.deviation)
 
 
 def matern(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
@@ -175,6 +189,15 @@ class Covariance:
         self.centre: Array = np.array([np.log(pair[0]) if log else pair[0] for _, pair, _, log in rows])
         self.deviation: Array = np.array([pair[1] for _, pair, _, _ in rows])
         self.bounds: Array = np.array([np.log(limits) if log else limits for _, _, limits, log in rows])
+
+    def with_uncertain_mean(self, deviation: float) -> Covariance:
+        """The same without a known covariance, plus a constant of unknown size: its standard deviation in units of the
+        scale.
+        """
+        other = copy(self)
+        other._known, other._unit = _UncertainConstant(deviation), 1.0
+        other._constant = other._known.covariance(self.points, self.points)
+        return other
 
     def value(self, theta: Array, name: str) -> float:
         """One hyperparameter as it enters the model (not its logarithm); for an absent one, its neutral value."""

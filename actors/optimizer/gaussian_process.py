@@ -2,8 +2,7 @@
 
 `GaussianProcess` is the fitted model. `maximum_a_posteriori` fits its hyperparameters: likelihood, log-priors, their
 gradient, and a bounded search. The functions `..._process` build the surrogates for the different prior means.
-`highest_density_intervals` returns the shortest interval that contains a single observation with a given probability.
-Kernels are in `covariance`.
+Kernels are in `covariance`, intervals of single observations in `prediction_intervals`.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack, solve_triangular
 from scipy.optimize import minimize
-from scipy.special import ndtr
 
 from actors.optimizer.covariance import Covariance, HyperPrior
 
@@ -154,6 +152,9 @@ class GaussianProcess:
         simulated_noise: the same for simulations; with one kind of observation only, equal to `noise`.
         evidence: difference of the log-likelihood to that of pure noise around the prior mean.
         hyperparameters: the other fitted values, by name.
+        residuals: (n,) costs less their prior mean, in units of `scale`.
+        covariance_terms: prior covariance, as a function of the hyperparameters.
+        estimated_mean: whether the prior mean is an estimate from the same costs.
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, chapters 2 and 5.
     """
@@ -168,6 +169,7 @@ class GaussianProcess:
         growth: NoiseGrowth | None = None,
         start: Array | None = None,
         iterations: int = ITERATIONS,
+        estimated_mean: bool = False,
     ) -> None:
         """Fit.
 
@@ -180,6 +182,7 @@ class GaussianProcess:
             start: initial hyperparameters; None: the centre of their priors, and a second start with longer
                 lengthscales and more noise.
             iterations: of the search for better ones.
+            estimated_mean: see the attribute.
 
         Raises:
             ValueError: the start has another number of hyperparameters.
@@ -194,8 +197,9 @@ class GaussianProcess:
             noisy[covariance.names.index("noise")] += 1.0
             starts = [covariance.centre, noisy]
         residuals = (costs - mean(self.points)) / scale
+        self.residuals, self.estimated_mean = residuals, estimated_mean
         fitted = maximum_a_posteriori(covariance, residuals, [s for s in starts if s is not None], iterations)
-        self._covariance, self._fitted = covariance, fitted
+        self.covariance_terms, self._fitted = covariance, fitted
         theta = fitted.theta
         self.lengths: Array = covariance.lengths(theta)
         self.signal = covariance.value(theta, "signal") * scale
@@ -214,9 +218,9 @@ class GaussianProcess:
 
     def predict(self, points: Array) -> tuple[Array, Array]:
         """See `Surrogate.predict`. The deviation excludes the observations' noise."""
-        K = self._covariance.cross(self._fitted.theta, points)
+        K = self.covariance_terms.cross(self._fitted.theta, points)
         V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
-        prior = self._covariance.variance(self._fitted.theta, points)
+        prior = self.covariance_terms.variance(self._fitted.theta, points)
         variance = prior - np.einsum("ij,ij->j", V, V)
         mean = self.mean(points) + self.scale * (K @ self._fitted.alpha)
         return mean, self.scale * np.sqrt(np.maximum(variance, 1e-12))
@@ -230,7 +234,7 @@ class GaussianProcess:
 
     def cross(self, points: Array) -> Array:
         """Prior covariances of the cost at points (m, d) with the observations: (m, n), in units of `scale`²."""
-        return self._covariance.cross(self._fitted.theta, points)
+        return self.covariance_terms.cross(self._fitted.theta, points)
 
     def expected(self, points: Array, cross: Array) -> Array:
         """Posterior means (m,) at points (m, d) from their `cross` (m, n)."""
@@ -244,13 +248,13 @@ class GaussianProcess:
 
     def prior_covariance(self, points: Array) -> Array:
         """Covariance of the noise-free cost between points (m, d): (m, m), in its unit squared."""
-        return np.asarray(self.scale**2 * self._covariance.between(self._fitted.theta, points, points))
+        return np.asarray(self.scale**2 * self.covariance_terms.between(self._fitted.theta, points, points))
 
     def joint_covariance(self, simulated: Array, real: Array) -> Array:
         """Posterior covariance of the noise-free simulated cost at points (a, d) and the real one at points (m, d): (a
         + m, a + m), in the cost's unit squared.
         """
-        theta, covariance = self._fitted.theta, self._covariance
+        theta, covariance = self._fitted.theta, self.covariance_terms
         K = np.concatenate([covariance.cross_simulated(theta, simulated), covariance.cross(theta, real)])
         V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
         mixed = covariance.between_simulated(theta, simulated, real, real=True)
@@ -262,16 +266,16 @@ class GaussianProcess:
         """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
         if self.growth is None or len(points) == 0:
             return np.full(len(points), self.noise)
-        return self.noise * np.exp(self.growth.features(points) @ self._covariance.growth(self.theta))
+        return self.noise * np.exp(self.growth.features(points) @ self.covariance_terms.growth(self.theta))
 
     def covariance(self, first: Array, second: Array) -> Array:
         """Posterior covariance of the noise-free cost between points (m, d) and (k, d): (m, k), in its unit squared."""
         theta, L = self._fitted.theta, self._fitted.L
-        V = solve_triangular(L, self._covariance.cross(theta, first).T, lower=True, check_finite=False)
+        V = solve_triangular(L, self.covariance_terms.cross(theta, first).T, lower=True, check_finite=False)
         W = V
         if second is not first:
-            W = solve_triangular(L, self._covariance.cross(theta, second).T, lower=True, check_finite=False)
-        return np.asarray(self.scale**2 * (self._covariance.between(theta, first, second) - V.T @ W))
+            W = solve_triangular(L, self.covariance_terms.cross(theta, second).T, lower=True, check_finite=False)
+        return np.asarray(self.scale**2 * (self.covariance_terms.between(theta, first, second) - V.T @ W))
 
 
 @dataclass(frozen=True)
@@ -324,7 +328,15 @@ def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior
     features[~mask] = 0.0
     covariance = Covariance(process.points, prior, growth=features, **terms)
     start = np.concatenate([process.theta, np.zeros(features.shape[1])])
-    varied = GaussianProcess(costs, covariance, mean=process.mean, scale=process.scale, growth=growth, start=start)
+    varied = GaussianProcess(
+        costs,
+        covariance,
+        mean=process.mean,
+        scale=process.scale,
+        growth=growth,
+        start=start,
+        estimated_mean=process.estimated_mean,
+    )
     charge = 0.5 * features.shape[1] * math.log(count)
     return varied if varied.log_likelihood > process.log_likelihood + charge else process
 
@@ -350,7 +362,8 @@ def constant_mean_process(
 ) -> GaussianProcess:
     """GP whose prior mean is the mean of the data: (n, dimension), (n,)."""
     centre = float(costs.mean())
-    return _fitted(points, costs, _constant(centre), _scale(costs - centre, costs), varying, prior, search)
+    mean, scale = _constant(centre), _scale(costs - centre, costs)
+    return _fitted(points, costs, mean, scale, varying, prior, search, estimated_mean=True)
 
 
 def zero_mean_process(
@@ -380,7 +393,7 @@ def simulated_mean_process(
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3); Kennedy & O'Hagan 2000 with ρ = 1.
     """
     scale = max(simulated.scale, 1e-9)
-    terms = {"known": simulated, "unit": scale}
+    terms: dict[str, Any] = {"known": simulated, "unit": scale}
     process = _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, search, **terms)
     process.simulated_noise = simulated.noise
     return process
@@ -421,11 +434,18 @@ def _fitted(
     varying: bool,
     prior: HyperPrior = CONSTANT_PRIOR,
     search: HyperparameterSearch = AFRESH,
+    *,
+    estimated_mean: bool = False,
     **terms: Any,
 ) -> GaussianProcess:
-    covariance = Covariance(points, prior, **terms)
     process = GaussianProcess(
-        costs, covariance, mean=mean, scale=scale, start=search.start, iterations=search.iterations
+        costs,
+        Covariance(points, prior, **terms),
+        mean=mean,
+        scale=scale,
+        start=search.start,
+        iterations=search.iterations,
+        estimated_mean=estimated_mean,
     )
     return with_varying_noise(process, costs, prior, **terms) if varying else process
 
@@ -450,40 +470,3 @@ def _scale(residuals: Array, costs: Array) -> float:
     floor = 0.1 * float(np.max(np.abs(costs)))
     scale = max(size, floor)
     return scale if scale >= SMALLEST_SCALE else 1.0
-
-
-ENDS = 64
-"""Number of lower ends that are tried, evenly spaced in the probability below them."""
-
-HALVINGS = 30
-
-
-def highest_density_intervals(weights: Array, means: Array, deviations: Array, level: float) -> Array:
-    """Shortest intervals (m, 2) of y = clip(z, 0, 1), z of a mixture of normal distributions.
-
-    If y is likely to be 0, the interval begins at 0 and contains no more probability for that. An interval between two
-    fixed quantiles would exclude the least likely end only.
-
-    Args:
-        weights: (J,), sum 1.
-        means, deviations: (J, m).
-        level: probability, between 0 and 1.
-    """
-    below = np.linspace(0.0, 1.0 - level, ENDS)
-    lows = _quantiles(weights, means, deviations, below)
-    highs = _quantiles(weights, means, deviations, below + level)
-    best = np.argmin(highs - lows, axis=0)
-    each = np.arange(means.shape[1])
-    return np.stack([lows[best, each], highs[best, each]], axis=1)
-
-
-def _quantiles(weights: Array, means: Array, deviations: Array, shares: Array) -> Array:
-    """Quantiles (k, m) for probabilities (k,), by bisection."""
-    low, high = np.zeros((len(shares), means.shape[1])), np.ones((len(shares), means.shape[1]))
-    none = weights @ ndtr(-means / deviations) >= shares[:, None]
-    all_of_it = weights @ ndtr((1.0 - means) / deviations) <= shares[:, None]
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        under = np.einsum("j,jkm->km", weights, ndtr((middle - means[:, None, :]) / deviations[:, None, :]))
-        low, high = np.where(under < shares[:, None], middle, low), np.where(under < shares[:, None], high, middle)
-    return np.where(none, 0.0, np.where(all_of_it, 1.0, 0.5 * (low + high)))

@@ -48,7 +48,8 @@ from scipy.spatial.distance import cdist
 from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
-from actors.optimizer.gaussian_process import GaussianProcess, highest_density_intervals
+from actors.optimizer.gaussian_process import GaussianProcess
+from actors.optimizer.prediction_intervals import highest_density_intervals
 from actors.optimizer.questions import ModelDiscrepancy
 
 Array = NDArray[np.float64]

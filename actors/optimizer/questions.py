@@ -510,8 +510,10 @@ class Suggestion:
         prediction_deviations: their standard deviations.
         seconds: CPU seconds used.
         noises: standard deviations of single real observations at the proposals; empty without a surrogate.
-        bands: with a `ModelDiscrepancy`: shortest intervals that contain single real observations at the proposals with
-            a probability of `sim_engine.prediction_band.LEVEL`.
+        bands: shortest intervals that contain single real observations at the proposals with a probability of
+            `sim_engine.prediction_band.LEVEL`: for a `PourQuery`, and a `MinimumQuery` with a map that is not `plain`;
+            up to 100 observations without a `ModelDiscrepancy`. They may differ from `means` and `deviations`, because
+            they are averaged over hyperparameters or hypotheses.
         feasibilities: probabilities that the proposals are neither refused nor fail; empty without any refusal or
             failure.
         posterior: answer to `CalibrationQuery.posterior`; None without a surrogate.

@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
 from actors.optimizer.knowledge_gradient import found, most_instructive, proposals
+from actors.optimizer.prediction_intervals import observation_intervals
 from actors.optimizer.questions import (
     CalibrationQuery,
     Data,
@@ -55,6 +56,9 @@ Array = NDArray[np.float64]
 
 WORST = 8
 """Number of worst disturbances of a request in an answer."""
+
+MOST_AVERAGED = 100
+"""Largest number of observations with intervals averaged over hyperparameters; more determine them well."""
 
 
 def describe(
@@ -95,6 +99,8 @@ def describe(
     }
     if model.averaged is not None and len(points):
         description["bands"] = tuples(model.averaged.bands(points, LEVEL))
+    elif _announces_pours(query) and len(points) and len(process.points) <= MOST_AVERAGED:
+        description["bands"] = tuples(observation_intervals(model.process, points, LEVEL))
     if query.predict_at:
         predictions, spreads = model.surrogate.predict(
             arrays.region.snap(array(query.predict_at, query.space.dimension))
@@ -109,6 +115,13 @@ def describe(
         across, up = sorted(int(i) for i in np.argsort(model.lengths, kind="stable")[:2])
         description["surrogate"] = mapped(query, arrays.region, model, at, (across, up), query.map_resolution)
     return description
+
+
+def _announces_pours(query: SurrogateQuery) -> bool:
+    """Whether the proposals are pours whose prediction a user sees: with a map, if the query is not for pours only."""
+    return isinstance(query, PourQuery) or (
+        isinstance(query, MinimumQuery) and query.map_resolution > 0 and not query.plain
+    )
 
 
 def posterior_of(

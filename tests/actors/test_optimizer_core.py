@@ -15,6 +15,7 @@ from actors.optimizer.questions import (
     SpaceFillingQuery,
 )
 from actors.optimizer.suggest import propose
+from orchestrator.requests import Prediction
 from sim_engine.search_space import Axis, Space
 from tests.support.hypothesis_examples import examples
 
@@ -168,6 +169,44 @@ def test_first_pour_goes_to_the_minimum_of_the_simulated_surrogate():
     first = propose(PourQuery(PLANE, Data(), simulated=sims, acquisition="posterior_minimum", count=3))
     assert math.dist(first.points[0], (0.3, 0.6)) < 0.08
     assert min(math.dist(first.points[0], p) for p in first.points[1:]) > 0.03
+
+
+def test_a_shown_pour_has_an_interval_that_knows_how_little_the_pours_say_and_nothing_else_changes():
+    places = cover(6, 3)
+    asked = MinimumQuery(PLANE, data_of(places, bowl(places)), seed=4)
+    hidden, shown = propose(asked), propose(replace(asked, map_resolution=2))
+    assert hidden.bands == ()
+    assert replace(shown, bands=(), surrogate=None, seconds=0.0) == replace(hidden, seconds=0.0)
+    (low, high) = shown.bands[0]
+    plug_in = Prediction(shown.means[0], shown.deviations[0], shown.noises[0]).of_a_pour()
+    assert 0.0 <= low < high
+    assert high - low > 1.3 * (plug_in[1] - plug_in[0]), "with six pours many hyperparameters are likely"
+
+
+def test_intervals_of_many_pours_tend_to_those_of_the_fitted_surrogate():
+    places = cover(60, 3)
+    costs = 1.0 + bowl(places) + 0.1 * np.random.default_rng(3).standard_normal(60)
+    shown = propose(MinimumQuery(PLANE, data_of(places, costs), map_resolution=2, seed=4))
+    low, high = shown.bands[0]
+    spread = 1.645 * math.hypot(shown.deviations[0], shown.noises[0])
+    assert (low, high) == pytest.approx((shown.means[0] - spread, shown.means[0] + spread), abs=0.3 * spread)
+
+
+@pytest.mark.parametrize("costs", [(1.0, 1.0), (0.0, 0.0, 0.0), (1e-9, 1e6, 3.0), (-5.0, -4.0, -5.0)])
+def test_intervals_are_finite_and_not_negative_whatever_the_pours(costs):
+    shown = propose(MinimumQuery(PLANE, data_of(cover(len(costs)), costs), map_resolution=2))
+    low, high = shown.bands[0]
+    assert 0.0 <= low <= high < math.inf
+
+
+def test_a_pour_after_simulations_has_an_interval_averaged_over_the_remainder_s_hyperparameters():
+    simulated, places = cover(30, 2), cover(3, 5)
+    sims, pours = data_of(simulated, bowl(simulated)), data_of(places, bowl(places) + np.array([0.0, 0.4, 0.1]))
+    answer = propose(PourQuery(PLANE, pours, simulated=sims, count=2))
+    assert len(answer.bands) == 2
+    for (low, high), mean, *spread in zip(answer.bands, answer.means, answer.deviations, answer.noises, strict=True):
+        plug_in = Prediction(mean, *spread).of_a_pour()
+        assert high - low > plug_in[1] - plug_in[0]
 
 
 def test_a_mean_absolute_difference_is_minimised_over_its_context():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from actors.optimizer.gaussian_process import highest_density_intervals
 from actors.optimizer.knowledge_gradient import predicted_minimum
+from actors.optimizer.prediction_intervals import highest_density_intervals
 from actors.optimizer.questions import (
     BenchOffset,
     Data,

@@ -26,6 +26,7 @@ from orchestrator.runs.stages import deployment_stages, prediction_stages
 from orchestrator.strategies.deployment import deployment_base
 from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
+from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
 from orchestrator.strategies.single_action import RepeatedSimulation
@@ -276,6 +277,21 @@ def test_d3_reports_intervals_scaled_by_its_earlier_pours(monkeypatch: pytest.Mo
     intervals = [[pour.predicted_interval for pour in some] for some in (scaled, plain)]
     assert intervals[0][0] == intervals[1][0]
     assert any(a != b for a, b in zip(*intervals, strict=True))
+
+
+def test_d2_reports_intervals_averaged_over_hyperparameters_up_to_the_worst_loss() -> None:
+    strategy = RealOnly(deployment_plan(strategy="D2", pours=6), SCENE, THETA, 1)
+    played = StrategyHarness(narrow_cup).run(strategy)
+    predicted = [request.predicted for request in played.pours if request.predicted is not None]
+    assert len(predicted) >= 2
+    found: Any = strategy.result()
+    shown = [pour.predicted_interval for pour in found.pours if pour.predicted is not None]
+    assert shown == [one.band for one in predicted]
+    for one in predicted:
+        assert one.band is not None
+        low, high = replace(one, band=None).of_a_pour()
+        assert one.band[1] - one.band[0] > min(high, 1.0) - low
+        assert 0.0 <= one.band[0] <= one.band[1] <= 1.0
 
 
 def test_the_line_of_a_pour_says_both() -> None:

@@ -232,8 +232,10 @@ class Deployment(ABC, Generic[S]):
             noise = suggestion.noises[0] if suggestion.noises else None
             band = suggestion.bands[0] if suggestion.bands else None
             known = Prediction(suggestion.means[0], suggestion.deviations[0], self._scatter(suggestion, noise), band)
-            if band is not None:
+            if band is not None and suggestion.discrepancy is not None:
                 known = replace(known, band=scaled_interval(known, self._pours, self._costing.worst))
+            elif band is not None:  # averaged over hyperparameters; the largest loss is unknown there
+                known = replace(known, band=(min(band[0], self._costing.worst), min(band[1], self._costing.worst)))
         self._pour(suggestion.points[0], known)
 
     def _scatter(self, suggestion: Suggestion, noise: float | None) -> float | None:
