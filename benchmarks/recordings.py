@@ -3,9 +3,9 @@
     python benchmarks/recordings.py                  # fits on fresh benches, coverage, cost
     python benchmarks/recordings.py --sample configs/recordings
 
-Each bench (`actors.dosing.virtual_dosing_bench`) has an error of grip, a lag and a discharge that the fit does not know.
-Four doses are recorded, three of them are fitted, and the fourth is predicted from its tilt alone. The bench is not the
-model of the fit: its lip holds liquid back, its stream dribbles, its balance has one of four filters.
+Each bench (`actors.dosing.virtual_dosing_bench`) has an error of grip, a lag and a discharge that the fit does not
+know. Four doses are recorded, three of them are fitted, and the fourth is predicted from its tilt alone. The bench is
+not the model of the fit: its lip holds liquid back, its stream dribbles, its balance has one of four filters.
 """
 
 from __future__ import annotations
@@ -115,11 +115,13 @@ def fits(count: int, first: int) -> None:
     from orchestrator.recordings.recording_fit import fit, judge
 
     inside = {"grip": 0, "lag": 0, "final": 0}
-    error = {"grip": [], "lag": [], "final": []}  # type: dict[str, list[float]]
+    error: dict[str, list[float]] = {"grip": [], "lag": [], "final": []}
     shares = []
     for seed in range(first, first + count):
         with tempfile.TemporaryDirectory() as folder:
-            bench, doses = recorded(seed, Path(folder), grip=math.radians(np.random.default_rng(seed).uniform(-1.0, 1.0)))
+            bench, doses = recorded(
+                seed, Path(folder), grip=math.radians(np.random.default_rng(seed).uniform(-1.0, 1.0))
+            )
             begin = time.process_time()
             found = fit(doses[:3], ("grip", "lag"))
             cpu = time.process_time() - begin
@@ -134,7 +136,8 @@ def fits(count: int, first: int) -> None:
         shares.append(judged.coverage)
         print(
             f"{seed}: grip {math.degrees(error['grip'][-1]):+.2f}°, lag {error['lag'][-1]:+.3f} s, final "
-            f"{1e3 * error['final'][-1]:+.2f} g, RMS {1e3 * judged.rms:.2f} g, coverage {judged.coverage:.2f}, {cpu:.1f} CPU s",
+            f"{1e3 * error['final'][-1]:+.2f} g, RMS {1e3 * judged.rms:.2f} g, coverage {judged.coverage:.2f}, "
+            f"{cpu:.1f} CPU s",
             flush=True,
         )
     for name, factor, unit in (("grip", 180.0 / math.pi, "°"), ("lag", 1.0, " s"), ("final", 1e3, " g")):

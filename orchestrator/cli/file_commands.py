@@ -31,7 +31,8 @@ from orchestrator.cli.console import (
 
 def validate(
     files: Annotated[
-        list[Path], typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files.", show_default=False)
+        list[Path],
+        typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files.", show_default=False),
     ],
     quiet: Quiet = False,
 ) -> None:

@@ -49,8 +49,8 @@ SEEN = 0.5e-3
 
 
 TURNED_BACK, AFTERWARDS = math.radians(10.0), 1.5
-"""Angle by which a cup is below its largest tilt for good [rad], and the time after which its liquid has landed [s]: the
-simulation ends then. The surface is about 7 mm lower at the lip, more than the head of a stream."""
+"""Angle by which a cup is below its largest tilt for good [rad], and the time after which its liquid has landed [s]:
+the simulation ends then. The surface is about 7 mm lower at the lip, more than the head of a stream."""
 
 
 @dataclass(frozen=True)
