@@ -112,7 +112,7 @@ def recorded(seed: int, folder: Path, grip: float = 0.0) -> tuple[Bench, list[Po
 
 def fits(count: int, first: int) -> None:
     """Fit three doses of each bench, predict the fourth, and print the coverage of the intervals."""
-    from orchestrator.recordings.recording_fit import fit, judge
+    from orchestrator.recordings.recording_fit import fit_recordings, judge_recording
 
     inside = {"grip": 0, "lag": 0, "final": 0}
     error: dict[str, list[float]] = {"grip": [], "lag": [], "final": []}
@@ -123,9 +123,9 @@ def fits(count: int, first: int) -> None:
                 seed, Path(folder), grip=math.radians(np.random.default_rng(seed).uniform(-1.0, 1.0))
             )
             begin = time.process_time()
-            found = fit(doses[:3], ("grip", "lag"))
+            found = fit_recordings(doses[:3], ("grip", "lag"))
             cpu = time.process_time() - begin
-            judged = judge(found, doses[3])
+            judged = judge_recording(found, doses[3])
         truth = {"grip": bench.grip, "lag": bench.scale.lag + bench.scale.delay, "final": doses[3].gain}
         for name, (value, low, high) in {
             **{one.name: (one.value, one.low, one.high) for one in found.values if one.name in truth},

@@ -55,14 +55,14 @@ def export(
     campaign.
     """
     from orchestrator.journal.journal import JOURNAL_NAME
-    from orchestrator.recordings.recording_export import export_run
+    from orchestrator.recordings.recording_export import export_recordings
     from orchestrator.run_errors import RunError
 
     folder = run if run.exists() or len(run.parts) > 1 else RUNS / run
     if not (folder / JOURNAL_NAME).is_file():
         raise RefusalError(f"{folder}: is no run; name the folder of a run, which has a {JOURNAL_NAME}", BAD_INPUT)
     with Refused(RunError, OSError):
-        written, left_out = export_run(folder, to)
+        written, left_out = export_recordings(folder, to)
     for reason in left_out:
         print_message(f"not exported: {reason}")
     for path in written:
@@ -98,8 +98,7 @@ def replay(
     from orchestrator.config.file_loading import load_parameters
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from orchestrator.recordings.recording_fit import read_values
-    from orchestrator.recordings.recording_replay import ReplayValues
-    from orchestrator.recordings.recording_replay import replay as replayed
+    from orchestrator.recordings.recording_replay import ReplayValues, replay_recording
     from orchestrator.results.figure_style import save
     from orchestrator.results.recording_figures import replay_figure
     from sim_engine.errors import DecantError
@@ -116,8 +115,11 @@ def replay(
     documents = []
     try:
         for one in loaded:
-            with Refused(DecantError, at=f"{one.path.name}: "), waiting_for(lambda one=one: f"replaying {one.name}"):  # type: ignore[misc]
-                found = replayed(one, given, parameters=theta, seed=seed, particles=particles > 0, simulator=simulator)
+            at, text = f"{one.path.name}: ", f"replaying {one.name}"
+            with Refused(DecantError, at=at), waiting_for(lambda text=text: text):  # type: ignore[misc]
+                found = replay_recording(
+                    one, given, parameters=theta, seed=seed, particles=particles > 0, simulator=simulator
+                )
             print(replay_text(found))
             documents.append(found.document())
             if png is not None:
@@ -159,8 +161,7 @@ def fit(
     The model is the tilting cup with the lag of the balance, not the particles; its flow is always fitted. Judged are
     the recordings of '--judge', and with '--until' the later readings of the fitted ones.
     """
-    from orchestrator.recordings.recording_fit import fit as fitted
-    from orchestrator.recordings.recording_fit import judge
+    from orchestrator.recordings.recording_fit import fit_recordings, judge_recording
     from sim_engine.errors import DecantError
     from sim_engine.settings.quantity import QuantityError, parse_quantity
 
@@ -171,10 +172,11 @@ def fit(
     loaded = _loaded(recordings)
     others = _loaded(judged or ())
     if both := sorted({one.path for one in loaded} & {one.path for one in others}):
-        raise RefusalError(f"--judge: {both[0].name} is fitted, too; judge another, or fit its beginning with --until")
+        text = f"--judge: {both[0].name} is fitted, too; judge another, or fit its beginning with --until"
+        raise RefusalError(text, BAD_INPUT)
     with Refused(DecantError), waiting_for(lambda: f"fitting {len(loaded)} recorded pours"):
-        found = fitted(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
-        judgements = [judge(found, one) for one in (*(loaded if seconds is not None else ()), *others)]
+        found = fit_recordings(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
+        judgements = [judge_recording(found, one) for one in (*(loaded if seconds is not None else ()), *others)]
     print(fit_text(found, judgements))
     document = found.document() | {"judged": [one.document() for one in judgements]}
     if output is not None:

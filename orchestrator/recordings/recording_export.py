@@ -1,4 +1,4 @@
-"""Recorded pours from the journal of a run: `export_run`.
+"""Recorded pours from the journal of a run: `export_recordings`.
 
 A dose has its tilts, its readings and the readings while the receiver was put on. A pour on hardware with the balance
 below the receiver has its tilts and readings. Any other pour has the tilts that the arm executed, and two readings: 0
@@ -36,7 +36,7 @@ FOLDER = "recordings"
 Pairs = Sequence[tuple[float, float]]
 
 
-def export_run(
+def export_recordings(
     directory: Path, to: Path | None = None, plan: CampaignPlan | None = None
 ) -> tuple[list[Path], list[str]]:
     """Write the pours and doses of a run as recorded pours. Files that exist are kept.

@@ -64,7 +64,7 @@ class RecordedPlacement(Settings):
     height: _length("height", "100 mm") = 0.1  # type: ignore[valid-type]
     """The pourer's lip above the receiver's rim."""
 
-    grip: Annotated[float, Quantity("rad", "0 deg", -0.2, 0.2)] = 0.0
+    grip: Annotated[float, Quantity("rad", "0 deg", -math.radians(10.0), math.radians(10.0))] = 0.0
     """Tilt of the vessel beyond the recorded tilt: the angle of the grip."""
 
 
@@ -280,7 +280,7 @@ def _checked(path: Path, section: RecordingFile, scene: Scene, series: TimeSerie
     if problems:
         raise ConfigError(problems)
     end = float(tilt.times[-1])
-    late = int(np.searchsorted(poured.times, end + LONGEST_GAP))
+    late = int(np.searchsorted(poured.times, end + LONGEST_GAP + 1e-9))
     if late < len(poured):
         text = (
             f"the tilt ends at {end:g} s, the readings at {poured.times[-1]:g} s; those after {end + LONGEST_GAP:g} s "

@@ -1,7 +1,8 @@
 """Fits unknown quantities of recorded pours, and judges the fit on readings that it has not seen.
 
-- `fit` fits unknowns of several recordings together: `Fit` with values and intervals.
-- `judge` predicts a recording, or the rest of one, from its tilt alone, and compares it with the readings: `Judgement`.
+- `fit_recordings` fits unknowns of several recordings together: `Fit` with values and intervals.
+- `judge_recording` predicts a recording, or the rest of one, from its tilt alone, and compares it with the readings:
+  `Judgement`.
 
 The model is the tilting cup with a balance (`actors.dosing.pour_response`), not the particles: a fit takes seconds. It
 minimises the weighted squares of reading minus model, together with the squares of the deviations from what is known
@@ -239,7 +240,9 @@ class Judgement:
         }
 
 
-def fit(recordings: Sequence[PourRecording], unknowns: Collection[str], *, until: float | None = None) -> Fit:
+def fit_recordings(
+    recordings: Sequence[PourRecording], unknowns: Collection[str], *, until: float | None = None
+) -> Fit:
     """Fit unknown quantities that recordings share.
 
     Args:
@@ -285,11 +288,11 @@ def fit(recordings: Sequence[PourRecording], unknowns: Collection[str], *, until
     )
 
 
-def judge(found: Fit, recording: PourRecording) -> Judgement:
+def judge_recording(found: Fit, recording: PourRecording) -> Judgement:
     """Predict a recording from its tilt and fitted values, and compare it with its readings.
 
     Args:
-        found: by `fit`. If the recording is one of the fitted, only readings after `Fit.until` are judged.
+        found: by `fit_recordings`. If the recording is one of the fitted, only readings after `Fit.until` are judged.
         recording: the pour.
 
     Raises:

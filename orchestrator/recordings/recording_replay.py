@@ -3,7 +3,7 @@
 - `simulate` moves the vessel along the recorded tilt in the particle simulator, and returns the poured mass.
 - `estimate` runs `actors.dosing.dose_estimator` over the recorded readings, without acting. It is the only place here
   that drives the estimator.
-- `replay` does both and compares them with the readings: `PourReplay`.
+- `replay_recording` does both and compares them with the readings: `PourReplay`.
 
 A replay predicts, except for the values that `ReplayValues` takes from a fit, and for the lag of the balance: the
 simulation's readings have the lag that the estimator found in the same recording. Reports name both.
@@ -414,7 +414,7 @@ class PourReplay:
         }
 
 
-def replay(
+def replay_recording(
     recording: PourRecording,
     values: ReplayValues = ReplayValues(),
     *,

@@ -204,7 +204,7 @@ def _places(
         elif quantity in UNITS:
             units = ", ".join(f"{quantity}_{each}" for each in UNITS[quantity] if each) or quantity
             add(theirs, f"has no known unit; name it by its unit: {units}")
-        elif guess := did_you_mean(own, list(known)):
+        elif guess := did_you_mean(own, [name for name in known if "_" in name]):
             add(theirs, f"unknown column; did you mean '{guess}'?")
         else:
             unread.append(theirs)
@@ -232,7 +232,7 @@ def _number(
                 problems.append(series.problem(line, "has no time; give every line its time", name))
             return None
         hint = "write a number"
-        if name.startswith("time"):
+        if required:
             hint = "write seconds from the start of the recording, not a date or a clock time"
         elif cell.strip().lower() in ("true", "false"):
             hint = "write 1 or 0"
