@@ -88,7 +88,7 @@ def _export(path: Path, pour: RecordedPour, scene: Scene, plan: CampaignPlan, ru
     signals = dose or notes.get("signals") or {}
     balance = {"model": _balance(plan), **({"step": f"{signals['step_g']:g} g"} if signals.get("step_g") else {})}
     if signals.get("times") and signals.get("read_at"):
-        tilt = list(zip(signals["times"], signals["tilt_deg"], strict=True))
+        tilt: Pairs = list(zip(signals["times"], signals["tilt_deg"], strict=True))
         mass = [
             *zip(signals.get("placed_at", ()), signals.get("placed_g", ()), strict=True),
             *zip(signals["read_at"], signals["readings_g"], strict=True),

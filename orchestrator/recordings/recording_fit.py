@@ -264,7 +264,7 @@ def fit_recordings(
     found = problem.solved(np.zeros(problem.size), problem.noise)
     weight = problem.effective_noise(found)
     found = problem.solved(found, weight)
-    covariance = np.linalg.inv(problem.information(found, weight))
+    covariance: Floats = np.asarray(np.linalg.inv(problem.information(found, weight)), dtype=np.float64)
     values = []
     for i, name in enumerate(names):
         unknown = problem.unknowns[name]
@@ -479,7 +479,8 @@ class _Problem:
         together = sum(float(r[1:] @ r[:-1]) for r in residuals) / max(sum(float(r @ r) for r in residuals), 1e-30)
         inflated = (1.0 + min(max(together, 0.0), 0.95)) / (1.0 - min(max(together, 0.0), 0.95))
         pooled = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2) * inflated))
-        return np.maximum(np.full(len(residuals), pooled), self.noise / 3.0)
+        effective: Floats = np.maximum(np.full(len(residuals), pooled), self.noise / 3.0)
+        return effective
 
     def _rows(self, state: Floats, noise: Floats) -> list[Floats]:
         """Derivatives of the weighted residuals."""
