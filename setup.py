@@ -20,7 +20,8 @@ NO_TAG = "0.0"
 """The tag that setuptools_scm reports for a repository without tags."""
 
 SHIPPED = (
-    "README.md", "campaigns", "daemon.yaml", "data", "laboratories", "schema", "studies", "systemd", "vessels",
+    "README.md", "campaigns", "daemon.yaml", "data", "laboratories", "recordings", "schema", "studies", "systemd",
+    "vessels",
 )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ import argparse
 import json
 import math
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DoseRecord
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
-from sim_engine.motion import Phase, Segment, plan_motion
+from sim_engine.motion import recorded_motion
 from sim_engine.scene import PourTask, SampledMotion, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import cylinder
@@ -86,15 +86,8 @@ class Comparison:
 
 def executed(scene: Scene, record: DoseRecord, grip: float) -> SampledMotion:
     """Return the motion of the cup about its lip with the executed tilt."""
-    planned = plan_motion(scene, ACTION, build_vessel(scene.pourer), build_vessel(scene.receiver))
-    times, tilts = record.times, record.tilts
-    speeds = np.diff(tilts) / np.diff(times)
-    segments = tuple(
-        Segment(float(t), float(d), float(tilt), float(v), 0.0)
-        for t, d, tilt, v in zip(times, np.diff(times), tilts, speeds, strict=False)
-    )
-    motion = replace(planned, segments=segments, phases=(Phase("tilt", 0.0, float(times[-1])),), tilt_error=-grip)
-    return SampledMotion(times, motion.sample(times))
+    vessels = build_vessel(scene.pourer), build_vessel(scene.receiver)
+    return recorded_motion(scene, ACTION, *vessels, record.times, record.tilts - grip)
 
 
 def compare(simulator: PourSimulator, flow: CupFlow, seed: int, amount: float) -> Comparison:

@@ -35,7 +35,12 @@ if TYPE_CHECKING:
     from orchestrator.catalogue.vessel_account import VesselAccount, VesselContent
     from orchestrator.config.action_assignments import AssignmentError
     from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.recordings.recording_export import export_recordings
+    from orchestrator.recordings.recording_file import PourRecording, load_recording, load_recordings
+    from orchestrator.recordings.recording_fit import Fit, Judgement, fit_recordings, judge_recording
+    from orchestrator.recordings.recording_replay import PourReplay, ReplayValues, replay_recording
     from orchestrator.results.publishing import Published
+    from orchestrator.results.recording_figures import replay_figure
     from orchestrator.run_errors import RunError
     from orchestrator.run_service import CheckReport
     from orchestrator.runs import events
@@ -56,10 +61,15 @@ __all__ = [
     "ConfigError",
     "DecantError",
     "Event",
+    "Fit",
     "InvalidArgumentError",
+    "Judgement",
     "LaboratoryError",
     "MissingExtraError",
+    "PourRecording",
+    "PourReplay",
     "Published",
+    "ReplayValues",
     "Run",
     "RunError",
     "RunningCampaign",
@@ -76,13 +86,20 @@ __all__ = [
     "check",
     "doctor",
     "events",
+    "export_recordings",
     "find_pours",
     "find_runs",
+    "fit_recordings",
+    "judge_recording",
     "load_campaign",
+    "load_recording",
+    "load_recordings",
     "load_vessel",
     "open_run",
     "plan",
     "publish",
+    "replay_figure",
+    "replay_recording",
     "run",
     "shipped",
     "simulate",
@@ -110,7 +127,12 @@ _HOMES = {
     "orchestrator.added_pours": ("add_pour",),
     "orchestrator.runs.events": ("Event",),
     "orchestrator.strategies.campaign_plan": ("CampaignPlan",),
+    "orchestrator.recordings.recording_export": ("export_recordings",),
+    "orchestrator.recordings.recording_file": ("PourRecording", "load_recording", "load_recordings"),
+    "orchestrator.recordings.recording_fit": ("Fit", "Judgement", "fit_recordings", "judge_recording"),
+    "orchestrator.recordings.recording_replay": ("PourReplay", "ReplayValues", "replay_recording"),
     "orchestrator.results.publishing": ("Published",),
+    "orchestrator.results.recording_figures": ("replay_figure",),
     "sim_engine.errors": ("DecantError", "InvalidArgumentError"),
     "sim_engine.resources": ("MissingExtraError",),
     "sim_engine.liquids": ("SimulationParameters",),

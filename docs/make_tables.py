@@ -37,6 +37,7 @@ from orchestrator.config.scene_builder import DEFAULTS, NEEDED
 from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySettings
+from orchestrator.recordings import recording_file as recording
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import OutputSettings
 from orchestrator.strategies.deployment.costing import CostSettings
@@ -85,6 +86,10 @@ SECTIONS: dict[str, type[Settings]] = {
     "liquid": LiquidSettings,
     "vessel": vessel.VesselFile,
     "profile": ProfileShape,
+    "recording": recording.RecordingFile,
+    "placement": recording.RecordedPlacement,
+    "recorded-balance": recording.RecordedBalance,
+    "origin": recording.RecordedOrigin,
     "laboratory": laboratory.LaboratorySettings,
     "ray": laboratory.RaySettings,
     "arm": UrArmSettings,
@@ -134,6 +139,9 @@ OF_SECTIONS = {
     "PoseErrorSettings": "[pose error](#pose-error)",
     "PoseNoise": "standard deviations of the [pose error](#pose-error)",
     "TransferSettings": "[transfer](#transfer)",
+    "RecordedPlacement": "[placement](#placement)",
+    "RecordedBalance": "[balance](#recorded-balance)",
+    "RecordedOrigin": "[origin](#origin)",
     "Loss": "[loss](#loss)",
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sim_engine.action import Action
 from sim_engine.hydrostatics import predicted_end_of_flow
-from sim_engine.scene import Scene
+from sim_engine.scene import SampledMotion, Scene
 from sim_engine.vessel.vessel import Vessel
 
 FloatArray = NDArray[np.float64]
@@ -145,17 +145,50 @@ class PourMotion:
 
     def sample(self, times: FloatArray) -> FloatArray:
         """Poses of the pourer's frame in the world, shape (T, 7): x y z [m], qw qx qy qz."""
-        tilt = self.tilt(times)
-        cos, sin = np.cos(tilt), np.sin(tilt)
-        px, py, pz = self.pivot_vessel
-        wx, wy, wz = self.pivot_world
-        poses = np.zeros((*tilt.shape, 7))
-        poses[..., 0] = wx - (cos * px + sin * pz)
-        poses[..., 1] = wy - py
-        poses[..., 2] = wz - (-sin * px + cos * pz)
-        poses[..., 3] = np.cos(0.5 * tilt)
-        poses[..., 5] = np.sin(0.5 * tilt)
-        return poses
+        return _poses(self.tilt(times), self.pivot_world, self.pivot_vessel)
+
+
+def _poses(
+    tilt: FloatArray, pivot_world: tuple[float, float, float], pivot_vessel: tuple[float, float, float]
+) -> FloatArray:
+    """Poses of a pourer that is turned about a pivot, see `PourMotion.sample`."""
+    cos, sin = np.cos(tilt), np.sin(tilt)
+    px, py, pz = pivot_vessel
+    wx, wy, wz = pivot_world
+    poses = np.zeros((*tilt.shape, 7))
+    poses[..., 0] = wx - (cos * px + sin * pz)
+    poses[..., 1] = wy - py
+    poses[..., 2] = wz - (-sin * px + cos * pz)
+    poses[..., 3] = np.cos(0.5 * tilt)
+    poses[..., 5] = np.sin(0.5 * tilt)
+    return poses
+
+
+def _pivot(
+    scene: Scene, action: Action, pourer: Vessel, receiver: Vessel
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """The pivot in the world and in the pourer's frame [m]."""
+    lip = pourer.lip_point(0.0)
+    vessel = np.array([lip[0], 0.0, lip[2]] if scene.pivot.kind == "lip" else [scene.pivot.x, 0.0, scene.pivot.z])
+    start = np.array([-action.x_offset, action.y_offset, receiver.rim_height + action.height - lip[2]])
+    world = start + vessel
+    return (float(world[0]), float(world[1]), float(world[2])), (float(vessel[0]), float(vessel[1]), float(vessel[2]))
+
+
+def recorded_motion(
+    scene: Scene, action: Action, pourer: Vessel, receiver: Vessel, times: FloatArray, tilts: FloatArray
+) -> SampledMotion:
+    """The pourer's motion for a tilt that was recorded: a turn about the scene's pivot.
+
+    Args:
+        scene: its pivot.
+        action: the placement.
+        pourer, receiver: geometry of the scene's vessels.
+        times: increasing; the motion starts at 0 (T,) [s].
+        tilts: of the vessel, errors of grip included (T,) [rad].
+    """
+    poses = _poses(np.asarray(tilts, dtype=float), *_pivot(scene, action, pourer, receiver))
+    return SampledMotion(np.asarray(times, dtype=float) - times[0], poses)
 
 
 def plan_motion(
@@ -176,18 +209,13 @@ def plan_motion(
         tilt_error: constant error of grip [rad], for a virtual bench.
         speed_factor: executed over commanded speed, for a virtual bench.
     """
-    lip = pourer.lip_point(0.0)
-    pivot_vessel = np.array([lip[0], 0.0, lip[2]] if scene.pivot.kind == "lip" else [scene.pivot.x, 0.0, scene.pivot.z])
-    start = np.array([-action.x_offset, action.y_offset, receiver.rim_height + action.height - lip[2]])
-
+    world, vessel_pivot = _pivot(scene, action, pourer, receiver)
     segments = turn(0.0, 0.0, action.max_angle, action.angular_velocity * speed_factor, action.angular_acceleration)
     tilted = segments[-1].start + segments[-1].duration
     phases = [Phase("tilt", 0.0, tilted)]
     hold = action.hold_time
-    world = tuple(float(v) for v in start + pivot_vessel)
-    vessel_pivot = tuple(float(v) for v in pivot_vessel)
     if hold is None:
-        tilting = PourMotion(tuple(segments), (phases[0],), world, vessel_pivot)  # type: ignore[arg-type]
+        tilting = PourMotion(tuple(segments), (phases[0],), world, vessel_pivot)
         end = predicted_end_of_flow(pourer, scene.liquid.volume, tilting.tilt, tilted + scene.max_hold_time)
         hold = min(max(end - tilted, 0.0), scene.max_hold_time)
     phases.append(Phase("hold", tilted, tilted + hold))
@@ -195,4 +223,4 @@ def plan_motion(
         back = turn(tilted + hold, action.max_angle, 0.0, action.return_velocity, action.angular_acceleration)
         segments += back
         phases.append(Phase("return", tilted + hold, back[-1].start + back[-1].duration))
-    return PourMotion(tuple(segments), tuple(phases), world, vessel_pivot, tilt_error)  # type: ignore[arg-type]
+    return PourMotion(tuple(segments), tuple(phases), world, vessel_pivot, tilt_error)

@@ -27,6 +27,7 @@ from sim_engine.settings.model import (
     NOT_IN_FINGERPRINT,
     SET_BY_PROGRAM,
     Choice,
+    FilePath,
     PositiveCount,
     Problems,
     Settings,
@@ -322,6 +323,9 @@ class SerialBalanceSettings(BalanceSettings):
 
     reconnect_time: Annotated[float, Quantity("s", "1.5 s", 0.0, 600.0), NOT_IN_FINGERPRINT] = 20.0
     """Maximum time to wait for a port that has disappeared."""
+
+    raw_lines: Annotated[FilePath | None, NOT_IN_FINGERPRINT] = None
+    """Folder for recordings of the balance's raw lines: a file for each connection, as `decant balance record` writes it."""  # noqa: E501
 
     def check_laboratory(self, problems: Problems, *, mode: str) -> None:
         """See `BalanceSettings.check_laboratory`."""

@@ -125,6 +125,32 @@ class Recorder:
         self.count = 0
         file.write(header(source, about))
 
+    @classmethod
+    def in_folder(cls, folder: Path, name: str, source: Source, port: str) -> Recorder:
+        """A recorder of a new file in a folder, which is made if needed; the file has the time in its name.
+
+        Args:
+            folder: of recordings.
+            name: of the balance.
+            source: origin of the bytes.
+            port: of the balance.
+
+        Raises:
+            OSError: the file can't be written.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        now = time.time()
+        stem = f"{name}-{time.strftime('%Y%m%d-%H%M%S', time.localtime(now))}"
+        number = 1
+        while True:
+            path = folder / (f"{stem}.jsonl" if number == 1 else f"{stem}-{number}.jsonl")
+            try:
+                file = path.open("x", encoding="utf-8")
+                break
+            except FileExistsError:
+                number += 1
+        return cls(file, source, {"port": port, "started": round(now, 3)})
+
     def __call__(self, direction: str, data: bytes) -> None:
         """Record bytes."""
         self.count += len(data)

@@ -16,6 +16,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, replace
+from pathlib import Path
 
 from actors.balance.balance_interface import (
     LOST_REFERENCE,
@@ -35,6 +36,7 @@ from actors.balance.balance_settings import SerialBalanceSettings, Settled, Sett
 from actors.balance.dialect_detection import Detected, detect
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.line_explanation import explain_line, shown_bytes
+from actors.balance.line_recording import Recorder, Source
 from actors.balance.readings import (
     OTHER_UNITS,
     Acknowledgement,
@@ -306,6 +308,9 @@ class SerialBalance:
         self._rule = spec.settling.scaled(spec.time_scale)
         self._interrupted = threading.Event()
         self._lock = threading.RLock()
+        if tap is None and spec.raw_lines is not None:
+            source: Source = "hardware" if spec.virtual is None else "virtual"
+            tap = Recorder.in_folder(Path(spec.raw_lines), name, source, spec.port)
         self._conversation = Conversation(spec, self._interrupted, tap)
         self._display = BalanceDisplay(spec.step)
         self._tared = self._reference_lost = False

@@ -159,6 +159,7 @@ class DoseProcedure:
         self._facts: ArmFacts | None = None
         self._executed: Executed | None = None
         self._tilts: list[tuple[float, float]] = []
+        self._placed: tuple[DoseReading, ...] = ()
         self._zero = self._at = self._duration = 0.0
 
     async def run(self) -> PourMeasurement:
@@ -269,9 +270,8 @@ class DoseProcedure:
                 f"{grams(LIGHTEST_RECEIVER)}"
             )
         begin = before[0].time - 1.0
-        placed = tuple(
-            DoseReading(one.time - begin, one.mass, one.stable) for one in self._readings.all if one.time >= begin
-        )
+        self._placed = tuple(one for one in self._readings.all if one.time >= begin)
+        placed = tuple(DoseReading(one.time - begin, one.mass, one.stable) for one in self._placed)
         rng = np.random.default_rng((self._seed, 41))
         step = self._readings.step or 1e-4
         self._series = series_of(self._scene, dose, self._settings, placed, rng, step=step)
@@ -384,6 +384,9 @@ class DoseProcedure:
             "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in self._tilts[::every]],
             "read_at": [round(one.time - self._at, 3) for one in during],
             "readings_g": [round(1e3 * (one.mass - self._zero), 3) for one in during],
+            "placed_at": [round(one.time - self._at, 3) for one in self._placed],
+            "placed_g": [round(1e3 * (one.mass - self._zero), 3) for one in self._placed],
+            "step_g": 1e3 * self._readings.step,
             **truth,
         }
         notes: dict[str, Any] = {"mode": self._setup.mode, "dose": about, "operator": self._setup.questions.take_log()}

@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,7 +29,7 @@ from actors.arm.arm_interface import (
 )
 from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing import Weighings
-from actors.balance.weighing_plan import PourMasses
+from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
 from actors.bench.ground_truth import PourAsk
 from actors.interfaces import (
@@ -153,6 +154,9 @@ SETTLING_TIME = 2.0
 LOOK_INTERVAL = 0.1
 """Time between two readings of the balance's display [s of the clock]."""
 
+BEFORE_TILT = 1.0
+"""Readings are recorded from so long before the first tilt on [s]."""
+
 _BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
 
 
@@ -189,6 +193,8 @@ class PourProcedure:
         self._broken: Exception | None = None
         self._executed: Executed | None = None
         self._facts: ArmFacts | None = None
+        self._tilts: list[tuple[float, float]] = []
+        self._readings: list[tuple[float, float]] = []
 
     @property
     def lasting(self) -> dict[str, PourMasses]:
@@ -351,12 +357,33 @@ class PourProcedure:
             "executed_s": float(executed.times[-1]),
             "largest_tilt_deg": _largest_tilt(executed),
             "executed": executed.record(),
+            **self._signals(),
             "operator": self._setup.questions.take_log(),
         }
+
+    def _signals(self) -> dict[str, Any]:
+        """Tilts and readings during the pour, on one clock that starts with the first tilt.
+
+        There are none without a balance below the receiver, and on a virtual bench: its balance is loaded afterwards.
+        """
+        below = self._setup.balance_spec.position in (Placement.RECEIVER, Placement.EVERYTHING)
+        if self._setup.mode != "hardware" or not below or min(len(self._tilts), len(self._readings)) < 2:
+            return {}
+        begin = self._tilts[0][0]
+        during = [(t - begin, mass) for t, mass in self._readings if t >= begin - BEFORE_TILT]
+        signals = {
+            "times": [round(t - begin, 3) for t, _ in self._tilts],
+            "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in self._tilts],
+            "read_at": [round(t, 3) for t, _ in during],
+            "readings_g": [round(1e3 * mass, 3) for _, mass in during],
+        }
+        return {"signals": signals}
 
     # ---- progress
 
     def _follow(self, state: ArmState) -> None:
+        if state.tilt is not None and state.moving:
+            self._tilts.append((time.monotonic(), state.tilt))
         self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
         self._seen(state)
 
@@ -372,6 +399,8 @@ class PourProcedure:
             with contextlib.suppress(LaboratoryError):
                 weight = await balance.read()
                 if math.isfinite(weight.mass):
+                    if weight.status in ("stable", "unstable"):
+                        self._readings.append((time.monotonic(), weight.mass))
                     self._report.show(weight.mass, weight.stable)
             await asyncio.sleep(LOOK_INTERVAL)
 

@@ -68,7 +68,7 @@ def simulated_dose(
     """
     check_dose(scene, dose)
     check_straight(scene)
-    series, bench = _set_up(scene, dose, seed, settings, held_tilt)
+    series, bench, placed = _set_up(scene, dose, seed, settings, held_tilt)
     loaded = bench.content
     controller = series.controller(DoseOrder(dose.amount, dose.limit, receiver_mass=bench.receiver_mass), seed=seed)
     record = bench.dose(controller if progress is None else _Shown(controller, progress))
@@ -78,7 +78,8 @@ def simulated_dose(
         raise UnknownPourError(unknown_amount(result))
     series.finish(result)
     retained = max(loaded - record.spilled - result.amount, 0.0)  # the receiver was weighed, the source was not
-    return PourMeasurement(loaded, record.spilled, retained, {"dose": _notes(dose, result, record, bench, series)})
+    notes = _notes(dose, result, record, bench, series, placed)
+    return PourMeasurement(loaded, record.spilled, retained, {"dose": notes})
 
 
 class _Shown:
@@ -106,7 +107,7 @@ class _Shown:
 
 def _set_up(
     scene: Scene, dose: DoseTarget, seed: int, settings: DosingSettings, held_tilt: float
-) -> tuple[DoseSeries, VirtualDosingBench]:
+) -> tuple[DoseSeries, VirtualDosingBench, tuple[DoseReading, ...]]:
     source = source_of(scene, dose)
     constants = seed if dose.source is None else source.constants
     drawn = np.random.default_rng((constants, 31))
@@ -132,7 +133,7 @@ def _set_up(
         held_tilt=held_tilt,
     )
     placed = bench.place_receiver()
-    return series_of(scene, dose, settings, placed, rng, step=scale.step), bench
+    return series_of(scene, dose, settings, placed, rng, step=scale.step), bench, placed
 
 
 def check_straight(scene: Scene) -> None:
@@ -161,8 +162,14 @@ def true_cup(scene: Scene) -> TrueCup:
 
 
 def _notes(
-    dose: DoseTarget, result: DoseResult, record: DoseRecord, bench: VirtualDosingBench, series: DoseSeries
+    dose: DoseTarget,
+    result: DoseResult,
+    record: DoseRecord,
+    bench: VirtualDosingBench,
+    series: DoseSeries,
+    placed: Sequence[DoseReading],
 ) -> dict[str, Any]:
+    before = placed[-1].time + 1.0  # the dose begins a second after the last of them
     every = max(len(record.times) // SIGNALS, 1)
     return {
         **after_dose(series),
@@ -177,4 +184,7 @@ def _notes(
         "in_receiver_g": [round(1e3 * float(m), 3) for m in record.true_mass[::every]],
         "read_at": [round(r.time, 3) for r in record.readings],
         "readings_g": [round(1e3 * (r.mass - bench.receiver_mass), 3) for r in record.readings],
+        "placed_at": [round(r.time - before, 3) for r in placed],
+        "placed_g": [round(1e3 * (r.mass - bench.receiver_mass), 3) for r in placed],
+        "step_g": 1e3 * bench.scale.step,
     }

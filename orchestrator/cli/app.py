@@ -20,6 +20,7 @@ from orchestrator.cli import (
     physics_command,
     pour_command,
     queue_commands,
+    recording_commands,
     report_command,
     robot_commands,
     run_commands,
@@ -243,6 +244,30 @@ _add(
     "decant balance explain kern.jsonl      # a recording",
     "decant balance explain terminal.log    # the lines as another program saved them",
     to=_balance,
+)
+
+_recording = _group(
+    "recording",
+    "Recorded pours: export them from runs, replay them, and fit unknown quantities.",
+    "decant recording replay configs/recordings/dose-1.yaml",
+    "decant recording export runs/dispense-20300131-1",
+)
+_add(
+    recording_commands.export,
+    "decant recording export dispense-20300131-1   # a run in the folder runs/",
+    to=_recording,
+)
+_add(
+    recording_commands.replay,
+    "decant recording replay configs/recordings/dose-1.yaml --png pictures",
+    "decant recording replay day-one/ --fitted fit.json",
+    to=_recording,
+)
+_add(
+    recording_commands.fit,
+    "decant recording fit day-one/ --unknown grip --unknown lag --judge day-two/ --output fit.json",
+    "decant recording fit configs/recordings/dose-1.yaml --until '5 s'   # judged on the rest",
+    to=_recording,
 )
 
 _server = _group(

@@ -31,7 +31,8 @@ from orchestrator.cli.console import (
 
 def validate(
     files: Annotated[
-        list[Path], typer.Argument(help="Campaign, study, vessel, laboratory or daemon files.", show_default=False)
+        list[Path],
+        typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files.", show_default=False),
     ],
     quiet: Quiet = False,
 ) -> None:
@@ -75,6 +76,13 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             return f"vessel, holds {1e6 * build_vessel(load_vessel(path)).capacity:.4g} mL to the brim", []
         case "laboratory":
             return f"laboratory, {load_laboratory(path).mode}", []
+        case "recording":
+            from orchestrator.recordings.recording_file import load_recording
+
+            recording = load_recording(path)
+            for warning in recording.warnings:
+                print_note(f"warning: {warning}")
+            return f"recorded pour, {len(recording.readings)} readings, {1e3 * recording.gain:.4g} g", []
         case "study":
             from orchestrator.study.study_file import load_study
             from orchestrator.study.study_plan import cells_of

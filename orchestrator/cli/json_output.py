@@ -518,6 +518,70 @@ class VesselHistoryOutput(_Output):
     entries: list[AccountOut]
 
 
+class RecordingExportOutput(_Output):
+    """Result of the export of a run's pours."""
+
+    recordings: list[Path]
+    """Files of the recorded pours (YAML), each with a CSV file of the same name."""
+
+    left_out: list[str]
+    """Reasons why pours could not be exported."""
+
+
+class RecordingReplayOutput(_Output):
+    """The replay of a recorded pour. Masses are without the receiver."""
+
+    recording: Path
+    readings: int
+    measured_g: float
+    """Mass at the end."""
+
+    onset: dict[str, float] | None
+    """Time [s] and recorded tilt [deg] at which the readings have risen; null if nothing flowed."""
+
+    arrivals: dict[str, float]
+    """How readings arrived: interval, longest gap, step, and number of readings that repeat while the mass rises."""
+
+    fitted: dict[str, Any]
+    """Values that differ from the file's, and the recordings that they were fitted on."""
+
+    simulation: dict[str, Any] | None
+    """Particle simulation of the recorded tilt: mass at the end, RMS of the readings, onset; null without it."""
+
+    estimator: dict[str, Any]
+    """Estimator of doses over the readings: mass and lag with 90 % intervals, innovation, coverage."""
+
+    warnings: list[str]
+
+
+class RecordingReplaysOutput(_Output):
+    """Replays of recorded pours."""
+
+    replays: list[RecordingReplayOutput]
+
+
+class RecordingFitOutput(_Output):
+    """Quantities that were fitted to recorded pours, and predictions of readings that were not."""
+
+    fitted: dict[str, dict[str, Any]]
+    """Value, 90 % interval and unit of each quantity, and whether the readings identify it."""
+
+    fitted_on: list[str]
+    """Names of the recordings."""
+
+    until_s: float | None
+    """Readings after this time were not fitted."""
+
+    rms_g: list[float]
+    """RMS of the residuals of each recording."""
+
+    held_readings: list[float] | None
+    """Share of the readings that repeat the one before while the mass rises, with its 90 % interval."""
+
+    judged: list[dict[str, Any]]
+    """Predicted and measured mass, RMS and coverage of each judged recording."""
+
+
 OUTPUTS: dict[str, Any] = {
     "run": RunOutput,
     "calibrate": CalibrateOutput,
@@ -540,6 +604,9 @@ OUTPUTS: dict[str, Any] = {
     "robot check": CheckOutput,
     "robot archive": ArchiveOutput,
     "balance check": BalanceCheckOutput,
+    "recording export": RecordingExportOutput,
+    "recording replay": RecordingReplaysOutput,
+    "recording fit": RecordingFitOutput,
     "queue submit": CampaignOut,
     "queue list": QueueOutput,
     "queue show": CampaignDetailOut,

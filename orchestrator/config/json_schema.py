@@ -43,6 +43,13 @@ def daemon_schema() -> dict[str, Any]:
     return _schema(DaemonFile, "Daemon")
 
 
+def recording_schema() -> dict[str, Any]:
+    """Schema of the YAML file of a recorded pour."""
+    from orchestrator.recordings.recording_file import RecordingFile
+
+    return _schema(RecordingFile, "Recording")
+
+
 def result_schema() -> dict[str, Any]:
     """Schema of a run's `summary.json`, with every kind of result."""
     from orchestrator.results.run_summary import summary_schema
@@ -63,6 +70,7 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "laboratory": laboratory_schema,
     "study": study_schema,
     "daemon": daemon_schema,
+    "recording": recording_schema,
     "result": result_schema,
     "output": output_schema,
 }

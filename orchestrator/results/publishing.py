@@ -13,6 +13,7 @@ from orchestrator.catalogue.run_reading import read_run
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal
 from orchestrator.journal.run_record import CampaignResult, read_record
+from orchestrator.recordings.recording_export import export_recordings
 from orchestrator.results import validity_warnings as regimes
 from orchestrator.results.html_report import REPORT_NAME, run_page
 from orchestrator.results.run_figures import draw_figures
@@ -60,7 +61,7 @@ class Published:
 def publish(
     plan: CampaignPlan, result: CampaignResult, recording: Path | None = None, dropped_events: int = 0
 ) -> Published:
-    """Write a run's figures (if the plan wants any), `theta.json`, `summary.json` and the report.
+    """Write a run's figures and recorded pours (if the plan wants any), `theta.json`, `summary.json` and the report.
 
     A run that has not finished may be published, too: its report describes its state. Safe to call again: the files
     are then written again.
@@ -76,6 +77,9 @@ def publish(
     """
     directory = result.directory
     figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
+    if plan.outputs.pour_recordings:
+        for reason in export_recordings(directory, plan=plan)[1]:
+            _log.warning("not recorded: %s", reason)
     summary = summary_of(plan, result, figures, recording=recording, dropped_events=dropped_events)
     write_summary(directory, summary)
     found = theta_of(result.results)

@@ -522,6 +522,9 @@ class OutputSettings(Settings):
     figures: Switch = True
     """Write figures at the end."""
 
+    pour_recordings: Switch = False
+    """Write each weighed pour and dose as a recorded pour into the folder 'recordings' of the run."""
+
     frame_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
     """Frames of particles per simulated second."""
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+from actors.balance.balance_settings import SerialBalanceSettings
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import missing_file, resolved
@@ -105,6 +106,10 @@ class References:
         if found is None or self.report.is_broken_within(found[1]):
             return None
         laboratory, at = found[0].ready(), found[1]
+        balance = laboratory.balance
+        if isinstance(balance, SerialBalanceSettings) and balance.raw_lines is not None:
+            folder = str(resolved(at.directory / balance.raw_lines))
+            laboratory = laboratory.with_values(balance=balance.with_values(raw_lines=folder))
         if laboratory.arm is None:
             return laboratory
         try:

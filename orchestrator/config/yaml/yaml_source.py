@@ -386,6 +386,7 @@ def _is_empty(node: Node) -> bool:
 
 
 TELLING = {
+    "recording": {"recorded", "series", "fill_deviation"},
     "study": {"mismatch", "compared", "campaign"},
     "campaign": {"calibration", "deployment", "seed", "liquid", "pourer", "receiver", "laboratory"},
     "vessel": {"profile", "mesh", "inner", "wall", "up"},
@@ -395,6 +396,7 @@ TELLING = {
 """Top-level keys that identify one kind of file, including wrong keys with a clear meaning; checked in this order."""
 
 NEEDED = {
+    "recording": "a recorded pour has keys such as recorded, pourer, receiver, liquid",
     "study": "a study has keys such as campaign, mismatch, calibration, deployment",
     "campaign": "a campaign has keys such as laboratory, liquid, calibration, deployment",
     "vessel": "a vessel has a name and a profile or mesh",
@@ -404,7 +406,7 @@ NEEDED = {
 
 
 def kind_of(data: Any) -> str | None:
-    """'study', 'campaign', 'vessel', 'daemon' or 'laboratory'; None if no key identifies it."""
+    """'recording', 'study', 'campaign', 'vessel', 'daemon' or 'laboratory'; None if no key identifies it."""
     keys = set(data) if isinstance(data, dict) else set()
     return next((kind for kind in TELLING if keys & telling(kind)), None)
 

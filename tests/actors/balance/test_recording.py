@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import itertools
 import json
 import time
 from pathlib import Path
@@ -12,12 +14,13 @@ from typer.testing import CliRunner, Result
 
 from actors.balance.dialect_registry import dialects
 from actors.balance.line_recording import LineEvent, LineRecording
+from actors.balance.readings import Reading
 from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import RecordedBalance
 from orchestrator.cli.app import app
 from tests.support.waiting import wait_for
 
-from .conftest import spec_for
+from .conftest import OF_VOICE, spec_for
 
 
 def record(port: str, path: Path, *options: str) -> Result:
@@ -347,3 +350,67 @@ def test_a_recorded_day_reads_as_it_did(path):
         far.close()
     assert seen
     assert set(seen) <= set(weights), "never a weight that was not recorded"
+
+
+ARRIVALS = Path(__file__).parents[2] / "data" / "balance-arrivals"
+
+
+def arrivals(number: int) -> list[tuple[float, str]]:
+    """Times [s] and displays [g] of a real balance, see the README there."""
+    with (ARRIVALS / f"series-{number}.csv").open(encoding="utf-8") as file:
+        return [(float(row["arrival_s"]), row["weight_g"]) for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("number", range(1, 7))
+def test_every_arrival_of_a_real_balance_is_read(number):
+    dialect = dialects()["kern-continuous"]
+    for _, shown in arrivals(number):
+        reading = dialect.decode(f"US,GS,{shown:>9} g".encode())
+        assert isinstance(reading, Reading)
+        assert float(reading.value) == float(shown)
+
+
+@pytest.mark.realtime
+def test_the_driver_reads_irregular_arrivals_in_their_order(tmp_path):
+    """Real readings, each as late as it was, twenty times as fast; the second one is the balance's tare."""
+    path = tmp_path / "arrivals.jsonl"
+    series = arrivals(4)[:80]
+    events = []
+    for (before, _), (at, shown) in itertools.pairwise([(-0.1, ""), *series]):
+        events.append(LineEvent(before + 0.11, "out", b"SI\r\n"))
+        events.append(LineEvent(at + 0.1, "in", f"S D {shown:>9} g\r\n".encode()))
+    LineRecording("typed", tuple(sorted(events, key=lambda one: one.time))).save(path)
+    far = RecordedBalance.start(path, speed=20.0)
+    seen: dict[float, float] = {}
+    try:
+        driver = SerialBalance(spec_for(far, "kcp"))
+        driver.connect()
+
+        def twenty() -> bool:
+            weight = driver.read()
+            seen[weight.time] = weight.mass
+            return len(seen) == 20
+
+        wait_for(twenty, "twenty readings")
+        driver.close()
+    finally:
+        far.close()
+    left = iter([round(1e-3 * float(shown), 9) for _, shown in series])
+    assert all(round(mass, 9) in left for mass in seen.values())
+
+
+def test_a_laboratory_can_keep_the_raw_lines_of_its_balance(tmp_path, voices):
+    far = voices("kern-swt")
+    for _ in range(2):
+        driver = SerialBalance(spec_for(far, OF_VOICE["kern-swt"], raw_lines=str(tmp_path / "lines")), "scale")
+        driver.connect()
+        wait_for(lambda driver=driver: driver.read().shown, "reading")
+        driver.close()
+    files = sorted((tmp_path / "lines").glob("scale-*.jsonl"))
+    assert len(files) == 2
+    for file in files:
+        kept = LineRecording.load(file)
+        assert kept.source == "hardware"
+        assert any(event.direction == "in" for event in kept.events)
+        assert kept.about["port"] == far.port
+        assert kept.about["started"] > 1.7e9

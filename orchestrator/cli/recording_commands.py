@@ -1,0 +1,264 @@
+"""The commands `decant recording export`, `replay` and `fit`: recorded pours from runs, and what they show."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from orchestrator.cli.command_options import Json, Parameters, Quiet
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    Refused,
+    print_json,
+    print_message,
+    print_note,
+    waiting_for,
+)
+from orchestrator.cli.shell_completion import RUNS, local_runs
+
+if TYPE_CHECKING:
+    from orchestrator.recordings.recording_file import PourRecording
+    from orchestrator.recordings.recording_fit import Fit, Judgement
+    from orchestrator.recordings.recording_replay import PourReplay
+
+Recordings = Annotated[
+    list[Path],
+    typer.Argument(help="Recorded pours (YAML), or folders of them.", metavar="RECORDING", show_default=False),
+]
+
+
+def export(
+    run: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder of a run, or its name in runs/.",
+            metavar="RUN",
+            show_default=False,
+            autocompletion=local_runs,
+        ),
+    ],
+    to: Annotated[
+        Path | None, typer.Option(help="Folder for the files; default: 'recordings' in the run's folder.")
+    ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write the weighed pours and doses of a run as recorded pours, from its journal.
+
+    Files that exist are kept. To write them at the end of every run, set 'outputs: {pour_recordings: true}' in the
+    campaign.
+    """
+    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.recordings.recording_export import export_recordings
+    from orchestrator.run_errors import RunError
+
+    folder = run if run.exists() or len(run.parts) > 1 else RUNS / run
+    if not (folder / JOURNAL_NAME).is_file():
+        raise RefusalError(f"{folder}: is no run; name the folder of a run, which has a {JOURNAL_NAME}", BAD_INPUT)
+    with Refused(RunError, OSError):
+        written, left_out = export_recordings(folder, to)
+    for reason in left_out:
+        print_message(f"not exported: {reason}")
+    for path in written:
+        print(path)
+    if as_json:
+        print_json({"recordings": written, "left_out": left_out})
+    if not written:
+        raise RefusalError(f"{folder}: no pour of this run can be exported", FAILED)
+
+
+def replay(
+    recordings: Recordings,
+    particles: Annotated[
+        int, typer.Option(min=0, max=50_000, help="Particles of the simulation; 0: only the estimator.")
+    ] = 1000,
+    parameters: Parameters = None,
+    values: Annotated[
+        Path | None,
+        typer.Option("--fitted", help="Values that 'decant recording fit --output' has written.", show_default=False),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Seed of simulation and estimator.")] = 0,
+    png: Annotated[
+        Path | None, typer.Option(help="Folder for a picture of each pour: NAME.png.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Replay recorded pours: simulate the recorded tilt, run the dosing estimator over the readings, and compare.
+
+    Nothing is fitted but the lag of the balance, which the estimator finds; values of '--fitted' are named. Exit code 2
+    if a file is invalid.
+    """
+    from orchestrator.config.file_loading import load_parameters
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.recordings.recording_fit import read_values
+    from orchestrator.recordings.recording_replay import ReplayValues, replay_recording
+    from orchestrator.results.figure_style import save
+    from orchestrator.results.recording_figures import replay_figure
+    from sim_engine.errors import DecantError
+    from sim_engine.liquids import SimulationParameters
+    from sim_engine.simulator import PourSimulator
+
+    with Refused(ConfigError):
+        theta = None if parameters is None else load_parameters(parameters)
+    with Refused(ValueError, OSError, at="--fitted: "):
+        given = ReplayValues() if values is None else read_values(values)
+    loaded = _loaded(recordings)
+    theta = (theta or SimulationParameters()).model_copy(update={"particles": max(particles, 200)})
+    simulator = PourSimulator() if particles else None
+    documents = []
+    try:
+        for one in loaded:
+            at, text = f"{one.path.name}: ", f"replaying {one.name}"
+            with Refused(DecantError, at=at), waiting_for(lambda text=text: text):  # type: ignore[misc]
+                found = replay_recording(
+                    one, given, parameters=theta, seed=seed, particles=particles > 0, simulator=simulator
+                )
+            print(replay_text(found))
+            documents.append(found.document())
+            if png is not None:
+                with Refused(OSError, at="--png: "):
+                    print_note(f"picture  {save(replay_figure(found), png / f'{one.name}.png')}")
+    finally:
+        if simulator is not None:
+            simulator.close()
+    if as_json:
+        print_json({"replays": documents})
+
+
+def fit(
+    recordings: Recordings,
+    unknown: Annotated[
+        list[str] | None,
+        typer.Option(help="Quantity to fit: grip, height, fill, lag, viscosity. Repeatable; default: grip and lag."),
+    ] = None,
+    until: Annotated[
+        str | None,
+        typer.Option(
+            help="Fit only the readings up to this time after the first tilt, for example '6 s'; the rest is judged."
+        ),
+    ] = None,
+    judged: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--judge", help="Recorded pour (or folder) to predict with the fit. Repeatable.", show_default=False
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Write the values to this JSON file.", show_default=False)
+    ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Fit unknown quantities that recorded pours share, with 90 % intervals, and judge the fit on other readings.
+
+    The model is the tilting cup with the lag of the balance, not the particles; its flow is always fitted. Judged are
+    the recordings of '--judge', and with '--until' the later readings of the fitted ones.
+    """
+    from orchestrator.recordings.recording_fit import fit_recordings, judge_recording
+    from sim_engine.errors import DecantError
+    from sim_engine.settings.quantity import QuantityError, parse_quantity
+
+    with Refused(QuantityError, at="--until: "):
+        seconds = None if until is None else parse_quantity(until, "s", "6 s")
+    if output is not None and (output.suffix != ".json" or not output.parent.is_dir()):
+        raise RefusalError(f"--output {output}: should be a .json file in a folder that exists", BAD_INPUT)
+    loaded = _loaded(recordings)
+    others = _loaded(judged or ())
+    if both := sorted({one.path for one in loaded} & {one.path for one in others}):
+        text = f"--judge: {both[0].name} is fitted, too; judge another, or fit its beginning with --until"
+        raise RefusalError(text, BAD_INPUT)
+    with Refused(DecantError), waiting_for(lambda: f"fitting {len(loaded)} recorded pours"):
+        found = fit_recordings(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
+        judgements = [judge_recording(found, one) for one in (*(loaded if seconds is not None else ()), *others)]
+    print(fit_text(found, judgements))
+    document = found.document() | {"judged": [one.document() for one in judgements]}
+    if output is not None:
+        with Refused(OSError, at="--output: "):
+            output.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    if as_json:
+        print_json(document)
+
+
+def _loaded(paths: Sequence[Path]) -> list[PourRecording]:
+    """Recorded pours; their warnings are printed."""
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.recordings.recording_file import load_recordings
+
+    with Refused(ConfigError):
+        found = load_recordings(paths)
+    for one in found:
+        for warning in one.warnings:
+            print_message(f"warning: {warning}")
+    return found
+
+
+def replay_text(found: PourReplay) -> str:
+    """A replay in a few lines.
+
+    Args:
+        found: the replay.
+    """
+    data = found.document()
+    read, simulated, estimator = data["arrivals"], data["simulation"], data["estimator"]
+    lines = [f"{found.recording.name}: {data['measured_g']:.4g} g measured, {_onset(data['onset'])}"]
+    if simulated is not None:
+        lines.append(
+            f"  predicted by the simulation: {simulated['final_g']:.4g} g ({simulated['final_difference_g']:+.3g} g), "
+            f"{_onset(simulated['onset'])}; RMS {simulated['rms_g']:.3g} g"
+        )
+    low, high = estimator["final_g"][1:]
+    lag = estimator["lag_s"]
+    lines.append(
+        f"  estimator: {low:.4g} to {high:.4g} g at the end; each reading predicted from those before: "
+        f"{100 * estimator['coverage']:.0f} % inside 90 %, mean normalised innovation squared "
+        f"{estimator['normalised_innovation']:.2f} (1 is right)"
+    )
+    fitted = data["fitted"]
+    given = [
+        f"{name.replace('_', ' [')}] {fitted[name]:g}" for name in ("grip_deg", "height_mm", "fill_g") if fitted[name]
+    ]
+    source = f" from {', '.join(fitted['on'])}" if fitted["on"] else ""
+    kept = f"; given{source}: {', '.join(given)}" if given else ""
+    lines.append(f"  fitted here: lag {lag[0]:.2f} s ({lag[1]:.2f} to {lag[2]:.2f} s){kept}")
+    lines.append(
+        f"  readings: every {read['interval_s']:.3g} s, longest gap {read['longest_gap_s']:.2g} s, "
+        f"{read['repeated']} of {read['rising']} repeat the one before while the mass rises"
+    )
+    return "\n".join(lines)
+
+
+def _onset(onset: dict[str, float] | None) -> str:
+    return "nothing flowed" if onset is None else f"onset at {onset['time_s']:.2f} s and {onset['tilt_deg']:.1f}°"
+
+
+def fit_text(found: Fit, judged: Sequence[Judgement]) -> str:
+    """A fit and its judgement, separately.
+
+    Args:
+        found: the fit.
+        judged: predictions of readings that were not fitted.
+    """
+    part = "" if found.until is None else f", readings of the first {found.until:g} s"
+    lines = [f"fitted on {', '.join(found.fitted_on)}{part} (90 % intervals)"]
+    lines += [f"  {one.name:<10} {one.text}" for one in found.values]
+    if found.held is not None:
+        share, low, high = (100 * one for one in found.held)
+        lines.append(f"  {'held':<10} {share:.0f} % of the readings while the mass rises ({low:.0f} to {high:.0f} %)")
+    lines.append(f"  residuals  {', '.join(f'{1e3 * one:.2g}' for one in found.rms)} g (RMS)")
+    lines.append("predicted, not fitted" if judged else "nothing was judged; name other recordings with --judge")
+    for one in judged:
+        value, low, high = (1e3 * number for number in one.final)
+        which = "later readings" if one.fitted else "whole pour"
+        lines.append(
+            f"  {one.name} ({which}): {value:.4g} g ({low:.4g} to {high:.4g}), measured "
+            f"{1e3 * one.measured_final:.4g} g; RMS {1e3 * one.rms:.2g} g, {100 * one.coverage:.0f} % of the readings "
+            "inside 90 %"
+        )
+    return "\n".join(lines)

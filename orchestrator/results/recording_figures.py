@@ -1,0 +1,56 @@
+"""Pictures of recorded pours: measured and predicted mass, residuals, tilt."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from orchestrator.recordings.recording_fit import Judgement
+from orchestrator.recordings.recording_replay import QUANTILE, PourReplay
+from orchestrator.results.figure_style import BEST, GREY, INK, MEASURED, PREDICTED, dress, entitle, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def replay_figure(found: PourReplay, judged: Judgement | None = None) -> Figure:
+    """Measured and predicted mass over time, residuals, and the tilt.
+
+    Args:
+        found: the replay.
+        judged: the prediction of a fit, shown in addition.
+    """
+    recording, estimated = found.recording, found.estimated
+    figure, (mass, residual, tilt) = new_figure(
+        3, 1, size=(7.2, 7.4), sharex=True, gridspec_kw={"height_ratios": (3.0, 2.0, 1.3)}
+    )
+    entitle(figure, f"Recorded pour {recording.name}")
+    times, net = recording.read_times, 1e3 * recording.net
+    if found.simulated is not None:
+        mass.plot(times, 1e3 * found.simulated, color=PREDICTED, lw=1.8, label="simulated from the tilt")
+        residual.plot(times, net - 1e3 * found.simulated, color=PREDICTED, lw=1.2, label="reading − simulated")
+    if judged is not None:
+        half = QUANTILE * judged.deviation
+        low, high = 1e3 * (judged.predicted - half), 1e3 * (judged.predicted + half)
+        mass.fill_between(judged.times, low, high, color=BEST, alpha=0.25, lw=0, label="fitted model, 90 %")
+        mass.plot(judged.times, 1e3 * judged.predicted, color=BEST, lw=1.2)
+    mass.plot(times, net, ".", color=MEASURED, ms=3.5, label="measured")
+    for onset, colour in ((found.onset, MEASURED), (found.simulated_onset, PREDICTED)):
+        if onset is not None:
+            mass.axvline(onset.time, color=colour, lw=0.8, ls=":")
+    dress(mass, y="in the receiver [g]")
+    mass.legend(frameon=False, fontsize=8.5, loc="upper left")
+    half = QUANTILE * 1e3 * estimated.deviation
+    residual.fill_between(estimated.times, -half, half, color=GREY, alpha=0.3, lw=0, label="estimator, 90 %")
+    residual.plot(estimated.times, 1e3 * estimated.innovation, ".", color=INK, ms=3.0, label="innovation")
+    limit = max(1.2 * float(np.quantile(np.abs(1e3 * estimated.innovation), 0.99)), 0.5)
+    if found.simulated is not None:
+        limit = max(limit, 1.1 * float(np.abs(net - 1e3 * found.simulated).max()))
+    residual.set_ylim(-limit, limit)
+    dress(residual, y="difference [g]")
+    residual.legend(frameon=False, fontsize=8.5, loc="upper left", ncols=3)
+    tilt.plot(recording.tilt_times, np.degrees(recording.tilts), color=INK, lw=1.2)
+    dress(tilt, x="time [s]", y="tilt [deg]")
+    tilt.set_xlim(recording.tilt_times[0], max(recording.tilt_times[-1], times[-1]))
+    return figure
