@@ -13,12 +13,13 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
+from actors.dosing.display_belief import DisplayBelief
 from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DoseResult, fine_flow
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing.dosing_settings import DosingSettings
@@ -119,9 +120,11 @@ class DoseSeries:
         self._step, self._fall_time = step, fall_time
         lag = draw_lags(placed, particles, rng, step=step)
         volumes = self._volumes(content)
-        self.belief = (
+        belief = (
             DoseBelief.prior(volumes, lag, rng) if knowledge is None else DoseBelief.known(knowledge, volumes, lag, rng)
         )
+        shown = DisplayBelief.placed([one.mass for one in placed])
+        self.belief = replace(belief, display=belief.display.joined(shown))
 
     @property
     def content(self) -> SourceContent:
@@ -306,4 +309,5 @@ def _single(belief: DoseBelief, particle: int) -> DoseBelief:
         belief.volume[one],
         belief.aim,
         belief.doses,
+        belief.display,
     )

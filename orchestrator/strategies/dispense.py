@@ -336,4 +336,5 @@ def _knowledge(fields: Mapping[str, Any]) -> DoseKnowledge:
         None if lag is None else tuple(lag),
         float(fields["aim"]),
         int(fields["doses"]),
+        tuple(fields["display"]),
     )
