@@ -20,8 +20,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,51 +52,80 @@ class DisplayBelief:
             changed: after a new reading, and after a repeated one (2 × 2 numbers). Two numbers, because some balances
             send each conversion two or three times, and others hold their display now and then for a second.
         noise: factor of the variance of a reading.
+        step: of the display [kg].
+        interval: mean time between two readings [s].
     """
 
     repeats: tuple[Beta, Beta] = (UNKNOWN_REPEATS, UNKNOWN_REPEATS)
     noise: float = 1.0
+    step: float = 1e-4
+    interval: float = 0.1
 
     @classmethod
-    def placed(cls, masses: Sequence[float]) -> DisplayBelief:
+    def placed(cls, times: Sequence[float], masses: Sequence[float], step: float) -> DisplayBelief:
         """What the readings show while the receiver is put on.
 
         During the rise the load changes by many display steps, so that each equal reading is a repeated one.
 
         Args:
-            masses: readings from before the step until it has settled [kg].
+            times: of the readings from before the rise until it has settled, increasing [s].
+            masses: the readings [kg].
+            step: of the display [kg].
         """
         repeats = Repeats(cls().repeats)
         if len(masses) < 4:
-            return cls()
+            return cls(step=step)
         low, high = (float(np.median(part)) for part in (masses[:3], masses[-3:]))
         for before, after in itertools.pairwise(masses):
             if low + RISING[0] * (high - low) < before < low + RISING[1] * (high - low):
                 repeats.see(after == before, 0.0)
-        return cls(repeats.beta())
+        return cls(repeats.beta(), step=step, interval=float(np.median(np.diff(times))))
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> DisplayBelief:
         """The belief with these `numbers`."""
-        a, b, c, d, noise = numbers
-        return cls(((a, b), (c, d)), noise)
+        a, b, c, d, noise, step, interval = numbers
+        return cls(((a, b), (c, d)), noise, step, interval)
+
+    @classmethod
+    def expected(cls, step: float, interval: float, repeated: float) -> DisplayBelief:
+        """The belief about a display whose data sheet is known.
+
+        Args:
+            step: of the display [kg].
+            interval: between two readings [s].
+            repeated: share of repeated readings.
+        """
+        beta = (20.0 * max(repeated, 0.005), 20.0 * (1.0 - max(repeated, 0.005)))
+        return cls((beta, beta), step=step, interval=interval)
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """The belief as five numbers, for `of`."""
-        return (*self.repeats[0], *self.repeats[1], self.noise)
+        """The belief as numbers, for `of`."""
+        return (*self.repeats[0], *self.repeats[1], self.noise, self.step, self.interval)
+
+    def draws(self, rng: np.random.Generator) -> Iterator[bool]:
+        """Whether each of the following readings repeats the one before, without end."""
+        chances, repeated = [a / (a + b) for a, b in self.repeats], False
+        while True:
+            repeated = bool(rng.random() < chances[repeated])
+            yield repeated
 
     def aged(self) -> DisplayBelief:
         """The belief with the weight of `LONGEST_MEMORY` readings at most, so that another mode of it is noticed."""
         first, second = (_shortened(pair) for pair in self.repeats)
-        return DisplayBelief((first, second), self.noise)
+        return replace(self, repeats=(first, second))
 
     def joined(self, other: DisplayBelief) -> DisplayBelief:
-        """This belief with the evidence of another one that knew nothing before."""
+        """This belief with the evidence of a newer one that knew nothing before."""
         x, y = UNKNOWN_REPEATS
         pairs = zip(self.repeats, other.repeats, strict=True)
         first, second = ((a + max(c - x, 0.0), b + max(d - y, 0.0)) for (a, b), (c, d) in pairs)
-        return DisplayBelief((first, second), self.noise)
+        return replace(other, repeats=(first, second), noise=self.noise)
+
+
+IDEAL_DISPLAY = DisplayBelief.expected(1e-4, 0.1, 0.0)
+"""A display of 0.1 g that repeats no reading."""
 
 
 class Repeats:

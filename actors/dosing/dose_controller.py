@@ -150,6 +150,10 @@ MOST_EQUAL = 12
 MOST_PAUSES = 6
 """Largest number of such interruptions of one dose."""
 
+DRIBBLES = 0.3e-3
+"""Mass that arrives late in addition, where the last stream is too slow to leave the lip cleanly [kg]: about half of
+what runs down the outside. Later doses know it from the ones before."""
+
 LATE_DROPS = 0.12e-3
 """Standard deviation of what still falls into the receiver after it was weighed [kg]."""
 
@@ -428,7 +432,7 @@ class DoseController:
 
     def _finish(self, end: DoseEnd, *, known: bool, amount: float = 0.0) -> None:
         self.phase = DosePhase.DONE
-        aim = self._belief.aim
+        aim = self._aim()
         if self._expected is not None and known and end is DoseEnd.REACHED:
             late = min(max(amount - self._expected, -1e-3), 1e-3)
             aim += max(0.25, 1.0 / (self._belief.doses + 2)) * (late - aim)
@@ -466,7 +470,7 @@ class DoseController:
         final = e.final_mass(
             self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=self._return_acceleration()
         )
-        middle, deviation = float(np.median(final)) + self._belief.aim, math.hypot(float(final.std()), 0.1e-3)
+        middle, deviation = float(np.median(final)) + self._aim(), math.hypot(float(final.std()), 0.1e-3)
         left, wait = order.amount - middle, 0.0
         if middle + 2.33 * deviation < order.amount + order.limit:
             wait = max(left, 0.0) / max(self.flow, 1e-6)
@@ -475,6 +479,12 @@ class DoseController:
         self._expected = float(np.median(final)) + self.flow * wait
         self._turn_back(wait=wait, gently=True)
         return True
+
+    def _aim(self) -> float:
+        """Mass to subtract from the target [kg]."""
+        clean = self._cup.density * self._cup.clean_flow(max(self._tilt, 0.1))
+        late = DRIBBLES if self._belief.doses == 0 and self.fine_flow < clean else 0.0
+        return self._belief.aim + late
 
     def _towards(self, tilt: float, speed: float, ahead: float) -> float:
         """Speed of a turn that ends at a tilt, with a deceleration of a third of the allowed one."""
@@ -544,17 +554,21 @@ class DoseController:
         elif self._now - self._begin > s.time_limit:
             self._turn_back(DoseEnd.TIME_LIMIT)
         elif self._doubt_since is not None and self._now - self._doubt_since > LONGEST_DOUBT:
-            self._pause(None)
+            self._pause()
         elif self._holds_too_long():
-            self._pause(DoseEnd.STREAM_MISSED)
+            self._pause(self._lost_stream())
         elif self._nearly_empty():
             self._turn_back(DoseEnd.SOURCE_EMPTY)
         elif self._rate() < 0.5 * max(self._late_flow, 1e-3) and (
             self._late_mass - net - self._late_flow > max(2.5e-3, 0.3 * self._late_mass)
             or (self.phase is DosePhase.POUR and float(np.median(e.flow_factor)) < 0.3 * self._factor_before)
         ):
-            left = float(np.median(e.volume))
-            self._pause(DoseEnd.SOURCE_EMPTY if left < 0.12 * self._cup.capacity else DoseEnd.STREAM_MISSED)
+            self._pause(self._lost_stream())
+
+    def _lost_stream(self) -> DoseEnd:
+        """Why less arrives than should have left the cup."""
+        left = float(np.median(self._estimator.volume))
+        return DoseEnd.SOURCE_EMPTY if left < 0.12 * self._cup.capacity else DoseEnd.STREAM_MISSED
 
     def _holds_too_long(self) -> bool:
         """Whether the display shows one reading for longer than displays do, although the load has changed."""
@@ -565,7 +579,7 @@ class DoseController:
         surely = float(np.quantile(e.reading, 0.1)) - 0.5 * self._step_size
         return surely - shown > max(4.0 * SEEN, self._step_size)
 
-    def _pause(self, suspected: DoseEnd | None) -> None:
+    def _pause(self, suspected: DoseEnd | None = None) -> None:
         """Turn back and weigh, because the readings do not follow the stream; the weight decides whether it missed."""
         self._suspected, self._paused = suspected, True
         self._turn_back()

@@ -62,7 +62,7 @@ FLOW_FACTOR = (1.0, 0.2)
 """Flow factor before the first dose: median, and standard deviation of its logarithm."""
 
 FIRST_AIM = 0.3e-3
-"""`DoseBelief.aim` of the first dose [kg]."""
+"""`DoseBelief.aim` of the first dose, if its last stream leaves the lip cleanly [kg]."""
 
 SHAPE_RANGE = (0.22, 1.0)
 FACTOR_RANGE = (0.05, 2.0)
@@ -533,7 +533,7 @@ class DoseEstimator:
         volume = self.volume
         if weighed is not None:  # the content of the receiver has left the source
             volume = np.maximum(self._belief.volume - weighed / self.cup.density, 0.0)
-        display = DisplayBelief(self.repeats.beta(), self.noise)
+        display = replace(self._belief.display, repeats=self.repeats.beta(), noise=self.noise)
         return DoseBelief(
             self.onset_bias, self.flow_factor, self.lag, self.lag_shape, volume, aim, self._belief.doses + 1, display
         )

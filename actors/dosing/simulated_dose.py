@@ -165,12 +165,9 @@ def _notes(
 ) -> dict[str, Any]:
     every = max(len(record.times) // SIGNALS, 1)
     return {
-        **after_dose(series),
+        **after_dose(series, result),
         "wanted": dose.amount,
-        "received": result.amount,
         "true": record.received,
-        "end": str(result.end),
-        "top_ups": result.top_ups,
         "duration": record.duration,
         "times": [round(float(t), 3) for t in record.times[::every]],
         "tilt_deg": [round(math.degrees(float(t)), 2) for t in record.tilts[::every]],
