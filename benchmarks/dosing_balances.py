@@ -113,7 +113,9 @@ def program(commit: str) -> tuple[Any, Any]:
         source = subprocess.run(shown, cwd=ROOT, check=True, capture_output=True, text=True).stdout
         module = types.ModuleType(f"before.{name}")
         sys.modules[f"before.{name}"] = module
-        exec(compile(source.replace("actors.dosing.dose_", "before.dose_"), f"{name}@{commit}", "exec"), module.__dict__)
+        exec(
+            compile(source.replace("actors.dosing.dose_", "before.dose_"), f"{name}@{commit}", "exec"), module.__dict__
+        )
     return sys.modules["before.dose_series"], sys.modules["before.dose_controller"]
 
 
@@ -223,7 +225,9 @@ def main() -> None:
     parser.add_argument("--rows", type=int, nargs="*", help="numbers of rows, from 0")
     parser.add_argument("--before", default="", metavar="COMMIT", help="pour with the dosing code of a commit, too")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}; implies --before {BEFORE}")
+    parser.add_argument(
+        "--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}; implies --before {BEFORE}"
+    )
     options = parser.parse_args()
     first = FIRST_FINAL_SEED if options.final else options.first
     before = options.before or (BEFORE if options.json else "")

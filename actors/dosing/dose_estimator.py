@@ -473,7 +473,18 @@ class DoseEstimator:
         places = (np.arange(count) + self._rng.random()) / count
         drawn = np.minimum(np.searchsorted(np.cumsum(weight), places), count - 1)
         self._log_weight = np.zeros(count)
-        for name in ("onset_bias", "flow_factor", "lag", "lag_shape", "volume", "mass", "flow", "zero", "_ended", "_flowed"):
+        for name in (
+            "onset_bias",
+            "flow_factor",
+            "lag",
+            "lag_shape",
+            "volume",
+            "mass",
+            "flow",
+            "zero",
+            "_ended",
+            "_flowed",
+        ):
             setattr(self, name, getattr(self, name)[drawn])
         for name in ("_lags", "_mass_history", "_flow_history"):
             setattr(self, name, getattr(self, name)[:, drawn])

@@ -308,9 +308,7 @@ def series_of(
     source = source_of(scene, dose)
     cup = CupFlow(build_vessel(scene.pourer), scene.liquid)
     content = SourceContent(source.mass, source.deviation)
-    return DoseSeries(
-        cup, settings, content, placed, rng, step=step, knowledge=source.knowledge, display=display
-    )
+    return DoseSeries(cup, settings, content, placed, rng, step=step, knowledge=source.knowledge, display=display)
 
 
 def unknown_amount(result: DoseResult) -> str:
