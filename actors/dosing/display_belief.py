@@ -39,6 +39,9 @@ repeat every second one."""
 LONGEST_MEMORY = 150.0
 """Readings that the knowledge about repeats amounts to at most, so that a balance whose mode was changed is noticed."""
 
+SMALLEST_STEP = 0.1e-3
+"""Steps of finer displays are examined like this one [kg]; noise moves their last digits."""
+
 RISING = (0.03, 0.97)
 """Part of a step of the load in which every new reading differs from the one before."""
 
@@ -54,12 +57,17 @@ class DisplayBelief:
         noise: factor of the variance of a reading.
         step: of the display [kg].
         interval: mean time between two readings [s].
+        jitter: standard deviation of the time at which a reading arrives [s].
+        rest: time constant with which the last few steps of a change are shown [s]: the filters of some balances get
+            slower as soon as the load hardly moves.
     """
 
     repeats: tuple[Beta, Beta] = (UNKNOWN_REPEATS, UNKNOWN_REPEATS)
     noise: float = 1.0
     step: float = 1e-4
     interval: float = 0.1
+    jitter: float = 0.0
+    rest: float = 0.0
 
     @classmethod
     def placed(cls, times: Sequence[float], masses: Sequence[float], step: float) -> DisplayBelief:
@@ -79,13 +87,21 @@ class DisplayBelief:
         for before, after in itertools.pairwise(masses):
             if low + RISING[0] * (high - low) < before < low + RISING[1] * (high - low):
                 repeats.see(after == before, 0.0)
-        return cls(repeats.beta(), step=step, interval=float(np.median(np.diff(times))))
+        gaps = np.diff(times)
+        middle = float(np.median(gaps))
+        # the median, because a lost reading leaves a gap of two intervals
+        jitter = 1.48 * float(np.median(np.abs(gaps - middle))) / math.sqrt(2.0)
+        # from five steps off to one step off
+        off = np.abs(np.asarray(masses) - high) / max(step, SMALLEST_STEP)
+        near, nearer = (int(np.flatnonzero(np.append(True, off > limit))[-1]) for limit in (5.5, 0.9))
+        late = float(times[min(nearer, len(times) - 1)] - times[min(near, len(times) - 1)])
+        return cls(repeats.beta(), step=step, interval=middle, jitter=jitter, rest=late / math.log(5.5))
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> DisplayBelief:
         """The belief with these `numbers`."""
-        a, b, c, d, noise, step, interval = numbers
-        return cls(((a, b), (c, d)), noise, step, interval)
+        a, b, c, d, *others = numbers
+        return cls(((a, b), (c, d)), *others)
 
     @classmethod
     def expected(cls, step: float, interval: float, repeated: float) -> DisplayBelief:
@@ -102,7 +118,7 @@ class DisplayBelief:
     @property
     def numbers(self) -> tuple[float, ...]:
         """The belief as numbers, for `of`."""
-        return (*self.repeats[0], *self.repeats[1], self.noise, self.step, self.interval)
+        return (*self.repeats[0], *self.repeats[1], self.noise, self.step, self.interval, self.jitter, self.rest)
 
     def draws(self, rng: np.random.Generator) -> Iterator[bool]:
         """Whether each of the following readings repeats the one before, without end."""

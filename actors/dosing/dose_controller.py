@@ -154,7 +154,14 @@ DRIBBLES = 0.3e-3
 """Mass that arrives late in addition, where the last stream is too slow to leave the lip cleanly [kg]: about half of
 what runs down the outside. Later doses know it from the ones before."""
 
-LATE_DROPS = 0.12e-3
+SLOW_FILTER, LONGEST_FILTER = 2.5, 3.0
+"""Time constants of a filter that gets slower at rest, after which its reading counts; largest such time [s]."""
+
+AT_REST = 0.8
+"""Time for which a reading has to stay the same until it counts as weighed [s]. The filters of some balances get slower
+as soon as the load hardly moves."""
+
+LATE_DROPS = 0.14e-3
 """Standard deviation of what still falls into the receiver after it was weighed [kg]."""
 
 LONGEST_SETTLING = 10.0
@@ -228,6 +235,7 @@ class DoseController:
         self._top_ups = self._pauses = 0
         self._suspected: DoseEnd | None = None
         self._paused = False
+        self._remainder = 0.0
         self._interval = 0.1
         self._unchanged_since = 0.0
         self._factor_before = float(np.median(belief.flow_factor))
@@ -371,21 +379,32 @@ class DoseController:
     def _settle(self) -> float:
         waited = self._now - self._since
         lag = float(np.median(self._estimator.lag))
-        needed = min(max(3, self._estimator.repeats.in_a_row(STALE) + 1), MOST_EQUAL)
+        old = min(self._estimator.repeats.in_a_row(STALE) + 1, MOST_EQUAL)
+        needed = max(old, math.ceil(AT_REST / self._interval) + 1, 4)
         last = [r for r in self._recent if r.time > self._since][-needed:]
-        if len(last) == needed and waited > max(0.5, EARLIEST_WEIGHING * lag):
+        if len(last) == needed and waited > max(0.5, EARLIEST_WEIGHING * lag, self._slow_filter(lag)):
+            half = needed // 2
+            early, late = (math.fsum(r.mass for r in part) / half for part in (last[:half], last[-half:]))
             spread = max(r.mass for r in last) - min(r.mass for r in last)
-            flat = spread <= max(2.0 * self._step_size, 1e-4)
+            flat = spread <= max(2.0 * self._step_size, 1.5e-4) and abs(late - early) <= max(
+                0.6 * self._step_size, 5e-5
+            )
             behind = self._behind(last[-1].time) if flat else None
             if behind is not None:
-                self._weighed(last[-1].mass + behind)
+                self._weighed(late + behind)
                 return 0.0
             if waited > max(0.5, 3.0 * lag) and (flat or all(r.stable for r in last)):
-                self._weighed(math.fsum(r.mass for r in last) / len(last))
+                self._remainder = 0.0
+                self._weighed(late)
                 return 0.0
         if waited > LONGEST_SETTLING:
             self._finish(self._end or (DoseEnd.UNSTABLE if last else DoseEnd.CONNECTION_LOST), known=False)
         return 0.0
+
+    def _slow_filter(self, lag: float) -> float:
+        """Time after which a filter that gets slower at rest has come to its end [s]; 0 for other balances."""
+        rest = self._belief.display.rest
+        return min(SLOW_FILTER * rest, LONGEST_FILTER) if rest > 2.0 * lag + self._interval else 0.0
 
     def _behind(self, time: float) -> float | None:
         """Mass that a reading at this time still lags behind [kg]; None while the particles do not agree about it."""
@@ -395,7 +414,8 @@ class DoseController:
             return None
         rise = e.mass - e.predicted(time)
         middle, (largest, deviation) = float(np.median(rise)), LARGEST_REMAINDER
-        return middle if abs(middle) < largest and float(rise.std()) < deviation else None
+        self._remainder = float(rise.std())
+        return middle if abs(middle) < largest and self._remainder < deviation else None
 
     def _weighed(self, mass: float) -> None:
         assert self._zero is not None
@@ -424,7 +444,7 @@ class DoseController:
     def deviation(self) -> float:
         """Standard deviation of a weighed amount: two roundings, two readings, and late drops [kg]."""
         rounded = self._step_size / math.sqrt(12.0)
-        return math.sqrt(2.0 * (rounded**2 + self._noise**2) + LATE_DROPS**2)
+        return math.sqrt(2.0 * (rounded**2 + self._noise**2) + LATE_DROPS**2 + self._remainder**2)
 
     def _blind(self) -> float:
         """Time for which the display may repeat one reading, which hardly one in ten repeats exceeds [s]."""

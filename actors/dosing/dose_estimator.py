@@ -91,7 +91,7 @@ NOISE_RANGE = (0.25, 30.0)
 NOISE_READINGS = 10.0
 """Readings after which the factor follows a further one half as fast as at first."""
 
-LARGEST_SQUARE = 9.0
+LARGEST_SQUARE = 16.0
 """Largest squared innovation, over its variance, that counts for the factor: a gush is no noise."""
 
 
@@ -277,7 +277,7 @@ class DoseEstimator:
         count = len(belief.volume)
         self.zero = step * rng.permutation((np.arange(count) + 0.5) / count - 0.5)
         self.repeats = Repeats(belief.display.repeats)
-        self.noise = belief.display.noise
+        self.noise, self._jitter = belief.display.noise, belief.display.jitter
         self._last: float | None = None
         self._log_weight = np.zeros(count)
         self._squares = [0.0, 0.0]
@@ -336,7 +336,7 @@ class DoseEstimator:
             self.mass += gained + 0.02 * cup.density * flow * noise[0]
             # flow and onset wander, because wetting and film are not constant
             self._flowed = np.where(flows, self._flowed + TIME_STEP, self._flowed)
-            wetting = np.where(self._flowed < WETTING, 2.0, 1.0) * flows
+            wetting = np.where(self._flowed < WETTING, 3.0, 1.0) * flows
             self.flow_factor *= np.exp(0.03 * wetting * noise[1])
             self.onset_bias += math.radians(0.1) * wetting * noise[2]
             self.flow = flow
@@ -387,7 +387,9 @@ class DoseEstimator:
     def _scatter(self) -> float:
         """The same before the display rounds [kg]."""
         falls = max(self._recent_flow - self._middle_flow, 0.0)
-        return math.sqrt(self.noise) * math.hypot(self._sigma, FLOW_NOISE * self._middle_flow, END_NOISE * falls)
+        return math.sqrt(self.noise) * math.hypot(
+            self._sigma, math.hypot(FLOW_NOISE, self._jitter) * self._middle_flow, END_NOISE * falls
+        )
 
     def seen(self, reading: DoseReading) -> Seen:
         """Compare a reading with the one before, and learn from it how often the display repeats one.
