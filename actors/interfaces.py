@@ -150,6 +150,7 @@ class DoseKnowledge:
             the lag is to be measured again.
         aim: mass that arrives after the predicted end of the flow [kg].
         doses: number of doses.
+        display: numbers of `actors.dosing.display_belief.DisplayBelief`; empty if nothing is known.
     """
 
     onset_flow: tuple[float, ...]
@@ -157,6 +158,7 @@ class DoseKnowledge:
     lag: tuple[float, ...] | None
     aim: float
     doses: int
+    display: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-from actors.balance.balance_settings import SerialBalanceSettings
+from actors.balance.balance_settings import BalanceSettings, SerialBalanceSettings
+from actors.balance.display_behaviour import IDEAL
+from actors.balance.scale_model import ScaleSettings
 from actors.bench.bench_factory import MakeDevice, OpenBench, open_bench
 from actors.bench.pump_bench import predict_pump_dose
 from actors.bench.virtual_bench import BenchEmulators
+from actors.dosing.display_belief import DisplayBelief
 from actors.dosing.dose_series import DoseForecast, predict_dose
 from actors.interfaces import (
     Bench,
@@ -131,9 +134,22 @@ def predicted_dose(
         InvalidActionError: the dose is impossible.
     """
     if spec.pump is None:
-        return predict_dose(scene, dose, seed, spec.dosing, count)
+        return predict_dose(scene, dose, seed, spec.dosing, count, _expected_display(spec.balance))
     deviation = 0.0 if spec.balance is None else spec.balance.deviation
     return predict_pump_dose(scene, dose, seed, spec.pump, spec.dosing, deviation)
+
+
+def _expected_display(balance: BalanceSettings | None) -> DisplayBelief | None:
+    """The display of a balance according to its settings; None if they do not state its step."""
+    match balance:
+        case SerialBalanceSettings(virtual=ScaleSettings() as sheet, interval=interval):
+            step, behaviour = sheet.resolution, sheet.behaviour
+        case SerialBalanceSettings(step=float() as step, interval=interval):
+            behaviour = IDEAL
+        case _:
+            return None
+    equal = max(1.0 - interval / behaviour.conversion_interval, 0.0) if behaviour.conversion_interval > 0.0 else 0.0
+    return DisplayBelief.expected(step, interval, max(behaviour.repeat_probability, equal))
 
 
 def _without_ray(spec: LaboratorySettings, *, need_bench: bool, brief: bool) -> bool:

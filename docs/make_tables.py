@@ -426,6 +426,36 @@ def dosing(group: str) -> str:
     return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing.py --final --json`; {how}.</sub>\n"
 
 
+def dosing_balances() -> str:
+    """Doses with displays that repeat, delay and lose readings."""
+    data = json.loads((FOLDER / "data" / "dosing-balances.json").read_text(encoding="utf-8"))["rows"]
+    head = (
+        *("balance", "mean error g", "95 % g", "worst g", "earlier: mean, 95 %, worst g", "interval covers"),
+        *("innovations", "weighed after s", "false stops", "earlier"),
+    )
+    rows = []
+    for name, found in data.items():
+        now, before = found["now"], found.get("before")
+        low, high = now["mean_interval"]
+        rows.append(
+            (
+                name,
+                f"{now['mean']:.2f} ({low:.2f} … {high:.2f})",
+                f"{now['p95']:.2f}",
+                f"{now['worst']:.1f}",
+                "" if before is None else f"{before['mean']:.2f}, {before['p95']:.1f}, {before['worst']:.1f}",
+                f"{100 * now['coverage']:.0f} %",
+                f"{now['innovations']:.2f}",
+                f"{now['time']:.1f}",
+                str(now["false_stops"]),
+                "" if before is None else str(before["false_stops"]),
+            )
+        )
+    one = next(iter(data.values()))
+    how = f"{one['now']['doses']} doses a row, seeds {one['seeds'][0]} to {one['seeds'][1]}"
+    return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing_balances.py --final --json`; {how}.</sub>\n"
+
+
 def dosing_faults() -> str:
     """Doses of the virtual bench with a fault each."""
     data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))["faults"]
@@ -625,6 +655,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
     **{f"result-{name}": partial(measured, name) for name in MEASURED},
     **{name: partial(dosing, group) for name, group in DOSING.items()},
+    "dosing-balances": dosing_balances,
     "dosing-faults": dosing_faults,
     "dosing-particles": dosing_particles,
     "command-line": command_line,

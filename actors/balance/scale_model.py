@@ -1,18 +1,19 @@
 """A model of a scale: the weighing cell, its display and its range, in bench time.
 
 `ScaleSettings` is its data sheet. `EmulatedScale` shows what an emulated serial balance sends; it has no bytes and no
-clock. The driver of a simulated balance is in `simulated_balance`.
+clock. Habits of real displays are in `display_behaviour`, the driver of a simulated balance in `simulated_balance`.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from typing import Annotated
 
 import numpy as np
 
+from actors.balance.display_behaviour import IDEAL, DisplayBehaviour, DisplayModel
 from actors.balance.readings import KILOGRAMS, Reading, ReadingStatus
 from sim_engine.settings.model import SET_BY_PROGRAM, Settings
 from sim_engine.settings.quantity import Quantity
@@ -62,11 +63,18 @@ class ScaleSettings(Settings):
     settling_time: Duration = 1.5
     """Time until the display is within 1 % of a change."""
 
+    behaviour: DisplayBehaviour = IDEAL
+    """How its display departs from an ideal one: repeated and late readings, zero tracking, creep."""
+
     rest_time: Annotated[float, SET_BY_PROGRAM] = 0.3
     """Time without change until the display is stable [s]."""
 
     unit: Annotated[str, SET_BY_PROGRAM] = "g"
     """Unit of the display."""
+
+    def free_fields(self) -> frozenset[str]:
+        """Fields that do not affect any request: an ideal display, which runs of earlier versions lack."""
+        return frozenset({"behaviour"} if self.behaviour == IDEAL else ())
 
 
 ZERO_SHARE = 0.02
@@ -91,12 +99,15 @@ class EmulatedScale:
         self._load, self._loaded_at = Load((0.0,), (0.0,)), 0.0
         self._lagging = 0.0
         self._resting = math.inf
+        self._display = DisplayModel(self.settings.behaviour, self.settings.resolution, seed)
+        self._seen, self._still_since = Decimal(0), -math.inf
 
     def put(self, load: Load) -> None:
         """Change the load, now and in the future."""
         self._load, self._loaded_at = load, self.time
         self._offset = float(self._rng.normal(0.0, self.settings.noise))
         self._resting = 0.0
+        self._still_since = self.time
 
     def change(self, mass: float) -> None:
         """Change the mass on the tray [kg] while liquid flows: the same load goes on, with the same error."""
@@ -110,29 +121,41 @@ class EmulatedScale:
         lag = self.settings.settling_time / SETTLED
         while self.time < end:
             before = self._true(self.time)
-            if self._lagging == before and self.time >= self._loaded_at + self._load.times[-1]:
-                self._resting += end - self.time
-                self.time = end
+            ended = self.time >= self._loaded_at + self._load.times[-1]
+            if self._lagging == before and ended and self._display.settled:
+                rest, self.time = end - self.time, end
+                self._resting += rest
+                self._display.advance(self._filtered, rest, self._zero + self._tare)
                 return
             step = min(_STEP, end - self.time)
             self.time = min(self.time + step, end)
             target = self._true(self.time)
             self._lagging += (target - self._lagging) * (-math.expm1(-step / lag) if lag > 0.0 else 1.0)
-            if before == target and abs(target - self._lagging) < self.settings.resolution / 8.0:
+            arrived = before == target and abs(target - self._lagging) < self.settings.resolution / 8.0
+            if arrived:
                 self._lagging = target
-                self._resting += step
-            else:
-                self._resting = 0.0
+            self._display.advance(self._filtered, step, self._zero + self._tare)
+            self._resting = self._resting + step if arrived and self._display.settled else 0.0
 
     @property
     def stable(self) -> bool:
-        """Whether the display is stable."""
-        return self._resting >= self.settings.rest_time
+        """Whether the balance reports its display as stable."""
+        still = self.time - self._still_since if self.settings.behaviour.stable_display else self._resting
+        return still >= self.settings.rest_time
 
     @property
     def gross(self) -> float:
         """Load as measured by the cell [kg]; 0 after switching on."""
-        return self._lagging + self._offset + self.settings.drift * self.time - self._zero
+        return (self._display.value if self.settings.behaviour.acts else self._filtered) - self._zero
+
+    @property
+    def display(self) -> DisplayModel:
+        """The model that delays and loses readings."""
+        return self._display
+
+    @property
+    def _filtered(self) -> float:
+        return self._lagging + self._offset + self.settings.drift * self.time
 
     @property
     def truth(self) -> float:
@@ -193,7 +216,15 @@ class EmulatedScale:
         return ReadingStatus.UNDER if self.gross < -0.2 * self.settings.capacity else ReadingStatus.STABLE
 
     def reading(self) -> Reading:
-        """Return the display's reading."""
+        """Return the display's next reading."""
+        reading = self._display.show(self._new_reading)
+        if not self.settings.behaviour.stable_display or reading.value is None:
+            return reading
+        if abs(reading.value - self._seen) > self._decimal_step:
+            self._seen, self._still_since = reading.value, self.time
+        return replace(reading, status=ReadingStatus.STABLE if self.stable else ReadingStatus.UNSTABLE)
+
+    def _new_reading(self) -> Reading:
         if self.range is not ReadingStatus.STABLE:
             return Reading(self.range)
         status = ReadingStatus.STABLE if self.stable else ReadingStatus.UNSTABLE

@@ -15,6 +15,7 @@ import numpy as np
 
 from actors.balance.balance_interface import Weight
 from actors.balance.balance_settings import BalanceSettings, check_step
+from actors.balance.display_behaviour import IDEAL, DisplayBehaviour, DisplayModel
 from actors.balance.scale_model import SETTLED, Duration, Error, Load, PositiveMass
 from actors.balance.weighing_plan import Placement
 from actors.bench.bench_clock import Pace
@@ -52,6 +53,9 @@ class SimulatedBalanceSettings(BalanceSettings):
     settling_time: Duration = 1.5
     """Time until the display is within 1 % of a change."""
 
+    behaviour: DisplayBehaviour = IDEAL
+    """How its display departs from an ideal one: repeated readings, zero tracking, a filter that switches, creep."""
+
     drift: Annotated[float, SET_BY_PROGRAM] = 0.0
     """Drift of the zero [kg/s]."""
 
@@ -63,6 +67,13 @@ class SimulatedBalanceSettings(BalanceSettings):
         if mode == "hardware":
             problems.add("a laboratory of hardware weighs on a balance that is there; give its 'port'")
         check_step(self.resolution, self.load_tolerance, problems, "resolution")
+        for key in ("jitter", "lost", "stable_display"):
+            if getattr(self.behaviour, key):
+                problems.add("has no effect on a simulated balance; write 'kind: serial'", "behaviour", key)
+
+    def free_fields(self) -> frozenset[str]:
+        """Fields that do not affect any request: an ideal display, which runs of earlier versions lack."""
+        return frozenset({"behaviour"} if self.behaviour == IDEAL else ())
 
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
         """See `BalanceSettings.driver`."""
@@ -107,6 +118,9 @@ class VirtualBalance:
             self._time = self._shown = self._tare = 0.0
             self._load = Load((0.0,), (0.0,))
             self._loaded_at = 0.0
+            step = self._settings.resolution
+            self._display = DisplayModel(self._settings.behaviour, step, seed)
+            self._observed = DisplayModel(self._settings.behaviour, step, (*seed, 1))
         self._pace.resume()
 
     def put(self, load: Load) -> None:
@@ -159,7 +173,8 @@ class VirtualBalance:
         """See `BalanceDriver.read`. It has a separate noise stream, so that it does not affect measurements."""
         with self._lock:
             lag = abs(self._load_at(self._time) - self._shown)
-            return Weight(self._reading(self._display_rng), lag <= self._tolerance, self._time)
+            mass = self._observed.show(lambda: self._reading(self._display_rng))
+            return Weight(mass, lag <= self._tolerance, self._time)
 
     @property
     def _tolerance(self) -> float:
@@ -175,7 +190,7 @@ class VirtualBalance:
             self._wait(count * INTERVAL)
             self._advance(INTERVAL)
             with self._lock:
-                window.append(self._reading(self._rng))
+                window.append(self._display.show(lambda: self._reading(self._rng)))
             if len(window) == WINDOW and max(window) - min(window) <= self._tolerance:
                 return window[-1]
         raise LaboratoryError(
@@ -196,11 +211,15 @@ class VirtualBalance:
             lag = self._settings.settling_time / SETTLED
             share = -math.expm1(-seconds / lag) if lag > 0.0 else 1.0
             self._shown += (self._load_at(self._time) - self._shown) * share
+            filtered = self._shown + self._settings.drift * self._time
+            for display in (self._display, self._observed):
+                display.advance(filtered, seconds, self._tare)
 
     def _reading(self, rng: np.random.Generator) -> float:
         """Return one reading of the display [kg]."""
         s = self._settings
-        raw = self._shown + s.drift * self._time + rng.normal(0.0, s.noise) - self._tare
+        filtered = self._display.value if s.behaviour.acts else self._shown + s.drift * self._time
+        raw = filtered + rng.normal(0.0, s.noise) - self._tare
         return float(round(raw / s.resolution) * s.resolution if s.resolution > 0.0 else raw)
 
 

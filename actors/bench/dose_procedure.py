@@ -373,12 +373,9 @@ class DoseProcedure:
         every = max(len(self._tilts) // SIGNALS, 1)
         during = [one for one in self._readings.all if one.time >= self._at]
         about = {
-            **after_dose(self._series),
+            **after_dose(self._series, result),
             "wanted": self._dose.amount,
-            "received": result.amount,
             "spilled": None,  # nothing outside the receiver is weighed
-            "end": str(result.end),
-            "top_ups": result.top_ups,
             "duration": self._duration,
             "times": [round(t, 3) for t, _ in self._tilts[::every]],
             "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in self._tilts[::every]],

@@ -62,16 +62,20 @@ class DoseResult:
     Attributes:
         end: why it ended.
         amount: weighed in the receiver [kg]; None if it is unknown.
+        deviation: standard deviation of `amount` [kg].
         estimate: estimated amount past the lip, mean and standard deviation [kg].
         top_ups: number of times that the cup was tilted again.
         belief: for the next dose.
+        innovations: mean squared innovation, see `DoseEstimator`.
     """
 
     end: DoseEnd
     amount: float | None
+    deviation: float
     estimate: tuple[float, float]
     top_ups: int
     belief: DoseBelief
+    innovations: float
 
 
 FINE_WEBER = 0.8
@@ -118,6 +122,9 @@ ARM_PATIENCE = 0.2
 LATEST_ONSET = math.radians(1.5)
 """Tilt by which outflow can begin later than expected, even after many doses: the lip may have dried [rad]."""
 
+SEEN_AFTER = 0.5
+"""Time until a stream is seen on a balance that repeats no reading [s]."""
+
 LONGEST_DOUBT = 1.2
 """Time with implausible readings after which the cup is turned back [s]."""
 
@@ -126,6 +133,36 @@ EARLIEST_WEIGHING = 1.5
 
 LARGEST_REMAINDER = (1e-3, 0.1e-3)
 """Largest such rise, and its largest standard deviation [kg]."""
+
+LONGEST_HOLD = 1.6
+"""Time with one and the same reading, while the flow should change it, after which the cup is turned back and weighed
+[s]. Recorded pours have up to 1.1 s."""
+
+IMPROBABLE_HOLD = math.log(0.005)
+"""Logarithm of the probability of such a row of equal readings after which this happens earlier."""
+
+STALE = 0.01
+"""Largest probability that a reading which counts as weighed is an old one."""
+
+MOST_EQUAL = 12
+"""Equal readings that count as weighed, however often the display repeats one."""
+
+MOST_PAUSES = 6
+"""Largest number of such interruptions of one dose."""
+
+DRIBBLES = 0.3e-3
+"""Mass that arrives late in addition, where the last stream is too slow to leave the lip cleanly [kg]: about half of
+what runs down the outside. Later doses know it from the ones before."""
+
+SLOW_FILTER, LONGEST_FILTER = 2.5, 3.0
+"""Time constants of a filter that gets slower at rest, after which its reading counts; largest such time [s]."""
+
+AT_REST = 0.8
+"""Time for which a reading has to stay the same until it counts as weighed [s]. The filters of some balances get slower
+as soon as the load hardly moves."""
+
+LATE_DROPS = 0.14e-3
+"""Standard deviation of what still falls into the receiver after it was weighed [kg]."""
 
 LONGEST_SETTLING = 10.0
 """Time without rest of the balance after which the amount is unknown [s]."""
@@ -179,7 +216,7 @@ class DoseController:
             cup, belief, fall_time=fall_time, step=step, noise=noise, rng=np.random.default_rng((seed, 5))
         )
         self._belief = belief
-        self._step_size = step
+        self._step_size, self._noise = step, noise
         self.phase = DosePhase.CHECK
         self.result: DoseResult | None = None
         self._begin: float | None = None
@@ -195,7 +232,12 @@ class DoseController:
         self._ramp_begin, self._ramp_speed, self._ramp = 0.0, 0.0, settings.acceleration
         self._expected: float | None = None
         self._end: DoseEnd | None = None
-        self._top_ups = 0
+        self._top_ups = self._pauses = 0
+        self._suspected: DoseEnd | None = None
+        self._paused = False
+        self._remainder = 0.0
+        self._interval = 0.1
+        self._unchanged_since = 0.0
         self._factor_before = float(np.median(belief.flow_factor))
         self._idle_since: float | None = None
         self._late_volume = float(belief.volume.mean() - 2.0 * belief.volume.std())
@@ -240,7 +282,7 @@ class DoseController:
         paused = time - self._now > 0.3 and self.phase in (DosePhase.APPROACH, DosePhase.POUR)
         if paused:
             self._pass_over(time, tilt)
-            self._recent = [*self._recent, *readings][-12:]
+            self._recent = [*self._recent, *readings][-40:]
         else:
             for reading in readings:
                 self._take(reading, tilt, time)
@@ -298,7 +340,8 @@ class DoseController:
         aim = float(np.quantile(self._tilts_for(self.fine_flow), 0.35))
         growth = self._cup.volume_per_tilt(float(np.median(e.volume)), 2e-3) * self._cup.density
         # the flow at the moment when the stream is seen is about growth × speed × delay / lag of the cup
-        search = min(self._settings.search_speed, max(2.0 * self.fine_flow / growth, math.radians(0.8)))
+        calm = 2.0 * self.fine_flow / growth * SEEN_AFTER / (SEEN_AFTER + self._blind())
+        search = min(self._settings.search_speed, max(calm, math.radians(0.8)))
         return min(max(3.0 * (aim - ahead), -0.2), search)
 
     def _pour(self) -> float:
@@ -336,20 +379,32 @@ class DoseController:
     def _settle(self) -> float:
         waited = self._now - self._since
         lag = float(np.median(self._estimator.lag))
-        last = [r for r in self._recent if r.time > self._since][-3:]
-        if len(last) == 3 and waited > max(0.5, EARLIEST_WEIGHING * lag):
+        old = min(self._estimator.repeats.in_a_row(STALE) + 1, MOST_EQUAL)
+        needed = max(old, math.ceil(AT_REST / self._interval) + 1, 4)
+        last = [r for r in self._recent if r.time > self._since][-needed:]
+        if len(last) == needed and waited > max(0.5, EARLIEST_WEIGHING * lag, self._slow_filter(lag)):
+            half = needed // 2
+            early, late = (math.fsum(r.mass for r in part) / half for part in (last[:half], last[-half:]))
             spread = max(r.mass for r in last) - min(r.mass for r in last)
-            flat = spread <= max(2.0 * self._step_size, 1e-4)
+            flat = spread <= max(2.0 * self._step_size, 1.5e-4) and abs(late - early) <= max(
+                0.6 * self._step_size, 5e-5
+            )
             behind = self._behind(last[-1].time) if flat else None
             if behind is not None:
-                self._weighed(last[-1].mass + behind)
+                self._weighed(late + behind)
                 return 0.0
             if waited > max(0.5, 3.0 * lag) and (flat or all(r.stable for r in last)):
-                self._weighed(math.fsum(r.mass for r in last) / 3.0)
+                self._remainder = 0.0
+                self._weighed(late)
                 return 0.0
         if waited > LONGEST_SETTLING:
             self._finish(self._end or (DoseEnd.UNSTABLE if last else DoseEnd.CONNECTION_LOST), known=False)
         return 0.0
+
+    def _slow_filter(self, lag: float) -> float:
+        """Time after which a filter that gets slower at rest has come to its end [s]; 0 for other balances."""
+        rest = self._belief.display.rest
+        return min(SLOW_FILTER * rest, LONGEST_FILTER) if rest > 2.0 * lag + self._interval else 0.0
 
     def _behind(self, time: float) -> float | None:
         """Mass that a reading at this time still lags behind [kg]; None while the particles do not agree about it."""
@@ -359,32 +414,57 @@ class DoseController:
             return None
         rise = e.mass - e.predicted(time)
         middle, (largest, deviation) = float(np.median(rise)), LARGEST_REMAINDER
-        return middle if abs(middle) < largest and float(rise.std()) < deviation else None
+        self._remainder = float(rise.std())
+        return middle if abs(middle) < largest and self._remainder < deviation else None
 
     def _weighed(self, mass: float) -> None:
         assert self._zero is not None
         amount = mass - self._zero
-        missing = self._order.amount - amount
-        if self._end is None and missing > self._settings.smallest_top_up:
-            if self._top_ups < self._settings.most_top_ups:
-                self._top_ups += 1
-                self._rising, self._doubt_since = 0, None
-                self._estimator.update(DoseReading(self._now, amount), sigma=0.05e-3)
+        # within one step of the display, the particles know more than it shows
+        likely = min(max(float(self._estimator.mass.mean()), amount - self._step_size), amount + self._step_size)
+        if self._suspected is not None and self._late_mass - amount > max(2.5e-3, 0.3 * self._late_mass):
+            self._end = self._end or self._suspected
+        if self._end is None and self._order.amount - likely > self._settings.smallest_top_up:
+            paused = self._pauses if self._paused else self._top_ups
+            if paused < (MOST_PAUSES if self._paused else self._settings.most_top_ups):
+                self._pauses += self._paused
+                self._top_ups += not self._paused
+                if self._paused:
+                    self._estimator.loosen()
+                self._estimator.update(DoseReading(self._now, amount), sigma=max(0.05e-3, self.deviation))
+                self._rising, self._doubt_since, self._suspected, self._paused = 0, None, None, False
+                self._unchanged_since, self._estimator.repeats.run = self._now, 0.0
                 self._late_mass = amount
                 self._enter(DosePhase.APPROACH)
                 return
             self._end = DoseEnd.SHORT
         self._finish(self._end or DoseEnd.REACHED, known=True, amount=amount)
 
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of a weighed amount: two roundings, two readings, and late drops [kg]."""
+        rounded = self._step_size / math.sqrt(12.0)
+        return math.sqrt(2.0 * (rounded**2 + self._noise**2) + LATE_DROPS**2 + self._remainder**2)
+
+    def _blind(self) -> float:
+        """Time for which the display may repeat one reading, which hardly one in ten repeats exceeds [s]."""
+        return self._interval * self._estimator.repeats.in_a_row(0.1)
+
     def _finish(self, end: DoseEnd, *, known: bool, amount: float = 0.0) -> None:
         self.phase = DosePhase.DONE
-        aim = self._belief.aim
+        aim = self._aim()
         if self._expected is not None and known and end is DoseEnd.REACHED:
             late = min(max(amount - self._expected, -1e-3), 1e-3)
             aim += max(0.25, 1.0 / (self._belief.doses + 2)) * (late - aim)
         weighed = amount if known else None
         self.result = DoseResult(
-            end, weighed, self.amount, self._top_ups, self._estimator.belief(weighed=weighed, aim=aim)
+            end,
+            weighed,
+            self.deviation,
+            self.amount,
+            self._top_ups,
+            self._estimator.belief(weighed=weighed, aim=aim),
+            self._estimator.innovations,
         )
 
     # ---- flow
@@ -394,7 +474,7 @@ class DoseController:
         e, order, s = self._estimator, self._order, self._settings
         after = 0.1 * self.flow
         left = order.amount - float(np.median(e.mass)) - after
-        horizon = 0.9 + 1.0 * float(np.median(e.lag))
+        horizon = 0.9 + 1.0 * float(np.median(e.lag)) + self._blind()
         bulk = min(max(order.amount / 3.0, self.fine_flow), s.largest_flow)
         return min(self.fine_flow + max(left - 0.7 * self.fine_flow, 0.0) / horizon, bulk)
 
@@ -410,7 +490,7 @@ class DoseController:
         final = e.final_mass(
             self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=self._return_acceleration()
         )
-        middle, deviation = float(np.median(final)) + self._belief.aim, math.hypot(float(final.std()), 0.1e-3)
+        middle, deviation = float(np.median(final)) + self._aim(), math.hypot(float(final.std()), 0.1e-3)
         left, wait = order.amount - middle, 0.0
         if middle + 2.33 * deviation < order.amount + order.limit:
             wait = max(left, 0.0) / max(self.flow, 1e-6)
@@ -419,6 +499,12 @@ class DoseController:
         self._expected = float(np.median(final)) + self.flow * wait
         self._turn_back(wait=wait, gently=True)
         return True
+
+    def _aim(self) -> float:
+        """Mass to subtract from the target [kg]."""
+        clean = self._cup.density * self._cup.clean_flow(max(self._tilt, 0.1))
+        late = DRIBBLES if self._belief.doses == 0 and self.fine_flow < clean else 0.0
+        return self._belief.aim + late
 
     def _towards(self, tilt: float, speed: float, ahead: float) -> float:
         """Speed of a turn that ends at a tilt, with a deceleration of a third of the allowed one."""
@@ -429,13 +515,20 @@ class DoseController:
 
     def _take(self, reading: DoseReading, tilt: float, now: float) -> None:
         self._recent.append(reading)
-        del self._recent[:-12]
+        del self._recent[:-40]
+        if len(self._recent) > 1:
+            self._interval += 0.1 * (min(reading.time - self._recent[-2].time, 1.0) - self._interval)
         if self._zero is None or self.phase is DosePhase.DONE:
             return
         share = 1.0 if now <= self._now else min(max((reading.time - self._now) / (now - self._now), 0.0), 1.0)
         e = self._estimator
         e.advance(reading.time, self._tilt + share * (tilt - self._tilt))
         net = DoseReading(reading.time, reading.mass - self._zero, reading.stable)
+        seen = e.seen(net)
+        if seen.new < 0.5:
+            e.update(net, seen=seen)
+            return
+        self._unchanged_since = reading.time
         predicted = e.predicted(reading.time)
         gate = max(5.0 * math.hypot(float(predicted.std()), e.deviation()), 1.5e-3 + 0.1 * self.flow)
         if abs(net.mass - float(predicted.mean())) > gate:
@@ -450,7 +543,7 @@ class DoseController:
         self._rising = (
             self._rising + 1 if net.mass > before + 0.5 * self._step_size and net.mass > base + threshold else 0
         )
-        self._innovations = [*self._innovations[-2:], e.update(net)]
+        self._innovations = [*self._innovations[-2:], e.update(net, seen=seen)]
 
     def _pass_over(self, time: float, tilt: float) -> None:
         """Move the particles over a pause of the caller, in which the arm has turned back by itself."""
@@ -481,15 +574,35 @@ class DoseController:
         elif self._now - self._begin > s.time_limit:
             self._turn_back(DoseEnd.TIME_LIMIT)
         elif self._doubt_since is not None and self._now - self._doubt_since > LONGEST_DOUBT:
-            self._turn_back()
+            self._pause()
+        elif self._holds_too_long():
+            self._pause(self._lost_stream())
         elif self._nearly_empty():
             self._turn_back(DoseEnd.SOURCE_EMPTY)
         elif self._rate() < 0.5 * max(self._late_flow, 1e-3) and (
             self._late_mass - net - self._late_flow > max(2.5e-3, 0.3 * self._late_mass)
             or (self.phase is DosePhase.POUR and float(np.median(e.flow_factor)) < 0.3 * self._factor_before)
         ):
-            left = float(np.median(e.volume))
-            self._turn_back(DoseEnd.SOURCE_EMPTY if left < 0.12 * self._cup.capacity else DoseEnd.STREAM_MISSED)
+            self._pause(self._lost_stream())
+
+    def _lost_stream(self) -> DoseEnd:
+        """Why less arrives than should have left the cup."""
+        left = float(np.median(self._estimator.volume))
+        return DoseEnd.SOURCE_EMPTY if left < 0.12 * self._cup.capacity else DoseEnd.STREAM_MISSED
+
+    def _holds_too_long(self) -> bool:
+        """Whether the display shows one reading for longer than displays do, although the load has changed."""
+        e, shown = self._estimator, self._recent[-1].mass - (self._zero or 0.0)
+        rare = e.repeats.run < IMPROBABLE_HOLD or self._now - self._unchanged_since > LONGEST_HOLD
+        if e.repeats.run == 0.0 or not rare:
+            return False
+        surely = float(np.quantile(e.reading, 0.1)) - 0.5 * self._step_size
+        return surely - shown > max(4.0 * SEEN, self._step_size)
+
+    def _pause(self, suspected: DoseEnd | None = None) -> None:
+        """Turn back and weigh, because the readings do not follow the stream; the weight decides whether it missed."""
+        self._suspected, self._paused = suspected, True
+        self._turn_back()
 
     def _rate(self) -> float:
         """Slope of the last readings [kg/s]."""

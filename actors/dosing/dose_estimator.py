@@ -11,9 +11,17 @@ arm reports; `DoseEstimator.update` corrects them with a time-stamped reading:
   `calibrated_knowledge` is what a calibration adds to it.
 - `draw_lags` draws lags of the balance from the step when the empty receiver is put on it
   (`actors.balance.step_response`).
-
 The filter of a balance is rarely documented. Its total lag T decides the error of a dose, its shape ρ_s only the
 transients: 1 is a first-order lag, 1/4 four equal poles; a moving average lies near 1/3.
+
+A reading that equals the one before is either repeated or new, and happens to round to the same value. The particles
+give the probability L of the second case, the display's probability p of a repeat is known from earlier readings, so
+
+    P(new | equal) = (1 − p) L / (p + (1 − p) L)
+
+is the share of the update that is applied. A new reading is an interval of one display step, not a point: a particle
+that predicts a value within this interval stays where it is. Without this, several equal readings in a slow flow would
+count as several measurements.
 
 Source of the update: Burgers, van Leeuwen & Evensen, Mon. Weather Rev. 126 (1998): perturbed observations. Particles
 are moved instead of weighted, so that a hundred of them do not collapse on a sharp balance.
@@ -27,9 +35,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from actors.balance.step_response import FILTERS, LAGS, step_response
 from actors.dosing.cup_flow import CupFlow
+from actors.dosing.display_belief import DisplayBelief, Repeats
 from actors.interfaces import DoseKnowledge
 from sim_engine.liquids import SimulationParameters
 
@@ -52,13 +62,37 @@ FLOW_FACTOR = (1.0, 0.2)
 """Flow factor before the first dose: median, and standard deviation of its logarithm."""
 
 FIRST_AIM = 0.3e-3
-"""`DoseBelief.aim` of the first dose [kg]."""
+"""`DoseBelief.aim` of the first dose, if its last stream leaves the lip cleanly [kg]."""
 
 SHAPE_RANGE = (0.22, 1.0)
 FACTOR_RANGE = (0.05, 2.0)
 
 TRANSPORT_DELAY = (0.06, 0.03)
 """Mean and standard deviation of the delay from the balance's filter to the time stamp of a reading [s]."""
+
+WETTING = 1.5
+"""Time in which the liquid wets the lip, and onset and flow change faster [s]."""
+
+LATE = (0.35e-3, 0.4)
+"""What drains from lip and film after the flow has ended: standard deviation [kg], and the time that it takes [s]."""
+
+FLOW_NOISE = 0.014
+"""Standard deviation of a reading from slosh and impact, as the time that the flow needs for it [s]."""
+
+INDIFFERENT = 0.1e-3
+"""A reading that is off by no more is not taken for a repeated one: it does not matter [kg]."""
+
+END_NOISE = 0.05
+"""The same where the flow falls: the film is cut later or earlier, and with it ends the impact [s]."""
+
+NOISE_RANGE = (0.25, 30.0)
+"""Range of the factor of the variance of readings."""
+
+NOISE_READINGS = 10.0
+"""Readings after which the factor follows a further one half as fast as at first."""
+
+LARGEST_SQUARE = 16.0
+"""Largest squared innovation, over its variance, that counts for the factor: a gush is no noise."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +122,7 @@ class DoseBelief:
         volume: in the source vessel [m³].
         aim: mass to subtract from the target, because it arrives after the predicted end of the flow [kg].
         doses: number of doses that it was estimated from.
+        display: of the balance.
     """
 
     onset_bias: Floats
@@ -97,6 +132,7 @@ class DoseBelief:
     volume: Floats
     aim: float = FIRST_AIM
     doses: int = 0
+    display: DisplayBelief = DisplayBelief()
 
     @classmethod
     def prior(
@@ -152,6 +188,7 @@ class DoseBelief:
             np.maximum(volume[0] + volume[1] * _even_normal(count, rng), 0.0),
             knowledge.aim,
             knowledge.doses,
+            DisplayBelief.of(knowledge.display) if knowledge.display else DisplayBelief(),
         )
 
     def knowledge(self) -> DoseKnowledge:
@@ -165,6 +202,7 @@ class DoseBelief:
             tuple(map(float, values)),
             self.aim,
             self.doses,
+            self.display.numbers,
         )
 
     def refilled(self, volume: tuple[float, float], rng: np.random.Generator) -> DoseBelief:
@@ -185,7 +223,21 @@ class DoseBelief:
             flow_factor=np.clip(self.flow_factor * np.exp(0.05 * _even_normal(count, rng)), *FACTOR_RANGE),
             lag=np.clip(self.lag * np.exp(0.03 * _even_normal(count, rng)), *LAG_RANGE),
             lag_shape=np.clip(self.lag_shape + 0.02 * _even_normal(count, rng), *SHAPE_RANGE),
+            display=self.display.aged(),
         )
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A reading compared with the one before.
+
+    Attributes:
+        new: probability that it is a new one.
+        likelihood: of the reading for each particle (N,), if it equals the one before.
+    """
+
+    new: float
+    likelihood: Floats | None
 
 
 class DoseEstimator:
@@ -203,6 +255,11 @@ class DoseEstimator:
         time: of the particles [s].
         mass: past the lip (N,) [kg].
         flow: now (N,) [m³/s].
+        zero: reading of the balance for an empty receiver, minus the true one (N,) [kg]: the display's step hides it.
+        repeats: of the display.
+        noise: factor of the variance of a reading.
+        innovations: mean of the squared innovations of new readings over their predicted variance; about 1 if the
+            estimate is as uncertain as it states.
     """
 
     def __init__(
@@ -216,13 +273,22 @@ class DoseEstimator:
         rng: np.random.Generator,
     ) -> None:
         self.cup, self._rng = cup, rng
-        self._fall, self._sigma = fall_time, math.hypot(step / math.sqrt(12.0), noise)
+        self._fall, self._sigma, self._half = fall_time, noise, 0.5 * step
         count = len(belief.volume)
+        self.zero = step * rng.permutation((np.arange(count) + 0.5) / count - 0.5)
+        self.repeats = Repeats(belief.display.repeats)
+        self.noise, self._jitter = belief.display.noise, belief.display.jitter
+        self._last: float | None = None
+        self._log_weight = np.zeros(count)
+        self._squares = [0.0, 0.0]
         self.onset_bias, self.flow_factor = belief.onset_bias.copy(), belief.flow_factor.copy()
         self.lag, self.lag_shape = belief.lag.copy(), belief.lag_shape.copy()
         self.volume = belief.volume.copy()
         self._belief = belief
         self.mass, self.flow = np.zeros(count), np.zeros(count)
+        self._flowed = np.zeros(count)  # duration of the flow [s]
+        self._ended = np.full(count, math.inf)  # time since the end of the flow [s]
+        self._middle_flow = self._recent_flow = 0.0  # median now, and its decaying maximum [kg/s]
         self._lags = np.zeros((4, count))
         places = max(math.ceil(fall_time / TIME_STEP) + 2, 3)
         self._mass_history, self._flow_history = np.zeros((places, count)), np.zeros((places, count))
@@ -269,11 +335,21 @@ class DoseEstimator:
             gained = cup.density * flow * TIME_STEP
             self.mass += gained + 0.02 * cup.density * flow * noise[0]
             # flow and onset wander, because wetting and film are not constant
-            self.flow_factor *= np.exp(np.where(flows, 0.03 * noise[1], 0.0))
-            self.onset_bias += np.where(flows, math.radians(0.1) * noise[2], 0.0)
+            self._flowed = np.where(flows, self._flowed + TIME_STEP, self._flowed)
+            wetting = np.where(self._flowed < WETTING, 3.0, 1.0) * flows
+            self.flow_factor *= np.exp(0.03 * wetting * noise[1])
+            self.onset_bias += math.radians(0.1) * wetting * noise[2]
             self.flow = flow
+            self._ended = np.where(flows, 0.0, self._ended + TIME_STEP)
         else:
             self.flow = np.zeros_like(self.mass)
+            self._ended += TIME_STEP
+        self._middle_flow = cup.density * float(np.median(self.flow))
+        memory = 0.3 + float(self.lag[0])
+        self._recent_flow = max(self._middle_flow, self._recent_flow * (1.0 - TIME_STEP / memory))
+        if self._ended.min() < 4.0 * LATE[1]:
+            late = np.where(self._ended > 0.0, np.exp(-self._ended / LATE[1]), 0.0) / LATE[1]
+            self.mass += late * (self._belief.aim * TIME_STEP + LATE[0] * math.sqrt(LATE[1]) * noise[0])
         self._steps += 1
         here = self._steps % len(self._mass_history)
         self._mass_history[here], self._flow_history[here] = self.mass, self.flow
@@ -298,27 +374,69 @@ class DoseEstimator:
         predicted: Floats = (1.0 - part) * self._lags[3] + part * self._before
         return predicted
 
-    def deviation(self) -> float:
-        """Standard deviation of a reading at the current flow: display, slosh and impact [kg]."""
-        return math.hypot(self._sigma, 0.02 * self.cup.density * float(np.median(self.flow)))
+    @property
+    def innovations(self) -> float:
+        """See the class."""
+        total, count = self._squares
+        return total / count if count else 1.0
 
-    def update(self, reading: DoseReading, sigma: float | None = None) -> float:
+    def deviation(self) -> float:
+        """Standard deviation of a new reading at the current flow: display, slosh and impact [kg]."""
+        return math.hypot(self._half / math.sqrt(3.0), self._scatter())
+
+    def _scatter(self) -> float:
+        """The same before the display rounds [kg]."""
+        falls = max(self._recent_flow - self._middle_flow, 0.0)
+        return math.sqrt(self.noise) * math.hypot(
+            self._sigma, math.hypot(FLOW_NOISE, self._jitter) * self._middle_flow, END_NOISE * falls
+        )
+
+    def seen(self, reading: DoseReading) -> Seen:
+        """Compare a reading with the one before, and learn from it how often the display repeats one.
+
+        Args:
+            reading: see `update`.
+        """
+        equal = self._last is not None and abs(reading.mass - self._last) < 1e-9
+        self._last = reading.mass
+        if not equal:
+            self.repeats.see(False, 0.0)
+            return Seen(1.0, None)
+        off = self.predicted(reading.time) + self.zero - reading.mass
+        # particles are a coarse sample of the prediction: each stands for its neighbourhood
+        width = math.hypot(self._scatter(), 0.3 * float(off.std()), INDIFFERENT, 0.5 * self._half)
+        chance = _normal((self._half - off) / width) - _normal((-self._half - off) / width)
+        repeated = self.repeats.next
+        new = self.repeats.see(True, float(chance.mean()))
+        return Seen(new, repeated + (1.0 - repeated) * chance)
+
+    def update(self, reading: DoseReading, sigma: float | None = None, *, seen: Seen | None = None) -> float:
         """Correct the particles with a reading net of the receiver.
 
         Args:
             reading: its time lies within the last step, or shortly after it.
-            sigma: standard deviation of the reading [kg]; None takes `deviation`.
+            sigma: standard deviation of the reading [kg], if it is not one line of the display.
+            seen: of this reading, if the caller has it already.
 
         Returns:
             Innovation: reading minus the mean prediction [kg].
         """
-        predicted = self.predicted(reading.time)
-        deviation = self.deviation() if sigma is None else sigma
+        if sigma is None:
+            seen = self.seen(reading) if seen is None else seen
+            if seen.likelihood is not None:
+                return self._weigh(reading, seen)
+        self._resample(0.999)
+        predicted = self.predicted(reading.time) + self.zero
+        scatter, half = (self._scatter(), self._half) if sigma is None else (sigma, 0.0)
         innovation = reading.mass - float(predicted.mean())
         centred = predicted - predicted.mean()
         variance = float(centred @ centred) / (len(predicted) - 1)
-        perturbed = reading.mass + deviation * _even_normal(len(predicted), self._rng) - predicted
-        shift = perturbed / (variance + deviation**2) / (len(predicted) - 1)
+        deviation = math.sqrt(scatter**2 + half**2 / 3.0)
+        if sigma is None:
+            self._note(innovation**2 / (variance + deviation**2))
+        scattered = predicted + scatter * _even_normal(len(predicted), self._rng)
+        perturbed = np.clip(scattered, reading.mass - half, reading.mass + half) - scattered
+        shift = perturbed / (variance + scatter**2) / (len(predicted) - 1)
 
         def gained(values: Floats) -> Floats:
             return float((values - values.mean()) @ centred) * shift
@@ -327,7 +445,9 @@ class DoseEstimator:
         calm = min(1.0, SURPRISE * math.sqrt(variance + deviation**2) / max(abs(innovation), 1e-9))
         log_factor, log_lag = np.log(self.flow_factor), np.log(self.lag)
         changes = [gained(v) for v in (self.onset_bias, log_factor, log_lag, self.lag_shape, self.volume, self.mass)]
+        zero = gained(self.zero)
         self._lags += np.stack([gained(lag) for lag in self._lags])
+        self.zero += zero
         self.onset_bias += changes[0]
         self.flow_factor = np.clip(np.exp(log_factor + changes[1]), *FACTOR_RANGE)
         self.lag = np.clip(np.exp(log_lag + calm * changes[2]), *LAG_RANGE)
@@ -336,6 +456,60 @@ class DoseEstimator:
         self.mass += changes[5]
         self._mass_history += changes[5]
         return innovation
+
+    def _weigh(self, reading: DoseReading, seen: Seen) -> float:
+        """Weight the particles with an equal reading, which may be a repeated one."""
+        assert seen.likelihood is not None
+        innovation = reading.mass - float((self.predicted(reading.time) + self.zero).mean())
+        self._log_weight += np.log(seen.likelihood)
+        self._resample(0.5)
+        return innovation
+
+    def _resample(self, share: float) -> None:
+        """Draw the particles according to their weights, if fewer than a share of them have an effect."""
+        weight = np.exp(self._log_weight - self._log_weight.max())
+        weight /= weight.sum()
+        count = len(weight)
+        if 1.0 / float(weight @ weight) > share * count:
+            return
+        places = (np.arange(count) + self._rng.random()) / count
+        drawn = np.minimum(np.searchsorted(np.cumsum(weight), places), count - 1)
+        self._log_weight = np.zeros(count)
+        for name in (
+            "onset_bias",
+            "flow_factor",
+            "lag",
+            "lag_shape",
+            "volume",
+            "mass",
+            "flow",
+            "zero",
+            "_ended",
+            "_flowed",
+        ):
+            setattr(self, name, getattr(self, name)[drawn])
+        for name in ("_lags", "_mass_history", "_flow_history"):
+            setattr(self, name, getattr(self, name)[:, drawn])
+        self._before = self._before[drawn]
+        # copies of one particle must not stay the same
+        self.onset_bias = self.onset_bias + 0.2 * float(self.onset_bias.std()) * _even_normal(count, self._rng)
+        spread = 0.2 * float(np.log(self.flow_factor).std())
+        self.flow_factor = np.clip(self.flow_factor * np.exp(spread * _even_normal(count, self._rng)), *FACTOR_RANGE)
+        spread = 0.2 * float(np.log(self.lag).std())
+        self.lag = np.clip(self.lag * np.exp(spread * _even_normal(count, self._rng)), *LAG_RANGE)
+
+    def _note(self, square: float) -> None:
+        """Note a squared innovation over its predicted variance; the noise of readings follows their mean."""
+        self._squares[0] += square
+        self._squares[1] += 1.0
+        pull = (min(square, LARGEST_SQUARE) - 1.0) / (NOISE_READINGS + self._squares[1])
+        self.noise = min(max(self.noise * math.exp(pull), NOISE_RANGE[0]), NOISE_RANGE[1])
+
+    def loosen(self) -> None:
+        """Allow more for onset and flow, because the readings did not follow them."""
+        count = len(self.volume)
+        self.onset_bias = self.onset_bias + math.radians(0.6) * _even_normal(count, self._rng)
+        self.flow_factor = np.clip(self.flow_factor * np.exp(0.1 * _even_normal(count, self._rng)), *FACTOR_RANGE)
 
     def final_mass(self, tilt: float, speed: float, *, latency: float, back: float, acceleration: float) -> Floats:
         """Mass past the lip after a return that is ordered now (N,) [kg].
@@ -372,8 +546,9 @@ class DoseEstimator:
         volume = self.volume
         if weighed is not None:  # the content of the receiver has left the source
             volume = np.maximum(self._belief.volume - weighed / self.cup.density, 0.0)
+        display = replace(self._belief.display, repeats=self.repeats.beta(), noise=self.noise)
         return DoseBelief(
-            self.onset_bias, self.flow_factor, self.lag, self.lag_shape, volume, aim, self._belief.doses + 1
+            self.onset_bias, self.flow_factor, self.lag, self.lag_shape, volume, aim, self._belief.doses + 1, display
         )
 
 
@@ -392,6 +567,11 @@ def calibrated_knowledge(tilt_zeros: Sequence[float]) -> DoseKnowledge:
     variance = ONSET[1] ** 2 - tolerance**2 + float(draws.var())
     pair = (ONSET[0] - float(draws.mean()), math.log(FLOW_FACTOR[0]))
     return DoseKnowledge(pair, (variance, 0.0, 0.0, FLOW_FACTOR[1] ** 2), None, FIRST_AIM, 0)
+
+
+def _normal(values: Floats) -> Floats:
+    """Standard normal distribution function."""
+    return np.asarray(ndtr(values), dtype=float)
 
 
 def draw_lags(

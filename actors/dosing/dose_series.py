@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
+from actors.dosing.display_belief import IDEAL_DISPLAY, DisplayBelief
 from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DoseResult, fine_flow
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing.dosing_settings import DosingSettings
@@ -30,9 +31,9 @@ from sim_engine.vessel.vessel import build_vessel, check_holds
 TICK = 0.05
 """Time between two decisions in a forecast [s]."""
 
-READING_TICKS = 2
-"""Decisions between two readings in a forecast."""
 
+NINETY_PERCENT = 1.645
+"""Half of the interval that contains 90 % of a normal distribution [standard deviations]."""
 
 LOST = (1e-3, 1e-3)
 """Mean and standard deviation of the mass that a dose takes from its source beyond the weighed amount [kg]: dribble and
@@ -72,6 +73,8 @@ class DoseForecast:
         clean_flow: smallest flow that leaves the lip cleanly; a slower stream may run down the outside [kg/s]. 0 for a
             pump, which has no lip.
         ends: number of simulated doses by their end.
+        weighing: half of the interval that contains the true amount with a probability of 90 %, once it is weighed
+            [kg].
     """
 
     amount: float
@@ -82,6 +85,12 @@ class DoseForecast:
     fine_flow: float
     clean_flow: float
     ends: dict[DoseEnd, int]
+    weighing: float = 0.0
+
+    @property
+    def reachable(self) -> float:
+        """Half of the interval around the expected amount that contains nine of ten doses as weighed [kg]."""
+        return math.hypot(0.5 * (self.interval[1] - self.interval[0]), self.weighing)
 
 
 class DoseSeries:
@@ -97,6 +106,7 @@ class DoseSeries:
         step: of the balance's display [kg].
         fall_time: of the stream from the lip into the receiver [s].
         knowledge: of earlier doses.
+        display: of the balance, if it is known otherwise.
 
     Attributes:
         belief: before the next dose.
@@ -114,14 +124,17 @@ class DoseSeries:
         step: float = 1e-4,
         fall_time: float = 0.17,
         knowledge: DoseKnowledge | None = None,
+        display: DisplayBelief | None = None,
     ) -> None:
         self._cup, self._settings, self._rng = cup, settings, rng
         self._step, self._fall_time = step, fall_time
         lag = draw_lags(placed, particles, rng, step=step)
         volumes = self._volumes(content)
-        self.belief = (
+        belief = (
             DoseBelief.prior(volumes, lag, rng) if knowledge is None else DoseBelief.known(knowledge, volumes, lag, rng)
         )
+        shown = DisplayBelief.placed([one.time for one in placed], [one.mass for one in placed], step)
+        self.belief = replace(belief, display=display or belief.display.joined(shown))
 
     @property
     def content(self) -> SourceContent:
@@ -166,7 +179,8 @@ class DoseSeries:
                 noise=0.0,
                 rng=np.random.default_rng((seed, 24, k)),
             )
-            result, duration = self._simulate(self._controller(order, widened, seed + k), truth, order)
+            draws = widened.display.draws(np.random.default_rng((seed, 25, k)))
+            result, duration = self._simulate(self._controller(order, widened, seed + k), truth, order, draws)
             amounts.append(float(truth.mass[0]))
             durations.append(duration)
             ends[result.end] += 1
@@ -182,12 +196,16 @@ class DoseSeries:
             fine,
             self._cup.density * self._cup.clean_flow(max(tilt, 0.1)),
             dict(ends),
+            NINETY_PERCENT * self._controller(order, widened, seed).deviation,
         )
 
-    def _simulate(self, controller: DoseController, truth: DoseEstimator, order: DoseOrder) -> tuple[DoseResult, float]:
+    def _simulate(
+        self, controller: DoseController, truth: DoseEstimator, order: DoseOrder, repeated: Iterator[bool]
+    ) -> tuple[DoseResult, float]:
         """One dose out of a cup of the controller's own model. Returns its result and its duration [s]."""
         base = order.receiver_mass if order.receiver_mass is not None else 0.2
         tilt, speed, readings, ticks = 0.0, 0.0, [DoseReading(0.0, base)], 0
+        every, shown = max(round(self.belief.display.interval / TICK), 1), base
         truth.start(0.0, 0.0)
         while controller.result is None:
             time = TICK * ticks
@@ -197,8 +215,11 @@ class DoseSeries:
             speed = command.speed
             ticks += 1
             truth.advance(TICK * ticks, tilt)
-            shown = round((base + float(truth.reading[0])) / self._step) * self._step
-            readings = [DoseReading(TICK * ticks, shown)] if ticks % READING_TICKS == 0 else []
+            readings = []
+            if ticks % every == 0:
+                if not next(repeated):
+                    shown = round((base + float(truth.reading[0])) / self._step) * self._step
+                readings = [DoseReading(TICK * ticks, shown)]
         return controller.result, TICK * ticks
 
     def _controller(self, order: DoseOrder, belief: DoseBelief, seed: int) -> DoseController:
@@ -236,7 +257,14 @@ def check_dose(scene: Scene, dose: DoseTarget) -> None:
         raise InvalidActionError(f"the receiver is too small: {error}") from error
 
 
-def predict_dose(scene: Scene, dose: DoseTarget, seed: int, settings: DosingSettings, count: int = 20) -> DoseForecast:
+def predict_dose(
+    scene: Scene,
+    dose: DoseTarget,
+    seed: int,
+    settings: DosingSettings,
+    count: int = 20,
+    display: DisplayBelief | None = None,
+) -> DoseForecast:
     """Predict a dose: the controller pours out of cups of its own model.
 
     Args:
@@ -245,12 +273,17 @@ def predict_dose(scene: Scene, dose: DoseTarget, seed: int, settings: DosingSett
         seed: of the prediction.
         settings: of the dose.
         count: number of simulated doses.
+        display: of the balance; None: as earlier doses from the source have shown, or an ideal one.
 
     Raises:
         InvalidActionError: see `check_dose`.
     """
     check_dose(scene, dose)
-    series = series_of(scene, dose, settings, (), np.random.default_rng((seed, 32)))
+    knowledge = source_of(scene, dose).knowledge
+    if display is None:
+        display = DisplayBelief.of(knowledge.display) if knowledge is not None and knowledge.display else IDEAL_DISPLAY
+    rng = np.random.default_rng((seed, 32))
+    series = series_of(scene, dose, settings, (), rng, step=display.step, display=display)
     return series.forecast(DoseOrder(dose.amount, dose.limit, receiver_mass=0.2), seed=seed, count=count)
 
 
@@ -262,6 +295,7 @@ def series_of(
     rng: np.random.Generator,
     *,
     step: float = 1e-4,
+    display: DisplayBelief | None = None,
 ) -> DoseSeries:
     """The series that a dose continues: with the content and the knowledge of its source.
 
@@ -269,12 +303,12 @@ def series_of(
         scene: pourer and liquid.
         dose: with its source.
         settings: of the dose.
-        placed, rng, step: see `DoseSeries`.
+        placed, rng, step, display: see `DoseSeries`.
     """
     source = source_of(scene, dose)
     cup = CupFlow(build_vessel(scene.pourer), scene.liquid)
     content = SourceContent(source.mass, source.deviation)
-    return DoseSeries(cup, settings, content, placed, rng, step=step, knowledge=source.knowledge)
+    return DoseSeries(cup, settings, content, placed, rng, step=step, knowledge=source.knowledge, display=display)
 
 
 def unknown_amount(result: DoseResult) -> str:
@@ -286,10 +320,20 @@ def unknown_amount(result: DoseResult) -> str:
     )
 
 
-def after_dose(series: DoseSeries) -> dict[str, Any]:
-    """What a series knows after a dose, JSON-ready: the content of its source, and the estimates for the next dose."""
+def after_dose(series: DoseSeries, result: DoseResult) -> dict[str, Any]:
+    """What a dose has shown, JSON-ready: its end, the content of its source, and the estimates for the next dose.
+
+    Args:
+        series: that the dose belongs to, after it.
+        result: of the dose.
+    """
     content = series.content
     return {
+        "received": result.amount,
+        "deviation": result.deviation,
+        "end": str(result.end),
+        "top_ups": result.top_ups,
+        "innovations": result.innovations,
         "left": [max(content.mass - LOST[0], 0.0), math.hypot(content.deviation, LOST[1])],
         "knowledge": asdict(series.belief.knowledge()),
     }
@@ -306,4 +350,5 @@ def _single(belief: DoseBelief, particle: int) -> DoseBelief:
         belief.volume[one],
         belief.aim,
         belief.doses,
+        belief.display,
     )

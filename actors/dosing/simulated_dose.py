@@ -172,12 +172,9 @@ def _notes(
     before = placed[-1].time + 1.0  # the dose begins a second after the last of them
     every = max(len(record.times) // SIGNALS, 1)
     return {
-        **after_dose(series),
+        **after_dose(series, result),
         "wanted": dose.amount,
-        "received": result.amount,
         "true": record.received,
-        "end": str(result.end),
-        "top_ups": result.top_ups,
         "duration": record.duration,
         "times": [round(float(t), 3) for t in record.times[::every]],
         "tilt_deg": [round(math.degrees(float(t)), 2) for t in record.tilts[::every]],

@@ -10,7 +10,8 @@ not the model of `actors.dosing.dose_estimator`:
 | flow | discharge that depends on the head, fluctuations, slosh, a film that drains late, drops |
 | dribble | below a Weber number a part runs down the outside: half of it falls later, half is spilled |
 | stream | falls from a height that changes, with initial speed, spread in time; its impact fluctuates |
-| balance | first order, Butterworth of fourth order, moving average, switching lag; delay, display, noise |
+| balance | first order, Butterworth of fourth order, moving average, switching lag; delay, display, noise; the |
+|   | behaviours of real displays: `actors.balance.display_behaviour` |
 | arm | commands at 10 or 20 Hz; limits of speed and acceleration, servo lag; back after 0.2 s without news |
 
 `DosingFault` disturbs a dose. Every dose is deterministic for a seed.
@@ -30,6 +31,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.balance.display_behaviour import IDEAL, DisplayBehaviour, DisplayModel
 from actors.dosing.dose_controller import TiltCommand
 from actors.dosing.dose_estimator import DoseReading
 from sim_engine.hydrostatics import GRAVITY
@@ -93,6 +95,8 @@ class TrueScale:
         delay: until a reading arrives [s].
         step: of the display [kg].
         noise: standard deviation before the display [kg].
+        behaviour: how the display departs from an ideal one. Its zero is tracked at the load before the readings, as
+            of a balance that was tared with the receiver on it.
     """
 
     kind: Literal["first", "fourth", "average", "switching"] = "first"
@@ -101,6 +105,7 @@ class TrueScale:
     delay: float = 0.05
     step: float = 1e-4
     noise: float = 2e-5
+    behaviour: DisplayBehaviour = IDEAL
 
 
 @dataclass(frozen=True)
@@ -277,6 +282,8 @@ class VirtualDosingBench:
         self._wet_hold = 1e-3 * wets * float(rng.uniform(0.1, 0.5))
         self.discharge = float(rng.normal(0.60, 0.04))
         self._wetness = wetness
+        self._display_seed = (seed, 79) if dose_seed is None else (seed, 80, dose_seed)
+        self._displays = 0
         self._servo_lag = float(rng.uniform(0.03, 0.06))
         self._network = float(rng.uniform(0.008, 0.025))
         if dose_seed is not None:
@@ -313,14 +320,14 @@ class VirtualDosingBench:
         rng, scale = self._rng, self.scale
         placed, duration = 1.0 + float(rng.uniform(0.0, 0.3)), float(rng.uniform(0.03, 0.25))
         cell, end = _Filter(scale, 0.0), 1.5 + 8.0 * scale.lag + 0.5
-        shown, readings, ask = _Display(scale, rng), [], 0.0
+        shown, readings, ask = self._display(0.0), [], 0.0
         for k in range(round(end / TIME_STEP)):
             time = k * TIME_STEP
             share = min(max((time - placed) / duration, 0.0), 1.0)
-            value = cell.step(self.receiver_mass * share)
+            shown.advance(cell.step(self.receiver_mass * share))
             if time >= ask:
                 ask += scale.interval
-                readings.append(shown.reading(time + scale.delay, value))
+                readings += shown.readings(time + scale.delay)
         self._wetness *= 0.85
         return tuple(readings)
 
@@ -330,7 +337,7 @@ class VirtualDosingBench:
         dt = TIME_STEP
         missing = fault is not None and fault.kind == "receiver missing"
         base = 0.0 if missing else self.receiver_mass
-        cell, shown = _Filter(scale, base), _Display(scale, rng)
+        cell, shown = _Filter(scale, base), self._display(base)
         drops = int(rng.integers(0, 4))
         tilt = target = speed = ordered = 0.0
         fresh, pending = 0.0, deque[tuple[float, float]]()
@@ -382,11 +389,11 @@ class VirtualDosingBench:
                     load += 5e-3
                 if fault.kind == "unstable":
                     load += 2e-3 * math.sin(8.0 * time) + 1e-3 * normals[2 * k + 1]
-            value = cell.step(load)
+            shown.advance(cell.step(load))
             if time >= next_reading:
                 next_reading += scale.interval + 0.005 * normals[2 * k + 1] * scale.interval / 0.1
                 if not (fault is not None and fault.kind == "line cut" and time > pour.first_flow + fault.at):
-                    pending_readings.append(shown.reading(time + scale.delay, value))
+                    pending_readings += shown.readings(time + scale.delay)
             if k % 4 == 0:
                 signals.append((time, tilt, pour.received, pour.flow))
             k += 1
@@ -404,6 +411,12 @@ class VirtualDosingBench:
             columns[3],
             tuple(delivered),
         )
+
+    def _display(self, load: float) -> _Display:
+        """The display with a load at rest [kg]."""
+        self._displays += 1
+        seed = (*self._display_seed, self._displays)
+        return _Display(self.scale, self._rng, DisplayModel(self.scale.behaviour, self.scale.step, seed, load))
 
     def pour(self) -> LivePour:
         """Liquid that follows a tilt from elsewhere, such as that of an emulated arm."""
@@ -517,15 +530,25 @@ class LivePour:
 
 
 class _Display:
-    """Rounds, and reports when the value rests."""
+    """Rounds, repeats, delays and loses readings, and reports when the value rests."""
 
-    def __init__(self, scale: TrueScale, rng: np.random.Generator) -> None:
-        self._scale, self._rng = scale, rng
+    def __init__(self, scale: TrueScale, rng: np.random.Generator, model: DisplayModel) -> None:
+        self._scale, self._rng, self._model, self._load = scale, rng, model, model.value
         self._last: deque[float] = deque(maxlen=max(round(0.6 / scale.interval), 3))
 
-    def reading(self, arrival: float, value: float) -> DoseReading:
+    def advance(self, value: float) -> None:
+        """Let one step of time pass, with this value of the filter [kg]."""
+        self._model.advance(value, TIME_STEP, self._load)
+
+    def readings(self, due: float) -> list[DoseReading]:
+        """The reading that is due then [s]; none if it is lost."""
         step = self._scale.step
-        shown = round((value + self._scale.noise * float(self._rng.standard_normal())) / step) * step
+        shown = self._model.show(self._new)
         self._last.append(shown)
         full = len(self._last) == self._last.maxlen
-        return DoseReading(arrival, shown, full and max(self._last) - min(self._last) < 1.5 * step)
+        stable = full and max(self._last) - min(self._last) < 1.5 * step
+        return [] if self._model.loses() else [DoseReading(self._model.arrival(due), shown, stable)]
+
+    def _new(self) -> float:
+        step = self._scale.step
+        return round((self._model.value + self._scale.noise * float(self._rng.standard_normal())) / step) * step

@@ -212,6 +212,7 @@ def _row(number: int, planned: PlannedDose, source: DoseSource, found: DoseForec
         "fine_flow_g_s": 1e3 * found.fine_flow,
         "clean_flow_g_s": 1e3 * found.clean_flow,
         "left_g": 1e3 * left,
+        "reachable_tolerance_g": 1e3 * found.reachable,
         "ends": {str(end): count for end, count in found.ends.items()},
     }
 
@@ -240,6 +241,11 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
         f"{100.0 * predicted.enough:.0f} %",
         f"  spill risk: {risk}",
     ]
+    if predicted.reachable > planned.limit:
+        lines.append(
+            f"  balance: nine of ten doses are within {1e3 * predicted.reachable:.2g} g as weighed with this balance; the "
+            f"tolerance of {1e3 * planned.limit:.2g} g is smaller"
+        )
     for end, count in predicted.ends.items():
         if end != "reached":
             lines.append(f"  {count} of {sum(predicted.ends.values())} predicted doses end otherwise: {end}")
@@ -313,4 +319,5 @@ def dose_text(dose: Dose) -> str:
     time = "" if dose.duration_s is None else f" after {dose.duration_s:.1f} s"
     error = dose.received_g - dose.wanted_g
     end = "" if dose.end == "reached" else f"; {dose.end}"
-    return f"dose {dose.number}, {dose.wanted_g:g} g: {dose.received_g:.1f} g weighed ({error:+.1f} g){time}{end}"
+    sure = "" if dose.half_interval_g is None else f" ± {dose.half_interval_g:.1f} g"
+    return f"dose {dose.number}, {dose.wanted_g:g} g: {dose.received_g:.1f} g{sure} weighed ({error:+.1f} g){time}{end}"

@@ -322,7 +322,8 @@ class PlannedOrder:
 
         Returns:
             'amount_g', 'interval_g' (90 %), 'spilled_g', 'duration_s', and for an amount 'error_g',
-            'error_interval_g', 'enough' (probability that the source holds it) and 'ends'.
+            'error_interval_g', 'reachable_tolerance_g' (half of the 90 % interval of the dose as weighed with this balance),
+            'enough' (probability that the source holds it) and 'ends'.
 
         Raises:
             InvalidActionError: the pour can't be made.
@@ -343,6 +344,7 @@ class PlannedOrder:
             "error_g": 1e3 * (found.amount - wanted),
             "error_interval_g": [low - 1e3 * wanted, high - 1e3 * wanted],
             "duration_s": found.duration + (0.0 if bench is None else bench.operator_time),
+            "reachable_tolerance_g": 1e3 * found.reachable,
             "enough": found.enough,
             "ends": {str(end): count for end, count in found.ends.items()},
         }
@@ -421,7 +423,8 @@ def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float
     """
     about: dict[str, Any] = measured.notes.get(DOSE, {})
     received = 1e3 * float(about.get("received", measured.delivered))
-    half, spilled = INTERVAL * 1e3 * math.sqrt(2.0) * deviation, spilled_mass(measured)
+    half = INTERVAL * 1e3 * float(about.get("deviation", math.sqrt(2.0) * deviation))
+    spilled = spilled_mass(measured)
     found: dict[str, Any] = {
         "received_g": received,
         "received_interval_g": [received - half, received + half],

@@ -106,6 +106,9 @@ class PredictionOut(_Out):
     duration_s: float | None = None
     """Expected time until it is weighed, in the rig's own time."""
 
+    reachable_tolerance_g: float | None = None
+    """Half of the interval that contains nine of ten doses as weighed with this balance."""
+
     enough: float | None = None
     """Probability that the source holds the amount."""
 

@@ -664,14 +664,15 @@ def _dose_table(stage: str, dispensed: Dispensed) -> ResultTable:
     for dose in dispensed.doses:
         error = None if dose.received_g is None else dose.received_g - dose.wanted_g
         cells = [str(dose.number), dose.position or "—", f"{dose.wanted_g:g}"]
-        cells += ["—" if grams is None else f"{grams:.2f}" for grams in (dose.received_g, error, dose.spilled_g)]
+        cells += ["—" if grams is None else f"{grams:.2f}" for grams in (dose.received_g, error, dose.half_interval_g)]
+        cells += ["—" if dose.spilled_g is None else f"{dose.spilled_g:.2f}"]
         cells += ["—" if dose.duration_s is None else f"{dose.duration_s:.1f}", dose.source or "—"]
         cells += ["—" if dose.left_g is None else f"{dose.left_g:.0f} ± {2.0 * (dose.left_deviation_g or 0.0):.1f}"]
         cells += [f"{dose.end}{', source filled before' if dose.filled else ''}"]
         rows.append(ResultRow(cells, "bad" if dose.received_g is None else ""))
-    header = ["dose", "position", "wanted [g]", "received [g]", "difference [g]", "spilled [g]", "time [s]"]
-    header += ["source", "left [g]", "end"]
-    return ResultTable(f"{stage}: {len(rows)} wanted amounts", header, rows, frozenset({0, *range(2, 7), 8})).filled()
+    header = ["dose", "position", "wanted [g]", "received [g]", "difference [g]", "± (90 %) [g]", "spilled [g]"]
+    header += ["time [s]", "source", "left [g]", "end"]
+    return ResultTable(f"{stage}: {len(rows)} wanted amounts", header, rows, frozenset({0, *range(2, 8), 9})).filled()
 
 
 def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:

@@ -13,6 +13,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from actors.balance.scale_model import ScaleSettings
+from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.laboratory_settings import HiddenLiquidBase
 from orchestrator.journal.codec import to_json
 from orchestrator.requests import WRITTEN_IF_SET
@@ -22,7 +24,14 @@ from sim_engine.scene import Scene
 from sim_engine.settings.model import BY_CONTENT, NOT_IN_FINGERPRINT, SET_BY_PROGRAM, marks_of
 from sim_engine.vessel.shapes import ProfileShape, Shape
 
-WITH_FREE_FIELDS = HiddenLiquidBase, Liquid, ProfileShape, SimulationParameters
+WITH_FREE_FIELDS = (
+    HiddenLiquidBase,
+    Liquid,
+    ProfileShape,
+    ScaleSettings,
+    SimulatedBalanceSettings,
+    SimulationParameters,
+)
 
 
 def fingerprint(plan: CampaignPlan) -> dict[str, Any]:

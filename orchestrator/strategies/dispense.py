@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
+from actors.dosing.dose_series import NINETY_PERCENT
 from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget
 from orchestrator.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
@@ -118,6 +119,9 @@ class Dose(ResultPart):
     received_g: float | None
     """Amount weighed in the receiver [g]; None if it is unknown."""
 
+    deviation_g: float | None = None
+    """Standard deviation of this amount [g]: steps and noise of the display, and late drops; None if it is unknown."""
+
     spilled_g: float | None
     """Mass outside the receiver [g]; None if it is unknown."""
 
@@ -144,6 +148,11 @@ class Dose(ResultPart):
 
     signals: DoseSignals = DoseSignals()
     """Signals over time."""
+
+    @property
+    def half_interval_g(self) -> float | None:
+        """Half of the interval that contains the true amount with a probability of 90 % [g]."""
+        return None if self.deviation_g is None else NINETY_PERCENT * self.deviation_g
 
 
 class Dispensed(StageResult):
@@ -272,6 +281,7 @@ class Dispense:
                 number=pour.number,
                 wanted_g=1e3 * pour.dose.amount,
                 received_g=received,
+                deviation_g=None if "deviation" not in about else 1e3 * about["deviation"],
                 spilled_g=spilled,
                 duration_s=about.get("duration"),
                 end=end,
@@ -336,4 +346,5 @@ def _knowledge(fields: Mapping[str, Any]) -> DoseKnowledge:
         None if lag is None else tuple(lag),
         float(fields["aim"]),
         int(fields["doses"]),
+        tuple(fields.get("display", ())),
     )

@@ -59,6 +59,8 @@ class FaultyDisplay:
         self.scale = scale
         self.faults = BalanceFaults()
         self._frozen: Reading | None = None
+        self.count = 0
+        """Number of readings so far."""
 
     def set(self, changes: dict[str, Any]) -> None:
         """Change faults by name; others stay."""
@@ -67,6 +69,7 @@ class FaultyDisplay:
 
     def reading(self) -> Reading:
         """Return the display's reading."""
+        self.count += 1
         if self._frozen is not None:
             return self._frozen
         if self.faults.fault:
@@ -179,7 +182,7 @@ class Emulation:
         if self._repeat_at is not None and now >= self._repeat_at:
             self._repeat_at = now + self._repeat.interval / (self._time_scale or 1.0)
             reading = self._display.reading()
-            self._answers.append((now, self._repeat.line(reading) if self._repeat.line is not None else self._weight()))
+            self._send(self._repeat.line(reading) if self._repeat.line is not None else self._weight(), now)
         if self._following is not None:
             self._follow(self._following, now)
         ready = b"".join(line for at, line in self._answers if at <= now)
@@ -236,6 +239,7 @@ class Emulation:
         self._now = now
 
     def _carry_out(self, command: bytes, now: float) -> None:
+        seen = self._display.count
         reply = self._encoder.answer(b"?" if self._display.faults.stranger else command, self._display)
         if isinstance(reply, Repeat):
             self._repeat, self._repeat_at = reply, now
@@ -249,6 +253,9 @@ class Emulation:
             patience = COMMAND_PATIENCE if reply.patience is None else reply.patience
             self._waiting = (reply, now + (patience / self._time_scale if self._time_scale > 0.0 else math.inf))
             self._wait_on(now)
+        elif self._display.count > seen:
+            faults = self._display.faults
+            self._send(spoil(reply, faults, self._rng) if reply else b"", now + self._latency + faults.delay)
         else:
             self._reply(reply, now)
 
@@ -279,6 +286,12 @@ class Emulation:
         if line:
             faults = self._display.faults
             self._answers.append((now + self._latency + faults.delay, spoil(line, faults, self._rng)))
+
+    def _send(self, line: bytes, due: float) -> None:
+        """Send a weight, which may come late or be lost (see `DisplayBehaviour`)."""
+        display = self._scale.display
+        if line and not display.loses():
+            self._answers.append((display.arrival(due, self._time_scale or 1.0), line))
 
     def _weight(self) -> bytes:
         return weight_line(self._encoder.dialect, self._display.reading())

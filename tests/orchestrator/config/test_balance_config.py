@@ -8,11 +8,13 @@ from textwrap import dedent
 import pytest
 
 from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
+from actors.balance.display_behaviour import DisplayBehaviour
 from actors.balance.scale_model import ScaleSettings
 from actors.balance.weighing_plan import Placement
 from orchestrator.config.yaml.section_validation import PlacedProblems, validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.runs.fingerprint import deciding
 from tests.support.campaign_files import written_out
 
 
@@ -86,6 +88,19 @@ def test_a_virtual_balance_has_a_data_sheet():
     assert load(VIRTUAL + "dialect: sbi\n", mode="virtual").dialect == "sbi"
 
 
+def test_a_virtual_balance_behaves_as_a_real_one_if_the_laboratory_says_so():
+    text = "virtual: {resolution: 2 g, behaviour: {repeat_probability: 0.42, jitter: 30 ms, creep: 0.0002}}\n"
+    found = load(text + "interval: 0.2 s\n", mode="virtual").virtual
+    assert found is not None
+    assert found.behaviour == DisplayBehaviour(repeat_probability=0.42, jitter=0.03, creep=2e-4)
+
+
+def test_an_ideal_display_leaves_the_fingerprint_of_earlier_runs():
+    assert "behaviour" not in deciding(ScaleSettings())
+    held = ScaleSettings(behaviour=DisplayBehaviour(repeat_probability=0.42))
+    assert deciding(held)["behaviour"]["repeat_probability"] == 0.42
+
+
 def test_where_the_operator_types_there_is_no_line():
     assert load("placement: manual\nload_tolerance: 1 g\n").typed
 
@@ -125,6 +140,22 @@ def test_the_balance_shown_on_that_page_is_one():
         (SIMPLE + "baud: 9601", "hardware", r"lab.yaml:3:7: baud: no balance talks at 9601 baud; .* 9600, "),
         (SIMPLE + "step: 50 g", "hardware", r"lab.yaml:3:7: step: .* steps of 50 g can't tell .* load_tolerance, 5 g"),
         ("virtual: {resolution: 2 g}\nload_tolerance: 1 g", "virtual", r"lab.yaml:1:23: virtual.resolution: a display"),
+        (
+            "virtual: {behaviour: {repeat_probability: 1.2}}",
+            "virtual",
+            r"behaviour.repeat_probability: 1.2 is outside 0 … 0.95",
+        ),
+        ("virtual: {behaviour: {jitter: 30}}", "virtual", r"behaviour.jitter: 30 has no unit"),
+        (
+            "virtual: {behaviour: {longest_repeat: 0}}",
+            "virtual",
+            r"behaviour.longest_repeat: 0 is too small; at least 1",
+        ),
+        (
+            "virtual: {behaviour: {repeats: 0.4}}",
+            "virtual",
+            r"behaviour: unknown key 'repeats'|behaviour.repeats: unknown",
+        ),
         (SIMPLE + "step: 0 g", "hardware", r"step: 0 g should be above 0"),
     ],
 )

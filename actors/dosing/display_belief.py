@@ -1,0 +1,223 @@
+"""Repeated readings: how often a display shows its last value again although the load has changed.
+
+Balances convert more slowly than they send, or hold their display while the load moves. In ten recorded robot pours
+onto a USB balance, 42 % of the readings repeat the one before, for up to 1.1 s (Kennedy et al. 2019, precision pouring,
+University of Pennsylvania). `Repeats` infers the probability of a repeat from readings as they come; `DisplayBelief` is
+what one dose passes on to the next.
+
+A reading that equals the one before is either a repeated one, or a new one that rounds to the same value. With the
+probability p of a repeat, and the probability L that a new reading would be equal,
+
+    P(new | equal) = (1 − p) L / (p + (1 − p) L)
+
+p has two values, after a new reading and after a repeated one: some balances send every conversion two or three times,
+and others hold their display now and then for a second.
+
+Limitations: a display that moves by noise while it is held counts as new.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Beta = tuple[float, float]
+
+REPEATS = np.concatenate((np.array([0.002, 0.01, 0.025]), np.arange(0.05, 0.96, 0.05)))
+"""Probabilities of a repeated reading that are compared."""
+
+UNKNOWN_REPEATS = (0.3, 1.5)
+"""Beta distribution of the probability of a repeat before the first reading: most balances never repeat one, and a few
+repeat every second one."""
+
+LONGEST_MEMORY = 150.0
+"""Readings that the knowledge about repeats amounts to at most, so that a balance whose mode was changed is noticed."""
+
+SMALLEST_STEP = 0.1e-3
+"""Steps of finer displays are examined like this one [kg]; noise moves their last digits."""
+
+RISING = (0.03, 0.97)
+"""Part of a step of the load in which every new reading differs from the one before."""
+
+
+@dataclass(frozen=True)
+class DisplayBelief:
+    """What is known about the display of a balance.
+
+    Attributes:
+        repeats: Beta distribution of the probability that a reading repeats the one before although the load has
+            changed: after a new reading, and after a repeated one (2 × 2 numbers). Two numbers, because some balances
+            send each conversion two or three times, and others hold their display now and then for a second.
+        noise: factor of the variance of a reading.
+        step: of the display [kg].
+        interval: mean time between two readings [s].
+        jitter: standard deviation of the time at which a reading arrives [s].
+        rest: time constant with which the last few steps of a change are shown [s]: the filters of some balances get
+            slower as soon as the load hardly moves.
+    """
+
+    repeats: tuple[Beta, Beta] = (UNKNOWN_REPEATS, UNKNOWN_REPEATS)
+    noise: float = 1.0
+    step: float = 1e-4
+    interval: float = 0.1
+    jitter: float = 0.0
+    rest: float = 0.0
+
+    @classmethod
+    def placed(cls, times: Sequence[float], masses: Sequence[float], step: float) -> DisplayBelief:
+        """What the readings show while the receiver is put on.
+
+        During the rise the load changes by many display steps, so that each equal reading is a repeated one.
+
+        Args:
+            times: of the readings from before the rise until it has settled, increasing [s].
+            masses: the readings [kg].
+            step: of the display [kg].
+        """
+        repeats = Repeats(cls().repeats)
+        if len(masses) < 4:
+            return cls(step=step)
+        low, high = (float(np.median(part)) for part in (masses[:3], masses[-3:]))
+        for before, after in itertools.pairwise(masses):
+            if low + RISING[0] * (high - low) < before < low + RISING[1] * (high - low):
+                repeats.see(after == before, 0.0)
+        gaps = np.diff(times)
+        middle = float(np.median(gaps))
+        # the median, because a lost reading leaves a gap of two intervals
+        jitter = 1.48 * float(np.median(np.abs(gaps - middle))) / math.sqrt(2.0)
+        # from five steps off to one step off
+        off = np.abs(np.asarray(masses) - high) / max(step, SMALLEST_STEP)
+        near, nearer = (int(np.flatnonzero(np.append(True, off > limit))[-1]) for limit in (5.5, 0.9))
+        late = float(times[min(nearer, len(times) - 1)] - times[min(near, len(times) - 1)])
+        return cls(repeats.beta(), step=step, interval=middle, jitter=jitter, rest=late / math.log(5.5))
+
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> DisplayBelief:
+        """The belief with these `numbers`."""
+        a, b, c, d, *others = numbers
+        return cls(((a, b), (c, d)), *others)
+
+    @classmethod
+    def expected(cls, step: float, interval: float, repeated: float) -> DisplayBelief:
+        """The belief about a display whose data sheet is known.
+
+        Args:
+            step: of the display [kg].
+            interval: between two readings [s].
+            repeated: share of repeated readings.
+        """
+        beta = (20.0 * max(repeated, 0.005), 20.0 * (1.0 - max(repeated, 0.005)))
+        return cls((beta, beta), step=step, interval=interval)
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """The belief as numbers, for `of`."""
+        return (*self.repeats[0], *self.repeats[1], self.noise, self.step, self.interval, self.jitter, self.rest)
+
+    def draws(self, rng: np.random.Generator) -> Iterator[bool]:
+        """Whether each of the following readings repeats the one before, without end."""
+        chances, repeated = [a / (a + b) for a, b in self.repeats], False
+        while True:
+            repeated = bool(rng.random() < chances[repeated])
+            yield repeated
+
+    def aged(self) -> DisplayBelief:
+        """The belief with the weight of `LONGEST_MEMORY` readings at most, so that another mode of it is noticed."""
+        first, second = (_shortened(pair) for pair in self.repeats)
+        return replace(self, repeats=(first, second))
+
+    def joined(self, other: DisplayBelief) -> DisplayBelief:
+        """This belief with the evidence of a newer one that knew nothing before."""
+        x, y = UNKNOWN_REPEATS
+        pairs = zip(self.repeats, other.repeats, strict=True)
+        first, second = ((a + max(c - x, 0.0), b + max(d - y, 0.0)) for (a, b), (c, d) in pairs)
+        return replace(other, repeats=(first, second), noise=self.noise)
+
+
+IDEAL_DISPLAY = DisplayBelief.expected(1e-4, 0.1, 0.0)
+"""A display of 0.1 g that repeats no reading."""
+
+
+class Repeats:
+    """Probability of a repeated reading, from readings as they come.
+
+    Args:
+        beta: see `DisplayBelief.repeats`.
+    """
+
+    def __init__(self, beta: tuple[Beta, Beta]) -> None:
+        self._log = [_log_beta(*pair) for pair in beta]
+        self._state = 0
+        self.run = 0.0
+
+    def weights(self, state: int | None = None) -> Floats:
+        """Probabilities of `REPEATS`."""
+        log = self._log[self._state if state is None else state]
+        weights: Floats = np.exp(log - log.max())
+        return weights / weights.sum()
+
+    @property
+    def next(self) -> float:
+        """Probability that the next reading repeats the last one."""
+        return float(self.weights() @ REPEATS)
+
+    def see(self, equal: bool, chance: float) -> float:
+        """Learn from one reading.
+
+        Args:
+            equal: it equals the one before.
+            chance: probability that a new reading equals the one before.
+
+        Returns:
+            Probability that the reading is a new one.
+        """
+        repeated = self.next
+        if not equal:
+            self._log[self._state] = self._log[self._state] + np.log1p(-REPEATS)
+            self._state, self.run = 0, 0.0
+            return 1.0
+        self._log[self._state] = self._log[self._state] + np.log(REPEATS + (1.0 - REPEATS) * chance)
+        new = (1.0 - repeated) * chance / (repeated + (1.0 - repeated) * chance)
+        self._state = int(new < 0.5)
+        self.run = self.run + math.log(max(repeated, 1e-3)) if new < 0.5 else 0.0
+        return new
+
+    def beta(self) -> tuple[Beta, Beta]:
+        """The Beta distributions with the moments of the two probabilities."""
+        first, second = (_beta_of(self.weights(state)) for state in (0, 1))
+        return first, second
+
+    def in_a_row(self, chance: float) -> int:
+        """Number of repeated readings that are followed by a further one with less than a probability."""
+        start, on = (self._upper(state) for state in (0, 1))
+        return 1 + max(math.ceil(math.log(chance / start) / math.log(on)), 0) if start > chance else 0
+
+    def _upper(self, state: int) -> float:
+        weights = self.weights(state)
+        return float(REPEATS[min(int(np.searchsorted(np.cumsum(weights), 0.8)), len(REPEATS) - 1)])
+
+
+def _log_beta(a: float, b: float) -> Floats:
+    """Logarithm of a Beta distribution at `REPEATS`, up to a constant; each stands for its part of 0 … 1."""
+    edges = np.concatenate(([0.0], 0.5 * (REPEATS[1:] + REPEATS[:-1]), [1.0]))
+    log: Floats = (a - 1.0) * np.log(REPEATS) + (b - 1.0) * np.log1p(-REPEATS) + np.log(np.diff(edges))
+    return log
+
+
+def _shortened(beta: Beta) -> Beta:
+    share = min(LONGEST_MEMORY / sum(beta), 1.0)
+    return beta[0] * share, beta[1] * share
+
+
+def _beta_of(weights: Floats) -> Beta:
+    """The Beta distribution with the mean and variance of weighted `REPEATS`."""
+    mean = float(weights @ REPEATS)
+    variance = max(float(weights @ (REPEATS - mean) ** 2), 1e-5)
+    count = max(mean * (1.0 - mean) / variance - 1.0, 0.5)
+    return mean * count, (1.0 - mean) * count

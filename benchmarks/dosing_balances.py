@@ -1,0 +1,263 @@
+"""Pour doses with balances that repeat, delay and lose readings, beside an earlier version of the dosing code.
+
+    python benchmarks/dosing_balances.py --final --json     # the table of the evidence page: docs/data/dosing-balances.json
+    python benchmarks/dosing_balances.py --series 10        # development seeds, for tuning
+
+Every series is two doses of 100 g from the round beaker, whose outflow, lip and balance's filter the seed draws as in
+`benchmarks/dosing.py`. What differs between the rows is the display. The final seeds begin at 30000; development uses
+100 to 299. `--before COMMIT` pours the same series with the dosing code of that commit, on the same bench.
+
+The coverage is the share of doses whose true amount lies within the stated interval (90 %) of the weighed one. A false
+stop is an end other than "reached" that the bench gave no reason for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import types
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from actors.balance.display_behaviour import IDEAL, DisplayBehaviour
+from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing.virtual_dosing_bench import TrueScale, VirtualDosingBench
+from sim_engine.liquids import Liquid
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from dosing import CUPS, PARTICLES, ROOT, cup_flows
+
+DATA = ROOT / "docs" / "data" / "dosing-balances.json"
+BEFORE = "d2b6a1ff"
+"""The dosing code that took an unchanged reading as evidence that nothing had arrived."""
+
+CUP, AMOUNT, DOSES = "round beaker", 0.1, 2
+FIRST_SEED, FIRST_FINAL_SEED, SERIES = 100, 30000, 150
+
+
+@dataclass(frozen=True)
+class Display:
+    """One row: the display of the balance, and its range of lags [s]."""
+
+    behaviour: DisplayBehaviour = IDEAL
+    step: float = 1e-4
+    interval: float = 0.2
+    lags: tuple[float, float] = (0.1, 0.5)
+
+
+def repeats(probability: float) -> DisplayBehaviour:
+    """A display that repeats a reading with a probability, at most five times in a row."""
+    return DisplayBehaviour(repeat_probability=probability, longest_repeat=5)
+
+
+DISPLAYS = {
+    "0.1 g, every 0.1 s": Display(interval=0.1),
+    "0.1 g, every 0.2 s": Display(),
+    "42 % repeated": Display(repeats(0.42)),
+    "60 % repeated": Display(repeats(0.60)),
+    "2 g steps": Display(step=2e-3),
+    "2 g steps, 42 % repeated": Display(repeats(0.42), step=2e-3),
+    "a conversion each 0.5 s": Display(DisplayBehaviour(conversion_interval=0.5), interval=0.1),
+    "late and lost readings": Display(DisplayBehaviour(jitter=0.03, lost=0.02), interval=0.1),
+    "zero tracking": Display(DisplayBehaviour(zero_tracking=0.5, zero_band=4.0), interval=0.1),
+    "filter that switches": Display(DisplayBehaviour(rest_lag=1.0, rest_band=4.0), interval=0.1),
+    "creep": Display(DisplayBehaviour(creep=2.5e-4), interval=0.1),
+    "lag 0.9 to 1.1 s": Display(interval=0.1, lags=(0.9, 1.1)),
+}
+
+
+@dataclass(frozen=True)
+class Poured:
+    """One dose; masses [g], times [s].
+
+    Attributes:
+        error: in the receiver minus wanted.
+        reported: weighed minus truly received; None if nothing was reported.
+        deviation: stated standard deviation of the weighed amount; nan before it was stated.
+        innovations: mean squared innovation over its variance; nan likewise.
+    """
+
+    seed: int
+    place: int
+    error: float
+    reported: float | None
+    deviation: float
+    innovations: float
+    duration: float
+    top_ups: int
+    end: str
+
+
+@cache
+def program(commit: str) -> tuple[Any, Any]:
+    """The modules `dose_series` and `dose_controller` of a commit; '' is the present code."""
+    from actors.dosing import dose_controller, dose_series
+
+    if not commit:
+        return dose_series, dose_controller
+    package = types.ModuleType("before")
+    package.__path__ = []
+    sys.modules["before"] = package
+    for name in ("dose_estimator", "dose_controller", "dose_series"):
+        shown = ["git", "show", f"{commit}:actors/dosing/{name}.py"]
+        source = subprocess.run(shown, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+        module = types.ModuleType(f"before.{name}")
+        sys.modules[f"before.{name}"] = module
+        exec(
+            compile(source.replace("actors.dosing.dose_", "before.dose_"), f"{name}@{commit}", "exec"), module.__dict__
+        )
+    return sys.modules["before.dose_series"], sys.modules["before.dose_controller"]
+
+
+@cache
+def _flow() -> Any:
+    return cup_flows()(CUP, False)
+
+
+def pour_series(name: str, seed: int, commit: str = "") -> list[Poured]:
+    """Pour one series of a row."""
+    return list(_doses(DISPLAYS[name], seed, commit))
+
+
+def _doses(display: Display, seed: int, commit: str) -> Iterator[Poured]:
+    series_module, controller_module = program(commit)
+    rng = np.random.default_rng((seed, 11))
+    kind = str(rng.choice(["first", "fourth", "average", "switching"]))
+    scale = TrueScale(
+        kind,  # type: ignore[arg-type]
+        float(np.exp(rng.uniform(*np.log(display.lags)))),
+        interval=display.interval,
+        delay=float(rng.uniform(0.02, 0.09)),
+        step=display.step,
+        noise=float(rng.uniform(1e-5, 4e-5)),
+        behaviour=display.behaviour,
+    )
+    true, density = CUPS[CUP], float(Liquid(mass=0.1).density)
+    capacity = true.capacity * density
+    liquid = Liquid(mass=float(rng.uniform(0.5, 0.95)) * capacity)
+    bench = VirtualDosingBench(true, liquid, scale, seed, command_interval=float(rng.choice([0.05, 0.1])))
+    weighing, series, own = rng.normal(0.0, 0.3e-3, DOSES + 1).tolist(), None, np.random.default_rng((seed, 3))
+    for place in range(DOSES):
+        filled = bench.content < AMOUNT + 0.1 * capacity
+        if filled:
+            bench.refill(0.9 * capacity)
+        placed = bench.place_receiver()
+        content = series_module.SourceContent(bench.content + weighing.pop())
+        if series is None:
+            series = series_module.DoseSeries(
+                _flow(), DosingSettings(), content, placed, own, particles=PARTICLES, step=display.step
+            )
+        elif filled:
+            series.fill(content)
+        order = controller_module.DoseOrder(AMOUNT, receiver_mass=bench.receiver_mass)
+        controller = series.controller(order, seed=seed)
+        record = bench.dose(controller)
+        result = controller.result
+        series.finish(result)
+        yield Poured(
+            seed,
+            place,
+            1e3 * (record.received - AMOUNT),
+            None if result.amount is None else 1e3 * (result.amount - record.received),
+            1e3 * getattr(result, "deviation", math.nan),
+            getattr(result, "innovations", math.nan),
+            record.duration,
+            result.top_ups,
+            str(result.end),
+        )
+
+
+def figures(doses: list[Poured]) -> dict[str, Any]:
+    """Return errors [g], coverage, innovations, times [s] and false stops of some doses."""
+    sizes = np.abs([one.error for one in doses])
+    reported = [(abs(one.reported), one.deviation) for one in doses if one.reported is not None]
+    rng = np.random.default_rng(0)
+    means = sizes[rng.integers(0, len(sizes), (2000, len(sizes)))].mean(axis=1)
+    covered = [error <= 1.645 * deviation for error, deviation in reported]
+    return {
+        "doses": len(doses),
+        "mean": float(sizes.mean()),
+        "mean_interval": [float(np.quantile(means, q)) for q in (0.025, 0.975)],
+        "bias": float(np.mean([one.error for one in doses])),
+        "p95": float(np.quantile(sizes, 0.95)),
+        "worst": float(sizes.max()),
+        "reported": float(np.mean([error for error, _ in reported])),
+        "coverage": None if math.isnan(doses[0].deviation) else float(np.mean(covered)),
+        "innovations": None if math.isnan(doses[0].deviation) else float(np.mean([d.innovations for d in doses])),
+        "time": float(np.median([one.duration for one in doses])),
+        "top_ups": float(np.mean([one.top_ups for one in doses])),
+        "false_stops": sum(one.end != "reached" for one in doses),
+    }
+
+
+HEAD = (
+    f"{'':26} {'doses':>5} {'mean':>6} {'95 %':>6} {'worst':>6} {'bias':>6} {'covers':>6} {'innov.':>6} {'time':>5} "
+    f"{'stops':>5}"
+)
+
+
+def row(name: str, f: dict[str, Any]) -> str:
+    """Return one row of the table."""
+    covers = "" if f["coverage"] is None else f"{f['coverage']:.0%}"
+    innovations = "" if f["innovations"] is None else f"{f['innovations']:.2f}"
+    return (
+        f"{name:26} {f['doses']:5d} {f['mean']:6.2f} {f['p95']:6.2f} {f['worst']:6.2f} {f['bias']:+6.2f} {covers:>6} "
+        f"{innovations:>6} {f['time']:5.1f} {f['false_stops']:5d}"
+    )
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--final", action="store_true", help="use the final seeds instead of the development seeds")
+    parser.add_argument("--series", type=int, default=SERIES, help="number of series of two doses")
+    parser.add_argument("--first", type=int, default=FIRST_SEED, help="first development seed")
+    parser.add_argument("--rows", type=int, nargs="*", help="numbers of rows, from 0")
+    parser.add_argument("--before", default="", metavar="COMMIT", help="pour with the dosing code of a commit, too")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument(
+        "--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}; implies --before {BEFORE}"
+    )
+    options = parser.parse_args()
+    first = FIRST_FINAL_SEED if options.final else options.first
+    before = options.before or (BEFORE if options.json else "")
+    names = list(DISPLAYS) if options.rows is None else [list(DISPLAYS)[k] for k in options.rows]
+    data = json.loads(DATA.read_text(encoding="utf-8")) if options.json and DATA.exists() else {"rows": {}}
+    print(HEAD, flush=True)
+    with ProcessPoolExecutor(options.workers) as pool:
+        for name in names:
+            found: dict[str, Any] = {}
+            for commit in dict.fromkeys(("", before)):
+                seeds = range(first, first + options.series)
+                poured = [
+                    one
+                    for series in pool.map(pour_series, [name] * len(seeds), seeds, [commit] * len(seeds))
+                    for one in series
+                ]
+                found["before" if commit else "now"] = figures(poured) | {"ends": _ends(poured)}
+                print(row(name + (f" @{commit}" if commit else ""), found["before" if commit else "now"]), flush=True)
+            if options.json:
+                about = {"seeds": [first, first + options.series - 1], "before": before}
+                data["rows"][name] = found | about
+                DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+
+
+def _ends(doses: list[Poured]) -> dict[str, int]:
+    ends: dict[str, int] = {}
+    for one in doses:
+        ends[one.end] = ends.get(one.end, 0) + 1
+    return ends
+
+
+if __name__ == "__main__":
+    main()
