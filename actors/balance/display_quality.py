@@ -137,7 +137,7 @@ def repeated_readings(times: Sequence[float] | Floats, masses: Sequence[float] |
     return Repeats(share, max((centre - spread) / scale, 0.0), min((centre + spread) / scale, 1.0), n, longest, gaps)
 
 
-def dose_tolerance(flow: float, lag_error: float, gaps: Sequence[float], step: float, noise: float) -> float:
+def dose_tolerance(flow: float, lag_error: float, gaps: Sequence[float] | Floats, step: float, noise: float) -> float:
     """Tolerance that a dose keeps with about 95 % probability [kg]; see the module's formula.
 
     Args:

@@ -168,7 +168,7 @@ def _log_likelihood(misfit: Floats, squares: Floats, chances: Floats, changed: i
         changed: number of changed readings.
     """
     if not squares.shape[1]:
-        return -0.5 * misfit[None, :] + changed * np.log1p(-chances)[:, None]
+        return np.asarray(-0.5 * misfit[None, :] + changed * np.log1p(-chances)[:, None])
     p = chances[:, None, None]
     old = np.log(p + (1.0 - p) * np.exp(-0.5 * squares)[None]).sum(axis=2)
     return np.asarray(-0.5 * misfit[None, :] + changed * np.log1p(-chances)[:, None] + old)
