@@ -25,6 +25,8 @@ from actors import laboratory_settings as laboratory
 from actors.arm.arm_geometry import ArmLimits, RobotCell
 from actors.arm.arm_settings import ARMS, UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
+from actors.balance.display_behaviour import DisplayBehaviour
+from actors.balance.scale_model import ScaleSettings
 from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import OperatorSettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
@@ -102,6 +104,8 @@ SECTIONS: dict[str, type[Settings]] = {
     "bench": laboratory.BenchSettings,
     "balance": SerialBalanceSettings,
     "balance-display": laboratory.BenchBalance,
+    "virtual-balance": ScaleSettings,
+    "display-behaviour": DisplayBehaviour,
     "pose-error": PoseErrorSettings,
     "study": study.StudyFile,
     "level": study.LevelSettings,
@@ -132,6 +136,8 @@ OF_SECTIONS = {
     "JointAngles": "`{base, shoulder, elbow, wrist1, wrist2, wrist3}`, angles",
     "SerialBalanceSettings": "[balance](#balance)",
     "SimulatedBalanceSettings": "[balance](#balance)",
+    "ScaleSettings": "[virtual balance](#virtual-balance)",
+    "DisplayBehaviour": "[display behaviour](#display-behaviour)",
     "PumpSettings": "[pump](#pump)",
     "SpillSensorSettings": "[spill sensor](#spill-sensor)",
     "OperatorSettings": "[operator](#operator)",

@@ -1,4 +1,4 @@
-"""The commissioning check of a balance: rest, lag, linearity, and vibration.
+"""The commissioning check of a balance: rest, repeated readings, lag, tolerance of a dose, linearity, and vibration.
 
 `check_balance` reads a balance through its driver while loads are put on and taken off, and yields one `DeviceCheck`
 per finding. A `CheckOperator` has the hands: a person at the terminal, or the emulator of a virtual balance. Nothing is
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.balance.balance_interface import BalanceDriver, Weight
-from actors.balance.step_response import step_response
+from actors.balance.display_quality import arrivals, dose_tolerance, repeated_readings, smallest_change
+from actors.balance.scale_model import Load
+from actors.balance.step_response import StepResponse, step_response
 from actors.interfaces import DeviceCheck, LaboratoryError, State
 
 REST_TIME = 20.0
@@ -29,8 +31,23 @@ LEAD_TIME = 1.0
 STEP_TIME = 15.0
 """Observation of one step of the load [s]."""
 
+RISE_TIME = 10.0
+"""Duration of the slow rise of the load, for repeated readings [s]."""
+
+RISE_STEPS = 1.5
+"""Rise per reading of that load, in display steps."""
+
+FLOW = 8e-3
+"""Flow at the end of a dose for which its tolerance is stated: `DosingSettings.largest_fine_flow` [kg/s]."""
+
 SLOW = 1.0
 """Lag beyond which a dose is stopped late [s]."""
+
+REPEATED = 0.05
+"""Share of repeated readings beyond which doses become less exact."""
+
+DOSE = 2e-3
+"""Tolerance of a dose that a balance should support [kg]."""
 
 SPARSE = 4.0
 """Readings per second below which a flow is hardly seen."""
@@ -51,6 +68,10 @@ class CheckOperator(Protocol):
 
     def put(self) -> None:
         """Called while the display is observed: an emulator puts the load on now, a person already does."""
+        ...
+
+    def rise(self, mass: float, seconds: float) -> bool:
+        """Begin to add at least a mass [kg] steadily over a time [s], with the receiver on; False if it can't."""
         ...
 
     def reference(self) -> float | None:
@@ -75,6 +96,11 @@ class _Series:
         """Readings per second."""
         return (len(self.times) - 1) / float(self.times[-1] - self.times[0])
 
+    @property
+    def gaps(self) -> NDArray[np.float64]:
+        """Times between readings [s]."""
+        return np.diff(self.times)
+
     def trend(self, step: float) -> tuple[float, float, float]:
         """Slope, its standard error [kg/s], and the scatter around it [kg]; `step` is the display's [kg]."""
         t = self.times - self.times.mean()
@@ -92,6 +118,8 @@ class _Check:
         self._driver, self._operator = driver, operator
         self._repeatability, self._scale, self._step = repeatability, scale, step or 0.0
         self._noise, self._read_at = 0.0, -np.inf
+        self._gaps: Sequence[float] | NDArray[np.float64] = ()
+        self._interval, self._repeats = 0.1, 0.0
 
     def run(self) -> Iterator[DeviceCheck]:
         yield DeviceCheck("balance", "ok", self._driver.connect())
@@ -99,7 +127,12 @@ class _Check:
         self._driver.tare()
         self._step = self._step or self._driver.weigh().step
         yield from self._rest()
-        yield self._lag()
+        self._operator.announce()
+        lead = self._observe(LEAD_TIME)
+        self._operator.put()
+        placed = self._observe(STEP_TIME)
+        yield self._risen(lead, placed)
+        yield from self._lag(lead, placed)
         self._operator.empty()
         yield self._zero("after the load")
         weighed = 0
@@ -123,9 +156,17 @@ class _Check:
         slope, error, scatter = seen.trend(self._step)
         self._noise = scatter
         share, rate = float(seen.stable.mean()), seen.rate
+        gaps = arrivals(seen.times)
+        self._gaps, self._interval = seen.gaps, gaps.interval
         sparse = "set a faster output, or a shorter 'interval'; a flow needs several readings a second"
         yield DeviceCheck(
-            "readings", *_state(rate >= SPARSE, f"{rate:.1f} in a second; right: {SPARSE:g} or more", sparse)
+            "readings",
+            *_state(
+                rate >= SPARSE,
+                f"{rate:.1f} in a second, {gaps.interval:.3f} s apart (median; standard deviation {gaps.jitter:.3f} s, "
+                f"at most {gaps.longest:.2f} s); right: {SPARSE:g} or more",
+                sparse,
+            ),
         )
         said = f"{_g(scatter)} (standard deviation), {100 * share:.0f} % stable; right: {_g(self._tolerance)} or less"
         draught = "shield it from draught, put it on a firm table away from the arm's, or set a slower filter"
@@ -136,21 +177,48 @@ class _Check:
         warm = "let it warm up for an hour, keep the sun and draught off, level it, adjust it; then check again"
         yield DeviceCheck("drift", *_state(not drifting, said, warm))
 
-    def _lag(self) -> DeviceCheck:
-        self._operator.announce()
-        lead = self._observe(LEAD_TIME)
-        self._operator.put()
-        rest = self._observe(STEP_TIME)
+    def _risen(self, lead: _Series, placed: _Series) -> DeviceCheck:
+        """The resolution, and the share of repeated readings while the load rises slowly."""
+        wanted = max(0.1, RISE_STEPS * self._step * RISE_TIME / self._interval)
+        if not self._operator.rise(wanted, RISE_TIME):
+            return DeviceCheck("repeats", "warn", "not measured: nothing was poured", "repeat it, and pour water")
+        seen = self._observe(RISE_TIME + 2.0)
+        changed = smallest_change([*lead.masses, *placed.masses, *seen.masses])
+        step = max(self._step, changed)
+        found = repeated_readings(seen.times, seen.masses, step)
+        if found is None:
+            advice = f"repeat it, and pour at least {_g(wanted)} in {RISE_TIME:g} s, without a pause"
+            return DeviceCheck(
+                "repeats", "warn", f"not measured: the load rose too slowly for steps of {_g(step)}", advice
+            )
+        self._repeats, self._gaps = found.share, found.gaps or self._gaps
+        said = (
+            f"{100 * found.share:.0f} % of {found.count} readings repeat the one before while the load rises (95 %: "
+            f"{100 * found.low:.0f} to {100 * found.high:.0f} %), for at most {found.longest:.1f} s, in steps of "
+            f"{_g(step)}; right: {100 * REPEATED:.0f} % or less"
+        )
+        return DeviceCheck("repeats", *_state(found.share <= REPEATED, said, "set a faster output or display rate"))
+
+    def _lag(self, lead: _Series, rest: _Series) -> Iterator[DeviceCheck]:
         times, masses = [*lead.times, *rest.times], [*lead.masses, *rest.masses]
         try:
-            found = step_response(times, masses, resolution=self._step)
+            repeats = self._repeats if self._repeats > REPEATED else None
+            found = step_response(times, masses, resolution=self._step, repeats=repeats)
         except ValueError as error:
-            return DeviceCheck("lag", "warn", f"not measured: {error}", "repeat the check")
+            yield DeviceCheck("lag", "warn", f"not measured: {error}", "repeat the check")
+            return
         said = (
             f"{found.lag:.2f} ± {max(found.error, 0.01):.2f} s behind a load of {_g(found.step)} ({found.form}); "
             f"right: {SLOW:g} s or less"
         )
-        return DeviceCheck("lag", *_state(found.lag <= SLOW, said, "set a faster filter in its menu, then check again"))
+        yield DeviceCheck("lag", *_state(found.lag <= SLOW, said, "set a faster filter in its menu, then check again"))
+        yield self._dose(found)
+
+    def _dose(self, found: StepResponse) -> DeviceCheck:
+        tolerance = dose_tolerance(FLOW, found.error, self._gaps, self._step, self._noise)
+        said = f"±{_g(tolerance)} (95 %) can be met at {1e3 * FLOW:g} g/s at the end; right: {_g(DOSE)} or less"
+        advice = "weigh doses on a finer or faster balance, or ask for a wider tolerance"
+        return DeviceCheck("dose", *_state(tolerance <= DOSE, said, advice))
 
     def _reference(self, mass: float) -> DeviceCheck:
         weight = self._driver.weigh().mass
@@ -235,12 +303,12 @@ class EmulatedHands:
     """`CheckOperator` of a virtual balance.
 
     Attributes:
-        put_load: sets the mass on the balance from now on [kg].
+        put_load: sets the load on the balance from now on.
         receiver: mass of the empty receiver [kg].
         references: masses of the reference weights [kg].
     """
 
-    put_load: Callable[[float], None]
+    put_load: Callable[[Load], None]
     receiver: float = 0.15
     references: tuple[float, ...] = (0.05, 0.2, 0.5)
 
@@ -249,20 +317,25 @@ class EmulatedHands:
 
     def empty(self) -> None:
         """See `CheckOperator.empty`."""
-        self.put_load(0.0)
+        self.put_load(Load((0.0,), (0.0,)))
 
     def announce(self) -> None:
         """See `CheckOperator.announce`."""
 
     def put(self) -> None:
         """See `CheckOperator.put`."""
-        self.put_load(self.receiver)
+        self.put_load(Load((0.0,), (self.receiver,)))
+
+    def rise(self, mass: float, seconds: float) -> bool:
+        """See `CheckOperator.rise`."""
+        self.put_load(Load((0.0, seconds), (self.receiver, self.receiver + mass)))
+        return True
 
     def reference(self) -> float | None:
         """See `CheckOperator.reference`."""
         mass = next(self._left, None)
         if mass is not None:
-            self.put_load(mass)
+            self.put_load(Load((0.0,), (mass,)))
         return mass
 
     def move(self) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections import Counter, deque
 from dataclasses import dataclass
-from itertools import zip_longest
+from itertools import pairwise, zip_longest
 from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
@@ -52,6 +52,9 @@ class SettlingRule(Settings):
     steps: Annotated[float, Quantity("1", "1", 0.0, 100.0)] = 1.0
     """Largest difference between these readings, in steps of the display."""
 
+    hold: Annotated[Duration, NOT_IN_FINGERPRINT] = 1.5
+    """Time for which readings without flicker must last: some displays hold one for 1.1 s while the load moves."""
+
     deadline: PositiveDuration = 20.0
     """Maximum time for a weight to settle; then the weighing fails."""
 
@@ -61,7 +64,9 @@ class SettlingRule(Settings):
         Args:
             time_scale: bench seconds per second of the clock.
         """
-        return self.with_values(span=self.span / time_scale, deadline=self.deadline / time_scale)
+        return self.with_values(
+            span=self.span / time_scale, hold=self.hold / time_scale, deadline=self.deadline / time_scale
+        )
 
 
 @dataclass(frozen=True)
@@ -104,11 +109,13 @@ class Settling:
         allowed = self._rule.steps * step * (1.0 + 1e-9)
         while abs(self._spread()) > allowed:
             self._window.popleft()
-        first = self._window[0][0]
-        if len(self._window) < self._rule.readings or time - first < self._rule.span:
+        masses = [mass for _, mass in self._window]
+        changes = sum(before != after for before, after in pairwise(masses))
+        # a display that flickers is not held
+        span = self._rule.span if changes > 1 else max(self._rule.span, self._rule.hold)
+        if len(self._window) < self._rule.readings or time - self._window[0][0] < span:
             return None
-        masses = sorted(mass for _, mass in self._window)
-        return Settled(masses[len(masses) // 2], time, self._spread())
+        return Settled(sorted(masses)[len(masses) // 2], time, self._spread())
 
     def _spread(self) -> float:
         masses = [mass for _, mass in self._window]
@@ -334,6 +341,8 @@ class SerialBalanceSettings(BalanceSettings):
             self._check_line(problems)
         if self.settling.deadline <= self.settling.span:
             problems.add("nothing can settle: 'deadline' should be longer than 'span'", "settling")
+        elif self.settling.deadline <= self.settling.hold:
+            problems.add("nothing can settle: 'deadline' should be longer than 'hold'", "settling")
 
     def _check_port(self, problems: Problems, mode: str) -> None:
         if self.port and self.virtual is not None:

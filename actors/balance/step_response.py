@@ -4,6 +4,12 @@ The rise is compared with the step responses of the filters that balances have (
 and with unknown moment and duration of the placing. The result is a probability for every filter and lag: commissioning
 states its mean and deviation, closed-loop dosing draws from it. The module knows no balance.
 
+Some displays repeat their last reading while the load moves (`display_behaviour`). A reading r that equals the one
+before is then old with a probability p, and says nothing about the load: its likelihood is p + (1 − p) L(r), that of a
+changed reading (1 − p) L(r). Unless p is given, it is 0 as long as no reading in the middle of the rise is repeated.
+Otherwise it is unknown, and the result is averaged over the values `REPEATS`. A rise of few readings may have no repeat
+in its middle; then the stated error is too small unless p is given.
+
 Limitations: a pure delay before the display moves cannot be seen, because the moment of the placing is unknown.
 """
 
@@ -25,6 +31,12 @@ SMALLEST = 20.0
 MISFIT = 0.05
 """Largest root mean square difference between readings and model, as a fraction of the step."""
 
+REPEATS = (0.1, 0.3, 0.5, 0.7, 0.85)
+"""Probabilities of a repeated reading that are compared."""
+
+LONGEST_HOLD = 1.5
+"""Longest time for which a display may hold its reading [s]; 1.1 s were recorded (Kennedy et al. 2019)."""
+
 SCATTER = 0.006
 """Standard deviation of a reading besides the display's step, as a fraction of the step: the model's own error."""
 
@@ -42,6 +54,7 @@ class StepResponse:
         step: change of the load [kg].
         residual: root mean square difference between readings and likeliest model, during the rise [kg].
         probability: of every filter and lag (filters, lags), in the order of `FILTERS` and `LAGS`; the sum is 1.
+        repeats: probability that a reading repeats the one before instead of showing the load.
     """
 
     lag: float
@@ -51,15 +64,19 @@ class StepResponse:
     step: float
     residual: float
     probability: Floats
+    repeats: float = 0.0
 
 
-def step_response(times: Sequence[float], masses: Sequence[float], *, resolution: float) -> StepResponse:
+def step_response(
+    times: Sequence[float], masses: Sequence[float], *, resolution: float, repeats: float | None = None
+) -> StepResponse:
     """Compare the readings around one step of the load with the filters that a balance can have.
 
     Args:
         times: of the readings, increasing [s].
         masses: the readings, stable or not [kg]: some before the step, and some at rest after it.
         resolution: step of the display [kg].
+        repeats: probability that a reading repeats the one before; None: unknown.
 
     Returns:
         The lag. If the display moved between two readings, its lag is shorter than their interval can show: then
@@ -81,24 +98,39 @@ def step_response(times: Sequence[float], masses: Sequence[float], *, resolution
     rest = np.concatenate((np.diff(risen[:4]), np.diff(risen[-4:])))
     noise = float(np.median(np.abs(rest)))
     first = float(t[np.argmax(risen > max(0.01, 4.0 * noise))])
-    rise = (t > first - 0.3) & (np.cumsum(risen > 0.997) < 4)
-    t, risen = t[rise], risen[rise]
+    held = np.concatenate(([False], m[1:] == m[:-1]))
+    if repeats is None:
+        motion = 3.0 * resolution / abs(step) + 4.0 * noise
+        chances = np.array(REPEATS) if _holds(risen, held, motion) else np.zeros(1)
+    else:
+        chances = np.array([repeats])
+    if not chances.any():
+        held[:] = False
+    rise = (t > first - (LONGEST_HOLD if held.any() else 0.3)) & (np.cumsum(risen > 0.997) < 4)
+    t, risen, held = t[rise], risen[rise], held[rise]
     sigma = math.hypot(SCATTER, resolution / abs(step), noise)
     moments = first - np.arange(0.0, 1.5, MOMENT)
-    fits = []
+    fits, misfits = [], []
     for (_, response), lag in itertools.product(FILTERS.values(), LAGS):
         for duration in PLACING:
             place = (t[None, :] - moments[:, None]) / lag
             smooth = np.mean([response(place - part * duration / lag) for part in (0.1, 0.3, 0.5, 0.7, 0.9)], axis=0)
-            fits.append(-0.5 * np.sum(((smooth - risen) / sigma) ** 2, axis=1))
-    grid = np.array(fits).reshape(len(FILTERS), len(LAGS), -1)
-    residual = sigma * math.sqrt(-2.0 * float(grid.max()) / len(t))
+            squares = ((smooth - risen) / sigma) ** 2
+            misfits.append(np.sum(squares[:, ~held] if held.any() else squares, axis=1))
+            fits.append(_log_likelihood(misfits[-1], squares[:, held], chances, int(np.sum(~held))))
+    # (filters, lags, probabilities of a repeat, placings and moments)
+    grid = np.array(fits).reshape(len(FILTERS), len(LAGS), len(PLACING), len(chances), -1).swapaxes(2, 3)
+    grid = grid.reshape(len(FILTERS), len(LAGS), len(chances), -1)
+    place = np.unravel_index(int(grid.argmax()), grid.shape)
+    misfit = np.array(misfits).reshape(len(FILTERS), len(LAGS), -1)[place[0], place[1], place[3]]
+    residual = sigma * math.sqrt(float(misfit) / max(int(np.sum(~held)), 1))
     if residual > MISFIT + resolution / abs(step):
         raise ValueError(
             f"the readings do not follow one step (they differ by {1e3 * residual * abs(step):g} g from it); put the "
             "load on in one movement, and let go"
         )
-    evidence = np.exp(grid - grid.max()).sum(axis=2)
+    each = np.exp(grid - grid.max()).sum(axis=3)
+    evidence = each.sum(axis=2)
     probability = evidence / evidence.sum()
     of_lag = probability.sum(axis=0)
     mean = float(of_lag @ LAGS)
@@ -112,7 +144,34 @@ def step_response(times: Sequence[float], masses: Sequence[float], *, resolution
         step,
         residual * abs(step),
         probability,
+        float(chances @ each.sum(axis=(0, 1)) / each.sum()),
     )
+
+
+def _holds(risen: Floats, held: NDArray[np.bool_], motion: float) -> bool:
+    """Whether a reading within the rise is repeated, although the next change is larger than `motion`."""
+    # the display of a filter that overshoots may turn near the end
+    for i in np.flatnonzero(held & (risen > motion) & (risen < min(1.0 - motion, 0.9))):
+        later = risen[i + 1 :][~held[i + 1 :]]
+        if len(later) and later[0] - risen[i] > motion:
+            return True
+    return False
+
+
+def _log_likelihood(misfit: Floats, squares: Floats, chances: Floats, changed: int) -> Floats:
+    """Logarithm of the likelihood (chances, moments) of the readings.
+
+    Args:
+        misfit: sum of the squares of the changed readings (moments,).
+        squares: of the repeated readings (moments, readings).
+        chances: probabilities of a repeat.
+        changed: number of changed readings.
+    """
+    if not squares.shape[1]:
+        return np.asarray(-0.5 * misfit[None, :] + changed * np.log1p(-chances)[:, None])
+    p = chances[:, None, None]
+    old = np.log(p + (1.0 - p) * np.exp(-0.5 * squares)[None]).sum(axis=2)
+    return np.asarray(-0.5 * misfit[None, :] + changed * np.log1p(-chances)[:, None] + old)
 
 
 def _poles(roots: Sequence[complex]) -> Callable[[Floats], Floats]:

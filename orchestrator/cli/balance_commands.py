@@ -12,7 +12,12 @@ import dataclasses
 import json
 import sys
 import time
+<<<<<<< HEAD
 from collections.abc import Iterator, Sequence
+=======
+from collections.abc import Iterator
+from functools import partial
+>>>>>>> scales
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,8 +29,13 @@ from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, p
 if TYPE_CHECKING:
     from actors.balance.balance_check import CheckOperator
     from actors.balance.balance_settings import BalanceEmulator, SerialBalanceSettings
+<<<<<<< HEAD
     from actors.balance.line_explanation import DialectFit
     from actors.balance.line_recording import Capture, Recorder
+=======
+    from actors.balance.line_recording import Recorder
+    from actors.balance.scale_model import Load
+>>>>>>> scales
     from actors.interfaces import DeviceCheck
 
 CHECK_SCALE = 4.0
@@ -60,11 +70,11 @@ def check(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check a balance before the first pour: connection, noise, drift, lag, linearity, vibration by the moving arm.
+    """Check a balance before the first pour: connection, noise, drift, repeated readings, lag, linearity and vibration.
 
-    You put loads on and take them off as the command asks; have the empty receiver ready and, for the linearity,
-    weights of known mass. Every line shows the reading and the right value. The balance is tared, nothing else is
-    changed. For a virtual laboratory the loads are simulated. Exit code 1 if a check fails.
+    You put loads on and take them off as the command asks; have the empty receiver and a cup of water ready and, for
+    the linearity, weights of known mass. Every line shows the reading and the right value. The balance is tared,
+    nothing else is changed. For a virtual laboratory the loads are simulated. Exit code 1 if a check fails.
     """
     from actors.balance.balance_check import EmulatedHands, check_balance
     from orchestrator.cli.robot_commands import print_table
@@ -73,7 +83,7 @@ def check(
     with _settings(balance, given) as (spec, emulator), _tap(record, balance, emulator is not None) as tap:
         if emulator is None and not sys.stdin.isatty():
             raise RefusalError("the check asks for loads at a terminal, with nothing piped into it", BAD_INPUT)
-        hands: CheckOperator = Person() if emulator is None else EmulatedHands(emulator.put)
+        hands: CheckOperator = Person() if emulator is None else EmulatedHands(partial(_put, emulator))
         driver = _driver(spec, tap)
         try:
             for found in check_balance(
@@ -146,6 +156,7 @@ def record(
         print_message(f"{to}: {0 if tap is None else tap.count} bytes; {counts}")
 
 
+<<<<<<< HEAD
 def explain(
     file: Annotated[
         Path,
@@ -272,6 +283,11 @@ def _fit_in_json(fit: DialectFit) -> dict[str, Any]:
             for line, (reason, count) in fit.refused.items()
         ],
     }
+=======
+def _put(emulator: BalanceEmulator, load: Load) -> None:
+    """Set the load of an emulated balance from now on."""
+    emulator.order("put", {"times": list(load.times), "masses": list(load.masses)})
+>>>>>>> scales
 
 
 class Person:
@@ -288,6 +304,14 @@ class Person:
     def put(self) -> None:
         """See `CheckOperator.put`."""
         print_message("now")
+
+    def rise(self, mass: float, seconds: float) -> bool:
+        """See `CheckOperator.rise`."""
+        text = (
+            f"Leave the receiver on. Take {1e3 * mass:.0f} g of water or more in a cup. Press Enter, pour it slowly "
+            f"and steadily into the receiver, for {seconds:g} s; 'skip' without water: "
+        )
+        return _ask(text) != "skip"
 
     def reference(self) -> float | None:
         """See `CheckOperator.reference`."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from actors.balance.balance_check import EmulatedHands, check_balance
-from actors.balance.scale_model import SETTLED, ScaleSettings
+from actors.balance.scale_model import SETTLED, Load, ScaleSettings
 from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.interfaces import DeviceCheck
@@ -42,7 +42,18 @@ def checked() -> Iterator[Callable[..., dict[str, DeviceCheck]]]:
 @pytest.mark.slow
 def test_a_healthy_balance_passes_and_each_finding_says_what_is_right(checked):
     found = checked(ScaleSettings(settling_time=1.5))
-    names = ["balance", "readings", "noise", "drift", "lag", "return to zero", "linearity", "vibration"]
+    names = [
+        "balance",
+        "readings",
+        "noise",
+        "drift",
+        "repeats",
+        "lag",
+        "dose",
+        "return to zero",
+        "linearity",
+        "vibration",
+    ]
     assert sorted(found) == sorted(names)
     assert {check.state for check in found.values()} == {"ok"}, found
     assert all("right: " in check.found for name, check in found.items() if name != "balance")
@@ -66,7 +77,7 @@ class WrongWeights(EmulatedHands):
     def reference(self) -> float | None:
         mass = super().reference()
         if mass is not None:
-            self.put_load(mass + 2e-3)
+            self.put_load(Load((0.0,), (mass + 2e-3,)))
         return mass
 
 

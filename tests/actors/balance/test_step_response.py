@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from actors.balance.display_behaviour import DisplayBehaviour, DisplayModel
 from actors.balance.scale_model import SETTLED, EmulatedScale, Load, ScaleSettings
 from actors.balance.step_response import step_response
 from tests.support.hypothesis_examples import examples
@@ -85,3 +86,29 @@ def test_the_emulated_scale_has_the_lag_that_its_data_sheet_says():
 def test_readings_that_are_no_step_are_refused(masses, said):
     with pytest.raises(ValueError, match=said):
         step_response([0.1 * i for i in range(len(masses))], masses, resolution=1e-4)
+
+
+def held(times, masses, probability, seed):
+    """The readings as a display shows them that repeats some, at most five in a row."""
+    display = DisplayModel(DisplayBehaviour(repeat_probability=probability), 1e-4, (seed,))
+    return times, [display.show(lambda mass=mass: mass) for mass in masses]
+
+
+@pytest.mark.parametrize("probability", [0.42, 0.6])
+def test_a_display_that_repeats_readings_has_its_lag_within_the_stated_error(probability):
+    """Taken as new, the repeated readings are no step at all, or give a lag that is wrong by more than stated."""
+    found = [
+        step_response(*held(*readings("first order", 0.4, put=1.0 + 0.02 * seed), probability, seed), resolution=1e-4)
+        for seed in range(5)
+    ]
+    assert all(abs(one.lag - 0.4) < 3.0 * one.error for one in found)
+    assert all(one.error < 0.15 for one in found)
+    assert np.mean([one.repeats for one in found]) == pytest.approx(probability, abs=0.2)
+
+
+def test_a_known_share_of_repeats_widens_the_error_of_a_rise_without_any():
+    times, masses = readings("first order", 0.2, interval=0.2)
+    plain, wide = (step_response(times, masses, resolution=1e-4, repeats=p) for p in (0.0, 0.6))
+    assert plain.repeats == 0.0
+    assert wide.error > 2.0 * plain.error
+    assert step_response(times, masses, resolution=1e-4).lag == plain.lag
