@@ -12,12 +12,8 @@ import dataclasses
 import json
 import sys
 import time
-<<<<<<< HEAD
 from collections.abc import Iterator, Sequence
-=======
-from collections.abc import Iterator
 from functools import partial
->>>>>>> scales
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,13 +25,9 @@ from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, p
 if TYPE_CHECKING:
     from actors.balance.balance_check import CheckOperator
     from actors.balance.balance_settings import BalanceEmulator, SerialBalanceSettings
-<<<<<<< HEAD
     from actors.balance.line_explanation import DialectFit
     from actors.balance.line_recording import Capture, Recorder
-=======
-    from actors.balance.line_recording import Recorder
     from actors.balance.scale_model import Load
->>>>>>> scales
     from actors.interfaces import DeviceCheck
 
 CHECK_SCALE = 4.0
@@ -156,7 +148,6 @@ def record(
         print_message(f"{to}: {0 if tap is None else tap.count} bytes; {counts}")
 
 
-<<<<<<< HEAD
 def explain(
     file: Annotated[
         Path,
@@ -283,11 +274,7 @@ def _fit_in_json(fit: DialectFit) -> dict[str, Any]:
             for line, (reason, count) in fit.refused.items()
         ],
     }
-=======
-def _put(emulator: BalanceEmulator, load: Load) -> None:
-    """Set the load of an emulated balance from now on."""
-    emulator.order("put", {"times": list(load.times), "masses": list(load.masses)})
->>>>>>> scales
+    from actors.balance.scale_model import Load
 
 
 class Person:
