@@ -12,7 +12,7 @@ Source: averaging over hyperparameters: Rasmussen & Williams, Gaussian Processes
 BoTorch's fully Bayesian models (Eriksson & Jankowiak, High-dimensional Bayesian optimization with sparse axis-aligned
 subspaces, UAI 2021), which draw with a Markov chain. Too narrow plug-in intervals and leave-one-out coverage: Acharki,
 Bertoncello & Garnier, Robust prediction interval estimation for Gaussian processes by cross-validation method, 2023.
-Uncertain mean: section 2.7 of Rasmussen & Williams. Coverage on recorded transfers: docs/evidence/real-recordings.md.
+Uncertain mean: section 2.7 of Rasmussen & Williams. Coverage on recorded transfers: docs/evidence/recordings.md.
 
 Limitations: kernel and priors are those of the surrogate. A cost that is larger at a corner than all observations
 suggest stays outside.
