@@ -1,7 +1,7 @@
 """Pour doses with balances that repeat, delay and lose readings, beside an earlier version of the dosing code.
 
-    python benchmarks/dosing_balances.py --final --json     # the table of the evidence page: docs/data/dosing-balances.json
-    python benchmarks/dosing_balances.py --series 10        # development seeds, for tuning
+    python benchmarks/dosing_balances.py --final --json   # the evidence page's table: docs/data/dosing-balances.json
+    python benchmarks/dosing_balances.py --series 10      # development seeds, for tuning
 
 Every series is two doses of 100 g from the round beaker, whose outflow, lip and balance's filter the seed draws as in
 `benchmarks/dosing.py`. What differs between the rows is the display. The final seeds begin at 30000; development uses

@@ -160,7 +160,8 @@ class Repeats:
         """Probabilities of `REPEATS`."""
         log = self._log[self._state if state is None else state]
         weights: Floats = np.exp(log - log.max())
-        return weights / weights.sum()
+        weights /= weights.sum()
+        return weights
 
     @property
     def next(self) -> float:

@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,7 +132,7 @@ class DoseBelief:
     volume: Floats
     aim: float = FIRST_AIM
     doses: int = 0
-    display: DisplayBelief = DisplayBelief()
+    display: DisplayBelief = field(default_factory=DisplayBelief)
 
     @classmethod
     def prior(

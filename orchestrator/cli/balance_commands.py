@@ -274,7 +274,11 @@ def _fit_in_json(fit: DialectFit) -> dict[str, Any]:
             for line, (reason, count) in fit.refused.items()
         ],
     }
-    from actors.balance.scale_model import Load
+
+
+def _put(emulator: BalanceEmulator, load: Load) -> None:
+    """Set the load of an emulated balance from now on."""
+    emulator.order("put", {"times": list(load.times), "masses": list(load.masses)})
 
 
 class Person:

@@ -322,8 +322,8 @@ class PlannedOrder:
 
         Returns:
             'amount_g', 'interval_g' (90 %), 'spilled_g', 'duration_s', and for an amount 'error_g',
-            'error_interval_g', 'reachable_tolerance_g' (half of the 90 % interval of the dose as weighed with this balance),
-            'enough' (probability that the source holds it) and 'ends'.
+            'error_interval_g', 'reachable_tolerance_g' (half of the 90 % interval of the dose as weighed with this
+            balance), 'enough' (probability that the source holds it) and 'ends'.
 
         Raises:
             InvalidActionError: the pour can't be made.
