@@ -61,9 +61,9 @@ decant validate-solver --full --write docs
 ```
 
 Measured outside, on recordings that may not be redistributed (Kennedy et al. 2019, precision pouring, University of
-Pennsylvania; four vessels of 184 to 624 mL, slow tilts): particles hold 0.7 to 1.3 % of the capacity more than measured,
-plain hydrostatics 0.6 to 2.0 % less. A robot's pour of 106 g: RMS 2.2 g on a balance with 2 g steps, final amount 2 %
-short, onset within 0.7°. No test repeats this ([real recordings](recordings.md)).
+Pennsylvania; four vessels of 184 to 624 mL, slow tilts): particles hold 0.7 to 1.3 % of the capacity more than
+measured, plain hydrostatics 0.6 to 2.0 % less. A robot's pour of 106 g: RMS 2.2 g on a balance with 2 g steps, final
+amount 2 % short, onset within 0.7°. No test repeats this ([real recordings](recordings.md)).
 
 θ of all cases unless they say otherwise: {theta}.
 N is the number of particles.
