@@ -226,7 +226,8 @@ def replay_text(found: PourReplay) -> str:
     ]
     source = f" from {', '.join(fitted['on'])}" if fitted["on"] else ""
     kept = f"; given{source}: {', '.join(given)}" if given else ""
-    lines.append(f"  fitted here: lag {lag[0]:.2f} s ({lag[1]:.2f} to {lag[2]:.2f} s){kept}")
+    where = "fitted here" if found.values.lag is None else "given, and corrected by the readings"
+    lines.append(f"  lag {lag[0]:.2f} s ({lag[1]:.2f} to {lag[2]:.2f} s), {where}{kept}")
     lines.append(
         f"  readings: every {read['interval_s']:.3g} s, longest gap {read['longest_gap_s']:.2g} s, "
         f"{read['repeated']} of {read['rising']} repeat the one before while the mass rises"
