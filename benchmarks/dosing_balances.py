@@ -223,14 +223,14 @@ def main() -> None:
     parser.add_argument("--series", type=int, default=SERIES, help="number of series of two doses")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="first development seed")
     parser.add_argument("--rows", type=int, nargs="*", help="numbers of rows, from 0")
-    parser.add_argument("--before", default="", metavar="COMMIT", help="pour with the dosing code of a commit, too")
+    parser.add_argument("--before", default="", metavar="COMMIT", help="pour with the code of a commit, too; -: none")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument(
         "--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}; implies --before {BEFORE}"
     )
     options = parser.parse_args()
     first = FIRST_FINAL_SEED if options.final else options.first
-    before = options.before or (BEFORE if options.json else "")
+    before = "" if options.before == "-" else options.before or (BEFORE if options.json else "")
     names = list(DISPLAYS) if options.rows is None else [list(DISPLAYS)[k] for k in options.rows]
     data = json.loads(DATA.read_text(encoding="utf-8")) if options.json and DATA.exists() else {"rows": {}}
     print(HEAD, flush=True)
@@ -247,7 +247,7 @@ def main() -> None:
                 found["before" if commit else "now"] = figures(poured) | {"ends": _ends(poured)}
                 print(row(name + (f" @{commit}" if commit else ""), found["before" if commit else "now"]), flush=True)
             if options.json:
-                about = {"seeds": [first, first + options.series - 1], "before": before}
+                about = {"seeds": [first, first + options.series - 1]}
                 data["rows"][name] = found | about
                 DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 

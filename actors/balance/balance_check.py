@@ -20,6 +20,7 @@ from actors.balance.balance_interface import BalanceDriver, Weight
 from actors.balance.display_quality import arrivals, dose_tolerance, repeated_readings, smallest_change
 from actors.balance.scale_model import Load
 from actors.balance.step_response import StepResponse, step_response
+from actors.dosing.dosing_settings import DosingSettings
 from actors.interfaces import DeviceCheck, LaboratoryError, State
 
 REST_TIME = 20.0
@@ -37,8 +38,8 @@ RISE_TIME = 10.0
 RISE_STEPS = 1.5
 """Rise per reading of that load, in display steps."""
 
-FLOW = 8e-3
-"""Flow at the end of a dose for which its tolerance is stated: `DosingSettings.largest_fine_flow` [kg/s]."""
+FLOW = DosingSettings().largest_fine_flow
+"""Flow at the end of a dose for which its tolerance is stated [kg/s]."""
 
 SLOW = 1.0
 """Lag beyond which a dose is stopped late [s]."""

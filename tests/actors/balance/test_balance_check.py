@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 
 import pytest
 
 from actors.balance.balance_check import EmulatedHands, check_balance
+from actors.balance.display_behaviour import DisplayBehaviour
 from actors.balance.scale_model import SETTLED, Load, ScaleSettings
 from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
@@ -69,6 +71,18 @@ def test_a_slow_and_drifting_balance_is_named_with_what_to_do(checked):
     assert found["drift"].state == "warn"
     assert float(found["drift"].found.split(" ")[0]) == pytest.approx(1.2, abs=0.15)
     assert "warm up" in found["drift"].advice
+
+
+@pytest.mark.slow
+def test_a_display_that_repeats_its_readings_is_named_with_the_tolerance_it_permits(checked):
+    found = checked(ScaleSettings(settling_time=1.5, behaviour=DisplayBehaviour(repeat_probability=0.6)))
+    assert found["repeats"].state == "warn"
+    low, high = (float(text) / 100 for text in re.findall(r"(\d+) to (\d+) %", found["repeats"].found)[0])
+    assert low - 0.05 < 0.6 < high + 0.1
+    tolerance = float(found["dose"].found.split(" ")[0].removeprefix("±"))
+    assert tolerance > 0.65, "an ideal display permits 0.57 g"
+    lag, error = (float(part) for part in found["lag"].found.split(" s ")[0].split(" ± "))
+    assert lag == pytest.approx(1.5 / SETTLED, abs=3.0 * error + 0.1)
 
 
 class WrongWeights(EmulatedHands):
