@@ -101,7 +101,7 @@ def test_the_driver_weighs_what_was_recorded(tmp_path):
 @pytest.mark.realtime
 def test_a_unit_that_lost_a_letter_once_is_no_other_unit(tmp_path):
     path = tmp_path / "damaged.jsonl"
-    lines = [b"S S 0.01230 kg", b"S S 0.01230 k", b"S S 12.30 g", *[b"S S 0.01230 kg"] * 6]
+    lines = [b"S S 0.01230 kg", b"S S 0.01230 k", b"S S 12.30 g", *[b"S S 0.01230 kg"] * 40]  # longer than `hold`
     events = [
         event
         for i, line in enumerate(lines)
