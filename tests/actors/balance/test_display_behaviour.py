@@ -2,7 +2,7 @@
 
 The recordings of Bluetooth balances in github.com/miharekar/visualizer have gaps with medians of 0.09 to 0.12 s,
 standard deviations of 0.021 to 0.046 s, and largest values of 0.22 to 0.46 s; in one of the six, 22 % of the readings
-repeat the one before while the load rises, up to 4 in a row, and in the others 1 to 4 %.
+repeat the one before while the load rises, up to 4 in a row, and in the others 0 to 6 %.
 """
 
 from __future__ import annotations
