@@ -15,7 +15,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 import decant
-from orchestrator.config.file_loading import load_parameters, load_campaign
+from orchestrator.config.file_loading import load_campaign, load_parameters
 from orchestrator.journal.run_record import read_result
 from orchestrator.results import figure_style as style
 from orchestrator.results.pour_figures import simulation_figure
