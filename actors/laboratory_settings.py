@@ -29,7 +29,7 @@ from actors.liquid_devices import (
     SpillSensorSettings,
     check_devices,
 )
-from sim_engine.liquids import RETIRED_PARAMETERS, SimulationParameters
+from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.settings.model import (
     NOT_IN_FINGERPRINT,
@@ -94,8 +94,6 @@ class BenchBalance(Settings):
 
 class HiddenLiquidBase(Settings):
     """θ of the 'real' liquid of the virtual bench. Hidden: calibration never reads it."""
-
-    retired: ClassVar[dict[str, str]] = RETIRED_PARAMETERS
 
     def parameters(self) -> SimulationParameters:
         """The hidden θ."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.config.file_loading import recorded_campaign
+from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.codec import Results
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.run_record import CampaignResult, Row, answers, pour_row, read_record, read_result
@@ -260,7 +260,7 @@ def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run
     folder = Path(directory).expanduser()
     if not (folder / JOURNAL_NAME).is_file():
         raise FileNotFoundError(f"{folder}: there is no run in this folder (no {JOURNAL_NAME})")
-    plan = recorded_campaign(folder / "resolved.json") if campaign is None else campaign
+    plan = load_campaign(folder / "resolved.json") if campaign is None else campaign
     return Run(plan, read_result(folder))
 
 

@@ -15,7 +15,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 import decant
-from orchestrator.config.file_loading import load_parameters, recorded_campaign
+from orchestrator.config.file_loading import load_campaign, load_parameters
 from orchestrator.journal.run_record import read_result
 from orchestrator.results import figure_style as style
 from orchestrator.results.pour_figures import simulation_figure
@@ -36,7 +36,7 @@ DPI, TEXT = 100, 13.0
 
 def main(run: Path) -> None:
     """Draw all parts in the same resolution, so that nothing is scaled."""
-    plan, results = recorded_campaign(run / RESOLVED), read_result(run).results
+    plan, results = load_campaign(run / RESOLVED), read_result(run).results
     figures = figures_of(plan, results)
     (deployed,) = deployments_of(results).values()
     assert deployed.recommended is not None

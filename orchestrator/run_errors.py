@@ -9,7 +9,7 @@ class RunError(DecantError):
     """A run can't begin or continue. The text is for the user who can fix the cause.
 
     Attributes:
-        exit_code: of the command line: 1 failed, 3 an answer of the operator is needed.
+        exit_code: of the command line: 1 failed, 2 bad input, 3 an answer of the operator is needed.
     """
 
     exit_code = 1

@@ -255,9 +255,6 @@ class SimulationParameters(BaseModel):
         return cls.model_validate(rounded)
 
 
-RETIRED_PARAMETERS = {"viscosity": "xsph_rate", "eddies": "smagorinsky_constant", "lip_drop": "rim_correction"}
-"""Names that earlier versions had for parameters, and the present ones."""
-
 ROOM = 20.0
 """Default temperature [°C]."""
 

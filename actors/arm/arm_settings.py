@@ -119,7 +119,6 @@ class ArmSettings(Settings):
 
     tag: ClassVar[str] = "kind"
     default_tag: ClassVar[str] = "ur"
-    retired: ClassVar[dict[str, str]] = {"kind: numbers": "kind: simulated"}
 
     doses: ClassVar[bool] = False
     """Whether the driver pours wanted amounts, see `actors.arm.arm_interface.DosingArm`."""
@@ -266,10 +265,6 @@ _LIMITS = "{box: {low: {x: …, y: …, z: …}, high: {x: …, y: …, z: …}}
 class UrArmSettings(ArmSettings):
     """A UR arm that holds the pourer."""
 
-    retired: ClassVar[dict[str, str]] = ArmSettings.retired | {
-        "untilt_speed": "upright_speed",
-        "announcement": "warning_time",
-    }
     doses: ClassVar[bool] = True
     emulator: ClassVar[str] = "actors.emulators.ur_controller.arm_emulator:UrEmulator"
 

@@ -172,7 +172,6 @@ class BalanceSettings(Settings):
 
     tag: ClassVar[str] = "kind"
     default_tag: ClassVar[str] = "serial"
-    retired: ClassVar[dict[str, str]] = {"kind: numbers": "kind: simulated"}
 
     receives_load: ClassVar[bool] = False
     """Whether, on a virtual bench, the driver itself receives the load instead of an emulator. It then has `prepare`

@@ -30,11 +30,10 @@ from orchestrator.cli import (
     vessel_command,
     view_command,
 )
-from orchestrator.cli.command_options import Command, Commands, command, examples
+from orchestrator.cli.command_options import command, examples
 
 app = typer.Typer(
     name="decant",
-    cls=Commands,
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
@@ -78,7 +77,7 @@ def _group(name: str, text: str, *shown: str) -> typer.Typer:
         shown: examples: how its commands are used together.
     """
     group = typer.Typer(
-        name=name, cls=Commands, no_args_is_help=True, rich_markup_mode="markdown", help=text, epilog=examples(*shown)
+        name=name, no_args_is_help=True, rich_markup_mode="markdown", help=text, epilog=examples(*shown)
     )
     app.add_typer(group)
     return group
@@ -90,6 +89,7 @@ def _add(
     name: str | None = None,
     to: typer.Typer = app,
     unknown_options: bool = False,
+    quiet: bool = False,
 ) -> None:
     """Add a command.
 
@@ -99,10 +99,11 @@ def _add(
         name: name of the command; None: that of the function.
         to: the group that it belongs to.
         unknown_options: whether unknown options are taken as words instead of being refused.
+        quiet: whether it has the option `--quiet`.
     """
     settings = {"ignore_unknown_options": unknown_options}
-    add = to.command(name or work.__name__, cls=Command, context_settings=settings, epilog=examples(*shown))
-    add(command(work))
+    add = to.command(name or work.__name__, context_settings=settings, epilog=examples(*shown))
+    add(command(work, quiet=quiet))
 
 
 _add(
@@ -110,25 +111,30 @@ _add(
     "decant run configs/campaigns/quickstart.yaml",
     "decant run configs/campaigns/quickstart.yaml --live   # open the printed address in a browser",
     "decant run my.yaml --resume   # after a stop, a crash or a power failure; finished work is not repeated",
+    quiet=True,
 )
 _add(
     campaign_commands.calibrate,
     "decant calibrate configs/campaigns/recorded.yaml --json",
     "decant calibrate my.yaml && decant plan my.yaml --parameters runs/my-20300131-1/theta.json",
+    quiet=True,
 )
 _add(
     campaign_commands.plan,
     "decant plan my.yaml --parameters theta.json",
     "decant plan my.yaml --parameters theta.json --receiver vase.yaml --json",
+    quiet=True,
 )
 _add(
     simulate_command.simulate,
     "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
     "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
     "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
+    quiet=True,
 )
-_add(file_commands.validate, "decant validate my.yaml vase.yaml", "decant validate configs/campaigns/*.yaml")
-_add(file_commands.migrate, "decant migrate my.yaml rig.yaml   # keep a copy: the files are rewritten")
+_add(
+    file_commands.validate, "decant validate my.yaml vase.yaml", "decant validate configs/campaigns/*.yaml", quiet=True
+)
 _add(file_commands.init, "decant init lab", "decant run lab/campaigns/quickstart.yaml")
 _add(file_commands.schema, "decant schema > campaign.json", "decant schema result > result.json")
 _add(
@@ -136,23 +142,27 @@ _add(
     "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --dry-run --png path.png",
     "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --empty --slow 0.2 --enable-motion",
     "decant pour my.yaml --set angular_velocity=20 --set x_offset=100 --enable-motion",
+    quiet=True,
 )
 _add(
     dose_command.dose,
     "decant dose my.yaml --laboratory configs/laboratories/twin.yaml --amount '50 g' --dry-run",
     "decant dose my.yaml --laboratory configs/laboratories/twin.yaml --amount '50 g' --amount '25 g' --tolerance '1 g'",
+    quiet=True,
 )
 _add(
     report_command.report,
     "decant report quickstart-20300131-1              # a run in the folder runs/",
     "decant report runs/quickstart-20300131-1 --pdf -o for-the-lab-meeting.html",
     "decant report configs/studies/quick.yaml         # or the study's folder",
+    quiet=True,
 )
 _add(
     view_command.view,
     "decant view quickstart-20300131-1                    # a run of the folder runs/",
     "decant view runs/first runs/second                   # side by side",
     "decant view runs/first --pour 7 --particles 5000     # simulate pour 7 again with 5000 particles",
+    quiet=True,
 )
 _add(file_commands.plugins, "decant plugins", "decant plugins --json")
 
@@ -161,6 +171,7 @@ _add(
     "decant vessel cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
     "decant vessel cup.yaml --photo side.png --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
     "decant vessel mug.yaml --mesh scan.stl --wall '3 mm'",
+    quiet=True,
 )
 
 
@@ -187,8 +198,9 @@ _add(
     "decant study run configs/studies/paper.yaml --jobs 2    # continues a stopped study",
     name="run",
     to=_study,
+    quiet=True,
 )
-_add(study_command.report_study, "decant study report configs/studies/quick.yaml", name="report", to=_study)
+_add(study_command.report_study, "decant study report configs/studies/quick.yaml", name="report", to=_study, quiet=True)
 
 _robot = _group(
     "robot",
@@ -256,18 +268,21 @@ _add(
     recording_commands.export,
     "decant recording export dispense-20300131-1   # a run in the folder runs/",
     to=_recording,
+    quiet=True,
 )
 _add(
     recording_commands.replay,
     "decant recording replay configs/recordings/dose-1.yaml --png pictures",
     "decant recording replay day-one/ --fitted fit.json",
     to=_recording,
+    quiet=True,
 )
 _add(
     recording_commands.fit,
     "decant recording fit day-one/ --unknown grip --unknown lag --judge day-two/ --output fit.json",
     "decant recording fit configs/recordings/dose-1.yaml --until '5 s'   # judged on the rest",
     to=_recording,
+    quiet=True,
 )
 
 _server = _group(

@@ -20,7 +20,6 @@ from orchestrator.cli.command_options import (
     LiveAt,
     OtherLaboratory,
     Parameters,
-    Quiet,
     Receiver,
     Resume,
     RunId,
@@ -65,7 +64,6 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         laboratory: OtherLaboratory = None,
         seed: Seed = None,
         as_json: Json = False,
-        quiet: Quiet = False,
     ) -> None:
         from orchestrator.cli.foreground_run import (
             check_campaign_can_run,
@@ -179,7 +177,6 @@ def plan(
     laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Plan a pour in simulation (D1), for the campaign's receivers or for a new one.
 

@@ -1,18 +1,14 @@
-"""Arguments and options that several commands share, and the classes of the application's commands.
-
-`command` turns a function with such parameters into a command. `Commands` and `Command` refuse names that earlier
-versions used, and give the new name (`RETIRED_COMMANDS`, `RETIRED_OPTIONS`).
-"""
+"""Arguments and options that several commands share. `command` turns a function with such parameters into a command."""
 
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
 
 from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail, set_quiet
 from orchestrator.cli.shell_completion import files_of, local_runs
@@ -50,15 +46,6 @@ OtherLaboratory = Annotated[
         help="Laboratory file (YAML) instead of the campaign's.",
         show_default=False,
         autocompletion=files_of("laboratory"),
-    ),
-]
-Quiet = Annotated[
-    bool,
-    typer.Option(
-        "--quiet",
-        "-q",
-        callback=set_quiet,
-        help="Print only results, questions, warnings and errors: no progress, no notes.",
     ),
 ]
 Seed = Annotated[
@@ -122,56 +109,20 @@ Receiver = Annotated[
         autocompletion=files_of("vessel"),
     ),
 ]
-
-
-RETIRED_COMMANDS = {
-    "serve": "server start",
-    "shutdown": "server stop",
-    **{
-        name: f"queue {name}"
-        for name in ("submit", "list", "show", "logs", "pause", "resume", "stop", "answer", "move")
-    },
-    "arm": "queue enable",
-    "enable": "queue enable",
-    "abort": "estop (or queue abort CAMPAIGN_ID, for one campaign)",
-    "doctor": "robot check",
-    "jog": "robot jog",
-    "physics": "validate-solver",
-}
-"""Commands of earlier versions, with their new names."""
-
-RETIRED_OPTIONS = {"--arm": "--enable-motion", "--verb": "--task"}
-"""Options of earlier versions, with their new names."""
-
-
-class Commands(TyperGroup):
-    """A group of commands."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse a retired command."""
-        if args and args[0] not in self.commands:
-            if ctx.parent is None and args[0] in RETIRED_COMMANDS:
-                _refuse(f"decant {args[0]}", f"decant {RETIRED_COMMANDS[args[0]]}")
-            if self.name == "study" and args[0].endswith((".yaml", ".yml")):
-                _refuse("decant study FILE", "decant study run FILE")
-        return super().parse_args(ctx, args)
-
-
-class Command(TyperCommand):
-    """One command."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Refuse retired options."""
-        known = {name for parameter in self.params for name in parameter.opts}
-        options = (arg.partition("=")[0] for arg in args[: args.index("--") if "--" in args else len(args)])
-        for option in options:
-            if option in RETIRED_OPTIONS and option not in known:
-                _refuse(option, RETIRED_OPTIONS[option])
-        return super().parse_args(ctx, args)
-
-
-def _refuse(old: str, new: str) -> None:
-    fail(RefusalError(f"{old}: is called {new} now", BAD_INPUT))
+_QUIET = inspect.Parameter(
+    "quiet",
+    inspect.Parameter.KEYWORD_ONLY,
+    default=False,
+    annotation=Annotated[
+        bool,
+        typer.Option(
+            "--quiet",
+            "-q",
+            callback=set_quiet,
+            help="Print only results, questions, warnings and errors: no progress, no notes.",
+        ),
+    ],
+)
 
 
 def examples(*commands: str) -> str:
@@ -207,14 +158,25 @@ def call(work: Callable[..., None], /, *args: Any, **kwargs: Any) -> None:
         fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
 
 
-def command(work: Callable[..., None]) -> Callable[..., None]:
+def command(work: Callable[..., None], *, quiet: bool = False) -> Callable[..., None]:
     """Make a command of a function whose parameters declare its arguments and options.
 
-    The command does what `call` does; `--quiet` has been applied by its own callback.
+    The command does what `call` does.
+
+    Args:
+        work: the function.
+        quiet: whether the command has the option `--quiet`. The option's callback applies it; the function doesn't
+            get it.
     """
 
     @functools.wraps(work)
     def run(*args: Any, **kwargs: Any) -> None:
+        kwargs.pop(_QUIET.name, None)
         call(work, *args, **kwargs)
 
+    if quiet:
+        own = inspect.signature(work, eval_str=True)
+        parameters = [*own.parameters.values(), _QUIET]
+        run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {one.name: one.annotation for one in parameters}
     return run

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Campaign, InProcess, Json, OtherLaboratory, Quiet, Seed
+from orchestrator.cli.command_options import Campaign, InProcess, Json, OtherLaboratory, Seed
 from orchestrator.cli.console import (
     BAD_INPUT,
     FAILED,
@@ -60,7 +60,6 @@ def dose(
     laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Pour wanted amounts: the tilt is decided from the balance while the liquid flows.
 

@@ -1,7 +1,6 @@
-"""The commands for files: `decant validate`, `migrate`, `init`, `schema` and `plugins`.
+"""The commands for files: `decant validate`, `init`, `schema` and `plugins`.
 
 - `validate` reads files, builds vessels and tries actions; it starts nothing.
-- `migrate` rewrites files of earlier versions.
 - `init` copies example files into a folder.
 - `schema` prints JSON schemas.
 - `plugins` lists the plug-ins of installed packages, including those that can't be used.
@@ -11,13 +10,12 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, Quiet
+from orchestrator.cli.command_options import Json
 from orchestrator.cli.console import (
     BAD_INPUT,
     FAILED,
@@ -34,7 +32,6 @@ def validate(
         list[Path],
         typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files.", show_default=False),
     ],
-    quiet: Quiet = False,
 ) -> None:
     """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured."""
     from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -102,56 +99,6 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             for text in dict.fromkeys(warned):
                 print_note(text)
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
-
-
-def migrate(
-    files: Annotated[
-        list[Path],
-        typer.Argument(help="Campaign, study, vessel, laboratory, daemon or θ files; rewritten.", show_default=False),
-    ],
-) -> None:
-    """Rename what earlier versions called otherwise, in place; comments and layout stay."""
-    from orchestrator.config.file_loading import load_campaign, load_laboratory, load_parameters, load_vessel
-    from orchestrator.config.migration import migrate_file
-    from orchestrator.config.yaml.file_access import resolved
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.config.yaml.yaml_source import Document, kind_of
-
-    def load_study(path: Path) -> object:
-        from orchestrator.study.study_file import load_study
-
-        return load_study(path)
-
-    def load_daemon(path: Path) -> object:
-        from orchestrator.daemon.daemon_settings import load_settings
-
-        return load_settings(path)
-
-    kinds: dict[str, Callable[[Path], object]] = {
-        "vessel": load_vessel,
-        "laboratory": load_laboratory,
-        "study": load_study,
-        "campaign": load_campaign,
-        "daemon": load_daemon,
-    }
-    left = 0
-    for path in files:
-        try:
-            kind = kind_of(Document.read(resolved(path)).data)
-            result = migrate_file(path, load_parameters if kind is None else kinds[kind])
-        except (ConfigError, OSError) as error:
-            print_message(str(error))
-            left += 1
-            continue
-        for line, old, new in result.renamed:
-            print(f"{path}:{line}: {old} -> {new}")
-        if not result.renamed and not result.problems:
-            print(f"{path}: nothing to rename")
-        if result.problems:
-            left += 1
-            print_message("\n".join(map(str, result.problems)))
-    if left:
-        raise RefusalError(f"{left} of {len(files)} file(s) have problems that can't be solved by renaming", BAD_INPUT)
 
 
 def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one that does not exist yet.")]) -> None:

@@ -408,8 +408,6 @@ class RunCheckOutput(_Output):
 
     problems: list[str]
     entries: int
-    entries_without_chain: int
-    """Entries of older versions, which have no hash chain."""
 
     pours: list[str]
 

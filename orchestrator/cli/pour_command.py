@@ -21,7 +21,6 @@ from orchestrator.cli.command_options import (
     InProcess,
     Json,
     OtherLaboratory,
-    Quiet,
     SceneName,
 )
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message, print_note
@@ -57,7 +56,6 @@ def pour(
     in_process: InProcess = False,
     enable_motion: EnableMotion = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Pour once with a given action on the campaign's bench, only plan the pour, or try it with an empty pourer.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, Parameters, Quiet
+from orchestrator.cli.command_options import Json, Parameters
 from orchestrator.cli.console import (
     BAD_INPUT,
     FAILED,
@@ -47,7 +47,6 @@ def export(
         Path | None, typer.Option(help="Folder for the files; default: 'recordings' in the run's folder.")
     ] = None,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Write the weighed pours and doses of a run as recorded pours, from its journal.
 
@@ -88,7 +87,6 @@ def replay(
         Path | None, typer.Option(help="Folder for a picture of each pour: NAME.png.", show_default=False)
     ] = None,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Replay recorded pours: simulate the recorded tilt, run the dosing estimator over the readings, and compare.
 
@@ -154,7 +152,6 @@ def fit(
         Path | None, typer.Option("--output", "-o", help="Write the values to this JSON file.", show_default=False)
     ] = None,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Fit unknown quantities that recorded pours share, with 90 % intervals, and judge the fit on other readings.
 

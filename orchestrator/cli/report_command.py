@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, Quiet
+from orchestrator.cli.command_options import Json
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
 from orchestrator.cli.shell_completion import RUNS, files_of, local_runs
 
@@ -28,7 +28,6 @@ def report(
     ] = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also write every figure of a run as PDF, for LaTeX.")] = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Write the report of a run or a study: one self-contained HTML file, suitable for printing.
 
@@ -70,22 +69,24 @@ def _nothing_there(folder: Path) -> str:
 
 
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
-    from orchestrator.config.file_loading import recorded_campaign
+    from orchestrator.config.file_loading import load_campaign
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from orchestrator.journal.journal import JOURNAL_NAME
     from orchestrator.journal.journal_check import check_journal
+    from orchestrator.journal.journal_file import JournalFormatError
     from orchestrator.journal.run_record import read_result
     from orchestrator.results.html_report import REPORT_NAME
     from orchestrator.results.publishing import publish_if_missing, report_on, write_reduced_report
     from orchestrator.run_errors import RunError
     from orchestrator.runs.run_folder import RESOLVED, missing_plugins, read_versions
 
-    check = check_journal(folder / JOURNAL_NAME)
+    with Refused(JournalFormatError, code=BAD_INPUT):
+        check = check_journal(folder / JOURNAL_NAME)
     for problem in check.problems:
         print_message(f"warning: {problem}")
     try:
         try:
-            plan = recorded_campaign(folder / RESOLVED)
+            plan = load_campaign(folder / RESOLVED)
             result = read_result(folder)
         except (ConfigError, RunError) as error:
             reason = f"Its campaign or its results can't be read: {error}"

@@ -245,7 +245,7 @@ def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json 
 def check(run: Which, state: State = None, as_json: Json = False) -> None:
     """Check a run's records: SQLite's own check, the hash chain over all entries, and the ledger of pours.
 
-    Exit code 0: complete and unchanged, or of an older version without a hash chain. 1: damaged or incomplete.
+    Exit code 0: complete and unchanged. 1: damaged or incomplete. 2: there is no run, or one of another version.
     """
     from orchestrator.journal.journal import JOURNAL_NAME
     from orchestrator.journal.journal_check import check_journal, has_begun
@@ -266,7 +266,6 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
                 "complete": not found.problems,
                 "problems": found.problems,
                 "entries": found.entries,
-                "entries_without_chain": 0 if found.chained else found.entries,
                 "pours": found.pours,
             }
         )
@@ -372,7 +371,7 @@ def add(
     folders: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders that contain runs.")],
     state: State = None,
 ) -> None:
-    """Register runs that the catalogue lacks: from an older version, from another machine, or moved."""
+    """Register runs that the catalogue lacks: from another machine, or moved."""
     from orchestrator.catalogue.run_registry import enter, runs_below
 
     found: list[Path] = []

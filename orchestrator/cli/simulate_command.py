@@ -21,7 +21,6 @@ from orchestrator.cli.command_options import (
     Campaign,
     Json,
     Parameters,
-    Quiet,
     Receiver,
     SceneName,
     Thetas,
@@ -87,7 +86,6 @@ def simulate(
         Path | None, typer.Option(help="With --from: write a table of the predictions as CSV.", show_default=False)
     ] = None,
     backend: Annotated[BackendChoice, typer.Option(help="Device that the solver runs on.")] = BackendChoice.CPU,
-    quiet: Quiet = False,
 ) -> None:
     """Simulate one pour of a campaign's scene with several seeds, and print the fate of the liquid.
 

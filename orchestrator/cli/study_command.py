@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Json, Quiet
+from orchestrator.cli.command_options import Json
 from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, Refused, print_json, print_note
 from orchestrator.cli.shell_completion import files_of
 
@@ -44,7 +44,6 @@ def run_study(
         bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
     ] = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Compare C1 to C4 and D1 to D3 with repetitions, on virtual benches that differ more or less from the simulator.
 
@@ -109,7 +108,7 @@ def _workers(plan: StudyPlan, folder: Path, jobs: int | None, cluster: RaySettin
         yield ClusterCells(plan, folder, tasks, jobs)
 
 
-def report_study(file: StudyPath, as_json: Json = False, quiet: Quiet = False) -> None:
+def report_study(file: StudyPath, as_json: Json = False) -> None:
     """Write figures, tables and the page of a study from the results that there are."""
     from orchestrator.study.study_folder import StudyError, opened
     from orchestrator.study.study_plan import cells_of

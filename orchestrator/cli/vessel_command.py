@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from orchestrator.cli.command_options import Json, Quiet
+from orchestrator.cli.command_options import Json
 from orchestrator.cli.console import BAD_INPUT, RefusalError, print_json, print_message, print_note, waiting_for
 
 if TYPE_CHECKING:
@@ -103,7 +103,6 @@ def vessel(
     floor: Annotated[str | None, typer.Option(help="Thickness of the floor; default: as the wall.")] = None,
     name: Annotated[str | None, typer.Option(help="Name of the vessel; default: the file's name.")] = None,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Make a vessel file from measurements: callipers, photograph, points, depth image, a mesh, fill or tilt tables.
 

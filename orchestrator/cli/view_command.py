@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import LiveAt, Quiet
+from orchestrator.cli.command_options import LiveAt
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_message, print_note
 from orchestrator.cli.shell_completion import local_runs
 
@@ -51,7 +51,6 @@ def view(
         Path | None, typer.Option("--output", "-o", help="Write the recording here and exit.", show_default=False)
     ] = None,
     at: LiveAt = None,
-    quiet: Quiet = False,
 ) -> None:
     """Serve recordings for a browser and print the address, until Ctrl-C. Needs no display.
 
@@ -172,12 +171,12 @@ def _run_of(what: Path) -> Path:
 
 
 def _plan_of(run: Path) -> CampaignPlan:
-    from orchestrator.config.file_loading import recorded_campaign
+    from orchestrator.config.file_loading import load_campaign
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from orchestrator.runs.run_folder import RESOLVED
 
     with Refused(ConfigError, at="the run's own campaign can't be read:\n"):
-        return recorded_campaign(run / RESOLVED)
+        return load_campaign(run / RESOLVED)
 
 
 def live_view(plan: CampaignPlan, *, live: bool, at: str | None) -> LiveView | None:

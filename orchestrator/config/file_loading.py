@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import replace
 from itertools import accumulate
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from pydantic import create_model
 
@@ -20,9 +19,8 @@ from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
-from orchestrator.journal.upgrade import upgraded_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan
-from sim_engine.liquids import RETIRED_PARAMETERS, Liquid, LiquidSettings, SimulationParameters
+from sim_engine.liquids import Liquid, LiquidSettings, SimulationParameters
 from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import VesselSpec
@@ -41,18 +39,6 @@ def load_campaign(path: Path | str, laboratory: Path | str | None = None, seed: 
     """
     other = None if laboratory is None else Path(laboratory)
     return campaign_from(Document.read(resolved(Path(path))), other, seed)
-
-
-def recorded_campaign(path: Path | str) -> CampaignPlan:
-    """The plan of a run's `resolved.json`, also of one that version 0.2 wrote: to report it, not to resume it.
-
-    Raises:
-        ConfigError: as `load_campaign`.
-    """
-    document = Document.read(resolved(Path(path)))
-    written, document.data = document.data, upgraded_campaign(document.data)
-    plan = campaign_from(document)
-    return plan if document.data == written else replace(plan, resolved=written)
 
 
 def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
@@ -148,8 +134,6 @@ class _LooseQuantity(Quantity):
 
 class _ThetaBase(Settings):
     """Parameters as `decant calibrate` writes them: numbers in SI, or quantities with units."""
-
-    retired: ClassVar[dict[str, str]] = RETIRED_PARAMETERS
 
 
 def _theta_model() -> type[_ThetaBase]:

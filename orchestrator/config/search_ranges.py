@@ -18,7 +18,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from orchestrator.strategies.campaign_plan import NormalPrior
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
-from sim_engine.liquids import RETIRED_PARAMETERS, ParameterInfo, SimulationParameters
+from sim_engine.liquids import ParameterInfo, SimulationParameters
 from sim_engine.scene import Pivot
 from sim_engine.search_space import Axis, Scale, Space
 from sim_engine.settings.model import Problems, Settings, Text
@@ -166,8 +166,6 @@ def _pivot_form(value: Any) -> str:
 class MotionBase(Settings):
     """Values of the motion that are not searched."""
 
-    retired: ClassVar[dict[str, str]] = {"hold_cap": "max_hold_time"}
-
     pivot: (
         Annotated[
             Annotated[Literal["lip"], Tag("word")] | Annotated[PivotPoint, Tag("point")], Discriminator(_pivot_form)
@@ -308,8 +306,6 @@ def _parameter_form(value: Any) -> str:
 
 class ParametersBase(Settings):
     """Parameters: a value fixes one; a range, or a measured value with a tolerance, makes calibration search it."""
-
-    retired: ClassVar[dict[str, str]] = RETIRED_PARAMETERS
 
     def fixed(self) -> dict[str, float]:
         """Parameters with a value, SI."""

@@ -84,17 +84,17 @@ create table node_action (
     started real, campaign text, error text, json_result text
 ) strict;
 """
-"""Batches, reservations, ordered pours and materials; added in format 4. Masses in kg, capacities in m³."""
-
-_FROM_2 = """
-alter table campaign add column batch text not null default '';
-alter table campaign add column held integer not null default 0;
-alter table campaign add column not_before real;
-"""
+"""Batches, reservations, ordered pours and materials. Masses in kg, capacities in m³."""
 
 
 class StoreError(RunError):
     """The state directory can't be used; the message gives the reason and a remedy."""
+
+
+class StoreFormatError(StoreError):
+    """The state directory has the format of another version."""
+
+    exit_code = 2
 
 
 class DesiredState(StrEnum):
@@ -209,7 +209,7 @@ class Store:
         path: path of the SQLite file.
 
     Raises:
-        StoreError: another daemon uses the file, its format differs, or it can't be written.
+        StoreError: another daemon uses the file, another version wrote it, or it can't be written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -234,6 +234,9 @@ class Store:
         self._lock.flush()
         try:
             self._open()
+        except StoreError:
+            self._lock.close()
+            raise
         except sqlite3.OperationalError as error:  # the disk, the folder or their permissions, rather than the content
             self._lock.close()
             raise StoreError(f"{path}: can't be opened for writing ({error}); --state names another folder") from error
@@ -246,20 +249,21 @@ class Store:
         try:
             self._prepare()
         except BaseException:
-            self._db.close()  # an interrupted upgrade would keep the file locked
+            self._db.close()
             raise
 
     def _prepare(self) -> None:
+        version = self._db.execute("pragma user_version").fetchone()[0]
+        if version not in (0, FORMAT):
+            raise StoreFormatError(
+                f"{self.path}: written in format {version}, this version of Decant reads format {FORMAT}; "
+                "use the version that wrote it, or name another folder with --state"
+            )
         self._db.row_factory = sqlite3.Row
         self._db.execute("pragma journal_mode = wal")
         self._db.execute("pragma synchronous = full")
-        version = self._db.execute("pragma user_version").fetchone()[0]
         if version == 0:
             self._db.executescript(f"begin immediate; {_SCHEMA} {_STATION} pragma user_version = {FORMAT}; commit;")
-        elif version == 2:  # a queue outlives an upgrade of the program
-            self._db.executescript(f"begin immediate; {_FROM_2} {_STATION} pragma user_version = {FORMAT}; commit;")
-        elif version != FORMAT:
-            raise StoreError(f"{self.path}: written in format {version}, and this version of Decant has {FORMAT}")
 
     def close(self) -> None:
         """Close the file and release the lock. May be called twice."""

@@ -24,7 +24,6 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 
 from pydantic import BaseModel, ValidationError
 
-from orchestrator.journal.upgrade import upgraded_outcome, upgraded_request, upgraded_result
 from orchestrator.requests import WRITTEN_IF_SET, Outcome, Request
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import StageResult
@@ -45,7 +44,7 @@ def encode_request(request: Request) -> dict[str, Any]:
 
 def decode_request(data: Mapping[str, Any]) -> Request:
     """Inverse of `encode_request`. Raises CodecError."""
-    return cast(Request, from_json(upgraded_request(data), Request))
+    return cast(Request, from_json(data, Request))
 
 
 def encode_outcome(outcome: Outcome) -> dict[str, Any]:
@@ -55,7 +54,7 @@ def encode_outcome(outcome: Outcome) -> dict[str, Any]:
 
 def decode_outcome(data: Mapping[str, Any]) -> Outcome:
     """Inverse of `encode_outcome`. Raises CodecError."""
-    return cast(Outcome, from_json(upgraded_outcome(data), Outcome))
+    return cast(Outcome, from_json(data, Outcome))
 
 
 def canonical(data: Any) -> str:
@@ -350,7 +349,7 @@ def decode_result(data: Mapping[str, Any]) -> StageResult:
             f"Known are: {', '.join(sorted(StageResult.KINDS))}"
         )
     try:
-        return known.model_validate(from_json(upgraded_result(data)))
+        return known.model_validate(from_json(data))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])

@@ -53,7 +53,6 @@ from orchestrator.journal.journal_file import (
     lay_out,
     take_lock,
 )
-from orchestrator.journal.upgrade import upgraded_fingerprint
 from orchestrator.run_clock import begin_run, end_run, run_time
 from orchestrator.states import State
 
@@ -196,7 +195,7 @@ class JournalReader:
             raise JournalError(f"{self.path}: the journal has no header; it is damaged")
         check_format(row[0], self.path)
         try:
-            return Header(row[1], upgraded_fingerprint(json.loads(row[2])), row[3])
+            return Header(row[1], json.loads(row[2]), row[3])
         except ValueError as error:
             raise JournalError(f"{self.path}: the journal's header is damaged ({error})") from None
 
@@ -274,7 +273,6 @@ class Journal(JournalReader):
             connection = opened.enter_context(closing(connect_writer(path)))
             if not has_tables(connection, path):
                 lay_out(connection, header, path)
-            check_format(connection.execute("select format from header").fetchone()[0], path, resuming=True)
             journal = cls(path, lock, connection)
             journal._check_same_campaign(header)
             journal._ledger = journal._open_ledger()

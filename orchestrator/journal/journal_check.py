@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from orchestrator.journal.codec import canonical
-from orchestrator.journal.journal_file import WITHOUT_CHAIN, JournalError, chain_of, check_format, connect
+from orchestrator.journal.journal_file import JournalError, chain_of, check_format, connect
 
 LEDGER_NAME = "pours.jsonl"
 
@@ -240,7 +240,6 @@ class JournalCheck:
         problems: one text each; empty: the records are complete and unchanged.
         pours: pours that have begun, from the ledger.
         entries: number of entries in the journal.
-        chained: whether the journal has a hash chain; a journal of version 0.2 has none, so changes can't be found.
         begun: whether there is a run; False in a folder where a run died before its first entry.
     """
 
@@ -248,7 +247,6 @@ class JournalCheck:
     problems: tuple[str, ...] = ()
     pours: tuple[str, ...] = ()
     entries: int = 0
-    chained: bool = True
     begun: bool = True
 
     @property
@@ -256,9 +254,7 @@ class JournalCheck:
         """The result as one sentence without a full stop."""
         if self.problems:
             return f"damaged or incomplete: {'; '.join(self.problems)}"
-        if self.chained:
-            return f"complete and unchanged ({self.entries} entries)"
-        return f"not verifiable: the journal ({self.entries} entries) is of a version without a hash chain"
+        return f"complete and unchanged ({self.entries} entries)"
 
     def require(self) -> None:
         """Raise an error if the journal fails the check.
@@ -359,15 +355,14 @@ def _checked(
     if header is None:
         return JournalCheck(path, (*problems, f"{path.name} has no header"), pours)
     check_format(header[0], path)
-    old = header[0] == WITHOUT_CHAIN
     repeated = {line.seq: line for line in ledger or ()}
     entries = 0
-    stored = {} if old else dict(connection.execute("select seq, digest from chain").fetchall())
+    stored = dict(connection.execute("select seq, digest from chain").fetchall())
     for place, (row, digest) in enumerate(chain_of(connection)):
         if row[0] != place:
             problems.append(f"entry {place} of the journal is missing")
             break
-        if place and not old and stored.pop(place, None) != digest:
+        if place and stored.pop(place, None) != digest:
             problems.append(f"entry {place} of the journal ({row[3]}) was changed after it was written")
             break
         line = repeated.pop(place, None)
@@ -383,9 +378,9 @@ def _checked(
                 f"the journal ends with entry {entries}, but {LEDGER_NAME} has entries about pours up to entry "
                 f"{max(repeated)}: entries were lost"
             )
-    if ledger is None and not problems and not old and (entries or [name for name in traces if _is_record(name)]):
+    if ledger is None and not problems and (entries or [name for name in traces if _is_record(name)]):
         problems.append(f"{LEDGER_NAME}, the ledger of pours, is missing")
-    return JournalCheck(path, tuple(problems), pours, entries, not old)
+    return JournalCheck(path, tuple(problems), pours, entries)
 
 
 def _is_record(name: str) -> bool:

@@ -31,9 +31,6 @@ from orchestrator.run_errors import RunError
 FORMAT = 3
 """Version of the tables and of the entries' bodies. A journal of another version is refused."""
 
-WITHOUT_CHAIN = 2
-"""The format of version 0.2, before the hash chain. Such a journal can be read, and not resumed."""
-
 _CHAIN = """
 create table chain (seq integer primary key, digest blob not null) strict;
 create trigger chain_is_never_changed before update on chain
@@ -63,6 +60,12 @@ class JournalError(RunError):
     """The journal can't be used; the text gives the reason and the remedy."""
 
 
+class JournalFormatError(JournalError):
+    """The journal has the format of another version."""
+
+    exit_code = 2
+
+
 class JournalLockedError(JournalError):
     """Another process is writing this journal."""
 
@@ -82,19 +85,17 @@ class Header:
     created: float = 0.0
 
 
-def check_format(found: int, path: Path, *, resuming: bool = False) -> None:
-    """Check that this version of Decant can read a journal, or resume it.
+def check_format(found: int, path: Path) -> None:
+    """Check that this version of Decant can read and resume a journal.
 
     Raises:
-        JournalError: another version wrote it.
+        JournalFormatError: another version wrote it.
     """
-    if found == FORMAT or (found == WITHOUT_CHAIN and not resuming):
-        return
-    does = "resumes" if resuming else "reads"
-    raise JournalError(
-        f"{path}: written in format {found}, this version of Decant {does} format {FORMAT}; "
-        "go on with the version that began the run (see versions.json beside it) or begin a new run"
-    )
+    if found != FORMAT:
+        raise JournalFormatError(
+            f"{path}: written in format {found}, this version of Decant reads format {FORMAT}; "
+            "use the version that began the run (see versions.json next to it), or begin a new run"
+        )
 
 
 EventRow = tuple[int, str, float, str, str]

@@ -17,7 +17,7 @@ import numpy as np
 from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import unpack
 from actors.arm.planning.kinematics import pourer_motion
-from orchestrator.config.file_loading import recorded_campaign
+from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.journal.run_record import RecordedPour, read_record
 from orchestrator.recordings.recording_file import write_recording
@@ -54,7 +54,7 @@ def export_recordings(
         OSError: a file can't be written.
     """
     try:
-        plan = plan or recorded_campaign(directory / RESOLVED)
+        plan = plan or load_campaign(directory / RESOLVED)
     except ConfigError as error:
         raise RunError(f"{directory}: its campaign can't be read: {error}") from error
     scenes, record = scenes_of(plan), read_record(directory)

@@ -511,8 +511,6 @@ class DispensePlan:
 class OutputSettings(Settings):
     """Outputs in addition to the journal."""
 
-    retired: ClassVar[dict[str, str]] = {"rrd": "recording", "record_rate": "frame_rate"}
-
     directory: FilePath | None = None
     """Folder of the runs; 'runs' in the working directory unless given."""
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
@@ -94,7 +94,6 @@ def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
     strategy = settings.model_fields["strategy"].default
     model = create_model(f"{strategy}ArmSettings", __base__=ArmSettings, __doc__=ArmSettings.__doc__, **fields)
     model.variant = strategy
-    model.retired = {old: new for old, new in settings.retired.items() if new.partition(":")[0] in fields}
     return model
 
 
@@ -114,8 +113,6 @@ class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial_sampl
 
 class D3ArmSettings(_arm(D3Settings, "prior_simulations", "initial_samples", "kappa", pours="15")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
-
-    retired: ClassVar[dict[str, str]] = D3Settings.retired
 
     simulations_per_pour: SimulationCount | None = None
     """Simulations between two pours; not 'free', because the requests would then depend on the clock."""

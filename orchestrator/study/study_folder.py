@@ -23,7 +23,6 @@ from pydantic import SerializeAsAny, field_validator
 from actors.runtime.ray_cluster import versions
 from orchestrator.journal.codec import decode_result, digest, first_difference, from_json, to_json
 from orchestrator.journal.journal_file import locked_alone
-from orchestrator.journal.upgrade import upgraded_fingerprint
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import ResultPart, StageResult
 from orchestrator.study.study_plan import StudyCell, StudyPlan, study_fingerprint
@@ -161,7 +160,7 @@ def check_settings(study: StudyPlan) -> None:
     path = study.folder / SETTINGS
     if not path.is_file():
         return
-    before, now = upgraded_fingerprint(json.loads(path.read_text(encoding="utf-8"))), study_fingerprint(study)
+    before, now = json.loads(path.read_text(encoding="utf-8")), study_fingerprint(study)
     if digest(before) != digest(now):
         raise StudyError(
             f"{study.folder}: this study was begun with other settings: {first_difference(before, now)}. Set that "

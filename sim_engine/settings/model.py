@@ -269,12 +269,6 @@ class Settings(BaseModel):
     required: ClassVar[dict[str, str]] = {}
     """Keys that are mandatory in files although their fields have defaults, each with an example."""
 
-    retired: ClassVar[dict[str, str]] = {}
-    """Renamed keys of earlier versions, 'old key' → 'new key', and values, 'key: old value' → 'key: new value'."""
-
-    removed: ClassVar[dict[str, str]] = {}
-    """Keys, and values as 'key: value', of earlier versions without a counterpart, each with what to do instead."""
-
     recorded_as_given: ClassVar[bool] = False
     """Whether a run's record omits keys that were omitted, because some keys exclude others."""
 

@@ -20,7 +20,6 @@ CACHE = str(cache_directory())
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(REGENERATE, action="store_true", default=False, help="write the golden files anew")
-    parser.addoption("--rewrite-runs", action="store_true", default=False, help="make tests/data/old_runs anew, too")
 
 
 @pytest.fixture

@@ -3,9 +3,6 @@
 A golden file is text of lines. Text has to be equal. Numbers with a point or an exponent may differ by a relative
 `RTOL`: libraries of linear algebra and vector instructions differ in the last bits between machines. Integers have to
 be equal, because seeds and counts are integers.
-
-`pytest tests/golden --regenerate --rewrite-runs` makes the run folders of `tests/data/old_runs` anew, too. That is for
-the version that wrote them: later versions have to read them as they are.
 """
 
 from __future__ import annotations

@@ -15,8 +15,11 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from actors.runtime.child_process import child_environment
+from orchestrator.cli.app import app
+from orchestrator.daemon.daemon_store import FORMAT as STORE_FORMAT
 from orchestrator.daemon.daemon_store import Store, StoreError
 from orchestrator.journal.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
 from orchestrator.journal.journal_check import BEGUN, LEDGER_NAME, JournalDamagedError, check_journal, read_ledger
@@ -176,16 +179,43 @@ def test_other_settings_are_refused_by_name(path: Path) -> None:
     Journal.resume(path, HEADER).close()  # and the refusal left no lock behind
 
 
-def test_another_format_is_refused(path: Path) -> None:
-    Journal.create(path, HEADER).close()
-    connection = sqlite3.connect(path)
-    connection.execute("update header set format = ?", [FORMAT + 1])
-    connection.commit()
-    connection.close()
-    with pytest.raises(JournalError, match=f"written in format {FORMAT + 1}"):
-        Journal.resume(path, HEADER)
-    with pytest.raises(JournalError, match=f"reads format {FORMAT}"):
-        JournalReader(path)
+@pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
+def test_a_journal_of_another_format_is_refused_and_stays_as_it_is(path: Path, other: int) -> None:
+    journal = Journal.create(path, HEADER)
+    pour(journal, 1)
+    journal.close()
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("update header set format = ?", [other])
+        connection.commit()
+    before = {file.name: file.read_bytes() for file in (path, path.with_name(LEDGER_NAME))}
+    told = f"{path}: written in format {other}, this version of Decant reads format {FORMAT}; use the version that "
+    told += "began the run (see versions.json next to it), or begin a new run"
+    for use in (JournalReader, check_journal, lambda path: Journal.resume(path, HEADER)):
+        with pytest.raises(JournalError) as refused:
+            use(path)
+        assert (str(refused.value), refused.value.exit_code) == (told, 2)
+    for command in (["report", str(path.parent)], ["runs", "check", str(path.parent)]):
+        result = CliRunner().invoke(app, command)
+        assert (result.exit_code, result.stdout, result.stderr) == (2, "", f"{told}\n")
+    assert {file.name: file.read_bytes() for file in (path, path.with_name(LEDGER_NAME))} == before
+    assert not (path.parent / "report.html").exists()
+
+
+@pytest.mark.parametrize("other", [2, STORE_FORMAT + 1])
+def test_a_queue_of_another_format_is_refused_and_stays_as_it_is(tmp_path: Path, other: int) -> None:
+    path = tmp_path / "daemon.sqlite"
+    with closing(sqlite3.connect(path)) as connection:
+        connection.executescript(f"create table campaign (id text primary key); pragma user_version = {other};")
+    before = path.read_bytes()
+    for _ in range(2):  # the refusal leaves no lock behind
+        with pytest.raises(StoreError) as refused:
+            Store(path)
+        assert str(refused.value) == (
+            f"{path}: written in format {other}, this version of Decant reads format {STORE_FORMAT}; "
+            "use the version that wrote it, or name another folder with --state"
+        )
+    assert CliRunner().invoke(app, ["server", "start", "--state", str(tmp_path), "--port", "0"]).exit_code == 2
+    assert path.read_bytes() == before
 
 
 def test_what_is_not_a_journal_is_refused(path: Path) -> None:
@@ -378,23 +408,6 @@ def test_an_empty_journal_next_to_a_recording_is_not_begun_again(path: Path) -> 
     (path.parent / "campaign.rrd").touch()
     with pytest.raises(JournalDamagedError, match=r"is empty, but the folder has campaign.rrd"):
         Journal.resume(path, HEADER)
-
-
-def test_a_journal_of_version_0_2_is_read_and_not_resumed(path: Path) -> None:
-    journal = Journal.create(path, HEADER)
-    pour(journal, 1)
-    journal.close()
-    path.with_name(LEDGER_NAME).unlink()
-    with closing(sqlite3.connect(path)) as connection:  # what that version wrote
-        connection.execute("drop table chain")
-        connection.execute("update header set format = 2")
-        connection.commit()
-    found = check_journal(path)
-    assert (found.problems, found.verdict.partition(":")[0]) == ((), "not verifiable")
-    count = len(bodies(path))
-    with pytest.raises(JournalError, match="written in format 2, this version of Decant resumes format 3"):
-        Journal.resume(path, HEADER)
-    assert len(bodies(path)) == count
 
 
 def test_a_run_can_be_checked_while_it_is_written(path: Path) -> None:

@@ -15,7 +15,6 @@ from actors.optimizer.questions import (
     BenchOffset,
     CalibrationQuery,
     Data,
-    DiscrepancyFound,
     Disturbance,
     MinimumQuery,
     ModelDiscrepancy,
@@ -27,7 +26,6 @@ from actors.optimizer.questions import (
     SimulationQuery,
     SpaceFillingQuery,
     Suggestion,
-    SuggestionQuery,
     SurrogateMap,
 )
 from orchestrator.journal.codec import (
@@ -38,7 +36,6 @@ from orchestrator.journal.codec import (
     encode_outcome,
     encode_request,
     first_difference,
-    to_json,
 )
 from orchestrator.requests import Failed, Pour, Poured, Prediction, Simulate, Simulated, Suggest, Suggested
 from sim_engine.action import ACTION_DIMENSIONS, Action
@@ -150,75 +147,6 @@ def test_requests_survive_bit_for_bit(request: Simulate | Pour | Suggest) -> Non
     assert read == request
     assert hash(read) == hash(request)  # strategies keep requests in dictionaries
     assert canonical(encode_request(read)) == canonical(written)
-
-
-ANYWHERE = Space((Axis("x", 0.0, 1.0),))
-
-QUESTION: dict[str, Any] = {
-    "space": to_json(ANYWHERE, Space),
-    "data": {"points": [[0.1], [0.2]], "costs": [0.0, 1.0]},
-    "simulated": {"points": [[0.4]], "costs": [0.5]},
-    "infeasible": [[0.6]],
-    **{"pending": [[0.3]], "count": 2, "seed": 7, "mean": "constant", "acquisition": "lcb", "kappa": 1.5},
-    **{"map_resolution": 0, "noise": "constant", "plain": False},
-    **{key: [] for key in ("map_at", "predict_at", "context", "refused", "failed", "constraints", "pouring")},
-    **dict.fromkeys(("posterior", "design", "risk", "effort", "mismatch")),
-}
-"""A question of version 0.2, whose single type had all fields."""
-
-BASE = {"seed": 7, "kappa": 1.5, "infeasible": ((0.6,),)}
-OLD_DATA, OLD_SIMULATED = Data(((0.1,), (0.2,)), (0.0, 1.0)), Data(((0.4,),), (0.5,))
-PROPOSAL = BASE | {"pending": ((0.3,),), "count": 2}
-MISMATCH = {"play": [], "drawn": [], "ignorance": 0.1, "worst": 2.0, "left": 3, "limit": None, "looks_ahead": False}
-
-
-@pytest.mark.parametrize(
-    ("changes", "query"),
-    [
-        (
-            {"acquisition": "sobol"},
-            SpaceFillingQuery(ANYWHERE, ((0.1,), (0.2,)), ((0.3,),), 2, 7, infeasible=((0.6,),)),
-        ),
-        ({"count": 0, "mean": "zero"}, RegressionQuery(ANYWHERE, OLD_DATA, **BASE, mean="zero")),
-        ({"plain": True}, MinimumQuery(ANYWHERE, OLD_DATA, **PROPOSAL, plain=True)),
-        (
-            {"risk": {"disturbances": [], "level": 0.5}, "count": 0},
-            RiskQuery(ANYWHERE, OLD_DATA, **BASE, count=0, risk=Risk((), 0.5)),
-        ),
-        ({"context": [[0.9]]}, CalibrationQuery(ANYWHERE, OLD_DATA, **PROPOSAL, contexts=((0.9,),))),
-        (
-            {"mean": "scaled", "acquisition": "knowledge", "pouring": [[0.8]]},
-            SimulationQuery(
-                ANYWHERE, OLD_DATA, **PROPOSAL, simulated=OLD_SIMULATED, pouring=((0.8,),), coupling="scaled"
-            ),
-        ),
-        ({"mean": "pooled"}, PourQuery(ANYWHERE, OLD_DATA, **PROPOSAL, simulated=OLD_SIMULATED)),
-        (
-            {"mean": "adaptive", "acquisition": "least_loss", "mismatch": MISMATCH},
-            PourQuery(
-                ANYWHERE,
-                OLD_DATA,
-                **PROPOSAL,
-                simulated=OLD_SIMULATED,
-                acquisition="least_loss",
-                discrepancy=ModelDiscrepancy((), uninformative=0.1, worst=2.0, pours_left=3, lookahead=False),
-            ),
-        ),
-    ],
-    ids=lambda value: type(value).__name__,
-)
-def test_a_question_of_version_0_2_is_read_as_the_query_that_asks_the_same(
-    changes: dict[str, Any], query: SuggestionQuery
-) -> None:
-    written = {"type": "Suggest", "purpose": "pour", "problem": QUESTION | changes}
-    assert decode_request(written) == Suggest(query, "pour")
-
-
-def test_an_answer_of_version_0_2_is_read_with_its_conclusions_about_the_simulator() -> None:
-    found = {"ignorance": 0.2, "shifts": [0.1], "deviations": [0.05], "factor": 1.1}
-    read = decode_outcome({"type": "Suggested", "suggestion": {"points": [], "mismatch": found}})
-    assert isinstance(read, Suggested)
-    assert read.suggestion.discrepancy == DiscrepancyFound(0.2, (0.1,), (0.05,), 1.1)
 
 
 @settings(max_examples=examples(60), deadline=None)

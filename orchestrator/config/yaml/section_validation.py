@@ -60,12 +60,7 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
                     cut = True
                     continue
                 unknown = detail["type"] == "extra_forbidden"
-                if (unknown or detail["type"] == "literal_error") and (retired := _retired(model, loc, data)):
-                    text, renamed = retired
-                    report.add(place.at(*loc), text, key=unknown, renamed=renamed)
-                    if unknown and renamed:  # the key is not reported as missing as well
-                        report.broken.add((place.document.path, place.at(*loc[:-1], renamed[1]).loc))
-                elif unknown and (owners := _owners(model, loc, data)):
+                if unknown and (owners := _owners(model, loc, data)):
                     if loc[:-1] not in guessed:
                         here = _variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1]))
                         names = " and ".join(sorted({owner.tag_word() for owner in owners}))
@@ -88,50 +83,18 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
 def _guess_variant(variants: set[type[Settings]], data: dict[str, Any], place: Place, report: Report) -> None:
     """Report that the key that selects the variant is missing or wrong; continue with the best-matching variant."""
     key, word = next(iter(variants)).tag, data.get(next(iter(variants)).tag)
-    new = next((s.retired[f"{key}: {word}"].partition(": ")[2] for s in variants if f"{key}: {word}" in s.retired), "")
-    if new:
-        report.add(place.at(key), f"{word!r} is called '{new}' now; write that", renamed=(str(word), new))
-        data[key] = new
-        return
     words = sorted(section.tag_word() for section in variants)
     if word is None:
         examples = [keys[key] for section in variants if key in (keys := section.required_keys())]
         text = f"key '{key}' is missing; add for example '{key}: {max(examples)}'"
         report.add(place, text, key=True)
         report.broken.add((place.document.path, place.at(key).loc))
-    elif pair := next((v.retired[f"{key}: {word}"] for v in variants if f"{key}: {word}" in v.retired), ""):
-        data[key] = pair.partition(": ")[2]
-        report.add(place.at(key), _renamed(word, data[key]), renamed=(word, data[key]))
-        return
     else:
         expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
         said = next(iter(variants)).unknown_tag(word) if isinstance(word, str) else ""
         report.add(place.at(key), said or _one_of(word, expected))
     by_word = {section.tag_word(): section for section in variants}
     data[key] = max(words, key=lambda word: len(data.keys() & by_word[word].written_keys()))
-
-
-def _retired(model: type[Settings], loc: Loc, data: Any) -> tuple[str, tuple[str, str] | None] | None:
-    """The message about a key or value that earlier versions had, and its old and new name, if it has a new one."""
-    if not loc or _loc_in(data, loc) != loc:
-        return None
-    key, pair = str(loc[-1]), f"{loc[-1]}: {_node(data, loc)}"
-    for section in _sections_at(model, loc[:-1], data):
-        if key in section.removed:
-            return section.removed[key], None
-        if key in section.retired:
-            new = section.retired[key]
-            return f"is called '{new}' now; rename it, or use 'decant migrate'", (key, new)
-        if pair in section.removed:
-            return f"{_node(data, loc)!r} {section.removed[pair]}", None
-        if pair in section.retired:
-            new = section.retired[pair].partition(": ")[2]
-            return _renamed(_node(data, loc), new), (str(_node(data, loc)), new)
-    return None
-
-
-def _renamed(value: Any, new: str) -> str:
-    return f"{value!r} is called '{new}' now; write that"
 
 
 def _variant(sections: set[type[Settings]], data: Any) -> set[type[Settings]]:

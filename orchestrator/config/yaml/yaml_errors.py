@@ -24,7 +24,6 @@ class Problem:
         where: dotted location in the file, e.g. 'deployment.pours'; empty for the whole file.
         message: the problem, and a correct value.
         source_line: the line as written in the file.
-        renamed: the retired name at the place and its new name, which `decant migrate` writes; None for other problems.
     """
 
     path: Path
@@ -33,7 +32,6 @@ class Problem:
     where: str
     message: str
     source_line: str = ""
-    renamed: tuple[str, str] | None = None
 
     def __str__(self) -> str:
         """`path:line:col: where: message` with the source line and a caret below."""

@@ -140,11 +140,11 @@ class Document:
                 known = (*known, part)
         return known
 
-    def problem(self, loc: Loc, message: str, *, key: bool = False, renamed: tuple[str, str] | None = None) -> Problem:
+    def problem(self, loc: Loc, message: str, *, key: bool = False) -> Problem:
         """A problem at a location. It points at the value if that fits on a line, else (or with `key`) at the key."""
         mark = self.marks[self.known_loc(loc)]
         line, column = mark.value if mark.inline and not key else mark.key
-        return Problem(self.path, line, column, dotted(loc), message, self.line(line), renamed)
+        return Problem(self.path, line, column, dotted(loc), message, self.line(line))
 
     def _plain(self, node: Node, loc: Loc, active: frozenset[int] = frozenset()) -> Any:
         self._nodes += 1
@@ -319,9 +319,9 @@ class Report:
     problems: list[Problem] = field(default_factory=list)
     broken: set[tuple[Path, Loc]] = field(default_factory=set)
 
-    def add(self, place: Place, message: str, *, key: bool = False, renamed: tuple[str, str] | None = None) -> None:
-        """Add a problem; its place then counts as invalid. `renamed`: see `Problem`."""
-        self.problems.append(place.document.problem(place.loc, message, key=key, renamed=renamed))
+    def add(self, place: Place, message: str, *, key: bool = False) -> None:
+        """Add a problem; its place then counts as invalid."""
+        self.problems.append(place.document.problem(place.loc, message, key=key))
         self.broken.add((place.document.path, place.document.known_loc(place.loc)))
 
     def is_broken(self, place: Place) -> bool:

@@ -58,8 +58,6 @@ class C4Settings(CalibrationSettings):
 
     has_prior: ClassVar[bool] = True
 
-    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
-
     strategy: Literal["C4"] = "C4"
     """Bayesian optimisation of the mean discrepancy over the actions, one simulation per iteration."""
 

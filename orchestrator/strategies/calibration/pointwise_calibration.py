@@ -156,8 +156,6 @@ class C1Settings(DesignSettings):
 
     examples: ClassVar[dict[str, str]] = {"grid": "{particles: 5, cohesion: 6}", "points_per_axis": "10"}
 
-    retired: ClassVar[dict[str, str]] = {"per_axis": "points_per_axis"}
-
     strategy: Literal["C1"] = "C1"
     """A uniform grid."""
 
@@ -266,8 +264,6 @@ class C3Settings(DesignSettings):
     """C3: Bayesian optimisation, each θ on all training pours."""
 
     examples: ClassVar[dict[str, str]] = {"iterations": "59"}
-
-    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
 
     strategy: Literal["C3"] = "C3"
     """Bayesian optimisation, each θ on all training pours."""

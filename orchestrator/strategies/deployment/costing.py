@@ -12,7 +12,7 @@ import statistics
 from collections import deque
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from orchestrator.requests import Failed, Outcome, Simulated
 from orchestrator.strategies.campaign_plan import DeploymentPlan
@@ -114,10 +114,6 @@ WITHOUT_OUTCOME = 2.0
 
 class CostSettings(Settings):
     """D3 with `simulations_per_pour: free`: costs by which simulations are chosen and ended."""
-
-    removed: ClassVar[dict[str, str]] = {
-        "simulation": "was retired; remove it: outcomes say what a simulation costs before anything depends on it"
-    }
 
     pour: Annotated[float, Quantity("s", "90 s", 0.0, 86400.0, positive=True)] = 90.0
     """Duration of a pour, including refilling and wiping."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from actors.optimizer.questions import (
     Data,
@@ -53,21 +53,6 @@ if TYPE_CHECKING:
 
 class D3Settings(SearchSettings):
     """D3: real pours with a simulated prior."""
-
-    retired: ClassVar[dict[str, str]] = SearchSettings.retired | {
-        "per_pour": "simulations_per_pour",
-        "prices": "costs",
-        "ignorance": "discrepancy_policy",
-    }
-
-    removed: ClassVar[dict[str, str]] = {
-        "trust": (
-            "was retired; remove it: 'model: adaptive' weighs the simulator by every pour ('discrepancy_policy' says "
-            "what follows), 'model: residual' always believes it"
-        ),
-        "model: pooled": "was retired; write 'adaptive', or 'residual' for the paper's",
-        "model: scaled": "was retired; write 'adaptive', or 'residual' for the paper's",
-    }
 
     strategy: Literal["D3"] = "D3"
     """Real pours with a simulated prior."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 from actors.optimizer.questions import (
     Data,
@@ -57,8 +57,6 @@ from sim_engine.settings.model import PositiveSimulationCount
 
 class SearchSettings(DeploymentSettings):
     """Settings of D1, D2 and D3: Bayesian optimisation."""
-
-    retired: ClassVar[dict[str, str]] = {"initial": "initial_samples"}
 
     kappa: Kappa = 2.0
     """κ of the lower confidence bound."""

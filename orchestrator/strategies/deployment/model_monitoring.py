@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
@@ -56,8 +56,6 @@ class DiscrepancyPolicySettings(Settings):
 class RiskLimitSettings(Settings):
     """D3 with `model: adaptive`: what no pour may lose, once one has kept it."""
 
-    retired: ClassVar[dict[str, str]] = {"otherwise": "fallback"}
-
     loss: Annotated[float, Quantity("1", "10 %", 1e-3, 1.0)] = 0.1
     """As a share of what spilling the whole load would cost."""
 
@@ -71,8 +69,6 @@ class RiskLimitSettings(Settings):
 
 class StopSettings(Settings):
     """D3 with `model: adaptive`: when no further pour is worth it."""
-
-    retired: ClassVar[dict[str, str]] = {"gain_below": "min_gain"}
 
     min_gain: Annotated[float, Quantity("1", "0.2 %", 1e-5, 1.0)] = 0.002
     """Share of what spilling the whole load would cost: ends when no further pour is expected to save as much."""

@@ -111,20 +111,3 @@ def test_a_campaign_runs_on_another_laboratory(tmp_path: Path, monkeypatch: pyte
     assert refused.exit_code == 2
     assert "ur-rtde" in refused.stderr
     assert "twin.yaml" in refused.stderr
-
-
-@pytest.mark.parametrize(
-    ("command", "name"),
-    [
-        ("run my.yaml --arm", "--arm: is called --enable-motion now"),
-        ("queue submit my.yaml --verb=plan", "--verb: is called --task now"),
-        ("arm quickstart-3f2a1c", "decant arm: is called decant queue enable now"),
-        ("serve lab.yaml", "decant serve: is called decant server start now"),
-        ("abort --all", "decant abort: is called decant estop"),
-        ("study my.yaml", "decant study FILE: is called decant study run FILE now"),
-    ],
-)
-def test_a_retired_name_is_refused_with_the_new_one(command: str, name: str) -> None:
-    result = invoke(command)
-    assert result.exit_code == 2
-    assert name in result.stderr

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import pytest
 
@@ -24,9 +24,6 @@ class Wheel(Settings):
 
 class Cart(Settings):
     """A cart."""
-
-    retired: ClassVar[dict[str, str]] = {"pace": "speed", "drive: clockwork": "drive: spring"}
-    removed: ClassVar[dict[str, str]] = {"horse": "was retired; remove it: carts go by themselves"}
 
     name: Annotated[Name, Example("cart-1")]
     """Its name."""
@@ -85,14 +82,6 @@ def test_all_errors_are_found_at_once_each_with_its_place() -> None:
 def test_rules_between_keys_only_see_keys_that_are_valid_themselves() -> None:
     assert read("name: one\nspeed: 70 deg/s\n")[1] == ["2:8: speed: is above the limit"]
     assert len(read("name: one\nspeed: 70 deg/s\nlimit: fast\n")[1]) == 1
-
-
-def test_renamed_keys_and_values_name_their_successors() -> None:
-    assert sorted(read("name: one\npace: 30 deg/s\ndrive: clockwork\nhorse: bay\n")[1]) == [
-        "2:1: pace: is called 'speed' now; rename it, or use 'decant migrate'",
-        "3:8: drive: 'clockwork' is called 'spring' now; write that",
-        "4:1: horse: was retired; remove it: carts go by themselves",
-    ]
 
 
 def test_a_program_cannot_leave_out_what_is_required() -> None:

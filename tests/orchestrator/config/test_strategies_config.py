@@ -236,50 +236,19 @@ def test_confirming_pours_need_a_bench(tmp_path: Path) -> None:
     assert "campaign.yaml:11:12: deployment.confirm: laboratory 'planning' has no bench to pour on" in problem
 
 
-# -- what was retired ----------------------------------------------------------------------------------------------
-
-
-def test_retired_keys_and_values_are_refused_together_with_their_places(tmp_path: Path) -> None:
-    text = DEPLOYED.replace("strategy: D1", "strategy: D3\n  pours: 5") + (
-        "  model: scaled\n  trust: {pours: 4, policy: widen}\n  simulations_per_pour: free\n"
-        "  costs: {simulation: 2 s}\n"
-    )
-    with pytest.raises(ConfigError) as caught:
-        load(tmp_path, text)
-    lines = [line for line in str(caught.value).splitlines() if "campaign.yaml:" in line]
-    line = text[: text.index("  model")].count("\n") + 1
-    assert [one.partition("campaign.yaml:")[2].partition(";")[0] for one in lines] == [
-        f"{line}:10: deployment.model: 'scaled' was retired",
-        f"{line + 1}:3: deployment.trust: was retired",
-        f"{line + 3}:11: deployment.costs.simulation: was retired",
-    ]
-    assert "write 'adaptive', or 'residual'" in lines[0]
-    assert "remove it: 'model: adaptive' weighs the simulator by every pour" in lines[1]
+# -- keys that do not exist ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("old", "retired", "new"),
+    ("good", "other", "told"),
     [
-        ("strategy: D1", "strategy: D3\n  pours: 5\n  per_pour: 2", "simulations_per_pour"),
-        ("strategy: D1", "strategy: D3\n  pours: 5\n  prices: {pour: 75 s}", "costs"),
-        ("strategy: D1", "strategy: D3\n  pours: 5\n  ignorance: {policy: ask}", "discrepancy_policy"),
-        ("strategy: D1", "strategy: D3\n  pours: 5\n  risk_limit: {otherwise: stop}", "fallback"),
-        ("strategy: D1", "strategy: D3\n  pours: 5\n  stop: {gain_below: 1 %}", "min_gain"),
-        ("strategy: D1", "strategy: D1\n  initial: 4", "initial_samples"),
-        ("strategy: D1", "strategy: D1\n  motion: {hold_cap: 4 s}", "max_hold_time"),
-        ("deployment:", "outputs: {rrd: false}\ndeployment:", "recording"),
-        ("deployment:", "simulator: {parameters: {viscosity: 3 1/s}}\ndeployment:", "xsph_rate"),
-        ("deployment:", "simulator: {parameters: {eddies: 0.1}}\ndeployment:", "smagorinsky_constant"),
-        ("deployment:", "simulator: {parameters: {lip_drop: 0.4}}\ndeployment:", "rim_correction"),
-        ("deployment:", "outputs: {record_rate: 4 1/s}\ndeployment:", "frame_rate"),
+        ("deployment:", "outputs: {record_rate: 4 1/s}\ndeployment:", "outputs.record_rate: unknown key; did you mean"),
+        ("strategy: D1", "strategy: D1\n  initial: 4", "deployment.initial: unknown key; did you mean"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  model: scaled", "deployment.model: 'scaled' is not known here"),
+        ("strategy: D1", "strategy: D3\n  pours: 5\n  trust: always", "deployment.trust: unknown key"),
     ],
 )
-def test_a_renamed_key_is_an_error_that_states_the_present_name(
-    tmp_path: Path, old: str, retired: str, new: str
+def test_a_name_that_only_an_unreleased_version_had_is_unknown(
+    tmp_path: Path, good: str, other: str, told: str
 ) -> None:
-    assert f"is called '{new}' now" in refusal(tmp_path, DEPLOYED.replace(old, retired))
-
-
-def test_a_retired_key_of_another_strategy_is_said_to_be_retired(tmp_path: Path) -> None:
-    text = DEPLOYED.replace("strategy: D1", "strategy: D2\n  pours: 5")
-    assert "deployment.trust: was retired; remove it" in refusal(tmp_path, text + "  trust: always\n")
+    assert told in refusal(tmp_path, DEPLOYED.replace(good, other))

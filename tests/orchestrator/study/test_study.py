@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,10 +26,8 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import (
     RESULT,
-    SETTINGS,
     CellResult,
     StudyError,
-    check_settings,
     code_now,
     code_warning,
     finished_results,
@@ -158,21 +155,6 @@ def test_settings_may_not_change_under_a_study_but_repetitions_may_be_added(tmp_
     more["C2"]["samples"] = 4
     with pytest.raises(StudyError, match="begun with other settings"), opened(small(tmp_path, calibration=more)):
         pass
-
-
-@pytest.mark.parametrize(("trust", "same"), [(None, True), ({"pours": 4, "limit": 2.5, "policy": "D2"}, False)])
-def test_a_study_of_version_0_2_goes_on_unless_it_used_what_is_retired(tmp_path: Path, trust: Any, same: bool) -> None:
-    study = small(tmp_path)
-    with opened(study):
-        pass
-    path = study.folder / SETTINGS
-    settings = json.loads(path.read_text(encoding="utf-8"))
-    settings["deployments"]["D3"]["settings"]["trust"] = trust
-    path.write_text(json.dumps(settings), encoding="utf-8")
-    with (
-        nullcontext() if same else pytest.raises(StudyError, match=r"other settings: deployments\.D3\.settings\.trust")
-    ):
-        check_settings(study)
 
 
 # -- final actions, and which code made a cell -----------------------------------------------------------------------
