@@ -210,7 +210,7 @@ def test_signed_out_the_page_claims_no_stop_and_names_the_physical_one(page: Any
         page.get_by_label("Token").wait_for()
         lab.do(lab.served.post("/emergency-stop/clear", role=Role.ADMIN))
         shown = page.locator("body").inner_text()
-        assert "All arms were told to stop" not in shown
+        assert "stop request to all arms" not in shown
         assert "STOPPED" not in shown
         assert page.title() == "Decant"
         assert not page.get_by_role("button", name="EMERGENCY STOP").is_visible()
