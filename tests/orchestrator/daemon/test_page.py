@@ -432,7 +432,7 @@ def test_a_lost_connection_is_told_with_what_to_do(page: Any, tmp_path: Path) ->
         page.goto(lab.address())
         page.get_by_text("Nothing runs here.").wait_for()
         page.context.set_offline(True)
-        page.get_by_text("the red mushroom button on the teach pendant").wait_for()
+        page.locator("#lost").get_by_text("the red mushroom button on the teach pendant").wait_for()
         page.context.set_offline(False)
         page.get_by_text("No connection to the daemon").wait_for(state="hidden")
         assert page.get_by_role("button", name="EMERGENCY STOP").is_enabled()
