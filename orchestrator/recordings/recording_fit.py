@@ -397,6 +397,7 @@ class FitProblem:
     def __init__(self, names: Sequence[str], lag: Unknown, readings: Sequence[FittedReadings]) -> None:
         self.names, self._readings = tuple(names), readings
         self.unknowns = UNKNOWNS | {"lag": lag}
+        self.onset_wander = ONSET_WANDER
         self.shared = len(names) + 1
         self.size = self.shared + OWN * len(readings)
         one = readings[0].recording
@@ -422,7 +423,7 @@ class FitProblem:
         scene = changed.scene(recording)
         mass = scene.liquid.mass + values("fill") + recording.fill_deviation * fill
         hypotheses = PourHypotheses(
-            ONSET[0] - values("grip") - recording.placement.grip + ONSET_WANDER * onset,
+            ONSET[0] - values("grip") - recording.placement.grip + self.onset_wander * onset,
             np.clip(values("flow") * np.exp(FLOW_WANDER * flow), *FACTOR_RANGE),
             np.maximum(mass, 1e-4) / scene.liquid.density,
             np.clip(values("lag"), *LAG_RANGE),

@@ -15,7 +15,7 @@ holds liquid back like a cup that is about 1 mm higher, so a height is told from
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from orchestrator.recordings.recording_fit import (
     FitProblem,
     FittedReadings,
     Judgement,
+    Unknown,
     fit_recordings,
     held_share,
     judge_recording,
@@ -44,14 +45,17 @@ Floats = NDArray[np.float64]
 STANDS_OUT = 3.0
 """Evidence above which an explanation counts: odds of 20 to 1."""
 
-NOMINAL = {"grip": math.radians(0.5)}
-"""Tolerances of a rig in order; what is not named is exact."""
+NOMINAL = {"grip": math.radians(0.5), "height": 0.5e-3}
+"""Deviations of a rig in order, in SI; the height's includes what the lip holds back."""
 
 WIDE = {"grip": math.radians(1.5), "height": 2.5e-3, "viscosity": 1.5}
 """Deviation of a wrong quantity, in SI; of the viscosity's logarithm."""
 
-STARTS = {"viscosity": (-3.0, 3.0)}
-"""Where a fit starts, in deviations; a thin liquid's viscosity has no influence near its own value."""
+ONSET_WANDER = math.radians(0.12)
+"""Differences of the onset between pours that are made in one go, with the same time to dry [rad]."""
+
+STARTS = (-2.5, 2.5)
+"""Where the fits of the viscosity start, in deviations: at its own value, that of water has no influence."""
 
 NOMINAL_LAG = 0.35
 """Lag that a rig's plan assumes, with the delay of its line [s]."""
@@ -230,40 +234,61 @@ def _fitted(pours: Sequence[PourRecording]) -> list[Explanation]:
     """The explanations by fits, each alone."""
     readings = [FittedReadings.of(one, None) for one in pours]
     lag = lag_before(pours)
-    base, state, noise = _solved(readings, lag, None)
-    plain = _log_evidence(base, state, noise)
+    wide = _problem(readings, lag, {"grip": WIDE["grip"], "height": WIDE["height"]})
+    state = wide.solved(np.zeros(wide.size), wide.noise)
+    noise = wide.effective_noise(state)
+    state = wide.solved(state, noise)
+    information = wide.information(state, noise)
+    data, slope = information - np.eye(wide.size), information @ state
+
+    def fitted(*free: str) -> tuple[float, Floats, Floats]:
+        """Evidence, state and covariance if only these are as uncertain as `WIDE`; exact for a linear model."""
+        prior = np.ones(wide.size)
+        for name, tolerance in NOMINAL.items():
+            if name not in free:
+                prior[wide.names.index(name)] = (WIDE[name] / tolerance) ** 2
+        covariance: Floats = np.asarray(np.linalg.inv(data + np.diag(prior)), dtype=np.float64)
+        _, volume = np.linalg.slogdet(np.eye(wide.size) + data / prior[:, None])
+        return 0.5 * float(slope @ covariance @ slope - volume), covariance @ slope, covariance
+
+    plain, first, _ = fitted()
     found = []
-    for name in WIDE:
-        problem, state, own = max(
-            (_solved(readings, lag, name, start, noise) for start in STARTS.get(name, (0.0,))),
-            key=lambda one: _log_evidence(*one),
-        )
-        unknown = problem.unknowns[name]
-        place = problem.names.index(name)
-        middle = float(state[place])
-        half = 1.645 * math.sqrt(float(np.linalg.inv(problem.information(state, own))[place, place]))
-        value, low, high = (float(unknown.at(one)) / unknown.factor for one in (middle, middle - half, middle + half))
-        unit = f" {unknown.unit}" if unknown.unit else " × the file's"
-        evidence = _log_evidence(problem, state, own) - plain
-        found.append(Explanation(name, evidence, f"{value:.2g}{unit} ({low:.2g} to {high:.2g})", False))
+    for name in NOMINAL:
+        evidence, own, covariance = fitted(name)
+        found.append(_explained(wide, name, own, covariance, evidence - plain))
+    tight = _problem(readings, lag, NOMINAL)
+    before = dict(zip(wide.names, first, strict=False))
+    for name, tolerance in NOMINAL.items():
+        before[name] *= WIDE[name] / tolerance
+    rest = first[len(wide.names) :]
+    reference = _log_evidence(tight, np.concatenate([[before[name] for name in tight.names], rest]), noise)
+    other = _problem(readings, lag, {**NOMINAL, "viscosity": WIDE["viscosity"]})
+    solved = []
+    for start in STARTS:
+        known = {**before, "viscosity": start}
+        solved.append(other.solved(np.concatenate([[known[name] for name in other.names], rest]), noise))
+    best = max(solved, key=lambda one: _log_evidence(other, one, noise))
+    covariance = np.asarray(np.linalg.inv(other.information(best, noise)), dtype=np.float64)
+    evidence = _log_evidence(other, best, noise) - reference
+    found.append(_explained(other, "viscosity", best, covariance, evidence))
     return found
 
 
-def _solved(
-    readings: Sequence[FittedReadings], lag: Any, wide: str | None, start: float = 0.0, noise: Floats | None = None
-) -> tuple[FitProblem, Floats, Floats]:
-    """A fit in which one quantity is uncertain: problem, state, and deviation of the readings."""
-    names = tuple(name for name in UNKNOWNS if name in {"grip", "lag", "flow", wide})
-    problem = FitProblem(names, lag, readings)
-    for name, deviation in {**NOMINAL, **({} if wide is None else {wide: WIDE[wide]})}.items():
+def _explained(problem: FitProblem, name: str, state: Floats, covariance: Floats, evidence: float) -> Explanation:
+    unknown, place = problem.unknowns[name], problem.names.index(name)
+    half = 1.645 * math.sqrt(float(covariance[place, place]))
+    value, low, high = (float(unknown.at(state[place] + one)) / unknown.factor for one in (0.0, -half, half))
+    unit = f" {unknown.unit}" if unknown.unit else " × the file's"
+    return Explanation(name, evidence, f"{value:.2g}{unit} ({low:.2g} to {high:.2g})", False)
+
+
+def _problem(readings: Sequence[FittedReadings], lag: Unknown, deviations: Mapping[str, float]) -> FitProblem:
+    """A fit of lag, flow, and quantities with these deviations before it."""
+    problem = FitProblem([name for name in UNKNOWNS if name in {"lag", "flow", *deviations}], lag, readings)
+    for name, deviation in deviations.items():
         problem.unknowns[name] = replace(problem.unknowns[name], deviation=deviation)
-    state = np.zeros(problem.size)
-    if wide is not None:
-        state[names.index(wide)] = start
-    if noise is None:
-        state = problem.solved(state, problem.noise)
-        noise = problem.effective_noise(state)
-    return problem, problem.solved(state, noise), noise
+    problem.onset_wander = ONSET_WANDER
+    return problem
 
 
 def _log_evidence(problem: FitProblem, state: Floats, noise: Floats) -> float:
