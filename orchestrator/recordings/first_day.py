@@ -166,8 +166,9 @@ def practice_day(folder: Path, seed: int, wrong: str | None = None, sign: int = 
     if wrong == "viscosity":
         assumed, true = (water, thick) if sign > 0 else (thick, water)
     cup = replace(CUP, height=CUP.height + (2e-3 * sign if wrong == "height" else 0.0))
-    held = math.radians(1.0) * sign if wrong == "grip" else 0.0
-    bench = VirtualDosingBench(cup, true, scale, seed, held_tilt=held)
+    bench = VirtualDosingBench(cup, true, scale, seed)
+    if wrong == "grip":  # in place of the bench's own error
+        bench.grip = -math.radians(1.0) * sign
     pourer = cylinder("beaker", inner_radius=CUP.radius, inner_height=CUP.height)
     receiver = cylinder("tumbler", inner_radius=0.035, inner_height=0.090)
     recordings = []

@@ -3,8 +3,9 @@
 `diagnose` compares explanations of the same pours: `RigDiagnosis`, a list of `Explanation`.
 
 - `lag` and `holds` are read directly, from the placing of the receiver and from repeated readings while the mass rises.
-- `grip`, `height` and `viscosity` are fits. In each, one quantity is as uncertain as `WIDE` says, and the others keep the
-  tolerances of a rig in order (`NOMINAL`).
+- `grip` and `height` explain the tilts at which pours of different fills begin. In each explanation, one quantity is as
+  uncertain as `WIDE` says, and the other keeps the tolerance of a rig in order (`NOMINAL`).
+- `viscosity` is tried at `FACTORS` of the file's, with lag, flow and onsets fitted again.
 - Each has an evidence: the logarithm of the Bayes factor against 'nothing is wrong' (Laplace's approximation; MacKay,
   Information Theory, Inference, and Learning Algorithms, chapter 28). More than `STANDS_OUT` counts.
 
@@ -15,17 +16,20 @@ holds liquid back like a cup that is about 1 mm higher, so a height is told from
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaln, xlog1py, xlogy
+from scipy.optimize import brentq
+from scipy.special import betaln, logsumexp, xlog1py, xlogy
 
+from actors.dosing.dose_estimator import ONSET
 from orchestrator.recordings.first_day import MISS
 from orchestrator.recordings.recording_file import PourRecording
 from orchestrator.recordings.recording_fit import (
+    OWN,
     UNKNOWNS,
     Fit,
     FitProblem,
@@ -37,25 +41,36 @@ from orchestrator.recordings.recording_fit import (
     judge_recording,
     lag_before,
 )
-from orchestrator.recordings.recording_replay import arrivals
+from orchestrator.recordings.recording_replay import arrivals, taller
 from sim_engine.errors import InvalidArgumentError
+from sim_engine.hydrostatics import retained_volume
+from sim_engine.vessel.vessel import build_vessel
 
 Floats = NDArray[np.float64]
 
-STANDS_OUT = 3.0
-"""Evidence above which an explanation counts: odds of 20 to 1."""
+STANDS_OUT = 2.0
+"""Evidence above which an explanation counts: odds of 7 to 1."""
 
-NOMINAL = {"grip": math.radians(0.5), "height": 0.5e-3}
-"""Deviations of a rig in order, in SI; the height's includes what the lip holds back."""
+NOMINAL = {"grip": math.radians(0.28), "height": 0.3e-3}
+"""Deviations of a rig in order, in SI."""
 
-WIDE = {"grip": math.radians(1.5), "height": 2.5e-3, "viscosity": 1.5}
-"""Deviation of a wrong quantity, in SI; of the viscosity's logarithm."""
+WIDE = {"grip": math.radians(1.5), "height": 2.5e-3}
+"""Deviations of a wrong quantity, in SI."""
 
-ONSET_WANDER = math.radians(0.12)
+HOLD, LIP = (0.25e-3, 0.3e-3), math.radians(0.27)
+"""Head that a lip holds back beyond the flow's own: mean and deviation [m], and its tilt; of benches in order."""
+
+ONSET_WANDER = math.radians(0.08)
 """Differences of the onset between pours that are made in one go, with the same time to dry [rad]."""
 
-STARTS = (-2.5, 2.5)
-"""Where the fits of the viscosity start, in deviations: at its own value, that of water has no influence."""
+SLOW = math.radians(8.0)
+"""Largest speed of the tilt of a pour that shows the onset; faster ones slosh [rad/s]."""
+
+OPEN_ONSET = math.radians(2.0)
+"""Deviation of the onset of a pour, if nothing is known about it [rad]."""
+
+FACTORS = (0.02, 0.1, 10.0, 50.0)
+"""Viscosities that are tried, over the file's; that of water itself has no influence."""
 
 NOMINAL_LAG = 0.35
 """Lag that a rig's plan assumes, with the delay of its line [s]."""
@@ -173,21 +188,33 @@ def diagnose(recordings: Sequence[PourRecording], lag: float = NOMINAL_LAG) -> R
             f"{len(pours)} pours have readings while they flow; a diagnosis needs 4, of two fills. Record them with the "
             "balance below the receiver"
         )
-    direct = [_lag(recordings, lag), *_holds(recordings)]
-    fitted = _fitted(pours)
-    order = sorted(direct, key=lambda one: -one.evidence) + sorted(fitted, key=lambda one: -one.evidence)
-    order.sort(key=lambda one: not one.stands_out)
+    order = explanations(recordings, pours, lag)
     main = next((one.name for one in order if one.stands_out and not one.direct), None)
     # the fit of a viscosity needs more than the tolerances of `UNKNOWNS`: the doses are then predicted without it
     unknowns = {"grip", "lag", *(() if main in (None, "viscosity") else (main,))}
     fit = fit_recordings(pours, tuple(unknowns))
     return RigDiagnosis(
-        tuple(order),
+        order,
         fit,
         tuple(judge_recording(fit, one) for one in doses),
         missed[0].gain if missed else None,
         tuple((one.name, one.gain, _wanted(one.name)) for one in doses if _wanted(one.name) > 0.0),
     )
+
+
+def explanations(
+    recordings: Sequence[PourRecording], pours: Sequence[PourRecording], lag: float = NOMINAL_LAG
+) -> tuple[Explanation, ...]:
+    """The explanations, the most credible first.
+
+    Args:
+        recordings: all, for lag and repeated readings.
+        pours: those that are fitted.
+        lag: that the rig's plan assumes [s].
+    """
+    direct = [_lag(recordings, lag), *_holds(recordings)]
+    order = sorted(direct, key=lambda one: -one.evidence) + sorted(_fitted(pours), key=lambda one: -one.evidence)
+    return tuple(sorted(order, key=lambda one: not one.stands_out))
 
 
 def _wanted(name: str) -> float:
@@ -231,63 +258,82 @@ def _holds(recordings: Sequence[PourRecording]) -> list[Explanation]:
 
 
 def _fitted(pours: Sequence[PourRecording]) -> list[Explanation]:
-    """The explanations by fits, each alone."""
+    """Grip and height from the onsets, and the viscosity from whole pours."""
     readings = [FittedReadings.of(one, None) for one in pours]
     lag = lag_before(pours)
-    wide = _problem(readings, lag, {"grip": WIDE["grip"], "height": WIDE["height"]})
-    state = wide.solved(np.zeros(wide.size), wide.noise)
-    noise = wide.effective_noise(state)
-    state = wide.solved(state, noise)
-    information = wide.information(state, noise)
-    data, slope = information - np.eye(wide.size), information @ state
+    problem = _problem(readings, lag)
+    state = problem.solved(np.zeros(problem.size), problem.noise)
+    noise = problem.effective_noise(state)
+    state = problem.solved(state, noise)
+    plain = _log_evidence(problem, state, noise)
+    covariance = np.asarray(np.linalg.inv(problem.information(state, noise)), dtype=np.float64)
+    places = [problem.shared + OWN * k for k in range(len(pours))]
+    onsets = ONSET[0] + OPEN_ONSET * state[places]
+    slow = [k for k, one in enumerate(pours) if np.gradient(one.tilts, one.tilt_times).max() < SLOW] or [*range(len(pours))]
+    places = [places[k] for k in slow]
+    between = OPEN_ONSET**2 * covariance[np.ix_(places, places)]
+    found = _from_onsets([pours[k] for k in slow], onsets[slow], between)
+    evidences = []
+    for factor in FACTORS:
+        changed = _problem([replace(one, recording=_thicker(one.recording, factor)) for one in readings], lag)
+        evidences.append(_log_evidence(changed, changed.solved(state, noise), noise) - plain)
+    best = int(np.argmax(evidences))
+    mean = float(logsumexp(evidences)) - math.log(len(evidences))
+    text = f"{FACTORS[best]:.2g} × the file's fits best of {', '.join(f'{one:.2g}' for one in FACTORS)}"
+    return [*found, Explanation("viscosity", mean, text, False)]
 
-    def fitted(*free: str) -> tuple[float, Floats, Floats]:
-        """Evidence, state and covariance if only these are as uncertain as `WIDE`; exact for a linear model."""
-        prior = np.ones(wide.size)
-        for name, tolerance in NOMINAL.items():
-            if name not in free:
-                prior[wide.names.index(name)] = (WIDE[name] / tolerance) ** 2
-        covariance: Floats = np.asarray(np.linalg.inv(data + np.diag(prior)), dtype=np.float64)
-        _, volume = np.linalg.slogdet(np.eye(wide.size) + data / prior[:, None])
-        return 0.5 * float(slope @ covariance @ slope - volume), covariance @ slope, covariance
 
-    plain, first, _ = fitted()
+def _from_onsets(pours: Sequence[PourRecording], onsets: Floats, covariance: Floats) -> list[Explanation]:
+    """Grip and height, from the tilts at which pours of different fills begin beyond those of an ideal rim (N,) [rad].
+
+    An onset is later by −grip + a · height + (a / cos θ) · hold, with the ideal onset θ and its derivative a.
+    """
+    ideal = np.array([_ideal_onset(one, 0.0) for one in pours])
+    slopes = np.array([_ideal_onset(one, 1e-3) for one in pours]) - ideal
+    slopes *= 1e3
+    held = slopes / np.cos(ideal)
+    effects = {"grip": -np.ones(len(pours)), "height": slopes}
+    miss = onsets - held * HOLD[0] - LIP
+    random = covariance + ONSET_WANDER**2 * np.eye(len(pours)) + HOLD[1] ** 2 * np.outer(held, held)
+
+    def prior(wrong: str | None) -> dict[str, float]:
+        return {name: WIDE[name] if name == wrong else NOMINAL[name] for name in effects}
+
+    def evidence(wrong: str | None) -> float:
+        total = random + sum(prior(wrong)[name] ** 2 * np.outer(one, one) for name, one in effects.items())
+        _, volume = np.linalg.slogdet(total)
+        return -0.5 * float(miss @ np.linalg.solve(total, miss) + volume)
+
     found = []
-    for name in NOMINAL:
-        evidence, own, covariance = fitted(name)
-        found.append(_explained(wide, name, own, covariance, evidence - plain))
-    tight = _problem(readings, lag, NOMINAL)
-    before = dict(zip(wide.names, first, strict=False))
-    for name, tolerance in NOMINAL.items():
-        before[name] *= WIDE[name] / tolerance
-    rest = first[len(wide.names) :]
-    reference = _log_evidence(tight, np.concatenate([[before[name] for name in tight.names], rest]), noise)
-    other = _problem(readings, lag, {**NOMINAL, "viscosity": WIDE["viscosity"]})
-    solved = []
-    for start in STARTS:
-        known = {**before, "viscosity": start}
-        solved.append(other.solved(np.concatenate([[known[name] for name in other.names], rest]), noise))
-    best = max(solved, key=lambda one: _log_evidence(other, one, noise))
-    covariance = np.asarray(np.linalg.inv(other.information(best, noise)), dtype=np.float64)
-    evidence = _log_evidence(other, best, noise) - reference
-    found.append(_explained(other, "viscosity", best, covariance, evidence))
+    for name, effect in effects.items():
+        deviation = prior(name)
+        total = random + sum(deviation[other] ** 2 * np.outer(one, one) for other, one in effects.items())
+        gain = deviation[name] ** 2 * np.linalg.solve(total, effect)
+        middle, spread = float(gain @ miss), math.sqrt(deviation[name] ** 2 * (1.0 - float(gain @ effect)))
+        unknown = UNKNOWNS[name]
+        value, low, high = ((middle + part * spread) / unknown.factor for part in (0.0, -1.645, 1.645))
+        text = f"{value:+.2g} {unknown.unit} ({low:+.2g} to {high:+.2g})"
+        found.append(Explanation(name, evidence(name) - evidence(None), text, False))
     return found
 
 
-def _explained(problem: FitProblem, name: str, state: Floats, covariance: Floats, evidence: float) -> Explanation:
-    unknown, place = problem.unknowns[name], problem.names.index(name)
-    half = 1.645 * math.sqrt(float(covariance[place, place]))
-    value, low, high = (float(unknown.at(state[place] + one)) / unknown.factor for one in (0.0, -half, half))
-    unit = f" {unknown.unit}" if unknown.unit else " × the file's"
-    return Explanation(name, evidence, f"{value:.2g}{unit} ({low:.2g} to {high:.2g})", False)
+def _ideal_onset(recording: PourRecording, height: float) -> float:
+    """Tilt at which liquid at rest reaches the lip of a pourer whose rim is higher [rad]."""
+    vessel = build_vessel(taller(recording.scene.pourer, height))
+    volume = recording.scene.liquid.volume
+    return float(brentq(lambda tilt: retained_volume(vessel, tilt) - volume, 0.0, math.radians(89.9)))
 
 
-def _problem(readings: Sequence[FittedReadings], lag: Unknown, deviations: Mapping[str, float]) -> FitProblem:
-    """A fit of lag, flow, and quantities with these deviations before it."""
-    problem = FitProblem([name for name in UNKNOWNS if name in {"lag", "flow", *deviations}], lag, readings)
-    for name, deviation in deviations.items():
-        problem.unknowns[name] = replace(problem.unknowns[name], deviation=deviation)
-    problem.onset_wander = ONSET_WANDER
+def _thicker(recording: PourRecording, factor: float) -> PourRecording:
+    scene = recording.scene
+    changed = {"dynamic_viscosity": factor * scene.liquid.dynamic_viscosity}
+    return replace(recording, scene=replace(scene, liquid=scene.liquid.model_copy(update=changed)))
+
+
+def _problem(readings: Sequence[FittedReadings], lag: Unknown) -> FitProblem:
+    """A fit of lag, flow, and an onset of each pour that is as good as unknown."""
+    problem = FitProblem(("lag", "flow"), lag, readings)
+    problem.onset_wander = OPEN_ONSET
     return problem
 
 
