@@ -2,7 +2,7 @@
 
     python benchmarks/first_day.py
 
-Two benches each have a wrong lag (1 s), repeated readings (42 %), grip (±1°), height (±2 mm) and viscosity (50 times as thick, or
+Two benches each have a wrong lag (1 s), repeated readings (42 %), grip (±1°), height (±2 mm) and viscosity (300 times as thick, or
 as thin, as the file). The question: is the wrong one the first that stands out? Seeds and questions are fixed here.
 The bench is not the model of the fits (`actors.dosing.virtual_dosing_bench`).
 """

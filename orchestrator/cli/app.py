@@ -275,6 +275,7 @@ _add(
     "decant recording first-day day-one --campaign configs/campaigns/first-day.yaml",
     "decant recording first-day practice --practise --wrong grip   # in seconds, without a laboratory",
     "decant recording first-day day-one   # explain the recordings of a folder again",
+    name="first-day",
     to=_recording,
 )
 

@@ -134,8 +134,8 @@ CUP = TrueCup(0.040, 0.100)
 PLACED_BEFORE = 20.0
 """Time from the placing of the receiver to the first motion [s]."""
 
-VISCOUS = 50.0
-"""Factor of a wrong viscosity: three quarters of glycerol in water, or a file of such a liquid with plain water."""
+VISCOUS = 300.0
+"""Factor of a wrong viscosity: a syrup in place of water, or a file of a syrup with plain water."""
 
 
 def practice_day(folder: Path, seed: int, wrong: str | None = None, sign: int = 1) -> list[PourRecording]:

@@ -44,6 +44,7 @@ from orchestrator.recordings.recording_fit import (
 from orchestrator.recordings.recording_replay import arrivals, taller
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.hydrostatics import retained_volume
+from sim_engine.liquids import Liquid
 from sim_engine.vessel.vessel import build_vessel
 
 Floats = NDArray[np.float64]
@@ -69,7 +70,7 @@ SLOW = math.radians(8.0)
 OPEN_ONSET = math.radians(2.0)
 """Deviation of the onset of a pour, if nothing is known about it [rad]."""
 
-FACTORS = (0.02, 0.1, 10.0, 50.0)
+FACTORS = (0.003, 0.03, 30.0, 300.0)
 """Viscosities that are tried, over the file's; that of water itself has no influence."""
 
 NOMINAL_LAG = 0.35
@@ -274,12 +275,13 @@ def _fitted(pours: Sequence[PourRecording]) -> list[Explanation]:
     between = OPEN_ONSET**2 * covariance[np.ix_(places, places)]
     found = _from_onsets([pours[k] for k in slow], onsets[slow], between)
     evidences = []
-    for factor in FACTORS:
+    tried = [factor for factor in FACTORS if all(_possible(one.scene.liquid, factor) for one in pours)]
+    for factor in tried:
         changed = _problem([replace(one, recording=_thicker(one.recording, factor)) for one in readings], lag)
         evidences.append(_log_evidence(changed, changed.solved(state, noise), noise) - plain)
     best = int(np.argmax(evidences))
     mean = float(logsumexp(evidences)) - math.log(len(evidences))
-    text = f"{FACTORS[best]:.2g} × the file's fits best of {', '.join(f'{one:.2g}' for one in FACTORS)}"
+    text = f"{tried[best]:.2g} × the file's fits best of {', '.join(f'{one:.2g}' for one in tried)}"
     return [*found, Explanation("viscosity", mean, text, False)]
 
 
@@ -322,6 +324,15 @@ def _ideal_onset(recording: PourRecording, height: float) -> float:
     vessel = build_vessel(taller(recording.scene.pourer, height))
     volume = recording.scene.liquid.volume
     return float(brentq(lambda tilt: retained_volume(vessel, tilt) - volume, 0.0, math.radians(89.9)))
+
+
+def _possible(liquid: Liquid, factor: float) -> bool:
+    """Whether a liquid can have this multiple of its viscosity."""
+    try:
+        Liquid(**liquid.model_dump() | {"dynamic_viscosity": factor * liquid.dynamic_viscosity})
+    except ValueError:
+        return False
+    return True
 
 
 def _thicker(recording: PourRecording, factor: float) -> PourRecording:

@@ -72,7 +72,7 @@ def diagnosis_figure(found: RigDiagnosis) -> Figure:
             evidence.text(29.5, row, f"{one.evidence:.0f}", ha="right", va="center", color="white", fontsize=8.5)
     evidence.axvline(STANDS_OUT, color=INK, lw=0.8, ls=":")
     evidence.set_xlim(0.0, 30.0)
-    dress(evidence, title="Which quantity is wrong?", x="evidence (dotted: odds of 20 to 1)", grid=None)
+    dress(evidence, title="Which quantity is wrong?", x="evidence (dotted: odds of 7 to 1)", grid=None)
     for row, one in enumerate(found.judged):
         low, high = (1e3 * (number - one.measured_final) for number in one.final[1:])
         doses.plot([low, high], [row, row], color=PREDICTED, lw=3.0, label="predicted, 90 %" if row == 0 else None)
