@@ -2,9 +2,9 @@
 
     python benchmarks/first_day.py
 
-Two benches each have a wrong lag (1 s), repeated readings (42 %), grip (±1°), height (±2 mm) and viscosity (300 times as thick, or
-as thin, as the file). The question: is the wrong one the first that stands out? Seeds and questions are fixed here.
-The bench is not the model of the fits (`actors.dosing.virtual_dosing_bench`).
+Two benches each have a wrong lag (1 s), repeated readings (42 %), grip (±1°), height (±2 mm) and viscosity (300 times
+as thick, or as thin, as the file). The question: is the wrong one the first that stands out? Seeds and
+questions are fixed here. The bench is not the model of the fits (`actors.dosing.virtual_dosing_bench`).
 """
 
 from __future__ import annotations

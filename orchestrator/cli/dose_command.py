@@ -251,8 +251,8 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
     ]
     if predicted.reachable > planned.limit:
         lines.append(
-            f"  balance: nine of ten doses are within {1e3 * predicted.reachable:.2g} g as weighed with this balance; the "
-            f"tolerance of {1e3 * planned.limit:.2g} g is smaller"
+            f"  balance: nine of ten doses are within {1e3 * predicted.reachable:.2g} g as weighed with this balance; "
+            f"the tolerance of {1e3 * planned.limit:.2g} g is smaller"
         )
     for end, count in predicted.ends.items():
         if end != "reached":

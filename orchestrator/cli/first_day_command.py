@@ -50,8 +50,8 @@ def first_day(
 ) -> None:
     """Record ten pours and five doses of water, replay them, and find which quantity of the rig is wrong.
 
-    With a campaign, its bench makes the steps that the folder lacks, one after the other; run the command again after an
-    interruption. Without one, the recordings of the folder are explained. Writes first-day.html and first-day.json.
+    With a campaign, its bench makes the steps that the folder lacks, one after the other; run the command again after
+    an interruption. Without one, the recordings of the folder are explained. Writes first-day.html and first-day.json.
     """
     from orchestrator.recordings.first_day import practice_day
     from orchestrator.recordings.recording_replay import replay_recording
@@ -137,7 +137,9 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
     if not bench.pours:
         raise RefusalError(f"laboratory {bench.name} has no bench: it simulates and plans", BAD_INPUT)
     if plan.deployment is None:
-        raise RefusalError(f"{path}: needs a 'deployment' with the action of the pours, as first-day.yaml has", BAD_INPUT)
+        raise RefusalError(
+            f"{path}: needs a 'deployment' with the action of the pours, as first-day.yaml has", BAD_INPUT
+        )
     if bench.balance is None or bench.balance.placement != "receiver":
         text = f"laboratory {bench.name}: the first day needs 'balance: {{placement: receiver}}', for its readings"
         raise RefusalError(text, BAD_INPUT)
@@ -150,7 +152,9 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
         if (folder / f"{step.name}.yaml").exists():
             continue
         what = f"{1e3 * step.amount:.0f} g" if step.amount is not None else f"to {math.degrees(step.angle):.0f}°"
-        print_message(f"step {number} of {len(steps)}, {step.name}: {step.purpose} ({what}); fill {1e3 * step.fill:.0f} g")
+        print_message(
+            f"step {number} of {len(steps)}, {step.name}: {step.purpose} ({what}); fill {1e3 * step.fill:.0f} g"
+        )
         if step.misses:
             print_message("  this pour misses the receiver on purpose: put a tray below it")
         _pour_step(folder, plan, path, laboratory, step, in_process=in_process, again=again)
@@ -182,9 +186,15 @@ def _pour_step(
         assert plan.deployment is not None
         deployment = dataclasses.replace(plan.deployment, scenes=filled(plan.deployment.scenes)[:1])
         used = dataclasses.replace(
-            plan, calibration=None, dispense=None, deployment=deployment, outputs=plan.outputs.model_copy(update=outputs)
+            plan,
+            calibration=None,
+            dispense=None,
+            deployment=deployment,
+            outputs=plan.outputs.model_copy(update=outputs),
         )
-        run = pour_weighed(chosen_pour(used, _assignments(used, step)), in_process=in_process, again=again, as_json=False)
+        run = pour_weighed(
+            chosen_pour(used, _assignments(used, step)), in_process=in_process, again=again, as_json=False
+        )
     else:
         used = dose_plan(path, laboratory, None, [f"{1e3 * step.amount:g} g"], "1 g", as_left=False, dry_run=False)
         assert used.dispense is not None
@@ -241,7 +251,9 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
     ]
     if differences:
         mean, worst = sum(differences) / len(differences), max(differences)
-        words.append(f"particles, nothing fitted: {mean:.2g} g from the weighed amount on average, {worst:.2g} g at most")
+        words.append(
+            f"particles, nothing fitted: {mean:.2g} g from the weighed amount on average, {worst:.2g} g at most"
+        )
     main = found.main
     if main is None:
         words.append("which quantity explains the difference? nothing stands out: the tolerances explain the pours")
@@ -274,7 +286,7 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
     picture = Picture.of(
         save(diagnosis_figure(found), folder / PICTURE),
         "Bars: evidence of each explanation. Intervals: doses predicted from the pours, minus the weighed amount.",
-        f"Evidence above {STANDS_OUT:g} counts. Lag and holds are read from the balance, the others are fitted to the pours.",
+        f"Evidence above {STANDS_OUT:g} counts. Lag and holds are read from the balance, the others are fitted.",
         wide=True,
     )
     explanations = ResultTable(

@@ -105,9 +105,7 @@ def first_day(pourer: VesselSpec, density: float) -> tuple[DayStep, ...]:
         steps.append((name, full, purpose, None, math.radians(speed), angle))
     steps += [(f"dose-{1e3 * amount:.0f}-g", 0.70, "a dose", amount, 0.0, 0.0) for amount in DOSES]
     return tuple(
-        DayStep(
-            f"{k:02d}-{name}", round(full * capacity * density, 3), purpose, amount, speed, angle, name == MISS
-        )
+        DayStep(f"{k:02d}-{name}", round(full * capacity * density, 3), purpose, amount, speed, angle, name == MISS)
         for k, (name, full, purpose, amount, speed, angle) in enumerate(steps, start=1)
     )
 
@@ -194,7 +192,10 @@ def practice_day(folder: Path, seed: int, wrong: str | None = None, sign: int = 
             folder / f"{step.name}.yaml",
             scene,
             columns,
-            recorded={"how": "virtual dosing bench: tilt of the arm, readings as they arrived", "licence": "Apache-2.0"},
+            recorded={
+                "how": "virtual dosing bench: tilt of the arm, readings as they arrived",
+                "licence": "Apache-2.0",
+            },
             placement={"x_offset": "90 mm", "height": "80 mm"},
             balance={"model": "emulated", "step": "0.1 g"},
             fill_deviation=0.5e-3,

@@ -375,6 +375,7 @@ class FittedReadings:
 
     @classmethod
     def of(cls, recording: PourRecording, until: float | None) -> FittedReadings:
+        """Those up to a time [s], or all. Raises InvalidArgumentError: fewer than five."""
         net, times = recording.net, recording.read_times
         later = np.interp(times + 0.5, times, net) - np.interp(times - 0.5, times, net)
         repeats = np.concatenate([[False], np.abs(np.diff(net)) < 0.5 * recording.step])

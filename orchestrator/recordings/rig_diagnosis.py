@@ -186,8 +186,8 @@ def diagnose(recordings: Sequence[PourRecording], lag: float = NOMINAL_LAG) -> R
     pours = [one for one in recordings if one not in doses and one not in missed and len(one.readings) > 10]
     if len(pours) < 4:
         raise InvalidArgumentError(
-            f"{len(pours)} pours have readings while they flow; a diagnosis needs 4, of two fills. Record them with the "
-            "balance below the receiver"
+            f"{len(pours)} pours have readings while they flow; a diagnosis needs 4, of two fills. Record them with "
+            "the balance below the receiver"
         )
     order = explanations(recordings, pours, lag)
     main = next((one.name for one in order if one.stands_out and not one.direct), None)
@@ -270,7 +270,8 @@ def _fitted(pours: Sequence[PourRecording]) -> list[Explanation]:
     covariance = np.asarray(np.linalg.inv(problem.information(state, noise)), dtype=np.float64)
     places = [problem.shared + OWN * k for k in range(len(pours))]
     onsets = ONSET[0] + OPEN_ONSET * state[places]
-    slow = [k for k, one in enumerate(pours) if np.gradient(one.tilts, one.tilt_times).max() < SLOW] or [*range(len(pours))]
+    speeds = [float(np.gradient(one.tilts, one.tilt_times).max()) for one in pours]
+    slow = [k for k, speed in enumerate(speeds) if speed < SLOW] or [*range(len(pours))]
     places = [places[k] for k in slow]
     between = OPEN_ONSET**2 * covariance[np.ix_(places, places)]
     found = _from_onsets([pours[k] for k in slow], onsets[slow], between)
