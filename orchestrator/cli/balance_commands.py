@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from actors.balance.balance_settings import BalanceEmulator, SerialBalanceSettings
     from actors.balance.line_explanation import DialectFit
     from actors.balance.line_recording import Capture, Recorder
+    from actors.balance.scale_model import Load
     from actors.interfaces import DeviceCheck
 
 CHECK_SCALE = 4.0
@@ -273,6 +274,7 @@ def _fit_in_json(fit: DialectFit) -> dict[str, Any]:
             for line, (reason, count) in fit.refused.items()
         ],
     }
+    from actors.balance.scale_model import Load
 
 
 class Person:
