@@ -101,7 +101,7 @@ def read_series(path: Path, names: Mapping[str, str] | None = None) -> TimeSerie
             repeat within a column.
     """
     try:
-        text = read_text(path, encoding="utf-8-sig", limit=SIZE_LIMIT)
+        text = read_text(path, limit=SIZE_LIMIT).removeprefix("\ufeff")
     except UnreadableError as error:
         raise ConfigError([Problem(path, 0, 0, "", str(error))]) from None
     lines = tuple(text.splitlines())

@@ -145,18 +145,13 @@ def read_bytes(path: Path, *, limit: int = SIZE_LIMIT) -> bytes:
     return content
 
 
-def read_text(path: Path, *, encoding: str = "utf-8", limit: int = SIZE_LIMIT) -> str:
+def read_text(path: Path, *, limit: int = SIZE_LIMIT) -> str:
     """The text of a file in UTF-8.
-
-    Args:
-        path: the file.
-        encoding: 'utf-8', or 'utf-8-sig' if a byte order mark may come first.
-        limit: maximum size [bytes].
 
     Raises:
         UnreadableError: as `read_bytes`, or it is not text in UTF-8.
     """
     try:
-        return read_bytes(path, limit=limit).decode(encoding)
+        return read_bytes(path, limit=limit).decode("utf-8")
     except UnicodeDecodeError as error:
         raise UnreadableError(f"is not text in UTF-8 (byte {error.start}); save it as UTF-8") from None
