@@ -31,6 +31,7 @@ import numpy as np
 from actors.balance.display_behaviour import IDEAL, DisplayBehaviour
 from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import TrueScale, VirtualDosingBench
+from actors.runtime.child_process import child_environment
 from sim_engine.liquids import Liquid
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -110,7 +111,9 @@ def program(commit: str) -> tuple[Any, Any]:
     sys.modules["before"] = package
     for name in ("dose_estimator", "dose_controller", "dose_series"):
         shown = ["git", "show", f"{commit}:actors/dosing/{name}.py"]
-        source = subprocess.run(shown, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+        source = subprocess.run(
+            shown, cwd=ROOT, check=True, capture_output=True, text=True, env=child_environment()
+        ).stdout
         module = types.ModuleType(f"before.{name}")
         sys.modules[f"before.{name}"] = module
         exec(

@@ -433,10 +433,10 @@ class DoseEstimator:
         variance = float(centred @ centred) / (len(predicted) - 1)
         deviation = math.sqrt(scatter**2 + half**2 / 3.0)
         if sigma is None:
-            self._note(innovation**2 / (variance + deviation**2))
+            self._note(innovation**2 / max(variance + deviation**2, 1e-16))
         scattered = predicted + scatter * _even_normal(len(predicted), self._rng)
         perturbed = np.clip(scattered, reading.mass - half, reading.mass + half) - scattered
-        shift = perturbed / (variance + scatter**2) / (len(predicted) - 1)
+        shift = perturbed / max(variance + scatter**2, 1e-16) / (len(predicted) - 1)
 
         def gained(values: Floats) -> Floats:
             return float((values - values.mean()) @ centred) * shift

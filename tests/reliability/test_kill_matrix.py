@@ -78,6 +78,10 @@ def test_every_combination_is_tried_or_has_a_reason_why_not() -> None:
         assert reason
 
 
+STAMPED = ("line_recording.py", "liquid_devices.py", "liquid_device_contracts.py")
+"""Files that record the time of day of raw lines and of events."""
+
+
 def test_what_has_no_clock_reads_none() -> None:
     """The reason why clocks that jump are not tried on arm, balance, simulators and optimiser.
 
@@ -86,7 +90,7 @@ def test_what_has_no_clock_reads_none() -> None:
     clock = re.compile(r"\btime\.time\(|datetime|time_ns\(|localtime|gmtime")
     files = [path for floor in ("actors", "sim_engine") for path in (ROOT / floor).rglob("*.py")]
     assert len(files) > 100
-    stamped = [path.name for path in files if path.name in ("liquid_devices.py", "liquid_device_contracts.py")]
+    stamped = [path.name for path in files if path.name in STAMPED]
     assert [path.name for path in files if clock.search(path.read_text("utf-8"))] == stamped
 
 

@@ -167,13 +167,3 @@ def test_keys_are_typed_in_the_sections_that_say_them():
 
     assert all(sentences(UrArmSettings))
     assert all(sentences(RobotCell))
-
-
-def test_names_of_earlier_versions_are_refused_with_the_new_ones():
-    text = changed("payload:", "untilt_speed: 12 deg/s\n  announcement: 4 s\n  payload:")
-    with pytest.raises(ConfigError) as caught:
-        load(text)
-    assert [problem.renamed for problem in caught.value.problems] == [
-        ("untilt_speed", "upright_speed"),
-        ("announcement", "warning_time"),
-    ]

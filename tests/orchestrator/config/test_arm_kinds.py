@@ -51,9 +51,3 @@ def test_what_is_wrong_with_a_kind_is_told_with_its_place(tmp_path):
     assert "a simulated arm stands nowhere" in refusal(
         tmp_path, "arm: {kind: simulated}\ncell: {receiver: {x: 700 mm, y: 0 mm, z: 0 mm}, direction: 0 deg}\n"
     )
-
-
-def test_the_earlier_name_of_a_simulated_arm_is_refused_with_the_new_one(tmp_path):
-    assert "7:13: arm.kind: 'numbers' is called 'simulated' now; write that" in refusal(
-        tmp_path, "arm: {kind: numbers}\n"
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import re
 import signal
@@ -33,13 +32,11 @@ from orchestrator.study.study_folder import (
     finished_results,
     is_finished,
     opened,
-    read_result,
     run_folder,
-    write_result,
 )
-from orchestrator.study.study_plan import GRID, StudyPlan, cells_of, study_fingerprint
+from orchestrator.study.study_plan import StudyPlan, cells_of, study_fingerprint
 from orchestrator.study.study_runner import run_cell
-from orchestrator.study.study_strategies import FinalPour, Tabled
+from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from sim_engine.solver_fingerprint import folder_digest
@@ -253,20 +250,6 @@ def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tm
     before = folder_digest(tmp_path)
     (tmp_path / "a.py").write_text("x = 2", encoding="utf-8")
     assert folder_digest(tmp_path) != before
-
-
-def test_the_grid_of_an_older_study_is_read(tmp_path: Path) -> None:
-    grid = Tabled(simulations=2)
-    found = CellResult(
-        results={GRID: grid}, simulations=2, pours=0, cpu_s=0.0, seconds=0.0, expected=(), code=code_now()
-    )
-    path = run_folder(tmp_path, GRID) / RESULT
-    path.parent.mkdir(parents=True)
-    write_result(tmp_path, GRID, found)
-    data = json.loads(path.read_text(encoding="utf-8"))
-    data["results"][GRID]["rows"] = [{"lost": "it diverged"}]
-    path.write_text(json.dumps(data), encoding="utf-8")
-    assert read_result(tmp_path, GRID) == found
 
 
 def test_two_commands_can_not_run_one_study(tmp_path: Path) -> None:
