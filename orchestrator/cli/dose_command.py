@@ -135,7 +135,8 @@ def _chosen(
         doses = _planned_doses(amounts, tolerance, scene.receiver.name)
         series = DispensePlan((scene,), doses, 0.0, as_left, plan.laboratory.name)
     small = dataclasses.replace(plan, name=f"{plan.name}-dose", calibration=None, deployment=None, dispense=series)
-    if problems := check_campaign(small, as_written=not amounts):
+    problems = check_campaign(small, as_written=not amounts, warn=lambda problem: print_note(f"warning: {problem}"))
+    if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     return small
 

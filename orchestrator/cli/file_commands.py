@@ -70,7 +70,10 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
         case "vessel":
             from sim_engine.vessel.vessel import build_vessel
 
-            return f"vessel, holds {1e6 * build_vessel(load_vessel(path)).capacity:.4g} mL to the brim", []
+            built = build_vessel(load_vessel(path))
+            for text in built.warnings:
+                print_note(f"warning: {path}: {text}")
+            return f"vessel, holds {1e6 * built.capacity:.4g} mL to the brim", []
         case "laboratory":
             return f"laboratory, {load_laboratory(path).mode}", []
         case "recording":

@@ -484,6 +484,9 @@ class PredictedDoseOutput(_Output):
     left_g: float
     """Expected content of the source after the dose."""
 
+    reachable_tolerance_g: float
+    """Half of the 90 % interval of the dose as weighed with this balance."""
+
     ends: dict[str, int]
     """Number of predicted doses by their end."""
 

@@ -130,7 +130,8 @@ def _chosen(path: Path, laboratory: Path | None, assignments: list[str], scene_n
     scene, space = scene_to_simulate(plan, scene_name)
     with Refused(ValueError, at="--set: "):
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
-    problems = check_vessels(scene, plan.source, wanted_in(plan, scene, scene_name))
+    wanted = wanted_in(plan, scene, scene_name)
+    problems = check_vessels(scene, plan.source, wanted, warn=lambda problem: print_note(f"warning: {problem}"))
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     if not plan.laboratory.pours:

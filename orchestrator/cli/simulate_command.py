@@ -153,7 +153,8 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
         action = assigned_action(options.assignments or [], fixed=scene.fixed, space=space)
     check_output(options.rrd, "--rrd", ".rrd")
     check_output(options.png, "--png", ".png")
-    problems = check_vessels(scene, plan.source, wanted_in(plan, scene, options.scene))
+    wanted = wanted_in(plan, scene, options.scene)
+    problems = check_vessels(scene, plan.source, wanted, warn=lambda problem: print_note(f"warning: {problem}"))
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     frame_rate = 20.0 if options.rrd or options.png else 0.0

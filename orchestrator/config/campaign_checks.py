@@ -244,12 +244,15 @@ class _Checker:
 
     def vessel(self, spec: VesselSpec, places: tuple[Loc, ...]) -> Vessel | None:
         if spec not in self.vessels:
+            where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
             try:
-                self.vessels[spec] = built(spec)
+                found = self.vessels[spec] = built(spec)
             except (VesselError, OSError) as error:
-                where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
                 self.add(places, f"vessel '{spec.name}'{where}: {error}")
                 self.vessels[spec] = None
+            else:
+                for text in found.warnings:
+                    self.warn(self.problem(places, f"vessel '{spec.name}'{where}: {text}"))
         return self.vessels[spec]
 
     def scene(
@@ -508,18 +511,21 @@ def check_campaign(
     return list(dict.fromkeys(checker.problems))
 
 
-def check_vessels(scene: Scene, source: Path, wanted: float | None = None) -> list[Problem]:
+def check_vessels(
+    scene: Scene, source: Path, wanted: float | None = None, *, warn: Callable[[Problem], None] = _ignore
+) -> list[Problem]:
     """Build the vessels of one scene.
 
     Args:
         scene: the scene.
         source: the campaign's file.
         wanted: volume that the receiver has to hold [m³]; the whole load unless given.
+        warn: called with what makes a vessel doubtful.
 
     Returns:
         Problems: a vessel that is invalid, or can't hold the load.
     """
-    checker = _Checker(source)
+    checker = _Checker(source, warn=warn)
     checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"), wanted)
     return checker.problems
 

@@ -221,10 +221,10 @@ class Supervisor:
     def refuse_new_work(self, rig: str = "") -> None:
         """Raise RequestRefusedError if the daemon or one rig accepts no new work."""
         if self.emergency is not None:
-            raise RequestRefusedError("the emergency stop is latched; nothing is taken before somebody has cleared it")
+            raise RequestRefusedError("the emergency stop is latched; requests are accepted again after it is cleared")
         if rig in self.emergencies:
             raise RequestRefusedError(
-                f"the emergency stop of rig {rig} is latched; it takes nothing before somebody has cleared it"
+                f"the emergency stop of rig {rig} is latched; it accepts requests again after it is cleared"
             )
         if self.stopping:
             again = "ray" in self.problems

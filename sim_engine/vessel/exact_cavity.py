@@ -12,6 +12,7 @@ Limitations: as those of `sim_engine.vessel.cavity`.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ from numpy.typing import NDArray
 
 from sim_engine.vessel.cavity import CavityFill, flood
 from sim_engine.vessel.mesh_distance import Crossings, GridLayout, crossings, layout_around
+from sim_engine.vessel.mesh_surface import components
+from sim_engine.vessel.shapes import VesselError
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -29,6 +32,12 @@ NODES = 400_000
 
 FINEST = 0.0008
 """Smallest spacing of the lattice [m]."""
+
+MOST_BODIES = 30
+"""Number of separate bodies that are examined."""
+
+FILLED = 0.01
+"""Smallest relative increase of the cavity without a body that counts as a filler."""
 
 BISECTIONS = 8
 """Halvings of the interval of a spacing that contains the brim."""
@@ -81,6 +90,64 @@ def exact_cavity(vertices: Floats, faces: Integers) -> ExactCavity:
         return ExactCavity(0.0, float(heights[0]), layout, pool, solid)
     brim = _brim(found, corners, layout, solid)
     return ExactCavity(_volume(pool, lowest, highest, layout, brim), brim, layout, pool, solid)
+
+
+@dataclass(frozen=True)
+class Filler:
+    """A separate body that fills a part of the cavity, such as the liquid or a stirrer.
+
+    Attributes:
+        faces: its faces, a mask (F,).
+        size: "72 × 72 × 57 mm".
+        capacities: a clause with the capacities with it and without it.
+    """
+
+    faces: Flags
+    size: str
+    capacities: str
+
+
+def fillers(vertices: Floats, faces: Integers, *, together: bool = False) -> Iterator[Filler]:
+    """Find separate bodies without which a closed mesh would hold more.
+
+    Costs nothing for a mesh of one body.
+
+    Args:
+        vertices: shape (V, 3) [m], z up.
+        faces: normals outwards, shape (F, 3).
+        together: whether a body is compared with a mesh that lacks the bodies found before.
+    """
+    part = components(faces)
+    bodies = np.unique(part)
+    if not 1 < len(bodies) <= MOST_BODIES:
+        return
+    kept = np.ones(len(faces), dtype=bool)
+    whole = _held(vertices, faces)
+    for body in bodies:
+        chosen = part == body
+        rest = kept & ~chosen
+        corners, others = vertices[faces[chosen]], vertices[faces[rest]]
+        within = np.all(corners.min(axis=(0, 1)) >= others.min(axis=(0, 1))) and np.all(
+            corners.max(axis=(0, 1)) <= others.max(axis=(0, 1))
+        )
+        if not within or whole is None:
+            continue
+        without = _held(vertices, faces[rest])
+        if without is None or without <= (1.0 + FILLED) * whole:
+            continue
+        size = " × ".join(f"{1e3 * x:.0f}" for x in np.ptp(corners.reshape(-1, 3), axis=0))
+        both = f"it holds {1e6 * whole:.0f} mL with it and {1e6 * without:.0f} mL without it"
+        yield Filler(chosen, f"{size} mm", both)
+        if together:
+            kept, whole = rest, without
+
+
+def _held(vertices: Floats, faces: Integers) -> float | None:
+    """Volume of the cavity [m³]; None if the surface is not closed."""
+    try:
+        return exact_cavity(vertices, faces).volume
+    except VesselError:
+        return None
 
 
 def _plane(corners: Floats, z: float, layout: GridLayout, free: Flags) -> Flags:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sim_engine import resources as cache
 from sim_engine.vessel.cavity import CavityFill, brim_height, flood, floor_height
 from sim_engine.vessel.distance_grid import SignedDistanceGrid, choose_spacing
-from sim_engine.vessel.exact_cavity import ExactCavity, exact_cavity
+from sim_engine.vessel.exact_cavity import ExactCavity, exact_cavity, fillers
 from sim_engine.vessel.mesh_distance import GridLayout, cast_rays, crossings, layout_around, signed_distance
 from sim_engine.vessel.mesh_surface import measure_opening, normals_and_areas, trace_meridians
 from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
@@ -168,7 +168,7 @@ def to_z(up: str) -> Floats:
     return np.stack([x, np.cross(target, x), target])
 
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Incremented whenever the same mesh would give other arrays."""
 
 SMALLEST_SHARE = 0.03
@@ -210,6 +210,7 @@ def _pack(vessel: Vessel) -> dict[str, NDArray[np.generic]]:
         "vertices": vessel.solid_vertices,
         "faces": vessel.solid_faces,
         "meridians": vessel.meridians,
+        "warnings": np.frombuffer("\n".join(vessel.warnings).encode(), dtype=np.uint8),
     }
 
 
@@ -226,6 +227,7 @@ def _unpack(spec: VesselSpec, stored: dict[str, NDArray[np.generic]]) -> Vessel:
         solid_faces=stored["faces"].astype(np.int64),
         grid=grid,
         meridians=stored["meridians"].astype(float),
+        warnings=tuple(stored["warnings"].astype(np.uint8).tobytes().decode().splitlines()),
         **scalars,
     )
 
@@ -237,6 +239,7 @@ def _measure(spec: VesselSpec, shape: MeshShape) -> Vessel:
     layout = layout_around(vertices, spacing)
     hits, inside = crossings(vertices, faces, layout)
     _check_one_body(vertices, faces, inside, layout, shape)
+    warnings = _doubts(vertices, faces, inside, layout, shape)
     found = flood(~inside)
     if refusal is not None:
         _check_walls(found, layout, exact_cavity(vertices, faces), refusal)
@@ -268,6 +271,7 @@ def _measure(spec: VesselSpec, shape: MeshShape) -> Vessel:
         capacity=len(points) * cell,
         wall_thickness=wall,
         meridians=meridians,
+        warnings=warnings,
     )
 
 
@@ -371,6 +375,39 @@ def _check_one_body(
         f"{shape.path.name}: {count} bodies that don't touch ({', '.join(shown[:4])}{', …' if count > 4 else ''}); a "
         "vessel is one: save it alone"
     )
+
+
+def _doubts(
+    vertices: Floats, faces: Integers, inside: NDArray[np.bool_], layout: GridLayout, shape: MeshShape
+) -> tuple[str, ...]:
+    """Warnings about bodies in the cavity, and about faces that two bodies share.
+
+    Raises:
+        VesselError: it has a sheet without thickness, which would be a wall that holds nothing apart.
+    """
+    name = shape.path.name
+    repair = f"decant vessel NEW.yaml --mesh {name}"
+    found = [
+        f"a separate body of {body.size} fills a part of the cavity and counts as solid: {body.capacities}. If it is "
+        f"the liquid, leave it out: {repair} --drop-bodies"
+        for body in fillers(vertices, faces)
+    ]
+    _, first, uses = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    shared = faces[first[uses > 1]]
+    if len(shared):
+        node = np.floor((vertices[shared].mean(axis=1) - layout.origin) / layout.spacing).astype(np.int64)
+        around = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        i, j, k = np.moveaxis(node[:, None] + around, 2, 0)
+        if np.mean(inside[i, j, k].any(axis=1)) < 0.5:
+            raise VesselError(
+                f"{name}: {len(shared)} faces are there twice and bound no solid: a sheet without thickness, such as "
+                f"the surface of a liquid; leave it out, or let 'decant vessel' repair it: {repair}"
+            )
+        found.append(
+            f"{len(shared)} faces are shared by two bodies, which both count as solid; if one of them is the liquid, "
+            "save the vessel alone"
+        )
+    return tuple(found)
 
 
 def _check_cavity(found: CavityFill, shape: MeshShape, spacing: float, vertices: Floats, bottom: float) -> None:

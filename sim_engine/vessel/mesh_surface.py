@@ -158,6 +158,28 @@ def normals_and_areas(vertices: Floats, faces: Integers) -> tuple[Floats, Floats
     return cross / np.maximum(length, 1e-30)[:, None], length / 2.0
 
 
+def edge_uses(faces: Integers) -> tuple[Integers, Integers, Integers]:
+    """Undirected edges (E, 2), faces at each (E,), and the edge of each side of each face (3 F,)."""
+    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    edges, index, uses = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+    return edges, uses, index.reshape(-1)
+
+
+def components(faces: Integers) -> Integers:
+    """Number of the connected part that each face belongs to, by common edges, shape (F,)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    edges, _, index = edge_uses(faces)
+    count = len(faces)
+    owner = np.repeat(np.arange(count), 3)
+    size = count + len(edges)
+    joined = coo_array((np.ones(len(owner), dtype=bool), (owner, count + index)), shape=(size, size))
+    number = connected_components(joined, directed=False)[1][:count]
+    _, part = np.unique(number, return_inverse=True)
+    return np.asarray(part, dtype=np.int64).reshape(-1)
+
+
 def sharp_edges(vertices: Floats, faces: Integers) -> Integers:
     """Vertex pairs of the edges where the surface turns by more than 30°, shape (E, 2)."""
     normal, _ = normals_and_areas(vertices, faces)

@@ -45,6 +45,7 @@ class Vessel:
         wall_thickness: smallest thickness of the solid [m].
         meridians: curves on the cavity's surface from its bottom to the lip's crest, in half planes through the axis at
             equal angles from +x, shape (directions, points, 3) [m]. Leaving liquid crosses one of them.
+        warnings: what makes its shape doubtful, such as a body in its cavity.
     """
 
     spec: VesselSpec
@@ -58,6 +59,7 @@ class Vessel:
     capacity: float
     wall_thickness: float
     meridians: Floats
+    warnings: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sim_engine.resources import MissingExtraError, installed
 from sim_engine.settings.plugin_registry import DISTRIBUTION
-from sim_engine.vessel.exact_cavity import exact_cavity
+from sim_engine.vessel.exact_cavity import exact_cavity, fillers
 from sim_engine.vessel.mesh import (
     FORMATS,
     MOST_FACES,
@@ -30,10 +30,10 @@ from sim_engine.vessel.mesh import (
     typical_wall,
     wall_thickness,
 )
+from sim_engine.vessel.mesh_surface import components
 from sim_engine.vessel.shapes import LengthUnit, MeshShape, VesselError
 from sim_engine.vessel_acquisition.surface_repair import (
     boundary_loops,
-    components,
     distinct,
     holes_filled,
     is_closed,
@@ -63,9 +63,6 @@ LARGE_HOLE = 0.01
 
 CHANGED = 0.01
 """Relative change of the cavity from which a repair is a warning."""
-
-MOST_BODIES = 30
-"""Number of separate bodies that are examined."""
 
 FLATNESS = 0.02
 """Largest deviation of a simplified surface [mm]."""
@@ -367,33 +364,17 @@ def _thickened(mesh: Any, wall: float) -> Any:
 
 def _without_fillers(vertices: Floats, faces: Integers, drop: bool, log: _Log) -> Integers:
     """Find separate bodies that fill a part of the cavity, and leave them out if that is wanted."""
-    part = components(faces)
-    bodies = np.unique(part)
-    if not 1 < len(bodies) <= MOST_BODIES:
-        return faces
-    whole = log.capacity(vertices, faces)
-    for body in bodies:
-        chosen = part == body
-        corners, others = vertices[faces[chosen]], vertices[faces[~chosen]]
-        within = np.all(corners.min(axis=(0, 1)) >= others.min(axis=(0, 1))) and np.all(
-            corners.max(axis=(0, 1)) <= others.max(axis=(0, 1))
-        )
-        if not within or whole is None:
-            continue
-        without = log.capacity(vertices, faces[~chosen])
-        if without is None or without <= (1.0 + CHANGED) * whole:
-            continue
-        size = " × ".join(f"{1e3 * x:.0f}" for x in np.ptp(corners.reshape(-1, 3), axis=0))
-        both = f"it holds {1e6 * whole:.0f} mL with it and {1e6 * without:.0f} mL without it"
+    kept = np.ones(len(faces), dtype=bool)
+    for body in fillers(vertices @ log.turn.T, faces, together=drop):
         if drop:
-            log.notes.append(f"a separate body of {size} mm in the cavity was left out: {both}")
-            faces, part, whole = faces[~chosen], part[~chosen], without
+            log.notes.append(f"a separate body of {body.size} in the cavity was left out: {body.capacities}")
+            kept &= ~body.faces
         else:
             log.warnings.append(
-                f"a separate body of {size} mm fills a part of the cavity and counts as solid: {both}. If it is the "
-                "liquid, leave it out with --drop-bodies"
+                f"a separate body of {body.size} fills a part of the cavity and counts as solid: {body.capacities}. "
+                "If it is the liquid, leave it out with --drop-bodies"
             )
-    return faces
+    return faces[kept]
 
 
 def _solid(vertices: Floats, faces: Integers) -> Any:

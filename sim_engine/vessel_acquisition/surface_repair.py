@@ -24,6 +24,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_engine.vessel.mesh_surface import components, edge_uses
+
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -54,34 +56,12 @@ GRID_NODES = 400_000
 """Nodes of the grid of `rebuilt`."""
 
 
-def edge_uses(faces: Integers) -> tuple[Integers, Integers, Integers]:
-    """Undirected edges (E, 2), faces at each (E,), and the edge of each side of each face (3 F,)."""
-    sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, index, uses = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
-    return edges, uses, index.reshape(-1)
-
-
 def is_closed(faces: Integers) -> bool:
     """Whether every directed edge is used as often as its opposite."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     forth = edges[np.lexsort((edges[:, 1], edges[:, 0]))]
     back = edges[np.lexsort((edges[:, 0], edges[:, 1]))][:, ::-1]
     return bool(np.array_equal(forth, back))
-
-
-def components(faces: Integers) -> Integers:
-    """Number of the connected part that each face belongs to, by common edges, shape (F,)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    edges, _, index = edge_uses(faces)
-    count = len(faces)
-    owner = np.repeat(np.arange(count), 3)
-    size = count + len(edges)
-    joined = coo_array((np.ones(len(owner), dtype=bool), (owner, count + index)), shape=(size, size))
-    number = connected_components(joined, directed=False)[1][:count]
-    _, part = np.unique(number, return_inverse=True)
-    return np.asarray(part, dtype=np.int64).reshape(-1)
 
 
 def welded(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, float]:

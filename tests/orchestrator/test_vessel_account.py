@@ -132,6 +132,21 @@ def test_a_campaign_of_the_daemon_pours_out_of_a_vessel_of_the_station(
     run(work())
 
 
+def test_a_lone_surrogate_in_a_liquid_is_refused(tmp_path: Path) -> None:
+    """The refusal quotes it, and UTF-8 has no code for it."""
+
+    async def work() -> None:
+        async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served:
+            client, headers = served.http, {**served.headers(), "Content-Type": "application/json"}
+            for properties in (r'{"\ud969x": null}', r'{"name": "\ud969"}', r'{"density": "1 \ud969"}'):
+                body = f'{{"id": "water", "properties": {properties}}}'
+                answer = await client.post("/api/v1/materials/liquids", content=body, headers=headers)
+                assert answer.status_code == 422, answer.text
+                assert answer.json()["detail"]
+
+    run(work())
+
+
 def test_a_person_weighs_a_source_on_the_command_line_and_sees_what_is_left(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

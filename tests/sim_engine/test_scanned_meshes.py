@@ -18,6 +18,7 @@ import pytest
 import trimesh
 
 from orchestrator.cli.console import RefusalError
+from orchestrator.cli.file_commands import validate
 from orchestrator.cli.vessel_command import vessel
 from orchestrator.cli.vessel_tables import read_points
 from orchestrator.config.file_loading import load_vessel
@@ -204,6 +205,72 @@ def test_a_mesh_that_is_not_closed_is_refused_in_a_vessel_file_with_the_command_
     path = unpacked("inner_faces.stl", tmp_path)
     with pytest.raises(VesselError, match=r"decant vessel NEW\.yaml --mesh inner_faces\.stl"):
         build_vessel(VesselSpec(name="cup", shape=MeshShape(path=path, unit="mm")))
+
+
+def with_liquid(kind: str) -> trimesh.Trimesh:
+    """A cup with a thick wall, and its liquid as CAD assemblies save it: a body, or the surface with both sides.
+
+    A body has faces in common with the cup if both have the same corners (grabcad.com and shapeways.com: assemblies
+    exported as one STL file).
+    """
+    outline = [(0, 0), (40, 0), (46, 90), (38, 90), (35, 49), (32, 8), (0, 8)]
+    mesh = trimesh.creation.revolve(np.array(outline, float), sections=16)
+    if kind == "alone":
+        return mesh
+    if kind == "surface":
+        disc = trimesh.creation.revolve(np.array([(0, 49), (30, 49)], float), sections=16)
+        disc = trimesh.Trimesh(disc.vertices, np.vstack([disc.faces, disc.faces[:, ::-1]]), process=False)
+        return trimesh.util.concatenate([mesh, disc])
+    low, high = ((8.5, 31), (49.0, 34)) if kind == "body" else ((8.0, 32), (49.0, 35))
+    liquid = trimesh.creation.revolve(np.array([(0, low[0]), low[::-1], high[::-1], (0, high[0])], float), sections=16)
+    return trimesh.util.concatenate([mesh, liquid])
+
+
+def vessel_file(folder: Path, kind: str) -> Path:
+    with_liquid(kind).export(folder / "cup.stl")
+    (folder / "cup.yaml").write_text("name: cup\nmesh: cup.stl\nunit: mm\n")
+    return folder / "cup.yaml"
+
+
+@pytest.mark.parametrize(
+    ("kind", "warning"),
+    [
+        ("alone", None),
+        (
+            "body",
+            r"a separate body of 68 × 68 × 40 mm fills .* holds (\d+) mL with it and (\d+) mL without it.*"
+            r"decant vessel NEW\.yaml --mesh cup\.stl --drop-bodies",
+        ),
+        ("body that touches", "faces are shared by two bodies, which both count as solid"),
+    ],
+)
+def test_a_body_in_the_cavity_of_a_mesh_in_a_vessel_file_is_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, warning: str | None
+) -> None:
+    path = vessel_file(tmp_path, kind)
+    for _ in range(2):  # computed, and from the cache
+        validate([path])
+        out, err = capsys.readouterr()
+        assert "ok (vessel, holds" in out
+        if warning is None:
+            assert "warning" not in err
+        else:
+            found = re.search(f"warning: .*cup.yaml: .*{warning}", " ".join(err.split()))
+            assert found, err
+            assert [float(text) for text in found.groups()] == pytest.approx(
+                [176.0, 312.0][: len(found.groups())], 0.03
+            )
+
+
+def test_a_surface_without_thickness_in_the_cavity_of_a_mesh_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(RefusalError) as refused:
+        validate([vessel_file(tmp_path, "surface")])
+    assert refused.value.code == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "bound no solid: a sheet without thickness" in said
+    assert "decant vessel NEW.yaml --mesh cup.stl" in said
 
 
 def test_bodies_that_touch_along_an_edge_are_drawn() -> None:

@@ -68,8 +68,8 @@ export function stopCard(stop, asking, waiting, acts) {
     onkeydown: (event) => { if (asking && event.key === "Escape") acts.askClear(null); } },
   el("h2", { id: head }, name),
   el("p", {}, `By ${stop.by} at ${clock(stop.time)}${stop.reason ? `: ${stop.reason}` : ""}. `,
-    all ? "All arms were told to stop, and nothing begins before this stop is cleared. " :
-      "Its arm was told to stop, and nothing begins on this rig before this stop is cleared. ",
+    all ? "The program has sent a stop request to all arms, and starts nothing before this stop is cleared. " :
+      "The program has sent a stop request to its arm, and starts nothing on this rig before this stop is cleared. ",
     "A pour that was under way is UNKNOWN: the operator is asked about it."),
   asking ? [
     el("h3", {}, all ? "Are all cells clear of people and obstacles?" : `Is the cell of ${stop.rig} clear of people and obstacles?`),

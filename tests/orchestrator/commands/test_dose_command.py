@@ -46,7 +46,7 @@ def test_a_dry_run_predicts_and_pours_nothing(campaign: Path) -> None:
 def test_doses_are_poured_weighed_and_recorded(campaign: Path) -> None:
     result = decant("dose", str(campaign), "--amount", "25 g", "--amount", "40 g", "--in-process")
     assert result.exit_code == 0, result.output
-    weighed = re.findall(r"dose (\d), (\d+) g: ([\d.]+) g weighed", result.stdout)
+    weighed = re.findall(r"dose (\d), (\d+) g: ([\d.]+) g ± [\d.]+ g weighed", result.stdout)
     assert [(number, wanted) for number, wanted, _ in weighed] == [("1", "25"), ("2", "40")]
     for _, wanted, received in weighed:
         assert float(received) == pytest.approx(float(wanted), abs=2.0)

@@ -210,7 +210,7 @@ def test_signed_out_the_page_claims_no_stop_and_names_the_physical_one(page: Any
         page.get_by_label("Token").wait_for()
         lab.do(lab.served.post("/emergency-stop/clear", role=Role.ADMIN))
         shown = page.locator("body").inner_text()
-        assert "All arms were told to stop" not in shown
+        assert "stop request to all arms" not in shown
         assert "STOPPED" not in shown
         assert page.title() == "Decant"
         assert not page.get_by_role("button", name="EMERGENCY STOP").is_visible()
@@ -432,7 +432,7 @@ def test_a_lost_connection_is_told_with_what_to_do(page: Any, tmp_path: Path) ->
         page.goto(lab.address())
         page.get_by_text("Nothing runs here.").wait_for()
         page.context.set_offline(True)
-        page.get_by_text("the red mushroom button on the teach pendant").wait_for()
+        page.locator("#lost").get_by_text("the red mushroom button on the teach pendant").wait_for()
         page.context.set_offline(False)
         page.get_by_text("No connection to the daemon").wait_for(state="hidden")
         assert page.get_by_role("button", name="EMERGENCY STOP").is_enabled()
