@@ -210,8 +210,7 @@ def test_a_mesh_that_is_not_closed_is_refused_in_a_vessel_file_with_the_command_
 def with_liquid(kind: str) -> trimesh.Trimesh:
     """A cup with a thick wall, and its liquid as CAD assemblies save it: a body, or the surface with both sides.
 
-    A body has faces in common with the cup if both have the same corners (grabcad.com and shapeways.com: assemblies
-    exported as one STL file).
+    A body has faces in common with the cup if both have the same corners.
     """
     outline = [(0, 0), (40, 0), (46, 90), (38, 90), (35, 49), (32, 8), (0, 8)]
     mesh = trimesh.creation.revolve(np.array(outline, float), sections=16)
