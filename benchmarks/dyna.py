@@ -38,8 +38,8 @@ from actors.interfaces import DoseTarget, ProgressCallback
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
+from orchestrator.journal.events import DecisionMade, Event
 from orchestrator.journal.run_record import POOL_RESTS, Occupancy
-from orchestrator.runs.events import DecisionMade, Event
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan, OutputSettings
 from orchestrator.strategies.deployment.costing import CostSettings

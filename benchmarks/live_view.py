@@ -35,11 +35,11 @@ from actors.optimizer.questions import Data, MinimumQuery
 from actors.optimizer.suggest import propose
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign
+from orchestrator.journal.events import Event, PourProgressed, RequestFinished, RequestStarted
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.live_view.viewer_server import environment, rerun_program
 from orchestrator.requests import Pour, Simulate, Simulated, Suggest, Suggested
-from orchestrator.runs.events import Event, PourProgressed, RequestFinished, RequestStarted
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.outcome import PourOutcome, RecordedFrames
 
