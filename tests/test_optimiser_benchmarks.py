@@ -98,33 +98,6 @@ def test_regret_is_nothing_at_the_minimum_and_observations_scatter_around_it() -
     assert np.std(noisy) > 0.0
 
 
-def test_the_table_of_models_is_of_the_campaigns_that_were_made(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    import hybrid_models
-
-    made: list[tuple[str, int, int, dict[str, float]]] = []
-    campaign = hybrid_models.campaign
-
-    def watched(model: str, world: Any, simulated: Any, pours: int) -> dict[str, float]:
-        found: dict[str, float] = campaign(model, world, simulated, pours)
-        made.append((model, world.seed, len(simulated), found))
-        return found
-
-    monkeypatch.setattr(hybrid_models, "campaign", watched)
-    arguments = ("--worlds", "right", "--models", "residual", "constant", "--seeds", "2")
-    result = result_of(hybrid_models, monkeypatch, capsys, *arguments, "--simulations", "8", "--pours", "3")
-    assert [(model, seed, count) for model, seed, count, _ in made] == [
-        (model, seed, 8) for model in ("residual", "constant") for seed in (0, 1)
-    ]
-    for row in result["rows"]:
-        for key in ("reported", "third", "mean"):
-            values = [found[key] for model, _, _, found in made if model == row["model"]]
-            assert row[key] == pytest.approx(np.mean(values), abs=1e-3)
-            assert row[f"{key}_error"] == pytest.approx(np.std(values, ddof=1) / 2**0.5, abs=1e-3)
-            assert 0.0 <= row[key] <= 1.0
-
-
 def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
