@@ -90,7 +90,7 @@ def test_peer_turns_its_cup_as_the_simulator_does(tmp_path: Path) -> None:
     import peer
     import standard_pour
 
-    job: dict[str, Any] = peer._job(tmp_path, peer.standard(), 400, seed=1)
+    job: dict[str, Any] = peer._job(tmp_path, 400, seed=1)
     pourer, _ = standard_pour.vessels()
     lines = (tmp_path / "pourer.obj").read_text().splitlines()
     mesh = np.array([line.split()[1:] for line in lines if line.startswith("v ")], dtype=float)
