@@ -1,6 +1,6 @@
 """Write the daemon's measurements into docs/evidence/reliability.md: `python benchmarks/daemon_page.py`.
 
-The figures are in docs/data/daemon.json. `daemon_stops`, `soak` and `idle_time` store them there and call this script.
+The figures are in docs/data/daemon.json. `daemon_stops` and `soak` store them there and call this script.
 """
 
 from __future__ import annotations
@@ -114,26 +114,9 @@ def _by_state(states: Mapping[str, int]) -> dict[str, int]:
     return found
 
 
-def idle_time(found: Mapping[str, Any]) -> str:
-    """Return the table of wall times with and without speculative simulations."""
-    rows = []
-    times = "once" if found["times"] == 1 else f"the median of {found['times']}"
-    for run in found["runs"]:
-        without = run["ahead"] == "no"
-        seconds = f"{run['wall']:.0f} s", f"{run['arm']:.0f} s", f"{run['wall'] - run['arm']:.0f} s"
-        made = "without" if without else f"{run['made ahead']:.0f} of them"
-        rows.append((run["campaign"], made, *seconds, "yes" if run["same decisions"] else "NO"))
-    return (
-        f"On {found['cores']} cores with a load of {found['load before']} beforehand, in turn, "
-        f"{times}:\n\n"
-        + markdown_table(("campaign", "simulations ahead", "wall", "the arm's own", "the rest", "same decisions"), rows)
-    )
-
-
 TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "stops": stops,
     "day": day,
-    "idle-time": idle_time,
 }
 
 

@@ -362,12 +362,8 @@ SHOWN_SHARES = (20.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
 MEASURED = (
     *(
         "recorded",
-        "recorded-2k",
-        "recorded-run",
-        "bands",
         "limits",
         "convergence",
-        "quickstart-calibration",
         "quickstart-coverage",
     ),
     *(

@@ -393,9 +393,10 @@ DRAINAGE = "A film of 8 mm, ν = 1,000 mm²/s, drains from a vertical wall of 10
 PUDDLE = "250 mL are let go on a plane: the radius is 0.894 (gV³t/3ν)^⅛ once they are flat (Huppert 1982)."
 CUP = (
     "The standard pour with 0.1 and 1 Pa s, at 1,000 kg/m³. Reference: the volume-of-fluid solver interFoam (OpenFOAM "
-    "1912), no-slip walls, cells of 2 mm (made with commit 46022671 by `benchmarks/grid_outflow.py`). With 4, 3 and 2.5 "
-    "mm it leaves 0.564, 0.580 and 0.584 of the thicker liquid at 3.1 s. SPlisHSPlasH 2.19 with the viscosity of Weiler "
-    "et al. 2018 is no reference, because it leaves 0.34 with walls of volume maps and 0.50 with walls of particles."
+    "1912), no-slip walls, cells of 2 mm (made with commit 46022671 by `benchmarks/grid_outflow.py`). With 4, 3 and "
+    "2.5 mm it leaves 0.564, 0.580 and 0.584 of the thicker liquid at 3.1 s. SPlisHSPlasH 2.19 with the viscosity of "
+    "Weiler et al. 2018 is no reference, because it leaves 0.34 with walls of volume maps and 0.50 with walls of "
+    "particles."
 )
 
 SIDE, VOLUME = 0.07, 200e-6
