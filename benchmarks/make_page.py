@@ -63,6 +63,7 @@ def page_text(records: dict[str, Any]) -> str:
     scaling = records.get("scaling")
     parts = [
         sections.introduction(),
+        sections.machines(records.values()),
         *stale(records),
         sections.targets(pours),
         sections.beside_the_peer(pours),

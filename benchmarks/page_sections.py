@@ -199,7 +199,8 @@ def memory(record: Record | None) -> str:
     if record is None or not record["result"]["memory"]:
         return missing(title, "scaling.py")
     parts = ("imports", "taichi", "arrays", "kernels_and_vessels", "pour", "process")
-    rows = [(f"{r['particles']:,}", *(f"{r[f'{part}_mb']:.0f}" for part in parts)) for r in record["result"]["memory"]]
+    ends = [record["result"]["memory"][0], record["result"]["memory"][-1]]
+    rows = [(f"{r['particles']:,}", *(f"{r[f'{part}_mb']:.0f}" for part in parts)) for r in ends]
     head = ("N", "packages", "Taichi", "the solver's arrays", "kernels and vessels", "the pour", "in all [MB]")
     return f"""## {title}
 
@@ -262,16 +263,25 @@ def missing(title: str, command: str) -> str:
     return f"## {title}\n\nNot measured yet: `python benchmarks/{command} --json`\n"
 
 
+def machines(records: Iterable[Record]) -> str:
+    """Return a line with the machines and solvers of all measurements."""
+    found = dict.fromkeys(_place(record["result"]["machine"]) for record in records)
+    return prose(f"Measured on {'; '.join(found)}.") + "\n" if found else ""
+
+
+def _place(machine: Mapping[str, Any]) -> str:
+    named = "{processor}, {cores} cores, {system}, Python {python}, Taichi {taichi}, solver {solver}"
+    return named.format_map(machine)
+
+
 def settings(records: Sequence[Record]) -> str:
-    """Return machine, software, commands and time of one or several measurements, in small print."""
-    machines: dict[str, list[str]] = {}
+    """Return commands and times of one or several measurements, in small print."""
+    made = []
     for record in records:
         m, core = record["result"]["machine"], record["result"].get("core")
-        place = f"{m['processor']}, {m['cores']} cores, {m['system']}, Python {m['python']}, Taichi {m['taichi']}"
         where = f"core {core}, " if core is not None else ""
-        moment = f"solver {m['solver']}, {m['date']}, {where}load {m['load_average'][0]}"
-        machines.setdefault(place, []).append(f"`{record['command']}` ({moment})")
-    return "<sub>" + "; ".join(f"{place}: {', '.join(made)}" for place, made in machines.items()) + "</sub>\n"
+        made.append(f"`{record['command']}` ({m['date']}, {where}load {m['load_average'][0]})")
+    return f"<sub>{', '.join(made)}</sub>\n"
 
 
 def prose(text: str) -> str:

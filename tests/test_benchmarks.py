@@ -195,7 +195,7 @@ def test_page_says_what_is_met_what_is_missed_and_what_is_not_measured(tmp_path:
     assert "| 2,000 | 0.50 | 17.0 | **34** |" in page
     assert "| 2,000 | 0.940 | 0.680 | 0.305 | right | 0.990 | 1.003 |" in page
     assert "abacus, 10 cores, wood" in page
-    assert "`python pour` (solver abc, today, core 1, load 0.1)" in page
+    assert "`python pour` (today, core 1, load 0.1)" in page
     assert "## Start-up\n\nNot measured yet: `python benchmarks/start_up.py --json`" in page
     assert (tmp_path / "images" / "performance-cost.png").stat().st_size > 1000
 
