@@ -246,6 +246,9 @@ def parameters() -> str:
     return _table(("name", "bounds", "default", "meaning"), rows)
 
 
+EFFECTS = {"no effect beyond the seeds' noise": "none", "spillage rises": "rises", "spillage falls": "falls"}
+
+
 def effects() -> str:
     """What each parameter does to the spillage of three pours, as last measured by the case `sensitivity`."""
     found = {(e.parameter, e.pour): e for e in sensitivity.effects(_measured("sensitivity"))}
@@ -256,7 +259,11 @@ def effects() -> str:
         cells = []
         for pour in sensitivity.POURS:
             e = found.get((name, pour))
-            cells.append("not measured yet" if e is None else f"{e.effect} over {e.where}: {e.change:+.3f} ± {e.error}")
+            cells.append(
+                "not measured yet"
+                if e is None
+                else f"{EFFECTS.get(e.effect, e.effect)}, {e.where}: {e.change:+.3f} ± {e.error}"
+            )
         rows.append((f"`{name}`", "" if info.unit == "1" else info.unit, *cells))
     return _table(("name", "unit", *(f"{pour} pour" for pour in sensitivity.POURS)), rows)
 
