@@ -198,16 +198,14 @@ def memory(record: Record | None) -> str:
     title = "Memory"
     if record is None or not record["result"]["memory"]:
         return missing(title, "scaling.py")
-    parts = ("imports", "taichi", "arrays", "kernels_and_vessels", "pour", "process")
-    ends = [record["result"]["memory"][0], record["result"]["memory"][-1]]
-    rows = [(f"{r['particles']:,}", *(f"{r[f'{part}_mb']:.0f}" for part in parts)) for r in ends]
-    head = ("N", "packages", "Taichi", "the solver's arrays", "kernels and vessels", "the pour", "in all [MB]")
-    return f"""## {title}
-
-Resident memory of a process with one simulator, early in a pour, by its use [MB].
-
-{table(head, rows, "rrrrrrr")}
-{settings([record])}"""
+    first, *_, last = record["result"]["memory"]
+    text = prose(
+        f"""A process with one simulator has {first["process_mb"]:.0f} MB early in a pour with {first["particles"]:,}
+        particles, and {last["process_mb"]:.0f} MB with {last["particles"]:,}: packages {last["imports_mb"]:.0f}, Taichi
+        {last["taichi_mb"]:.0f}, the solver's arrays {last["arrays_mb"]:.0f}, kernels and vessels
+        {last["kernels_and_vessels_mb"]:.0f}, the pour {last["pour_mb"]:.0f}."""
+    )
+    return f"## {title}\n\n{text}\n\n{settings([record])}"
 
 
 def start_up(record: Record | None) -> str:
