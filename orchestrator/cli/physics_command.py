@@ -370,8 +370,7 @@ def write_page(
 
 def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint: str) -> str:
     """The page of some records, in their order; see `write_page`."""
-    rows = [m for record in records.values() for m in record["measurements"]]
-    judged = [m for m in rows if m["judged"]]
+    judged = [m for record in records.values() for m in record["measurements"] if m["judged"]]
     failed = sum(not m["passed"] for m in judged)
     parts = [INTRODUCTION.format(theta=theta)]
     parts.append(f"{len(judged) - failed} of {len(judged)} criteria are met.\n")
@@ -381,18 +380,25 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint:
     for name, record in records.items():
         command = f"(`decant validate-solver {name}`){older.get(name, '')}"
         parts.append(f"## {record['title']}\n\n{record['about']} {command}\n")
-        rows: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
-        for m in record["measurements"]:
-            if m["judged"]:
-                rows.setdefault((m["name"], shown(m["reference"], m["unit"]), m["criterion"]), []).append(m)
-        if rows:
-            lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]
-            for (quantity, reference, criterion), some in rows.items():
-                numbers = "; ".join(f"{m['particles']:,}" for m in some)
-                values = "; ".join(shown(m["value"], m["unit"]) for m in some)
-                words = ", ".join({"FAIL": "**fails**"}.get(verdict(m), verdict(m)) for m in some)
-                lines.append(f"| {quantity} | {numbers} | {values} | {reference} | {criterion} | {words} |")
-            parts.append("\n".join(lines) + "\n")
+        if table := _criteria(record["measurements"]):
+            parts.append(table)
         if record["image"] is not None:
             parts.append(f"![{record['title']}](../{IMAGES}/{record['image']})\n")
     return "\n".join(parts)
+
+
+def _criteria(measurements: Sequence[Mapping[str, Any]]) -> str:
+    """Table of the quantities with a criterion, a row for all numbers of particles; empty if there are none."""
+    rows: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for m in measurements:
+        if m["judged"]:
+            rows.setdefault((m["name"], shown(m["reference"], m["unit"]), m["criterion"]), []).append(m)
+    if not rows:
+        return ""
+    lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]
+    for (quantity, reference, criterion), some in rows.items():
+        numbers = "; ".join(f"{m['particles']:,}" for m in some)
+        values = "; ".join(shown(m["value"], m["unit"]) for m in some)
+        words = ", ".join({"FAIL": "**fails**"}.get(verdict(m), verdict(m)) for m in some)
+        lines.append(f"| {quantity} | {numbers} | {values} | {reference} | {criterion} | {words} |")
+    return "\n".join(lines) + "\n"
