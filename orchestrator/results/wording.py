@@ -11,15 +11,14 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from orchestrator.journal.run_record import RunRecord
+from orchestrator.journal.run_record import RunState
 from orchestrator.results import figure_style as style
 from orchestrator.results.loss_units import (
     DISCREPANCY,
     LossUnit,
     at_least_nothing,
     deployment_unit,
-    is_calibration,
-    loss_of_pour,
+    minimised_loss,
 )
 from orchestrator.results.run_summary import Advice, PoolUse, PourSummary, ReceiverSummary, RunSummary
 from orchestrator.results.stage_views import SPLITS
@@ -243,7 +242,7 @@ def _poured_again(row: ReceiverSummary) -> list[str]:
 
 
 def open_questions(
-    plan: CampaignPlan, record: RunRecord, theta: Sequence[str], *, calibrated: bool, dropped_events: int
+    plan: CampaignPlan, record: RunState, theta: Sequence[str], *, calibrated: bool, dropped_events: int
 ) -> list[str]:
     """Open questions after a run that do not depend on the receiver.
 
@@ -365,7 +364,7 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
     return [*lines, *posterior.directions]
 
 
-def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -> list[str]:
+def without_advice(plan: CampaignPlan, record: RunState, *, calibrated: bool) -> list[str]:
     """The outcome of a run that recommends no action.
 
     Args:
@@ -373,9 +372,8 @@ def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -
     """
     if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
         said = ["No action is recommended yet: the result of a deployment is written when its stage ends."]
-        poured = [pour for pour in record.weighed if not is_calibration(plan, pour.request)]
-        losses = {loss_of_pour(plan, p.request, m): p for p in poured if (m := p.measured) is not None}
-        known = [loss for loss in losses if loss is not None]
+        losses = {loss: pour for pour in record.weighed if (loss := minimised_loss(plan, pour)) is not None}
+        known = list(losses)
         if known:
             action = losses[min(known)].request.action.values()
             best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
@@ -395,7 +393,7 @@ def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -
     return ["This run recommends no action."]
 
 
-def cost(record: RunRecord, occupancy: Mapping[str, PoolUse], time_scale: float | None = None) -> dict[str, str]:
+def cost(record: RunState, occupancy: Mapping[str, PoolUse], time_scale: float | None = None) -> dict[str, str]:
     """Costs of a run: pours, grams, minutes.
 
     Args:
@@ -436,7 +434,7 @@ def minutes(seconds: float) -> str:
     return f"{seconds / 60:.1f} min" if seconds < 5400.0 else f"{seconds / 3600:.1f} h"
 
 
-def standing(record: RunRecord, run: str) -> list[str]:
+def standing(record: RunState, run: str) -> list[str]:
     """State of an unfinished run and the next steps; empty for a finished one.
 
     Args:
@@ -473,7 +471,7 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-def what_was_asked(plan: CampaignPlan, record: RunRecord) -> dict[str, str]:
+def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
     """Names and values: the liquid, and the calibration of the simulator and the search for pours, or the doses."""
     found: list[tuple[str, str]] = []
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (

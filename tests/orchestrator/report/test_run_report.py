@@ -21,6 +21,7 @@ from orchestrator.cli.foreground_run import report_of_what_stands
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.journal_check import JournalCheck
 from orchestrator.journal.run_record import CampaignResult, RecordedDecision, read_record
+from orchestrator.requests import Failed
 from orchestrator.results import figure_style as style
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.html_report import run_page
@@ -156,7 +157,7 @@ def test_names_and_reasons_that_are_html_stay_text(made: Made) -> None:
     ]
     plan = replace(plan, deployment=replace(plan.deployment, scenes=tuple(scenes)))
     record = read_record(made.result.directory)
-    record.pours[0].state, record.pours[0].reason = "failed", SCRIPT
+    record.pours[0].state, record.pours[0].outcome = "failed", Failed("pour_failed", SCRIPT)
     record.notes.append((0.0, SCRIPT))
     record.decisions.append(RecordedDecision(0.0, SCRIPT, SCRIPT, {}, 0))
     summary = summarise(
