@@ -259,8 +259,8 @@ def fit_recordings(
     if not recordings:
         raise InvalidArgumentError("there is no recording to fit")
     names = tuple(name for name in UNKNOWNS if name in {*unknowns, *ALWAYS})
-    lag = _lag_before(recordings)
-    problem = _Problem(names, lag, [_Readings.of(one, until) for one in recordings])
+    lag = lag_before(recordings)
+    problem = FitProblem(names, lag, [FittedReadings.of(one, until) for one in recordings])
     found = problem.solved(np.zeros(problem.size), problem.noise)
     weight = problem.effective_noise(found)
     found = problem.solved(found, weight)
@@ -304,8 +304,8 @@ def judge_recording(found: Fit, recording: PourRecording) -> Judgement:
             f"{recording.name}: all its readings were fitted, and none is left to judge; fit only its beginning, or "
             "judge another recording"
         )
-    readings = _Readings.of(recording, None)
-    problem = _Problem(found._names, found._lag, [readings])
+    readings = FittedReadings.of(recording, None)
+    problem = FitProblem(found._names, found._lag, [readings])
     shared = problem.shared
     mean, covariance = np.zeros(problem.size), np.eye(problem.size)
     place = [*range(shared), *range(shared, problem.size)]
@@ -366,7 +366,7 @@ OWN = 3
 
 
 @dataclass(frozen=True, eq=False)
-class _Readings:
+class FittedReadings:
     """Readings of a recording that are fitted; a repeated reading while the mass rises is no new one."""
 
     recording: PourRecording
@@ -374,7 +374,8 @@ class _Readings:
     used: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, recording: PourRecording, until: float | None) -> _Readings:
+    def of(cls, recording: PourRecording, until: float | None) -> FittedReadings:
+        """Those up to a time [s], or all. Raises InvalidArgumentError: fewer than five."""
         net, times = recording.net, recording.read_times
         later = np.interp(times + 0.5, times, net) - np.interp(times - 0.5, times, net)
         repeats = np.concatenate([[False], np.abs(np.diff(net)) < 0.5 * recording.step])
@@ -388,15 +389,16 @@ class _Readings:
         return cls(recording, time_of_fall(recording), used)
 
 
-class _Problem:
+class FitProblem:
     """The model of several recordings. A state (P,) is in deviations from what was known before.
 
     It has the unknowns, then the shape of the balance's filter, then `OWN` for each recording.
     """
 
-    def __init__(self, names: Sequence[str], lag: Unknown, readings: Sequence[_Readings]) -> None:
-        self._names, self._readings = tuple(names), readings
+    def __init__(self, names: Sequence[str], lag: Unknown, readings: Sequence[FittedReadings]) -> None:
+        self.names, self._readings = tuple(names), readings
         self.unknowns = UNKNOWNS | {"lag": lag}
+        self.onset_wander = ONSET_WANDER
         self.shared = len(names) + 1
         self.size = self.shared + OWN * len(readings)
         one = readings[0].recording
@@ -411,7 +413,7 @@ class _Problem:
         """Readings of a recording for states (N, P), which agree in height and viscosity (N, R) [kg]."""
         readings = self._readings[k]
         recording = readings.recording
-        found = {name: self.unknowns[name].at(states[:, i]) for i, name in enumerate(self._names)}
+        found = {name: self.unknowns[name].at(states[:, i]) for i, name in enumerate(self.names)}
         onset, flow, fill = (states[:, self.shared + OWN * k + i] for i in range(OWN))
         count = len(states)
 
@@ -422,11 +424,11 @@ class _Problem:
         scene = changed.scene(recording)
         mass = scene.liquid.mass + values("fill") + recording.fill_deviation * fill
         hypotheses = PourHypotheses(
-            ONSET[0] - values("grip") - recording.placement.grip + ONSET_WANDER * onset,
+            ONSET[0] - values("grip") - recording.placement.grip + self.onset_wander * onset,
             np.clip(values("flow") * np.exp(FLOW_WANDER * flow), *FACTOR_RANGE),
             np.maximum(mass, 1e-4) / scene.liquid.density,
             np.clip(values("lag"), *LAG_RANGE),
-            np.clip(SHAPE[0] + SHAPE[1] * states[:, len(self._names)], *SHAPE_RANGE),
+            np.clip(SHAPE[0] + SHAPE[1] * states[:, len(self.names)], *SHAPE_RANGE),
         )
         shown, _ = respond(
             flow_of(scene), hypotheses, recording.tilt_times, recording.tilts, recording.read_times, readings.fall_time
@@ -438,7 +440,7 @@ class _Problem:
         predicted, slopes = [], []
         for k in range(len(self._readings)):
             columns = self._columns(k)
-            steps = {i: STEPS.get(self._names[i] if i < len(self._names) else "", 0.05) for i in columns}
+            steps = {i: STEPS.get(self.names[i] if i < len(self.names) else "", 0.05) for i in columns}
             alike = [i for i in columns if steps[i] == 0.05]
             states = np.stack([state, *(state + steps[i] * np.eye(self.size)[i] for i in alike)])
             shown = dict(zip([-1, *alike], self._predict(k, states), strict=True))
@@ -493,7 +495,7 @@ class _Problem:
         return rows
 
 
-def _lag_before(recordings: Sequence[PourRecording]) -> Unknown:
+def lag_before(recordings: Sequence[PourRecording]) -> Unknown:
     """The lag before a fit: from the placing of the receiver, if a recording has it."""
     unknown = UNKNOWNS["lag"]
     one = next((one for one in recordings if len(one.placed) > 5), None)
