@@ -292,6 +292,7 @@ _add(
     "decant recording first-day day-one   # explain the recordings of a folder again",
     name="first-day",
     to=_recording,
+    quiet=True,
 )
 
 _server = _group(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import EnableMotion, InProcess, Json, OtherLaboratory, Quiet
+from orchestrator.cli.command_options import EnableMotion, InProcess, Json, OtherLaboratory
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message, waiting_for
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ def first_day(
     enable_motion: EnableMotion = False,
     in_process: InProcess = False,
     as_json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
     """Record ten pours and five doses of water, replay them, and find which quantity of the rig is wrong.
 
@@ -219,7 +218,7 @@ def _assignments(plan: CampaignPlan, step: DayStep) -> list[str]:
     middle = {**scene.fixed, **{axis.name: axis.decode(0.5) for axis in space.axes}}
     offset = float(middle.get("x_offset") or 0.1)
     if step.misses:
-        offset += 2.0 * build_vessel(scene.receiver).rim_radius + 0.02
+        offset += 2.0 * build_vessel(scene.receiver).opening_radius + 0.02
     values = {
         "angular_velocity": math.degrees(step.speed),
         "max_angle": math.degrees(step.angle),

@@ -39,7 +39,7 @@ MISS = "miss"
 DOSES = (0.020, 0.020, 0.050, 0.050, 0.100)
 """Wanted amounts [kg]."""
 
-HOLD = 3.0
+HOLD = 20.0
 """Time at the largest tilt [s]."""
 
 
@@ -67,11 +67,11 @@ class DayStep:
 
 
 _POURS = (
-    ("slow-full-1", 0.70, 4.0, 0.06, "slow tilt to the onset, full"),
-    ("slow-low-1", 0.40, 4.0, 0.06, "slow tilt to the onset, less full"),
-    ("slow-full-2", 0.70, 4.0, 0.06, "slow tilt to the onset, full, again"),
-    ("slow-low-2", 0.40, 4.0, 0.06, "slow tilt to the onset, less full, again"),
-    ("slow-middle", 0.55, 4.0, 0.06, "slow tilt to the onset, a third fill"),
+    ("slow-full-1", 0.85, 3.0, 0.06, "slow tilt to the onset, full"),
+    ("slow-low-1", 0.25, 3.0, 0.06, "slow tilt to the onset, less full"),
+    ("slow-full-2", 0.85, 3.0, 0.06, "slow tilt to the onset, full, again"),
+    ("slow-low-2", 0.25, 3.0, 0.06, "slow tilt to the onset, less full, again"),
+    ("slow-middle", 0.55, 3.0, 0.06, "slow tilt to the onset, a third fill"),
     ("calm-1", 0.60, 12.0, 0.16, "a calm pour"),
     ("calm-2", 0.60, 12.0, 0.16, "a calm pour, again"),
     ("fast-1", 0.60, 40.0, 0.16, "a fast pour"),
@@ -98,7 +98,7 @@ def first_day(pourer: VesselSpec, density: float) -> tuple[DayStep, ...]:
             f"{pourer.name}: holds {1e3 * capacity * density:.0f} g; the first day doses {1e3 * max(DOSES):.0f} g from "
             f"a pourer that is 70 % full, and needs one of {1.25e3 * max(DOSES) / 0.7:.0f} g or more"
         )
-    steps = []
+    steps: list[tuple[str, float, str, float | None, float, float]] = []
     for name, full, speed, outflow, purpose in _POURS:
         rest = (full - outflow) * capacity
         angle = float(brentq(lambda tilt, rest=rest: retained_volume(vessel, tilt) - rest, 0.0, math.radians(89.9)))
@@ -132,8 +132,8 @@ CUP = TrueCup(0.040, 0.100)
 PLACED_BEFORE = 20.0
 """Time from the placing of the receiver to the first motion [s]."""
 
-VISCOUS = 300.0
-"""Factor of a wrong viscosity: a syrup in place of water, or a file of a syrup with plain water."""
+VISCOUS = (0.05, 0.1)
+"""Range of a wrong viscosity, as of thickened water or dilute syrup [Pa·s]: poured as 'water', or water as such."""
 
 
 def practice_day(folder: Path, seed: int, wrong: str | None = None, sign: int = 1) -> list[PourRecording]:
@@ -159,14 +159,13 @@ def practice_day(folder: Path, seed: int, wrong: str | None = None, sign: int = 
         behaviour=DisplayBehaviour(repeat_probability=0.42 if wrong == "holds" else 0.0),
     )
     water = Liquid(mass=0.3)
-    thick = water.model_copy(update={"dynamic_viscosity": VISCOUS * water.dynamic_viscosity})
+    thick = water.model_copy(update={"dynamic_viscosity": float(rng.uniform(*VISCOUS))})
     assumed, true = water, water
     if wrong == "viscosity":
         assumed, true = (water, thick) if sign > 0 else (thick, water)
     cup = replace(CUP, height=CUP.height + (2e-3 * sign if wrong == "height" else 0.0))
-    bench = VirtualDosingBench(cup, true, scale, seed)
-    if wrong == "grip":  # in place of the bench's own error
-        bench.grip = -math.radians(1.0) * sign
+    held = math.radians(1.0) * sign if wrong == "grip" else 0.0
+    bench = VirtualDosingBench(cup, true, scale, seed, held_tilt=held)
     pourer = cylinder("beaker", inner_radius=CUP.radius, inner_height=CUP.height)
     receiver = cylinder("tumbler", inner_radius=0.035, inner_height=0.090)
     recordings = []

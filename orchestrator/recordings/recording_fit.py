@@ -260,7 +260,7 @@ def fit_recordings(
         raise InvalidArgumentError("there is no recording to fit")
     names = tuple(name for name in UNKNOWNS if name in {*unknowns, *ALWAYS})
     lag = lag_before(recordings)
-    problem = FitProblem(names, lag, [FittedReadings.of(one, until) for one in recordings])
+    problem = _Problem(names, lag, [FittedReadings.of(one, until) for one in recordings])
     found = problem.solved(np.zeros(problem.size), problem.noise)
     weight = problem.effective_noise(found)
     found = problem.solved(found, weight)
@@ -305,7 +305,7 @@ def judge_recording(found: Fit, recording: PourRecording) -> Judgement:
             "judge another recording"
         )
     readings = FittedReadings.of(recording, None)
-    problem = FitProblem(found._names, found._lag, [readings])
+    problem = _Problem(found._names, found._lag, [readings])
     shared = problem.shared
     mean, covariance = np.zeros(problem.size), np.eye(problem.size)
     place = [*range(shared), *range(shared, problem.size)]
@@ -389,16 +389,15 @@ class FittedReadings:
         return cls(recording, time_of_fall(recording), used)
 
 
-class FitProblem:
+class _Problem:
     """The model of several recordings. A state (P,) is in deviations from what was known before.
 
     It has the unknowns, then the shape of the balance's filter, then `OWN` for each recording.
     """
 
     def __init__(self, names: Sequence[str], lag: Unknown, readings: Sequence[FittedReadings]) -> None:
-        self.names, self._readings = tuple(names), readings
+        self._names, self._readings = tuple(names), readings
         self.unknowns = UNKNOWNS | {"lag": lag}
-        self.onset_wander = ONSET_WANDER
         self.shared = len(names) + 1
         self.size = self.shared + OWN * len(readings)
         one = readings[0].recording
@@ -413,7 +412,7 @@ class FitProblem:
         """Readings of a recording for states (N, P), which agree in height and viscosity (N, R) [kg]."""
         readings = self._readings[k]
         recording = readings.recording
-        found = {name: self.unknowns[name].at(states[:, i]) for i, name in enumerate(self.names)}
+        found = {name: self.unknowns[name].at(states[:, i]) for i, name in enumerate(self._names)}
         onset, flow, fill = (states[:, self.shared + OWN * k + i] for i in range(OWN))
         count = len(states)
 
@@ -424,11 +423,11 @@ class FitProblem:
         scene = changed.scene(recording)
         mass = scene.liquid.mass + values("fill") + recording.fill_deviation * fill
         hypotheses = PourHypotheses(
-            ONSET[0] - values("grip") - recording.placement.grip + self.onset_wander * onset,
+            ONSET[0] - values("grip") - recording.placement.grip + ONSET_WANDER * onset,
             np.clip(values("flow") * np.exp(FLOW_WANDER * flow), *FACTOR_RANGE),
             np.maximum(mass, 1e-4) / scene.liquid.density,
             np.clip(values("lag"), *LAG_RANGE),
-            np.clip(SHAPE[0] + SHAPE[1] * states[:, len(self.names)], *SHAPE_RANGE),
+            np.clip(SHAPE[0] + SHAPE[1] * states[:, len(self._names)], *SHAPE_RANGE),
         )
         shown, _ = respond(
             flow_of(scene), hypotheses, recording.tilt_times, recording.tilts, recording.read_times, readings.fall_time
@@ -440,7 +439,7 @@ class FitProblem:
         predicted, slopes = [], []
         for k in range(len(self._readings)):
             columns = self._columns(k)
-            steps = {i: STEPS.get(self.names[i] if i < len(self.names) else "", 0.05) for i in columns}
+            steps = {i: STEPS.get(self._names[i] if i < len(self._names) else "", 0.05) for i in columns}
             alike = [i for i in columns if steps[i] == 0.05]
             states = np.stack([state, *(state + steps[i] * np.eye(self.size)[i] for i in alike)])
             shown = dict(zip([-1, *alike], self._predict(k, states), strict=True))

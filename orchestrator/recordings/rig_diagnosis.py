@@ -3,75 +3,83 @@
 `diagnose` compares explanations of the same pours: `RigDiagnosis`, a list of `Explanation`.
 
 - `lag` and `holds` are read directly, from the placing of the receiver and from repeated readings while the mass rises.
-- `grip` and `height` explain the tilts at which pours of different fills begin. In each explanation, one quantity is as
-  uncertain as `WIDE` says, and the other keeps the tolerance of a rig in order (`NOMINAL`).
-- `viscosity` is tried at `FACTORS` of the file's, with lag, flow and onsets fitted again.
+- `grip`, `height` and `viscosity` explain all readings of the pours, with one model of a cup and its lip (`_PourModel`)
+  that is fitted to all pours together. In each explanation, one quantity is as uncertain as `WIDE` says, and the others
+  keep the tolerance of a rig in order (`NOMINAL`). The viscosity is tried at `FACTORS` of the file's.
 - Each has an evidence: the logarithm of the Bayes factor against 'nothing is wrong' (Laplace's approximation; MacKay,
   Information Theory, Inference, and Learning Algorithms, chapter 28). More than `STANDS_OUT` counts.
 
-Pours are fitted and doses are predicted, so that the judgement is on readings that no fit has seen. The lip of a cup
-holds liquid back like a cup that is about 1 mm higher, so a height is told from a grip by the fills of the slow pours.
+What tells them apart, with θ the tilt at the onset: a grip shifts the onset by the same angle for all fills, a height
+by cos²θ / R, and a lip that holds back a head by cos θ / R. A lip holds back less once it is wet. A viscosity shows in
+the slow end of a pour, when the head is below a few millimetres.
+
+Pours are fitted and doses are predicted, so that the judgement is on readings that no fit has seen.
+
+Limitations: those of `actors.dosing.cup_flow`; a constant share of the liquid is lost along the outside of the cup.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.special import betaln, logsumexp, xlog1py, xlogy
 
-from actors.dosing.dose_estimator import ONSET
+from actors.dosing.dose_estimator import LAG_RANGE, SHAPE_RANGE
+from actors.dosing.pour_response import displayed
 from orchestrator.recordings.first_day import MISS
 from orchestrator.recordings.recording_file import PourRecording
-from orchestrator.recordings.recording_fit import (
-    OWN,
-    UNKNOWNS,
-    Fit,
-    FitProblem,
-    FittedReadings,
-    Judgement,
-    Unknown,
-    fit_recordings,
-    held_share,
-    judge_recording,
-    lag_before,
-)
-from orchestrator.recordings.recording_replay import arrivals, taller
+from orchestrator.recordings.recording_fit import SHAPE, UNKNOWNS, FittedReadings, Unknown, held_share, lag_before
+from orchestrator.recordings.recording_replay import QUANTILE, arrivals, flow_of
 from sim_engine.errors import InvalidArgumentError
-from sim_engine.hydrostatics import retained_volume
 from sim_engine.liquids import Liquid
-from sim_engine.vessel.vessel import build_vessel
 
 Floats = NDArray[np.float64]
 
-STANDS_OUT = 2.0
-"""Evidence above which an explanation counts: odds of 7 to 1."""
+STANDS_OUT = 1.0
+"""Evidence above which an explanation counts: odds of 2.7 to 1."""
 
-NOMINAL = {"grip": math.radians(0.28), "height": 0.3e-3}
+NOMINAL = {"grip": math.radians(0.4), "height": 0.5e-3}
 """Deviations of a rig in order, in SI."""
 
 WIDE = {"grip": math.radians(1.5), "height": 2.5e-3}
 """Deviations of a wrong quantity, in SI."""
 
-HOLD, LIP = (0.25e-3, 0.3e-3), math.radians(0.27)
-"""Head that a lip holds back beyond the flow's own: mean and deviation [m], and its tilt; of benches in order."""
+FACTORS = (0.01, 0.03, 0.1, 10.0, 30.0, 100.0)
+"""Viscosities that are tried, over the file's; that of thin liquids has no influence."""
 
-ONSET_WANDER = math.radians(0.08)
-"""Differences of the onset between pours that are made in one go, with the same time to dry [rad]."""
+SHARED = {
+    "grip": (0.0, WIDE["grip"]),
+    "height": (0.0, WIDE["height"]),
+    "lag": (math.log(0.35), 0.7),
+    "shape": SHAPE,
+    "flow": (0.0, 0.2),
+    "dry": (1.0e-3, 0.5e-3),
+    "wet": (0.3e-3, 0.2e-3),
+    "lost": (0.03, 0.02),
+}
+"""Mean and deviation before a fit of what all pours share: tilt of the vessel beyond the recorded [rad], rim above that
+of its shape [m], logarithm of the balance's lag (replaced by that of the placing), share of its slowest part, logarithm
+of the flow factor, head that a dry and a wet lip hold back [m], share that runs down the outside."""
 
-SLOW = math.radians(8.0)
-"""Largest speed of the tilt of a pour that shows the onset; faster ones slosh [rad/s]."""
+OWN = (0.2e-3, 0.02)
+"""Differences between pours: head that a dry lip holds back [m], logarithm of the flow. The third is the fill."""
 
-OPEN_ONSET = math.radians(2.0)
-"""Deviation of the onset of a pour, if nothing is known about it [rad]."""
+WETTING = 0.2
+"""Time in which flow wets a lip [s]."""
 
-FACTORS = (0.003, 0.03, 30.0, 300.0)
-"""Viscosities that are tried, over the file's; that of water itself has no influence."""
+READING_NOISE, FLOW_NOISE, NOISE_TIME = 0.1e-3, 0.02, 0.5
+"""Deviation of the model: of a reading [kg], and for each kg/s of flow [s]; time in which it is forgotten [s]."""
+
+DOSE_ERROR = 0.02
+"""Deviation of a predicted dose, as a share of it."""
+
+TIME_STEP = 0.025
+"""[s]"""
 
 NOMINAL_LAG = 0.35
 """Lag that a rig's plan assumes, with the delay of its line [s]."""
@@ -114,23 +122,43 @@ class Explanation:
         return self.evidence > STANDS_OUT
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
+class PredictedDose:
+    """A dose, predicted from its tilt and the fitted pours [kg].
+
+    Attributes:
+        name: of the recording.
+        predicted, low, high: value and 90 % interval.
+        weighed: in the receiver.
+        wanted: as the name says; 0 if it does not.
+    """
+
+    name: str
+    predicted: float
+    low: float
+    high: float
+    weighed: float
+    wanted: float
+
+    @property
+    def inside(self) -> bool:
+        """Whether the weighed mass is in the interval."""
+        return self.low <= self.weighed <= self.high
+
+
+@dataclass(frozen=True)
 class RigDiagnosis:
     """What a first day shows.
 
     Attributes:
-        explanations: the most credible first: what is read directly before what is fitted.
-        fit: with the quantity that explains the pours, if one does.
-        judged: doses, predicted from the pours.
+        explanations: those that stand out first: what is read directly, then what is fitted; by their evidence.
+        doses: predicted from the pours, and weighed.
         missed: mass in the receiver after the deliberate miss [kg]; None without one.
-        doses: weighed and wanted mass of the doses [kg]; the wanted is that of the name.
     """
 
     explanations: tuple[Explanation, ...]
-    fit: Fit
-    judged: tuple[Judgement, ...]
+    doses: tuple[PredictedDose, ...]
     missed: float | None
-    doses: tuple[tuple[str, float, float], ...]
 
     @property
     def main(self) -> Explanation | None:
@@ -139,23 +167,22 @@ class RigDiagnosis:
 
     @property
     def describes(self) -> bool:
-        """Whether the predicted doses agree: half of them or more inside their 90 % interval, or within 5 %."""
-        hits = [
-            one.final[1] <= one.measured_final <= one.final[2]
-            or abs(one.final[0] - one.measured_final) <= 0.05 * one.measured_final
-            for one in self.judged
-        ]
+        """Whether half of the doses or more are inside their interval, or within 5 %."""
+        hits = [one.inside or abs(one.predicted - one.weighed) <= 0.05 * one.weighed for one in self.doses]
         return 2 * sum(hits) >= len(hits)
 
     @property
     def dose_error(self) -> tuple[float, float] | None:
         """Mean and largest distance of the weighed from the wanted amount [kg]; None without doses."""
-        errors = [abs(weighed - wanted) for _, weighed, wanted in self.doses]
+        errors = [abs(one.weighed - one.wanted) for one in self.doses if one.wanted > 0.0]
         return (float(np.mean(errors)), max(errors)) if errors else None
 
     def document(self) -> dict[str, Any]:
         """JSON-ready; masses in grams."""
-        error = self.dose_error
+
+        def grams(value: float) -> float:
+            return round(1e3 * value, 3)
+
         return {
             "main": None if self.main is None else self.main.name,
             "describes": self.describes,
@@ -163,10 +190,18 @@ class RigDiagnosis:
                 {"name": one.name, "evidence": round(one.evidence, 2), "stands_out": one.stands_out, "text": one.text}
                 for one in self.explanations
             ],
-            **self.fit.document(),
-            "judged": [one.document() for one in self.judged],
-            "missed_g": None if self.missed is None else round(1e3 * self.missed, 3),
-            "dose_error_g": None if error is None else [round(1e3 * one, 3) for one in error],
+            "doses": [
+                {
+                    "recording": one.name,
+                    "predicted_g": grams(one.predicted),
+                    "interval_g": [grams(one.low), grams(one.high)],
+                    "weighed_g": grams(one.weighed),
+                    "wanted_g": grams(one.wanted),
+                }
+                for one in self.doses
+            ],
+            "missed_g": None if self.missed is None else grams(self.missed),
+            "dose_error_g": None if self.dose_error is None else [grams(one) for one in self.dose_error],
         }
 
 
@@ -178,8 +213,7 @@ def diagnose(recordings: Sequence[PourRecording], lag: float = NOMINAL_LAG) -> R
         lag: of the balance that the rig's plan assumes [s].
 
     Raises:
-        InvalidArgumentError: fewer than four pours have readings while they flow.
-        InvalidSceneError: the pourer is a mesh, whose height can't be fitted.
+        InvalidArgumentError: fewer than four pours have readings while they flow, or not all are of one pourer.
     """
     doses = [one for one in recordings if "dose" in one.name]
     missed = [one for one in recordings if one.name.endswith(MISS)]
@@ -189,33 +223,12 @@ def diagnose(recordings: Sequence[PourRecording], lag: float = NOMINAL_LAG) -> R
             f"{len(pours)} pours have readings while they flow; a diagnosis needs 4, of two fills. Record them with "
             "the balance below the receiver"
         )
-    order = explanations(recordings, pours, lag)
-    main = next((one.name for one in order if one.stands_out and not one.direct), None)
-    # the fit of a viscosity needs more than the tolerances of `UNKNOWNS`: the doses are then predicted without it
-    unknowns = {"grip", "lag", *(() if main in (None, "viscosity") else (main,))}
-    fit = fit_recordings(pours, tuple(unknowns))
-    return RigDiagnosis(
-        order,
-        fit,
-        tuple(judge_recording(fit, one) for one in doses),
-        missed[0].gain if missed else None,
-        tuple((one.name, one.gain, _wanted(one.name)) for one in doses if _wanted(one.name) > 0.0),
-    )
-
-
-def explanations(
-    recordings: Sequence[PourRecording], pours: Sequence[PourRecording], lag: float = NOMINAL_LAG
-) -> tuple[Explanation, ...]:
-    """The explanations, the most credible first.
-
-    Args:
-        recordings: all, for lag and repeated readings.
-        pours: those that are fitted.
-        lag: that the rig's plan assumes [s].
-    """
-    direct = [_lag(recordings, lag), *_holds(recordings)]
-    order = sorted(direct, key=lambda one: -one.evidence) + sorted(_fitted(pours), key=lambda one: -one.evidence)
-    return tuple(sorted(order, key=lambda one: not one.stands_out))
+    if other := next((one for one in recordings if one.scene.pourer != pours[0].scene.pourer), None):
+        raise InvalidArgumentError(f"{other.name}: has another pourer than {pours[0].name}; record a day with one")
+    fitted, best = _fitted(pours)
+    direct = sorted([_lag(recordings, lag), *_holds(recordings)], key=lambda one: -one.evidence)
+    order = sorted([*direct, *sorted(fitted, key=lambda one: -one.evidence)], key=lambda one: not one.stands_out)
+    return RigDiagnosis(tuple(order), tuple(best.predicted(one) for one in doses), missed[0].gain if missed else None)
 
 
 def _wanted(name: str) -> float:
@@ -258,82 +271,35 @@ def _holds(recordings: Sequence[PourRecording]) -> list[Explanation]:
     return [Explanation("holds", evidence, text, True)]
 
 
-def _fitted(pours: Sequence[PourRecording]) -> list[Explanation]:
-    """Grip and height from the onsets, and the viscosity from whole pours."""
-    readings = [FittedReadings.of(one, None) for one in pours]
-    lag = lag_before(pours)
-    problem = _problem(readings, lag)
-    state = problem.solved(np.zeros(problem.size), problem.noise)
-    noise = problem.effective_noise(state)
-    state = problem.solved(state, noise)
-    plain = _log_evidence(problem, state, noise)
-    covariance = np.asarray(np.linalg.inv(problem.information(state, noise)), dtype=np.float64)
-    places = [problem.shared + OWN * k for k in range(len(pours))]
-    onsets = ONSET[0] + OPEN_ONSET * state[places]
-    speeds = [float(np.gradient(one.tilts, one.tilt_times).max()) for one in pours]
-    slow = [k for k, speed in enumerate(speeds) if speed < SLOW] or [*range(len(pours))]
-    places = [places[k] for k in slow]
-    between = OPEN_ONSET**2 * covariance[np.ix_(places, places)]
-    found = _from_onsets([pours[k] for k in slow], onsets[slow], between)
-    evidences = []
-    tried = [factor for factor in FACTORS if all(_possible(one.scene.liquid, factor) for one in pours)]
-    for factor in tried:
-        changed = _problem([replace(one, recording=_thicker(one.recording, factor)) for one in readings], lag)
-        evidences.append(_log_evidence(changed, changed.solved(state, noise), noise) - plain)
-    best = int(np.argmax(evidences))
-    mean = float(logsumexp(evidences)) - math.log(len(evidences))
-    text = f"{tried[best]:.2g} × the file's fits best of {', '.join(f'{one:.2g}' for one in tried)}"
-    return [*found, Explanation("viscosity", mean, text, False)]
-
-
-def _from_onsets(pours: Sequence[PourRecording], onsets: Floats, covariance: Floats) -> list[Explanation]:
-    """Grip and height, from the tilts at which pours of different fills begin beyond those of an ideal rim (N,) [rad].
-
-    An onset is later by −grip + a · height + (a / cos θ) · hold, with the ideal onset θ and its derivative a.
-    """
-    ideal = np.array([_ideal_onset(one, 0.0) for one in pours])
-    slopes = np.array([_ideal_onset(one, 1e-3) for one in pours]) - ideal
-    slopes *= 1e3
-    held = slopes / np.cos(ideal)
-    effects = {"grip": -np.ones(len(pours)), "height": slopes}
-    miss = onsets - held * HOLD[0] - LIP
-    random = covariance + ONSET_WANDER**2 * np.eye(len(pours)) + HOLD[1] ** 2 * np.outer(held, held)
-
-    def prior(wrong: str | None) -> dict[str, float]:
-        return {name: WIDE[name] if name == wrong else NOMINAL[name] for name in effects}
-
-    def evidence(wrong: str | None) -> float:
-        total = random + sum(prior(wrong)[name] ** 2 * np.outer(one, one) for name, one in effects.items())
-        _, volume = np.linalg.slogdet(total)
-        return -0.5 * float(miss @ np.linalg.solve(total, miss) + volume)
-
+def _fitted(pours: Sequence[PourRecording]) -> tuple[list[Explanation], _Fit]:
+    """Grip, height and viscosity, and the fit of the best viscosity."""
+    plain = _fit(pours, 1.0, np.zeros(len(SHARED) + PER_POUR * len(pours)))
+    nothing = plain.evidence({})
+    liquid = pours[0].scene.liquid
+    tried = [one for one in FACTORS if _possible(liquid, one)]
+    fits = {factor: _fit(pours, factor, plain.state) for factor in tried}
+    thick = {factor: one.evidence({}) - nothing for factor, one in fits.items()}
+    best = max(tried, key=lambda one: thick[one])
+    viscosity = float(logsumexp(list(thick.values()))) - math.log(len(tried))
+    chosen = fits[best] if viscosity > STANDS_OUT else plain
     found = []
-    for name, effect in effects.items():
-        deviation = prior(name)
-        total = random + sum(deviation[other] ** 2 * np.outer(one, one) for other, one in effects.items())
-        gain = deviation[name] ** 2 * np.linalg.solve(total, effect)
-        middle, spread = float(gain @ miss), math.sqrt(deviation[name] ** 2 * (1.0 - float(gain @ effect)))
-        unknown = UNKNOWNS[name]
-        value, low, high = ((middle + part * spread) / unknown.factor for part in (0.0, -1.645, 1.645))
+    for name in NOMINAL:
+        at, unknown = list(SHARED).index(name), UNKNOWNS[name]
+        middle, spread = SHARED[name][1] * chosen.state[at], SHARED[name][1] * math.sqrt(chosen.covariance[at, at])
+        value, low, high = ((middle + part * spread) / unknown.factor for part in (0.0, -QUANTILE, QUANTILE))
         text = f"{value:+.2g} {unknown.unit} ({low:+.2g} to {high:+.2g})"
-        found.append(Explanation(name, evidence(name) - evidence(None), text, False))
-    return found
-
-
-def _ideal_onset(recording: PourRecording, height: float) -> float:
-    """Tilt at which liquid at rest reaches the lip of a pourer whose rim is higher [rad]."""
-    vessel = build_vessel(taller(recording.scene.pourer, height))
-    volume = recording.scene.liquid.volume
-    return float(brentq(lambda tilt: retained_volume(vessel, tilt) - volume, 0.0, math.radians(89.9)))
+        found.append(Explanation(name, plain.evidence({name}) - nothing, text, False))
+    text = f"{best:.2g} × the file's fits best of {', '.join(f'{one:.2g}' for one in tried)}"
+    return [*found, Explanation("viscosity", viscosity, text, False)], chosen
 
 
 def _possible(liquid: Liquid, factor: float) -> bool:
-    """Whether a liquid can have this multiple of its viscosity."""
+    """Whether a liquid can have this multiple of its viscosity, and it makes a difference."""
     try:
-        Liquid(**liquid.model_dump() | {"dynamic_viscosity": factor * liquid.dynamic_viscosity})
+        changed = Liquid(**liquid.model_dump() | {"dynamic_viscosity": factor * liquid.dynamic_viscosity})
     except ValueError:
         return False
-    return True
+    return liquid.is_thick or changed.is_thick
 
 
 def _thicker(recording: PourRecording, factor: float) -> PourRecording:
@@ -342,15 +308,156 @@ def _thicker(recording: PourRecording, factor: float) -> PourRecording:
     return replace(recording, scene=replace(scene, liquid=scene.liquid.model_copy(update=changed)))
 
 
-def _problem(readings: Sequence[FittedReadings], lag: Unknown) -> FitProblem:
-    """A fit of lag, flow, and an onset of each pour that is as good as unknown."""
-    problem = FitProblem(("lag", "flow"), lag, readings)
-    problem.onset_wander = OPEN_ONSET
-    return problem
+PER_POUR = len(OWN) + 1
 
 
-def _log_evidence(problem: FitProblem, state: Floats, noise: Floats) -> float:
-    """Laplace's approximation, without the terms that all problems of the same readings and noise share."""
-    misses = sum(float(np.sum((r / s) ** 2)) for r, s in zip(problem.residuals(state), noise, strict=True))
-    _, information = np.linalg.slogdet(problem.information(state, noise))
-    return -0.5 * (misses + float(state @ state) + float(information))
+class _PourModel:
+    """The readings of several pours for several states at once, from a tilting cup with a lip that wets.
+
+    A state (P,) is in deviations from what was known before: `SHARED`, then `PER_POUR` for each pour.
+    """
+
+    def __init__(self, pours: Sequence[PourRecording], factor: float) -> None:
+        liquid = pours[0].scene.liquid
+        liquid = Liquid(**liquid.model_dump() | {"dynamic_viscosity": factor * liquid.dynamic_viscosity})
+        self._cup = flow_of(replace(pours[0].scene, liquid=liquid))
+        self.pours = [FittedReadings.of(one, None) for one in pours]
+        self._fills = np.array([[one.scene.liquid.mass, one.fill_deviation] for one in pours])
+        end = max(max(one.tilt_times[-1], one.read_times[-1]) - one.tilt_times[0] for one in pours)
+        self._times = np.arange(0.0, end + 2.0 * TIME_STEP, TIME_STEP)
+        self._tilts = np.stack(
+            [
+                np.interp(self._times + one.tilt_times[0], one.tilt_times, one.tilts) + one.placement.grip
+                for one in pours
+            ]
+        )
+
+    def readings(self, states: Floats, lag: Unknown) -> list[Floats]:
+        """Readings of each pour for states (S, P) (S, R) [kg]."""
+        shared = {name: mean + deviation * states[:, i] for i, (name, (mean, deviation)) in enumerate(SHARED.items())}
+        own = states[:, len(SHARED) :].reshape(len(states), len(self.pours), PER_POUR)
+        cup, rim = self._cup, shared["height"]
+        flow = np.exp(shared["flow"][:, None] + OWN[1] * own[..., 1])
+        held = shared["dry"][:, None] + OWN[0] * own[..., 0]
+        content = (self._fills[:, 0] + self._fills[:, 1] * own[..., 2]) / cup.density
+        volume, wet = content.copy(), np.broadcast_to(shared["wet"][:, None], held.shape)
+        gone = np.zeros((len(self._times), *volume.shape))
+        for k, tilts in enumerate(self._tilts.T):
+            tilted = tilts + shared["grip"][:, None]
+            head = cup.head(volume, tilted) - held - rim[:, None] * np.cos(tilted)
+            flows = head > 0.0
+            if flows.any():
+                volume = np.maximum(volume - TIME_STEP * np.where(flows, flow * cup.flow_at(head, tilted), 0.0), 0.0)
+                held = np.where(flows, held + (wet - held) * (TIME_STEP / WETTING), held)
+            gone[k] = content - volume
+        mass = cup.density * (1.0 - shared["lost"])[:, None] * gone
+        shape = np.clip(shared["shape"], *SHAPE_RANGE)
+        lags = np.clip(lag.at(states[:, list(SHARED).index("lag")]), *LAG_RANGE)
+        return [
+            np.stack(
+                [
+                    displayed(
+                        self._times + one.recording.tilt_times[0],
+                        mass[:, s, k],
+                        one.recording.read_times,
+                        lag=float(lags[s]),
+                        lag_shape=float(shape[s]),
+                        fall_time=one.fall_time,
+                    )
+                    for s in range(len(states))
+                ]
+            )
+            for k, one in enumerate(self.pours)
+        ]
+
+    def whitened(self, state: Floats, lag: Unknown, noise: float) -> tuple[Floats, Floats]:
+        """Residuals (R,) of unit deviation, independent of each other, and their derivatives (R, P).
+
+        Args:
+            state: the state.
+            lag: of the balance before the fit.
+            noise: factor of the model's deviation.
+        """
+        size, step = len(state), 0.05
+        probes = np.zeros((len(SHARED) + PER_POUR, size))
+        probes[: len(SHARED), : len(SHARED)] = np.eye(len(SHARED))
+        for j in range(PER_POUR):  # of all pours at once: a pour depends on its own alone
+            probes[len(SHARED) + j, len(SHARED) + j :: PER_POUR] = 1.0
+        residuals, slopes = [], []
+        shown = self.readings(np.vstack([state, state + step * probes]), lag)
+        for k, (one, readings) in enumerate(zip(self.pours, shown, strict=True)):
+            times, each = one.recording.read_times[one.used], readings[:, one.used]
+            rate = np.abs(np.gradient(each[0], times))
+            display = math.hypot(one.recording.step / math.sqrt(12.0), one.recording.balance.noise)
+            deviation = noise * np.sqrt(READING_NOISE**2 + display**2 + (FLOW_NOISE * rate) ** 2)
+            part = np.zeros((len(times), size))
+            change = ((each[1:] - each[0]) / step).T
+            own = len(SHARED) + PER_POUR * k
+            part[:, : len(SHARED)], part[:, own : own + PER_POUR] = change[:, : len(SHARED)], change[:, len(SHARED) :]
+            residual, part = (one.recording.net[one.used] - each[0]) / deviation, part / deviation[:, None]
+            kept = np.exp(-np.diff(times) / NOISE_TIME)
+            fresh = np.sqrt(1.0 - kept**2)
+            residuals.append(np.append(residual[:1], (residual[1:] - kept * residual[:-1]) / fresh))
+            slopes.append(np.vstack([part[:1], (part[1:] - kept[:, None] * part[:-1]) / fresh[:, None]]))
+        return np.concatenate(residuals), np.vstack(slopes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The most credible state of a model, with `WIDE` grip and height."""
+
+    factor: float
+    lag: Unknown
+    state: Floats
+    covariance: Floats
+    misfit: float
+
+    def evidence(self, wrong: Collection[str]) -> float:
+        """Logarithm of the evidence, with `WIDE` for these quantities and `NOMINAL` for the others.
+
+        A Gaussian posterior of grip and height is weighted with the other prior over that of the fit.
+        """
+        _, volume = np.linalg.slogdet(self.covariance)
+        total = -0.5 * (self.misfit - volume)
+        places = [list(SHARED).index(name) for name in NOMINAL]
+        mean, information = self.state[places], np.linalg.inv(self.covariance[np.ix_(places, places)])
+        ratio = np.array([1.0 if name in wrong else WIDE[name] / NOMINAL[name] for name in NOMINAL])
+        narrowed = information + np.diag(ratio**2 - 1.0)
+        pull = information @ mean
+        total += float(np.log(ratio).sum()) + 0.5 * (np.linalg.slogdet(information)[1] - np.linalg.slogdet(narrowed)[1])
+        return float(total - 0.5 * (mean @ pull - pull @ np.linalg.solve(narrowed, pull)))
+
+    def predicted(self, recording: PourRecording) -> PredictedDose:
+        """A dose that was not fitted, from its tilt."""
+        count, model = len(SHARED), _PourModel([recording], self.factor)
+        state = np.append(self.state[:count], np.zeros(PER_POUR))
+        covariance = np.eye(len(state))
+        covariance[:count, :count] = self.covariance[:count, :count]
+        shown = model.readings(np.vstack([state, state + 0.05 * np.eye(len(state))]), self.lag)[0][:, -1]
+        slopes, value = (shown[1:] - shown[0]) / 0.05, float(shown[0])
+        half = QUANTILE * math.hypot(math.sqrt(slopes @ covariance @ slopes), DOSE_ERROR * value, READING_NOISE)
+        return PredictedDose(recording.name, value, value - half, value + half, recording.gain, _wanted(recording.name))
+
+
+def _fit(pours: Sequence[PourRecording], factor: float, state: Floats) -> _Fit:
+    """The fit of a multiple of the file's viscosity, by Levenberg's method from a first state."""
+    model, lag = _PourModel(pours, factor), lag_before(pours)
+    for noise in (5.0, 1.0):
+        residuals, slopes = model.whitened(state, lag, noise)
+        damping = 0.0
+        for _ in range(12):
+            information = slopes.T @ slopes + np.eye(len(state))
+            step = np.linalg.solve(information + damping * np.diag(np.diag(information)), slopes.T @ residuals - state)
+            step *= min(1.0, 1.5 / float(np.abs(step).max()))
+            after = model.whitened(state + step, lag, noise)
+            gained = float(
+                residuals @ residuals + state @ state - after[0] @ after[0] - (state + step) @ (state + step)
+            )
+            if gained > 0.0:
+                state, (residuals, slopes), damping = state + step, after, 0.3 * damping
+            else:
+                damping = max(10.0 * damping, 0.01)
+            if abs(gained) < 0.2 or damping > 100.0:
+                break
+    covariance: Floats = np.linalg.inv(slopes.T @ slopes + np.eye(len(state)))
+    return _Fit(factor, lag, state, covariance, float(residuals @ residuals + state @ state))

@@ -73,12 +73,12 @@ def diagnosis_figure(found: RigDiagnosis) -> Figure:
     evidence.axvline(STANDS_OUT, color=INK, lw=0.8, ls=":")
     evidence.set_xlim(0.0, 30.0)
     dress(evidence, title="Which quantity is wrong?", x="evidence (dotted: odds of 7 to 1)", grid=None)
-    for row, one in enumerate(found.judged):
-        low, high = (1e3 * (number - one.measured_final) for number in one.final[1:])
+    for row, dose in enumerate(found.judged):
+        low, high = (1e3 * (number - dose.measured_final) for number in dose.final[1:])
         doses.plot([low, high], [row, row], color=PREDICTED, lw=3.0, label="predicted, 90 %" if row == 0 else None)
-        doses.plot(1e3 * (one.final[0] - one.measured_final), row, ".", color=PREDICTED, ms=9.0)
+        doses.plot(1e3 * (dose.final[0] - dose.measured_final), row, ".", color=PREDICTED, ms=9.0)
     doses.axvline(0.0, color=MEASURED, lw=1.2, label="weighed")
-    doses.set_yticks(range(len(found.judged)), [one.name for one in found.judged])
+    doses.set_yticks(range(len(found.judged)), [dose.name for dose in found.judged])
     doses.invert_yaxis()
     doses.legend(frameon=False, fontsize=8.5, loc="best")
     dress(doses, title="Doses, predicted from the pours", x="predicted − weighed [g]", grid=None)
