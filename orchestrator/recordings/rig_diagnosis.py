@@ -40,13 +40,13 @@ from sim_engine.liquids import Liquid
 
 Floats = NDArray[np.float64]
 
-STANDS_OUT = 1.0
-"""Evidence above which an explanation counts: odds of 2.7 to 1."""
+STANDS_OUT = 0.0
+"""Evidence above which an explanation counts: it is more credible than 'nothing is wrong'."""
 
 NOMINAL = {"grip": math.radians(0.4), "height": 0.5e-3}
 """Deviations of a rig in order, in SI."""
 
-WIDE = {"grip": math.radians(1.5), "height": 2.5e-3}
+WIDE = {"grip": math.radians(1.0), "height": 2.0e-3}
 """Deviations of a wrong quantity, in SI."""
 
 FACTORS = (0.01, 0.03, 0.1, 10.0, 30.0, 100.0)
@@ -342,7 +342,13 @@ class _PourModel:
         content = (self._fills[:, 0] + self._fills[:, 1] * own[..., 2]) / cup.density
         volume, wet = content.copy(), np.broadcast_to(shared["wet"][:, None], held.shape)
         gone = np.zeros((len(self._times), *volume.shape))
+        fullest = np.repeat(content.max(axis=0)[:, None], len(self._times), axis=1)
+        highest = cup.head(fullest, self._tilts + shared["grip"].max()).max(axis=0)
+        idle = highest <= min(float(held.min()), float(wet.min())) + min(float(rim.min()), 0.0)
         for k, tilts in enumerate(self._tilts.T):
+            if idle[k]:
+                gone[k] = content - volume
+                continue
             tilted = tilts + shared["grip"][:, None]
             head = cup.head(volume, tilted) - held - rim[:, None] * np.cos(tilted)
             flows = head > 0.0
