@@ -144,6 +144,8 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
         raise RefusalError(text, BAD_INPUT)
     again = f"decant recording first-day {folder} --campaign {path}"
     again += "" if laboratory is None else f" --laboratory {laboratory}"
+    if bench.mode != "hardware":
+        print_message("a virtual bench weighs pours only at their end: this day is replayed, but not explained")
     require_flag(bench, enabled=enable_motion, again=f"{again} --enable-motion")
     with Refused(DecantError):
         steps = steps_of(scene_to_simulate(plan)[0].pourer, plan.deployment.scenes[0].liquid.density)
@@ -237,12 +239,13 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
     """
     from orchestrator.recordings.rig_diagnosis import ADVICE
 
-    inside = sum(one.final[1] <= one.measured_final <= one.final[2] for one in found.judged)
-    fitted = ", ".join(f"{one.name} {one.text}" for one in found.fit.values)
-    words = [
-        f"does the simulator describe this rig? {'yes' if found.describes else 'no'}: {inside} of {len(found.judged)} "
-        f"doses are inside the 90 % interval predicted from the pours ({fitted})"
-    ]
+    inside = sum(one.inside for one in found.doses)
+    words = []
+    if found.explanations:
+        words.append(
+            f"does the model describe this rig? {'yes' if found.describes else 'no'}: {inside} of {len(found.doses)} "
+            "doses are inside the 90 % interval predicted from the pours"
+        )
     differences = [
         abs(one["simulation"]["final_difference_g"])
         for one in replays
@@ -254,7 +257,12 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
             f"particles, nothing fitted: {mean:.2g} g from the weighed amount on average, {worst:.2g} g at most"
         )
     main = found.main
-    if main is None:
+    if not found.explanations:
+        words.append(
+            "which quantity explains the difference? unknown: fewer than 4 pours have readings while they flow; a real "
+            "balance below the receiver gives them"
+        )
+    elif main is None:
         words.append("which quantity explains the difference? nothing stands out: the tolerances explain the pours")
     else:
         further = [one.name for one in found.explanations if one.stands_out and one is not main]
@@ -265,8 +273,9 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
         words.append(f"how exact are doses? {1e3 * error[0]:.2g} g on average, {1e3 * error[1]:.2g} g at most")
     if found.missed is not None:
         words.append(f"the pour that misses on purpose put {1e3 * found.missed:.2g} g into the receiver")
-    advice = "widen the ranges; repeat this day after changes" if main is None else ADVICE[main.name]
-    words.append(f"what to calibrate next? {advice}")
+    if found.explanations:
+        advice = "widen the ranges; repeat this day after changes" if main is None else ADVICE[main.name]
+        words.append(f"what to calibrate next? {advice}")
     return words
 
 
@@ -282,11 +291,17 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
     from orchestrator.results.recording_figures import diagnosis_figure
     from orchestrator.results.wording import ResultRow, ResultTable
 
-    picture = Picture.of(
-        save(diagnosis_figure(found), folder / PICTURE),
-        "Bars: evidence of each explanation. Intervals: doses predicted from the pours, minus the weighed amount.",
-        f"Evidence above {STANDS_OUT:g} counts. Lag and holds are read from the balance, the others are fitted.",
-        wide=True,
+    pictures = (
+        []
+        if not found.explanations
+        else [
+            Picture.of(
+                save(diagnosis_figure(found), folder / PICTURE),
+                "Evidence of each explanation, and the doses as predicted from the pours, minus the weighed amount.",
+                f"Evidence above {STANDS_OUT:g} counts. Lag and holds are read from the balance, the rest is fitted.",
+                wide=True,
+            )
+        ]
     )
     explanations = ResultTable(
         "Explanations",
@@ -322,6 +337,6 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
         lead=f"{len(replays)} recordings of {folder.absolute().name}.",
         footer="Written by decant recording first-day.",
         words=words,
-        picture=picture,
-        tables=[explanations, pours],
+        pictures=pictures,
+        tables=[explanations, pours] if found.explanations else [pours],
     )

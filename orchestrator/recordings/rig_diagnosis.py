@@ -151,7 +151,8 @@ class RigDiagnosis:
     """What a first day shows.
 
     Attributes:
-        explanations: those that stand out first: what is read directly, then what is fitted; by their evidence.
+        explanations: those that stand out first: what is read directly, then what is fitted; by their evidence. None
+            if fewer than four pours have readings while they flow.
         doses: predicted from the pours, and weighed.
         missed: mass in the receiver after the deliberate miss [kg]; None without one.
     """
@@ -213,22 +214,20 @@ def diagnose(recordings: Sequence[PourRecording], lag: float = NOMINAL_LAG) -> R
         lag: of the balance that the rig's plan assumes [s].
 
     Raises:
-        InvalidArgumentError: fewer than four pours have readings while they flow, or not all are of one pourer.
+        InvalidArgumentError: not all are of one pourer.
     """
     doses = [one for one in recordings if "dose" in one.name]
     missed = [one for one in recordings if one.name.endswith(MISS)]
     pours = [one for one in recordings if one not in doses and one not in missed and len(one.readings) > 10]
+    arrived = missed[0].gain if missed else None
     if len(pours) < 4:
-        raise InvalidArgumentError(
-            f"{len(pours)} pours have readings while they flow; a diagnosis needs 4, of two fills. Record them with "
-            "the balance below the receiver"
-        )
+        return RigDiagnosis((), (), arrived)
     if other := next((one for one in recordings if one.scene.pourer != pours[0].scene.pourer), None):
         raise InvalidArgumentError(f"{other.name}: has another pourer than {pours[0].name}; record a day with one")
     fitted, best = _fitted(pours)
     direct = sorted([_lag(recordings, lag), *_holds(recordings)], key=lambda one: -one.evidence)
     order = sorted([*direct, *sorted(fitted, key=lambda one: -one.evidence)], key=lambda one: not one.stands_out)
-    return RigDiagnosis(tuple(order), tuple(best.predicted(one) for one in doses), missed[0].gain if missed else None)
+    return RigDiagnosis(tuple(order), tuple(best.predicted(one) for one in doses), arrived)
 
 
 def _wanted(name: str) -> float:
@@ -465,5 +464,5 @@ def _fit(pours: Sequence[PourRecording], factor: float, state: Floats) -> _Fit:
                 damping = max(10.0 * damping, 0.01)
             if abs(gained) < 0.2 or damping > 100.0:
                 break
-    covariance: Floats = np.linalg.inv(slopes.T @ slopes + np.eye(len(state)))
+    covariance: Floats = np.asarray(np.linalg.inv(slopes.T @ slopes + np.eye(len(state))), dtype=np.float64)
     return _Fit(factor, lag, state, covariance, float(residuals @ residuals + state @ state))

@@ -8,7 +8,7 @@ import numpy as np
 
 from orchestrator.recordings.recording_fit import Judgement
 from orchestrator.recordings.recording_replay import QUANTILE, PourReplay
-from orchestrator.recordings.rig_diagnosis import STANDS_OUT, RigDiagnosis
+from orchestrator.recordings.rig_diagnosis import RigDiagnosis
 from orchestrator.results.figure_style import BEST, GREY, INK, MEASURED, PREDICTED, dress, entitle, new_figure
 
 if TYPE_CHECKING:
@@ -70,15 +70,14 @@ def diagnosis_figure(found: RigDiagnosis) -> Figure:
     for row, one in enumerate(shown):
         if one.evidence > 30.0:
             evidence.text(29.5, row, f"{one.evidence:.0f}", ha="right", va="center", color="white", fontsize=8.5)
-    evidence.axvline(STANDS_OUT, color=INK, lw=0.8, ls=":")
     evidence.set_xlim(0.0, 30.0)
-    dress(evidence, title="Which quantity is wrong?", x="evidence (dotted: odds of 7 to 1)", grid=None)
-    for row, dose in enumerate(found.judged):
-        low, high = (1e3 * (number - dose.measured_final) for number in dose.final[1:])
+    dress(evidence, title="Which quantity is wrong?", x="evidence (above 0: more likely than nothing)", grid=None)
+    for row, dose in enumerate(found.doses):
+        low, high, middle = (1e3 * (one - dose.weighed) for one in (dose.low, dose.high, dose.predicted))
         doses.plot([low, high], [row, row], color=PREDICTED, lw=3.0, label="predicted, 90 %" if row == 0 else None)
-        doses.plot(1e3 * (dose.final[0] - dose.measured_final), row, ".", color=PREDICTED, ms=9.0)
+        doses.plot(middle, row, ".", color=PREDICTED, ms=9.0)
     doses.axvline(0.0, color=MEASURED, lw=1.2, label="weighed")
-    doses.set_yticks(range(len(found.judged)), [dose.name for dose in found.judged])
+    doses.set_yticks(range(len(found.doses)), [dose.name for dose in found.doses])
     doses.invert_yaxis()
     doses.legend(frameon=False, fontsize=8.5, loc="best")
     dress(doses, title="Doses, predicted from the pours", x="predicted − weighed [g]", grid=None)
