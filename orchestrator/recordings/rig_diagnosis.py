@@ -170,7 +170,7 @@ class RigDiagnosis:
     def describes(self) -> bool:
         """Whether half of the doses or more are inside their interval, or within 5 %."""
         hits = [one.inside or abs(one.predicted - one.weighed) <= 0.05 * one.weighed for one in self.doses]
-        return 2 * sum(hits) >= len(hits)
+        return bool(hits) and 2 * sum(hits) >= len(hits)
 
     @property
     def dose_error(self) -> tuple[float, float] | None:
@@ -222,7 +222,7 @@ def diagnose(recordings: Sequence[PourRecording], lag: float = NOMINAL_LAG) -> R
     arrived = missed[0].gain if missed else None
     if len(pours) < 4:
         return RigDiagnosis((), (), arrived)
-    if other := next((one for one in recordings if one.scene.pourer != pours[0].scene.pourer), None):
+    if other := next((one for one in [*pours, *doses] if one.scene.pourer != pours[0].scene.pourer), None):
         raise InvalidArgumentError(f"{other.name}: has another pourer than {pours[0].name}; record a day with one")
     fitted, best = _fitted(pours)
     direct = sorted([_lag(recordings, lag), *_holds(recordings)], key=lambda one: -one.evidence)
@@ -275,12 +275,15 @@ def _fitted(pours: Sequence[PourRecording]) -> tuple[list[Explanation], _Fit]:
     plain = _fit(pours, 1.0, np.zeros(len(SHARED) + PER_POUR * len(pours)))
     nothing = plain.evidence({})
     liquid = pours[0].scene.liquid
-    tried = [one for one in FACTORS if _possible(liquid, one)]
-    fits = {factor: _fit(pours, factor, plain.state) for factor in tried}
-    thick = {factor: one.evidence({}) - nothing for factor, one in fits.items()}
-    best = max(tried, key=lambda one: thick[one])
-    viscosity = float(logsumexp(list(thick.values()))) - math.log(len(tried))
-    chosen = fits[best] if viscosity > STANDS_OUT else plain
+    chosen, viscosity = plain, []
+    if tried := [one for one in FACTORS if _possible(liquid, one)]:
+        fits = [_fit(pours, factor, plain.state) for factor in tried]
+        evidences = [one.evidence({}) - nothing for one in fits]
+        best = int(np.argmax(evidences))
+        evidence = float(logsumexp(evidences)) - math.log(len(tried))
+        chosen = fits[best] if evidence > STANDS_OUT else plain
+        text = f"{tried[best]:.2g} × the file's fits best of {', '.join(f'{one:.2g}' for one in tried)}"
+        viscosity.append(Explanation("viscosity", evidence, text, False))
     found = []
     for name in NOMINAL:
         at, unknown = list(SHARED).index(name), UNKNOWNS[name]
@@ -288,8 +291,7 @@ def _fitted(pours: Sequence[PourRecording]) -> tuple[list[Explanation], _Fit]:
         value, low, high = ((middle + part * spread) / unknown.factor for part in (0.0, -QUANTILE, QUANTILE))
         text = f"{value:+.2g} {unknown.unit} ({low:+.2g} to {high:+.2g})"
         found.append(Explanation(name, plain.evidence({name}) - nothing, text, False))
-    text = f"{best:.2g} × the file's fits best of {', '.join(f'{one:.2g}' for one in tried)}"
-    return [*found, Explanation("viscosity", viscosity, text, False)], chosen
+    return [*found, *viscosity], chosen
 
 
 def _possible(liquid: Liquid, factor: float) -> bool:

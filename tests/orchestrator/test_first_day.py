@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import math
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
+from orchestrator.recordings import first_day as protocol
 from orchestrator.recordings import rig_diagnosis
 from orchestrator.recordings.first_day import first_day, practice_day
 from orchestrator.recordings.recording_file import load_recordings
-from orchestrator.recordings.rig_diagnosis import explanations
+from orchestrator.recordings.rig_diagnosis import diagnose
 from orchestrator.shipped import shipped
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.vessel.shapes import cylinder
+from tests.support.output_schema import validated
 
 BEAKER = cylinder("beaker", inner_radius=0.040, inner_height=0.100)
 SAMPLES = shipped("recordings/dose-1.yaml").parent
@@ -37,27 +40,63 @@ def test_a_pourer_that_is_too_small_is_refused_with_the_size_it_needs() -> None:
         first_day(cylinder("shot", inner_radius=0.02, inner_height=0.05), 998.0)
 
 
-@pytest.mark.parametrize("wrong", ["grip", "height"])
-def test_onsets_of_different_fills_tell_a_grip_from_a_height(wrong: str) -> None:
-    pours = load_recordings([SAMPLES])
-    ideal = np.array([rig_diagnosis._ideal_onset(one, 0.0) for one in pours])
-    taller = np.array([rig_diagnosis._ideal_onset(one, 2e-3) for one in pours])
-    shift = taller - ideal if wrong == "height" else np.full(len(pours), -math.radians(1.0))
-    held = (np.array([rig_diagnosis._ideal_onset(one, 1e-3) for one in pours]) - ideal) / 1e-3 / np.cos(ideal)
-    usual = rig_diagnosis.LIP + held * rig_diagnosis.HOLD[0]
-    found = rig_diagnosis._from_onsets(pours, usual + shift, np.eye(len(pours)) * math.radians(0.05) ** 2)
-    assert max(found, key=lambda one: one.evidence).name == wrong
-    assert any(one.stands_out for one in found)
-    found = rig_diagnosis._from_onsets(pours, usual, np.eye(len(pours)) * math.radians(0.05) ** 2)
-    assert not any(one.stands_out for one in found)
+def test_a_practice_day_finds_a_higher_rim_and_writes_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # four pours and a miss instead of ten, one dose, and coarse steps: seconds instead of a minute
+    kept = ("slow-full-1", "slow-low-1", "slow-middle", "calm-1", protocol.MISS)
+    monkeypatch.setattr(protocol, "_POURS", tuple(one for one in protocol._POURS if one[0] in kept))
+    monkeypatch.setattr(protocol, "DOSES", (0.020,))
+    monkeypatch.setattr(protocol, "HOLD", 4.0)
+    monkeypatch.setattr(rig_diagnosis, "TIME_STEP", 0.1)
+    monkeypatch.setattr(rig_diagnosis, "FACTORS", (30.0,))
+    day = tmp_path / "day"
+    arguments = [str(day), "--practise", "--wrong", "height", "--seed", "51003", "--particles", "0", "--json"]
+    result = CliRunner().invoke(app, ["recording", "first-day", *arguments])
+    assert result.exit_code == 0, result.output
+    document = validated("recording first-day", result.stdout)
+    assert document["main"] == "height"
+    assert float(document["explanations"][0]["text"].split(" mm")[0]) == pytest.approx(2.0, abs=0.7)
+    (dose,) = document["doses"]
+    assert dose["interval_g"][0] <= dose["weighed_g"] <= dose["interval_g"][1]
+    assert document["missed_g"] < 0.5
+    page = (day / "first-day.html").read_text(encoding="utf-8")
+    assert "which quantity explains the difference? height: +" in page
+    assert "measure the inner height of the pourer" in page
+
+
+def test_a_day_without_readings_while_pours_flow_is_replayed_but_not_explained(tmp_path: Path) -> None:
+    for name in ("dose-1", "dose-2"):
+        for one in SAMPLES.glob(f"{name}.*"):
+            shutil.copyfile(one, tmp_path / one.name)
+    result = CliRunner().invoke(app, ["recording", "first-day", str(tmp_path), "--particles", "0"])
+    assert result.exit_code == 0, result.output
+    assert "unknown: fewer than 4 pours have readings while they flow" in result.output
+    assert (tmp_path / "first-day.html").is_file()
+
+
+def test_recordings_of_two_pourers_are_no_day(tmp_path: Path) -> None:
+    pours = [replace(load_recordings([SAMPLES])[0], name=f"0{k}-slow") for k in range(5)]
+    other = replace(
+        pours[4], scene=replace(pours[4].scene, pourer=cylinder("other", inner_radius=0.03, inner_height=0.1))
+    )
+    with pytest.raises(InvalidArgumentError, match="another pourer"):
+        diagnose([*pours[:4], other])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong", ["lag", "holds", "height"])
-def test_a_wrong_quantity_of_the_practice_bench_is_found(wrong: str, tmp_path: Path) -> None:
-    day = practice_day(tmp_path, 3, wrong)
-    found = explanations(day, day[:9])
-    assert next(one.name for one in found if one.stands_out) == wrong
+@pytest.mark.parametrize(
+    ("seed", "wrong", "sign"),
+    [(51_000, "lag", 1), (51_001, "holds", 1), (51_007, "grip", -1), (51_008, "height", -1), (51_009, "viscosity", -1)],
+)
+def test_a_wrong_quantity_of_the_practice_bench_is_found(seed: int, wrong: str, sign: int, tmp_path: Path) -> None:
+    found = diagnose(practice_day(tmp_path, seed, wrong, sign))
+    assert found.main is not None
+    assert found.main.name == wrong
+    assert found.describes
+
+
+@pytest.mark.slow
+def test_nothing_stands_out_on_a_practice_bench_in_order(tmp_path: Path) -> None:
+    assert diagnose(practice_day(tmp_path, 51_010)).main is None
 
 
 @pytest.mark.parametrize(
