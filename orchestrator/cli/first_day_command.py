@@ -243,7 +243,7 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
     words = []
     if found.explanations:
         words.append(
-            f"does the model describe this rig? {'yes' if found.describes else 'no'}: {inside} of {len(found.doses)} "
+            f"Does the model describe this rig? {'yes' if found.describes else 'no'}: {inside} of {len(found.doses)} "
             "doses are inside the 90 % interval predicted from the pours"
         )
     differences = [
@@ -254,28 +254,28 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
     if differences:
         mean, worst = sum(differences) / len(differences), max(differences)
         words.append(
-            f"particles, nothing fitted: {mean:.2g} g from the weighed amount on average, {worst:.2g} g at most"
+            f"Particles, nothing fitted: {mean:.2g} g from the weighed amount on average, {worst:.2g} g at most"
         )
     main = found.main
     if not found.explanations:
         words.append(
-            "which quantity explains the difference? unknown: fewer than 4 pours have readings while they flow; a real "
+            "Which quantity explains the difference? unknown: fewer than 4 pours have readings while they flow; a real "
             "balance below the receiver gives them"
         )
     elif main is None:
-        words.append("which quantity explains the difference? nothing stands out: the tolerances explain the pours")
+        words.append("Which quantity explains the difference? nothing stands out: the tolerances explain the pours")
     else:
         further = [one.name for one in found.explanations if one.stands_out and one is not main]
         more = f"; also: {', '.join(further)}, less directly" if further else ""
-        words.append(f"which quantity explains the difference? {main.name}: {main.text}{more}")
+        words.append(f"Which quantity explains the difference? {main.name}: {main.text}{more}")
     error = found.dose_error
     if error is not None:
-        words.append(f"how exact are doses? {1e3 * error[0]:.2g} g on average, {1e3 * error[1]:.2g} g at most")
+        words.append(f"How exact are doses? {1e3 * error[0]:.2g} g on average, {1e3 * error[1]:.2g} g at most")
     if found.missed is not None:
-        words.append(f"the pour that misses on purpose put {1e3 * found.missed:.2g} g into the receiver")
+        words.append(f"The pour that misses on purpose put {1e3 * found.missed:.2g} g into the receiver")
     if found.explanations:
         advice = "widen the ranges; repeat this day after changes" if main is None else ADVICE[main.name]
-        words.append(f"what to calibrate next? {advice}")
+        words.append(f"What to calibrate next? {advice}")
     return words
 
 
@@ -334,7 +334,7 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
         title="First day",
         kicker="Recorded pours",
         heading="First day of a rig",
-        lead=f"{len(replays)} recordings of {folder.absolute().name}.",
+        lead=f"{len(replays)} recordings in the folder {folder.absolute().name}.",
         footer="Written by decant recording first-day.",
         words=words,
         pictures=pictures,

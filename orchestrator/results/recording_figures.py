@@ -65,13 +65,14 @@ def diagnosis_figure(found: RigDiagnosis) -> Figure:
     """
     figure, (evidence, doses) = new_figure(1, 2, size=(8.6, 3.4))
     shown = [one for one in reversed(found.explanations) if np.isfinite(one.evidence)]
-    values = [float(np.clip(one.evidence, 0.05, 30.0)) for one in shown]
+    values = [float(np.clip(one.evidence, -10.0, 30.0)) for one in shown]
     evidence.barh([one.name for one in shown], values, color=[BEST if one.stands_out else GREY for one in shown])
     for row, one in enumerate(shown):
         if one.evidence > 30.0:
             evidence.text(29.5, row, f"{one.evidence:.0f}", ha="right", va="center", color="white", fontsize=8.5)
-    evidence.set_xlim(0.0, 30.0)
-    dress(evidence, title="Which quantity is wrong?", x="evidence (above 0: more likely than nothing)", grid=None)
+    evidence.axvline(0.0, color=INK, lw=0.8)
+    evidence.set_xlim(-10.0, 30.0)
+    dress(evidence, title="Which quantity is wrong?", x="evidence (above 0: likelier than no error)", grid=None)
     for row, dose in enumerate(found.doses):
         low, high, middle = (1e3 * (one - dose.weighed) for one in (dose.low, dose.high, dose.predicted))
         doses.plot([low, high], [row, row], color=PREDICTED, lw=3.0, label="predicted, 90 %" if row == 0 else None)

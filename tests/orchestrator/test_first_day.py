@@ -7,17 +7,22 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from actors.dosing.pour_response import PourHypotheses, fall_time, respond
 from orchestrator.cli.app import app
 from orchestrator.recordings import first_day as protocol
 from orchestrator.recordings import rig_diagnosis
 from orchestrator.recordings.first_day import first_day, practice_day
-from orchestrator.recordings.recording_file import load_recordings
+from orchestrator.recordings.recording_file import PourRecording, load_recordings, write_recording
+from orchestrator.recordings.recording_replay import flow_of
 from orchestrator.recordings.rig_diagnosis import diagnose
 from orchestrator.shipped import shipped
 from sim_engine.errors import InvalidArgumentError
+from sim_engine.liquids import Liquid
+from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
 from tests.support.output_schema import validated
 
@@ -40,6 +45,44 @@ def test_a_pourer_that_is_too_small_is_refused_with_the_size_it_needs() -> None:
         first_day(cylinder("shot", inner_radius=0.02, inner_height=0.05), 998.0)
 
 
+def _poured(folder: Path, name: str, full: float, tilts: tuple[float, float], grip: float) -> PourRecording:
+    """A pour of the tilting-cup equation without a lip, of a cup that is held more tilted than reported [deg]."""
+    scene = Scene(name, BEAKER, cylinder("jar", inner_radius=0.05, inner_height=0.1), Liquid(mass=0.5 * full))
+    times = np.arange(0.0, 9.0, 0.05)
+    angles = np.radians(np.interp(times, [0.0, 4.0, 8.0, 9.0], [tilts[0], tilts[1], tilts[1], 0.0]))
+    truth = PourHypotheses(*(np.array([one]) for one in (-math.radians(grip), 1.0, scene.liquid.volume, 0.35, 0.6)))
+    at = times[::2]
+    shown, _ = respond(flow_of(scene), truth, times, angles, at, fall_time(0.13))
+    columns = {
+        "tilt_deg": [*zip(times, np.degrees(angles), strict=True)],
+        "mass_g": [(float(t), round(1e3 * float(m), 1)) for t, m in zip(at, shown[0], strict=True)],
+    }
+    path = write_recording(
+        folder / f"{name}.yaml",
+        scene,
+        columns,
+        recorded={"how": "computed"},
+        placement={"height": "80 mm"},
+        balance={"step": "0.1 g"},
+    )
+    return load_recordings([path])[0]
+
+
+@pytest.mark.parametrize(("grip", "main"), [(1.2, "grip"), (0.1, None)])
+def test_pours_of_three_fills_show_a_grip(
+    grip: float, main: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rig_diagnosis, "TIME_STEP", 0.1)
+    monkeypatch.setattr(rig_diagnosis, "FACTORS", ())
+    steps = [(0.85, (10.0, 28.0)), (0.55, (40.0, 53.0)), (0.55, (41.0, 53.0)), (0.25, (58.0, 70.0))]
+    found = diagnose([_poured(tmp_path, f"0{k}", full, tilts, grip) for k, (full, tilts) in enumerate(steps)])
+    values = {one.name: one for one in found.explanations}
+    assert (found.main and found.main.name) == main
+    assert float(values["grip"].text.split(" deg")[0]) == pytest.approx(grip, abs=0.35)
+    assert not values["height"].stands_out
+
+
+@pytest.mark.slow
 def test_a_practice_day_finds_a_higher_rim_and_writes_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # four pours and a miss instead of ten, one dose, and coarse steps: seconds instead of a minute
     kept = ("slow-full-1", "slow-low-1", "slow-middle", "calm-1", protocol.MISS)
@@ -59,7 +102,7 @@ def test_a_practice_day_finds_a_higher_rim_and_writes_a_page(tmp_path: Path, mon
     assert dose["interval_g"][0] <= dose["weighed_g"] <= dose["interval_g"][1]
     assert document["missed_g"] < 0.5
     page = (day / "first-day.html").read_text(encoding="utf-8")
-    assert "which quantity explains the difference? height: +" in page
+    assert "Which quantity explains the difference? height: +" in page
     assert "measure the inner height of the pourer" in page
 
 
@@ -73,11 +116,17 @@ def test_a_day_without_readings_while_pours_flow_is_replayed_but_not_explained(t
     assert (tmp_path / "first-day.html").is_file()
 
 
+def test_the_gain_of_two_weights_is_the_second(tmp_path: Path) -> None:
+    scene = load_recordings([SAMPLES])[0].scene
+    columns = {"tilt_deg": [(0.0, 0.0), (1.0, 60.0), (2.0, 0.0)], "mass_g": [(0.0, 0.0), (2.0, 69.09)]}
+    path = write_recording(tmp_path / "pour.yaml", scene, columns, recorded={"how": "weighed"}, balance={"zero": "0 g"})
+    assert load_recordings([path])[0].gain == pytest.approx(0.06909)
+
+
 def test_recordings_of_two_pourers_are_no_day(tmp_path: Path) -> None:
-    pours = [replace(load_recordings([SAMPLES])[0], name=f"0{k}-slow") for k in range(5)]
-    other = replace(
-        pours[4], scene=replace(pours[4].scene, pourer=cylinder("other", inner_radius=0.03, inner_height=0.1))
-    )
+    pours = [replace(load_recordings([SAMPLES])[0], path=tmp_path / f"0{k}-slow.yaml") for k in range(5)]
+    narrow = cylinder("other", inner_radius=0.03, inner_height=0.1)
+    other = replace(pours[4], scene=replace(pours[4].scene, pourer=narrow))
     with pytest.raises(InvalidArgumentError, match="another pourer"):
         diagnose([*pours[:4], other])
 
