@@ -288,7 +288,7 @@ _add(
 _add(
     first_day_command.first_day,
     "decant recording first-day day-one --campaign configs/campaigns/first-day.yaml",
-    "decant recording first-day practice --practise --wrong grip   # in seconds, without a laboratory",
+    "decant recording first-day practice --practise --wrong grip   # in minutes, without a laboratory",
     "decant recording first-day day-one   # explain the recordings of a folder again",
     name="first-day",
     to=_recording,

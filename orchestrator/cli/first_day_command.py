@@ -32,7 +32,7 @@ def first_day(
     ] = None,
     laboratory: OtherLaboratory = None,
     practise: Annotated[
-        bool, typer.Option("--practise", help="Record the day on a virtual dosing bench instead, in seconds.")
+        bool, typer.Option("--practise", help="Record the day on a virtual dosing bench instead, without a clock.")
     ] = False,
     wrong: Annotated[
         str | None,
