@@ -203,13 +203,20 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
         return plan.settings.build(replace(plan, known=known_simulations(plan, results)), pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
-        theta = calibrated_theta(results).theta
+        theta, plain = calibrated_theta(results).theta, plan.uncalibrated
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
-        measured = {prior.name: prior.mean for prior in plan.parameter_prior}
-        plain = SimulationParameters.from_values(plan.fixed_parameters | measured)
         drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()
-        return CalibrationEvaluation(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain, drawn=drawn)
+        return CalibrationEvaluation(
+            theta,
+            rivals,
+            pours,
+            Contexts.of(plan),
+            seed,
+            uncalibrated=plain,
+            drawn=drawn,
+            train_seeds=result_of(results, CALIBRATION, Calibrated).pour_seeds,
+        )
 
     found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
     return [*stages, found, StageDefinition(EVALUATION, evaluation)]

@@ -152,20 +152,28 @@ class Evaluation:
     Source: Lopez-Guevara et al., CoRL 2017, section 4.1 (test discrepancy).
     """
 
-    def __init__(self, thetas: Mapping[str, SimulationParameters], pours: Sequence[ScoredPour], seed: int) -> None:
+    def __init__(
+        self,
+        thetas: Mapping[str, SimulationParameters],
+        pours: Sequence[ScoredPour],
+        seed: int,
+        *,
+        train_seeds: Sequence[int] = (),
+    ) -> None:
         """Plan the simulations.
 
         Args:
             thetas: θ by label. 'random 1', 'random 2' … form the baseline; their median is reported. 'posterior 1',
                 'posterior 2' … are draws; the mean of their simulations is scored as well.
+            train_seeds: seeds on the usable training pours; empty: new ones.
         """
-        seeds = SeedStream(seed, "evaluation")
+        seeds, known = SeedStream(seed, "evaluation"), iter(train_seeds)
         self._cases: list[_Case] = []
         self._thetas = dict(thetas)
         for scored in pours:
             if scored.pour.spillage is None:
                 continue
-            seed_of_pour = seeds.next()
+            seed_of_pour = next(known) if train_seeds and scored.pour.split == "train" else seeds.next()
             for label, theta in thetas.items():
                 request = Simulate(scored.scene, scored.pour.action, theta, seed_of_pour, "evaluate")
                 self._cases.append(_Case(label, scored, request))
@@ -438,6 +446,7 @@ class CalibrationEvaluation:
         *,
         uncalibrated: SimulationParameters | None = None,
         drawn: Sequence[SimulationParameters] = (),
+        train_seeds: Sequence[int] = (),
     ) -> None:
         """Plan the simulations.
 
@@ -447,15 +456,17 @@ class CalibrationEvaluation:
             contexts: contexts of the regression.
             uncalibrated: θ that is used without a calibration; it is not scored if it is None or equals θ*.
             drawn: draws from θ's posterior.
+            train_seeds: seeds of simulations on the usable training pours; empty: new ones.
         """
         unseen = [scored for scored in pours if scored.pour.split != "train"]
         train = [scored for scored in pours if scored.pour.split == "train"]
         # Unseen pours come first in both, so that θ* and random θ have the same seeds on them.
-        self._calibrated = Evaluation({CALIBRATED: theta}, [*unseen, *train], seed)
+        self._calibrated = Evaluation({CALIBRATED: theta}, [*unseen, *train], seed, train_seeds=train_seeds)
         self._parts = [self._calibrated, Evaluation(random_thetas, unseen, seed)]
         self._uncalibrated: Evaluation | None = None
         if uncalibrated is not None and uncalibrated != theta:
-            self._uncalibrated = Evaluation({UNCALIBRATED: uncalibrated}, [*unseen, *train], seed)
+            plain = {UNCALIBRATED: uncalibrated}
+            self._uncalibrated = Evaluation(plain, [*unseen, *train], seed, train_seeds=train_seeds)
             self._parts.append(self._uncalibrated)
         if drawn:  # with other seeds: a draw can be θ* itself
             draws = {f"posterior {k}": theta for k, theta in enumerate(drawn, 1)}
