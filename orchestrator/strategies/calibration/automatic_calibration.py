@@ -129,7 +129,8 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
             new, self._before = self._trials.answered - self._before, self._trials.answered
             change = None if before is None else posterior_change(before, suggestion.posterior)
             if change is not None and change < UNCHANGED:
-                self._end(f"the last {new} of {self._before} simulations changed the posterior by {change:.2f} sd")
+                text = f"changed the posterior by only {change:.2f} standard deviations"
+                self._end(f"the last {new} of {self._before} simulations {text}")
             elif not left:
                 self._end(f"the limit of {self._budget} simulations is reached")
             else:

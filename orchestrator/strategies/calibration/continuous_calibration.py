@@ -90,8 +90,8 @@ class C4Settings(CalibrationSettings):
         if self.simulations != "auto":
             check_initial(self, self.initial_samples, self.simulations, "simulations", "simulations", complaints)
         elif not self.makes_posterior:
-            text = "needs a number with 'averaging: noise', which has no posterior; add for example 'simulations: 108'"
-            complaints.add(text, "simulations" if "simulations" in self.model_fields_set else "averaging")
+            text = "'noise' has no posterior, so 'simulations' needs a number; add for example 'simulations: 108'"
+            complaints.add(text, "averaging")
         return None if complaints.any else self
 
     def simulations_on(self, train: int) -> int:
