@@ -28,6 +28,7 @@ from orchestrator.strategies.calibration.posterior_summary import (
     unit_prior,
 )
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
+from orchestrator.strategies.strategy import Progress
 from orchestrator.strategies.trials import Trial
 from sim_engine.liquids import SimulationParameters
 
@@ -204,6 +205,11 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
 
     def _posterior_found(self) -> PosteriorFound | None:
         return None if self._posterior is None else posterior_found(self._posterior, self._plan.parameters)
+
+    def progress(self) -> Progress:
+        """As in the base class; no further simulations after the end."""
+        answered = self._trials.answered
+        return Progress(answered, self._budget if self._ended is None else answered)
 
     def result(self) -> Calibrated:
         """As in the base class, with the reason of the end and the seeds of the training pours."""
