@@ -23,6 +23,7 @@ from orchestrator.results.loss_units import (
     unit_of_pour,
 )
 from orchestrator.results.run_summary import (
+    NOT_SEARCHED,
     LogEntry,
     NotSimulated,
     ParameterSummary,
@@ -37,6 +38,7 @@ from orchestrator.results.run_summary import (
 from orchestrator.results.stage_views import (
     SPLITS,
     calibrated_label,
+    calibration_of,
     confirmations_of,
     deployments_of,
     evaluation_of,
@@ -94,11 +96,13 @@ def summarise(
     """
     record = record or RunState(Header(plan.name, {}))
     found, evaluation, gain = theta_of(results), evaluation_of(results), gain_of(results)
+    calibration = calibration_of(results)
     posterior = None if found is None or found.posterior is None else found.posterior.summary()
     space = None if plan.calibration is None else plan.calibration.parameters
     liquid = None if plan.calibration is None else plan.calibration.scene.liquid
     expected = None if found is None else found.predicted_discrepancy
     deviation = None if found is None else found.predicted_deviation
+    ended = None if calibration is None else calibration.ended
     discrepancy = _discrepancies(evaluation)
     receivers = _receivers(plan, results, best_not_covered or {})
     advised = wording.advice(plan, receivers)
@@ -126,7 +130,7 @@ def summarise(
         predicted_deviation=deviation,
         posterior=posterior,
         parameters=() if found is None else _parameters(plan.calibration, found),
-        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain, liquid)),
+        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain, liquid, ended)),
         discrepancy=discrepancy,
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,
@@ -337,7 +341,7 @@ def _parameters(calibration: CalibrationPlan | None, found: CalibratedTheta) -> 
                 name=style.PARAMETER_NAMES.get(name, name.replace("_", " ")),
                 value=style.display_value(name, value),
                 region=region,
-                searched="not searched" if axis is None else style.display_interval(name, axis.lower, axis.upper),
+                searched=NOT_SEARCHED if axis is None else style.display_interval(name, axis.lower, axis.upper),
             )
         )
     return tuple(rows)

@@ -20,7 +20,7 @@ from orchestrator.results.loss_units import (
     deployment_unit,
     minimised_loss,
 )
-from orchestrator.results.run_summary import Advice, PoolUse, PourSummary, ReceiverSummary, RunSummary
+from orchestrator.results.run_summary import NOT_SEARCHED, Advice, PoolUse, PourSummary, ReceiverSummary, RunSummary
 from orchestrator.results.stage_views import SPLITS
 from orchestrator.states import State
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
@@ -313,10 +313,12 @@ def theta_sentences(
     space: Space | None,
     gain: CalibrationGain | None,
     liquid: Liquid | None = None,
+    ended: str | None = None,
 ) -> list[str]:
     """The knowledge of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified.
 
     Args:
+        ended: reason of the end of an automatic calibration.
         liquid: of the pours, as declared; its viscosity is stated if the pours determine it.
     """
     said = []
@@ -326,7 +328,19 @@ def theta_sentences(
         said += map(_sentence, posterior_lines(posterior, space))
         if liquid is not None and liquid.is_thick:
             said += _identified_viscosity(posterior, liquid)
-    return said if gain is None else [*said, _sentence(gain.text)]
+    if ended is not None:
+        said.append(f"The calibration ended because {ended}.")
+    if gain is not None:
+        said.append(_sentence(gain.text))
+        if posterior is not None and gain.recommended == "calibrated":
+            said.append(POSTERIOR_ADVICE)
+    return said
+
+
+POSTERIOR_ADVICE = (
+    "Plan and predict with theta.json, as the run itself does: it averages over the θ that fit, and transfers better "
+    "to other vessels than θ* alone."
+)
 
 
 def _identified_viscosity(posterior: PosteriorSummary, liquid: Liquid) -> list[str]:
@@ -606,10 +620,16 @@ def question_table(summary: RunSummary) -> ResultTable:
 
 
 def theta_table(summary: RunSummary) -> ResultTable:
-    """θ* with its region."""
+    """θ* with its region: the searched parameters."""
     level = "region" if summary.posterior is None else f"{100 * summary.posterior.level:.0f} % of the θ that fit"
-    rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in summary.parameters]
+    searched = [one for one in summary.parameters if one.searched != NOT_SEARCHED]
+    rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in searched]
     return ResultTable("θ* with its region", ["parameter", "θ*", level, "searched"], rows).filled()
+
+
+def fixed_parameters(summary: RunSummary) -> str:
+    """The parameters that were not searched, with their values; empty if all were."""
+    return ", ".join(f"{one.name} {one.value}" for one in summary.parameters if one.searched == NOT_SEARCHED)
 
 
 def score_table(summary: RunSummary) -> ResultTable:

@@ -136,6 +136,16 @@ def test_ranges_of_theta_have_the_unit_of_their_value(made: Made) -> None:
     assert style.display_interval("receiver_x", -0.0244, -0.00273) == "-24.4 … -2.73 mm"
 
 
+def test_pictures_come_first_and_parameters_that_were_not_searched_in_one_line(made: Made) -> None:
+    assert made.page.index("<figure") < made.page.index("<h2>Summary</h2>")
+    shown = texts(made.page)
+    table = shown[shown.index("θ* with its region") : shown.index("Not searched: ")]
+    assert "not searched" not in table
+    fixed = [f"{one.name} {one.value}" for one in made.published.summary.parameters if one.searched == "not searched"]
+    assert fixed
+    assert f"Not searched: {', '.join(fixed)}." in shown
+
+
 def test_every_pour_stands_in_a_table_with_its_grams(made: Made) -> None:
     pours = read_record(made.result.directory).pours
     assert len(pours) == 5
