@@ -21,11 +21,11 @@ from machine import describe, say, show
 
 from actors.arm.arm_geometry import ArmLimits, Box, Centre, JointAngles, Point, Pose, RobotCell
 from actors.arm.arm_interface import ArmStoppedError
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import PourPath
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.ur_driver import UrArm
 from actors.arm.ur.urscript_writer import STOP_DECELERATION
+from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller import VirtualController
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid

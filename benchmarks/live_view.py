@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 import psutil
 
+from actors.arm.arm_settings import arm_kind
 from actors.interfaces import PourProgress
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.optimizer.suggest import propose
@@ -287,7 +288,7 @@ def _events(plan: CampaignPlan) -> Callable[[int], list[Event]]:
     assert plan.deployment is not None
     scene = plan.deployment.scenes[0]
     arm = plan.laboratory.arm
-    figure = None if arm is None else arm.figure()
+    figure = None if arm is None else arm_kind(arm).figure()
     home = () if figure is None else figure.home
     action = scene.action({"angular_velocity": 1.5, "x_offset": 0.1})
     rng = np.random.default_rng(1)

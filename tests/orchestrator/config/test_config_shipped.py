@@ -12,7 +12,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller.robot import MODELS as CONTROLLED
 from actors.emulators.ur_controller.robot import calibrated
 from actors.runtime.child_process import child_environment
@@ -26,7 +26,7 @@ from orchestrator.config.json_schema import (
 )
 from orchestrator.config.yaml.yaml_source import Document
 from sim_engine.action import DEG, Action
-from sim_engine.vessel.shapes import MeshShape
+from sim_engine.vessel.mesh_shape import MeshShape
 from tests.support.waiting import PATIENCE
 
 CONFIGS = Path(__file__).parents[3] / "configs"
