@@ -44,7 +44,7 @@ lint: $(READY)
 	$(BIN)/lint-imports
 
 unit: $(READY)
-	$(BIN)/pytest -m "not slow and not physics" -n 4 $(BY_FILE)
+	$(BIN)/pytest -m "not slow and not physics" -n 4 --timeout 300 $(BY_FILE)
 
 # What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/4 runs every fourth file.
 slow: $(READY)

@@ -341,7 +341,7 @@ class RequestExecutor:
             except TimeoutError:
                 raise PourUnknownError(
                     f"the pour had begun and was not weighed within {_duration(self.deadlines.pour)}; the bench was "
-                    "told to stop, and what was poured is unknown",
+                    "stopped, and the poured amount is unknown",
                     "; see to the bench. Resuming asks for its outcome",
                 ) from None
         return Poured(measurement)

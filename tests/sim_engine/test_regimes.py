@@ -234,7 +234,7 @@ def test_a_stream_of_too_few_particles_is_told_with_the_number_that_would_do() -
     coarse = planned(spacing=(WATER.volume / 500) ** (1 / 3))
     (told,) = coarse.not_covered
     assert told.kind == "thin_stream"
-    enough = int(told.text.partition("roughly; ")[2].partition(" particles")[0].replace(" ", ""))
+    enough = int(told.text.partition("approximate; ")[2].partition(" particles")[0].replace(" ", ""))
     assert 500 < enough < 5_000
     assert kinds(planned(spacing=(WATER.volume / enough) ** (1 / 3))) == set()
 

@@ -290,7 +290,7 @@ class UrArm:
             if means is not None:
                 means()
         raise ArmLostError(
-            "the arm was told to stop by all means there are, but could not be seen to stand: "
+            "a stop was sent to the arm in every available way, but the arm was not seen to stand still: "
             "look at it, and press the emergency stop if it moves"
         )
 

@@ -80,12 +80,14 @@ export function stopCard(stop, asking, waiting, acts) {
   ] : button(`ask ${stop.rig}`, all ? "Clear the stop" : `Clear the stop of ${stop.rig}`, async () => acts.askClear(stop.rig), "plain danger"));
 }
 
+const sentence = (text) => /[.?!]$/.test(text) ? text : `${text}.`;
+
 /** Whether an idle arm can move, and what to do if it can't. */
 function armStatus(arm) {
   if (!arm) return null;
-  if (arm.state === "ok") return el("p", { class: "arm" }, `Arm: ${arm.text}.`);
-  return el("p", { class: "arm problem" }, el("b", {}, arm.state === "fail" ? `The arm can't move: ${arm.text}` : `Arm: ${arm.text}`, `, since ${clock(arm.time)}.`),
-    arm.advice ? ` ${arm.advice[0].toUpperCase()}${arm.advice.slice(1)}.` : "");
+  if (arm.state === "ok") return el("p", { class: "arm" }, `Arm: ${sentence(arm.text)}`);
+  return el("p", { class: "arm problem" }, el("b", {}, arm.state === "fail" ? "The arm can't move" : "Arm", ` (since ${clock(arm.time)}): ${sentence(arm.text)}`),
+    arm.advice ? ` ${sentence(arm.advice[0].toUpperCase() + arm.advice.slice(1))}` : "");
 }
 
 export function rigCard(rig, campaign, acts) {

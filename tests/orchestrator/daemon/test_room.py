@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 from pathlib import Path
 
@@ -27,7 +28,7 @@ def test_without_room_nothing_is_begun_and_it_is_said_until_there_is_room(
             served.daemon.settings.__dict__["keep_free"] = 800_000_000
             key = await served.submit()
             while not (await served.get("/status"))["problems"]:
-                pass
+                await asyncio.sleep(0.01)
             status = await served.get("/status")
             assert "700 MB are free" in status["problems"][0]
             assert "keep_free" in status["problems"][0]
