@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+from actors.arm.arm_settings import arm_kind
 from actors.balance.balance_settings import BalanceSettings, SerialBalanceSettings
 from actors.balance.display_behaviour import IDEAL
 from actors.balance.scale_model import ScaleSettings
@@ -60,7 +61,7 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
             f"laboratory {spec.name} is external: a program makes its pours and asks for them with decant.AskTell; "
             "'decant plan', and 'decant calibrate' on weighed pours, need no pours"
         )
-    if spec.arm is not None and need_bench and (missing := spec.arm.missing()) is not None:
+    if spec.arm is not None and need_bench and (missing := arm_kind(spec.arm).missing()) is not None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
             "(--laboratory configs/laboratories/twin.yaml)"
@@ -82,10 +83,11 @@ def check_bench_packages(spec: LaboratorySettings) -> None:
     Raises:
         LaboratoryError: some are not; the text names them and their extra.
     """
-    arm = spec.arm
-    if not spec.dispenses or (arm is not None and not arm.emulator and arm.missing() is None and spec.balance is None):
+    kind = None if spec.arm is None else arm_kind(spec.arm)
+    emulated = kind is not None and kind.emulated
+    if not spec.dispenses or (kind is not None and not emulated and kind.missing() is None and spec.balance is None):
         return
-    needed = ["psutil"] if spec.mode == "virtual" and arm is not None and arm.emulator else []
+    needed = ["psutil"] if spec.mode == "virtual" and emulated else []
     if spec.balance is not None and not spec.balance.typed and isinstance(spec.balance, SerialBalanceSettings):
         needed.append("serial")
     missing = [module for module in needed if not installed(module)]

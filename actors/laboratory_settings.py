@@ -15,7 +15,7 @@ from pydantic import AfterValidator, Field, Strict, create_model, field_validato
 from pydantic_core import PydanticCustomError
 
 from actors.arm.arm_geometry import RobotCell
-from actors.arm.arm_settings import ARMS, ArmSettings
+from actors.arm.arm_settings import ArmSettings, arm_kind, arm_settings
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.dialect_registry import kinds
 from actors.balance.scale_model import Drift
@@ -185,7 +185,7 @@ class LaboratorySettings(Settings):
     ray: Annotated[RaySettings | None, NOT_IN_FINGERPRINT] = None
     """The Ray cluster to run on; unless given, a private Ray on this machine."""
 
-    arm: Annotated[ArmSettings, OneOf(lambda: ARMS.all)] | None = None
+    arm: Annotated[ArmSettings, OneOf(arm_settings)] | None = None
     """The arm that holds the pourer, virtual or real; `kind` is one of the installed kinds."""
 
     cell: RobotCell | None = None
@@ -287,7 +287,7 @@ class LaboratorySettings(Settings):
             self._check_without_arm(problems)
         else:
             self._check_with_arm(problems)
-            self.arm.check_laboratory(problems, mode=self.mode, cell=self.cell)
+            arm_kind(self.arm).check_laboratory(problems, mode=self.mode, cell=self.cell)
             if self.balance is not None:
                 inner = problems.within("balance")
                 if self.balance.typed:

@@ -75,6 +75,7 @@ class PumpSettings(Settings):
 
     tag: ClassVar[str] = "kind"
     default_tag: ClassVar[str] = "simulated"
+    plugins: ClassVar[str] = "decant.pumps"
 
     simulates: ClassVar[bool] = False
     """Whether the driver only simulates, for virtual laboratories. It then has `prepare` and `moved` as
@@ -94,11 +95,6 @@ class PumpSettings(Settings):
 
     time_scale: Annotated[float, SET_BY_PROGRAM] = 1.0
     """Bench seconds per second of the clock; 0 to skip all waits."""
-
-    @classmethod
-    def unknown_tag(cls, word: str) -> str:
-        """The plug-in that provides this kind, if it could not be loaded."""
-        return next((str(broken) for broken in PUMPS.broken if broken.name == word), "")
 
     @abstractmethod
     def driver(self) -> tuple[type[Any], tuple[Any, ...]]:
@@ -161,6 +157,7 @@ class SpillSensorSettings(Settings):
 
     tag: ClassVar[str] = "kind"
     default_tag: ClassVar[str] = "simulated"
+    plugins: ClassVar[str] = "decant.spill_sensors"
 
     simulates: ClassVar[bool] = False
     """Whether the driver only simulates, for virtual laboratories. It then has `spill` and `wipe` as
@@ -168,11 +165,6 @@ class SpillSensorSettings(Settings):
 
     kind: str = ""
     """Kind of the sensor."""
-
-    @classmethod
-    def unknown_tag(cls, word: str) -> str:
-        """The plug-in that provides this kind, if it could not be loaded."""
-        return next((str(broken) for broken in SPILL_SENSORS.broken if broken.name == word), "")
 
     @abstractmethod
     def driver(self) -> tuple[type[Any], tuple[Any, ...]]:

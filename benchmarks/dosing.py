@@ -33,7 +33,8 @@ from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from sim_engine.liquids import Liquid
 from sim_engine.vessel import profile
-from sim_engine.vessel.shapes import MeshShape, VesselSpec, cylinder
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselSpec, cylinder
 from sim_engine.vessel.vessel import Vessel, build_vessel
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -24,7 +24,8 @@ from pydantic_core import PydanticUndefined
 
 from actors import laboratory_settings as laboratory
 from actors.arm.arm_geometry import ArmLimits, RobotCell
-from actors.arm.arm_settings import ARMS, UrArmSettings
+from actors.arm.arm_settings import arm_settings
+from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.balance.display_behaviour import DisplayBehaviour
 from actors.balance.scale_model import ScaleSettings
@@ -125,7 +126,7 @@ OF_SECTIONS = {
     **{model.__name__: f"[{name}](#{name})" for name, model in SECTIONS.items()},
     "BenchBalance": "[display](#display)",
     "ClusterSettings": "`{address: host:port}`",
-    **dict.fromkeys((arm.__name__ for arm in ARMS.all.values()), "[arm](#arm)"),
+    **dict.fromkeys((arm.__name__ for arm in arm_settings().values()), "[arm](#arm)"),
     "RobotCell": "[cell](#cell)",
     "ArmLimits": "[limits](#limits)",
     "Box": "`{low: {x, y, z}, high: {x, y, z}}`, lengths",

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
+from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, arm_kind
 from actors.balance.balance_settings import balance_diagnostics
 from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import check_laboratory, reached
@@ -88,7 +88,7 @@ def check_bench(
     if spec.arm is not None:
         with reached(spec) as ready:
             assert ready.arm is not None
-            found = ready.arm.diagnostics()
+            found = arm_kind(ready.arm).diagnostics()
             if read is not None:
                 record = read(found)
             accept = f"decant robot check {path} --accept-safety"

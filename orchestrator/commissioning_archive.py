@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
+from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, arm_kind
 from actors.balance.dialect_registry import dialects
 from actors.balance.line_recording import LineRecording
 from actors.interfaces import DeviceCheck
@@ -233,7 +233,7 @@ def _read_robot_check(path: Path) -> tuple[str, str, Any]:
         raise ValueError("its laboratory has no arm")
     accepted = data["accepted"]
     record = None if accepted is None else SafetyRecord(**accepted)
-    look = arm.diagnostics_of(data["readout"])
+    look = arm_kind(arm).diagnostics_of(data["readout"])
     checks = look.checks(record, accept="decant robot check --accept-safety", virtual=data["source"] == "virtual")
     return "robot check", data["source"], {"checks": [dataclasses.asdict(check) for check in checks]}
 

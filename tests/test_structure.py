@@ -20,16 +20,33 @@ def modules() -> dict[str, Path]:
     return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
 
 
+PROCESSES = ("python_module", "ConnectedProcess")
+"""Functions that start the module which their first argument names, in a process of its own."""
+
+JOURNAL = "orchestrator.journal.codec"
+"""Names by text the modules that declare results, which import the journal's types."""
+
+
 def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:
-    """Modules that one imports anywhere in its text: at the top, within functions, and for types only."""
+    """Modules that one imports: at the top, within functions, for types only, and by a text that names them."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    nodes = list(ast.walk(tree))
+    started = {id(node.args[0]) for node in nodes if isinstance(node, ast.Call) and _called(node) in PROCESSES}
+    for node in nodes:
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in started:
+            text = node.value.partition(":")[0]
+            found |= {text} if "." in text and name != JOURNAL else set()
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
             full = {f"{node.module}.{alias.name}" for alias in node.names}
             found |= {module if module in known else node.module for module in full}
     return (found & known.keys()) - {name}
+
+
+def _called(node: ast.Call) -> str:
+    return node.func.id if isinstance(node.func, ast.Name) and node.args else ""
 
 
 def test_no_module_imports_itself_through_others() -> None:

@@ -53,6 +53,7 @@ print(len(StrategyHarness(spill).run(make()).pours), "pours")
 
 CONTRACT = """
 import pytest
+from actors.arm.arm_settings import arm_kind
 from actors.arm.simulated_arm import SimulatedArmSettings, SimulatedArm
 from decant.plugins.testing import ACTIONS, SCENE, ArmBench, ArmContract
 
@@ -61,7 +62,7 @@ class TestMyArm(ArmContract):
     def bench(self):
         spec = SimulatedArmSettings(time_scale=20.0)
         arm = SimulatedArm(spec)
-        path = spec.plan(SCENE, SCENE.action(ACTIONS.decode([0.8, 0.5]) | {"max_angle": 1.7}))
+        path = arm_kind(spec).plan(SCENE, SCENE.action(ACTIONS.decode([0.8, 0.5]) | {"max_angle": 1.7}))
         yield ArmBench(arm, path, time_scale=20.0)
         arm.close()
 """

@@ -9,20 +9,17 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import Pose, RobotCell
+from actors.arm.arm_geometry import Pose
 from actors.arm.arm_interface import ArmFacts, ArmNotReleasedError, ArmPose, ArmRefusedError, ArmState, ArmStoppedError
 from actors.arm.arm_settings import ArmSettings
 from actors.arm.planned_pour import ExecutedMotion, MotionPath
 from actors.bench.bench_clock import Pace
-from sim_engine.action import Action
 from sim_engine.motion import PourMotion
-from sim_engine.scene import Scene
-from sim_engine.settings.model import Problems
 
 FloatArray = NDArray[np.float64]
 
@@ -62,23 +59,6 @@ class SimulatedArmSettings(ArmSettings):
 
     kind: Literal["simulated"] = "simulated"
     """A simulated arm without protocol."""
-
-    def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
-        """See `ArmSettings.check_laboratory`."""
-        if mode == "hardware":
-            problems.add("a simulated arm moves nothing; write 'mode: virtual'", "arm")
-        if cell is not None:
-            problems.add("a simulated arm stands nowhere; remove the section", "cell")
-
-    def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `ArmSettings.driver`."""
-        return SimulatedArm, (self,)
-
-    def plan(self, scene: Scene, action: Action) -> MotionPath:
-        """See `ArmSettings.plan`."""
-        from actors.bench.pour_feasibility import plan_pour
-
-        return MotionPath(plan_pour(scene, action), approach_time=APPROACH_TIME)
 
 
 class SimulatedArm:

@@ -1,26 +1,26 @@
 """Settings of a balance: its placement, its device, its serial line, and the rule for a settled weight.
 
-`BalanceSettings` is the base class; `SerialBalanceSettings` and plug-ins' classes derive from it and name the driver
-(`SimulatedBalanceSettings` is in `simulated_balance`). `Settling` applies a `SettlingRule`: a weight counts if the
-balance reports several stable readings in a row and they agree. The drivers themselves are in other modules.
+`BalanceSettings` is the base class, from which `SerialBalanceSettings` and plug-ins' classes derive
+(`SimulatedBalanceSettings` is in `simulated_balance`). `BalanceKind` joins settings with driver, emulator and
+diagnostics; Decant's own kinds are in `actors.device_kinds`. `Settling` applies a `SettlingRule`: a weight counts if
+the balance reports several stable readings in a row and they agree.
 """
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections import Counter, deque
 from dataclasses import dataclass
 from itertools import pairwise, zip_longest
-from pkgutil import resolve_name
-from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
+from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, Self, TypeVar
 
 from pydantic import Field
 
 from actors.balance.balance_interface import BalanceDriver
-from actors.balance.dialect_registry import BALANCES, dialects
+from actors.balance.dialect_registry import dialects, drivers
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.scale_model import Duration, Error, PositiveDuration, PositiveMass, ScaleSettings
-from actors.balance.serial_port import look_at_port, tcp_address
+from actors.balance.serial_port import tcp_address
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import DeviceCheck, LaboratoryError
 from sim_engine.settings.model import (
@@ -125,9 +125,6 @@ class Settling:
 AUTO = "auto"
 """Value of `dialect` that selects automatic detection."""
 
-SERIAL_EMULATOR = "actors.emulators.serial_balance.balance_process:SerialBalanceEmulator"
-"""Emulates a balance on a serial line of a virtual bench; a name, because drivers do not import emulators."""
-
 USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
 """Usual speeds of balances [bits per second]."""
 
@@ -167,11 +164,12 @@ _TYPED = ("kind", "placement", "load_tolerance", "step", "repeatability")
 class BalanceSettings(Settings):
     """The balance: its placement and its connection, as frozen values that are sent to the bench's machine.
 
-    A package adds a kind with a subclass, registered in the entry-point group `decant.balances` under its `kind`.
+    A package adds a kind with a subclass and its `BalanceKind`.
     """
 
     tag: ClassVar[str] = "kind"
     default_tag: ClassVar[str] = "serial"
+    plugins: ClassVar[str] = "decant.balances"
 
     receives_load: ClassVar[bool] = False
     """Whether, on a virtual bench, the driver itself receives the load instead of an emulator. It then has `prepare`
@@ -191,11 +189,6 @@ class BalanceSettings(Settings):
 
     time_scale: Annotated[float, SET_BY_PROGRAM] = 1.0
     """Bench seconds per second of the clock; 1 for a real device, 0 disables waiting."""
-
-    @classmethod
-    def unknown_tag(cls, word: str) -> str:
-        """The plug-in that provides this kind, if it could not be loaded."""
-        return next((str(broken) for broken in BALANCES.broken if broken.name == word), "")
 
     def check_laboratory(self, problems: Problems, *, mode: str) -> None:
         """Add a problem for each combination of values that is invalid in a laboratory.
@@ -226,19 +219,38 @@ class BalanceSettings(Settings):
         """Standard deviation of repeated weighings of the same load [kg]; 0 if unknown."""
         return 0.0
 
+    @property
+    def longest_call(self) -> float:
+        """Upper limit of a call's duration [s of the clock]; deadlines around the driver should be a little longer."""
+        return 120.0
+
+
+B = TypeVar("B", bound=BalanceSettings)
+
+
+class BalanceKind(ABC, Generic[B]):
+    """One kind of balance: joins its settings with driver, emulator and diagnostics.
+
+    A subclass is registered in the entry-point group `decant.balances` under the `kind` of its settings.
+
+    Args:
+        spec: settings of one balance.
+    """
+
+    settings: ClassVar[type[BalanceSettings]]
+    """Class of the settings."""
+
+    def __init__(self, spec: B) -> None:
+        self.spec = spec
+
     @abstractmethod
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """Return the class of the driver (an `actors.balance.balance_interface.BalanceDriver`, importable by name) and
+        """The class of the driver (an `actors.balance.balance_interface.BalanceDriver`, importable by name) and
         its arguments.
 
         Args:
             name: for messages.
         """
-
-    @property
-    def longest_call(self) -> float:
-        """Upper limit of a call's duration [s of the clock]; deadlines around the driver should be a little longer."""
-        return 120.0
 
     def start_emulator(self) -> BalanceEmulator | None:
         """Start the emulator on a virtual bench; None if the device needs none."""
@@ -272,6 +284,12 @@ class BalanceSettings(Settings):
         finally:
             driver.close()
         return checks
+
+
+def balance_kind(spec: BalanceSettings) -> BalanceKind[Any]:
+    """The kind of a balance, for its settings."""
+    found: BalanceKind[Any] = drivers()[spec.kind](spec)
+    return found
 
 
 def dialect_names() -> list[str]:
@@ -378,22 +396,6 @@ class SerialBalanceSettings(BalanceSettings):
         """See `BalanceSettings.deviation`."""
         return self.repeatability
 
-    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `BalanceSettings.driver`."""
-        return resolve_name("actors.balance.serial_balance:SerialBalance"), (self, name)
-
-    def start_emulator(self) -> BalanceEmulator | None:
-        """See `BalanceSettings.start_emulator`."""
-        if self.virtual is None:
-            return None
-        emulator: BalanceEmulator = resolve_name(SERIAL_EMULATOR)(self, self.virtual)
-        return emulator
-
-    def diagnostics(self, *, tare: bool) -> list[DeviceCheck]:
-        """See `BalanceSettings.diagnostics`; checks the port first."""
-        port = look_at_port(self.port)
-        return [port] if port.state == "fail" else [port, *super().diagnostics(tare=tare)]
-
     @property
     def longest_call(self) -> float:
         """See `BalanceSettings.longest_call`."""
@@ -463,4 +465,4 @@ def balance_diagnostics(balance: BalanceSettings | None, *, tare: bool) -> list[
         return [DeviceCheck("balance", "fail", "the file has none", "add a 'balance' section, or 'placement: manual'")]
     if balance.typed:
         return [DeviceCheck("balance", "ok", "all weights are typed by the operator")]
-    return balance.diagnostics(tare=tare)
+    return balance_kind(balance).diagnostics(tare=tare)

@@ -1,4 +1,4 @@
-"""The plug-in registry of balances, built-in and installed: dialects of serial lines, and settings of drivers."""
+"""The plug-in registry of balances, built-in and installed: dialects of serial lines, and kinds with drivers."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ def _balance(loaded: Any, name: str) -> Dialect | type[Any]:
     found: Dialect | type[Any]
     if isinstance(loaded, Dialect):
         found, called = loaded, loaded.name
-    elif isinstance(loaded, type) and callable(getattr(loaded, "driver", None)) and hasattr(loaded, "model_fields"):
-        found, called = loaded, loaded.model_fields["kind"].default
+    elif isinstance(loaded, type) and callable(getattr(loaded, "driver", None)) and hasattr(loaded, "settings"):
+        found, called = loaded, loaded.settings.model_fields["kind"].default
     else:
-        raise TypeError("should be an instance of a Dialect, or a class of settings with a method 'driver'")
+        raise TypeError("should be an instance of a Dialect, or a class derived from decant.plugins.BalanceKind")
     if called != name:
         raise ValueError(f"it calls itself '{called}', which should be the name that it is registered under")
     return found
 
 
 BALANCES: PluginRegistry[Dialect | type[Any]] = PluginRegistry("decant.balances", "balance", _balance)
-"""All installed balances: instances of dialects, and subclasses of `BalanceSettings`."""
+"""All installed balances: instances of dialects, and subclasses of `BalanceKind`."""
 
 
 def dialects() -> dict[str, Dialect]:
@@ -32,9 +32,14 @@ def dialects() -> dict[str, Dialect]:
     return {name: found for name, found in BALANCES.all.items() if isinstance(found, Dialect)}
 
 
-def kinds() -> dict[str, type[Any]]:
-    """Settings of drivers by the names that files use."""
+def drivers() -> dict[str, type[Any]]:
+    """Kinds of balances with drivers (`BalanceKind`) by the names that files use."""
     return {name: found for name, found in BALANCES.all.items() if isinstance(found, type)}
+
+
+def kinds() -> dict[str, type[Any]]:
+    """Settings of these kinds by the names that files use."""
+    return {name: found.settings for name, found in drivers().items()}
 
 
 def encoders() -> dict[str, Callable[[], ProtocolEncoder]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 
@@ -74,10 +74,6 @@ class SimulatedBalanceSettings(BalanceSettings):
     def free_fields(self) -> frozenset[str]:
         """Fields that do not affect any request: an ideal display, which runs of earlier versions lack."""
         return frozenset({"behaviour"} if self.behaviour == IDEAL else ())
-
-    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `BalanceSettings.driver`."""
-        return VirtualBalance, (self, name)
 
     @property
     def position(self) -> Placement:

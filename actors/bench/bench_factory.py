@@ -14,10 +14,11 @@ from typing import Any
 
 from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import PlannedPour
-from actors.arm.arm_settings import ArmSettings, UrArmSettings
+from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.arm.simulated_arm import SimulatedArmSettings
+from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_device import DeviceBalance
-from actors.balance.balance_settings import BalanceSettings
+from actors.balance.balance_settings import BalanceSettings, balance_kind
 from actors.balance.scale_model import Load
 from actors.balance.weighing_plan import PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
@@ -147,7 +148,7 @@ class PouringBench:
     async def _dose(
         self, scene: Scene, dose: DoseTarget, path: PlannedPour, seed: int, progress: ProgressCallback | None
     ) -> PourMeasurement:
-        if not self._arm_spec.doses:
+        if not arm_kind(self._arm_spec).doses:
             raise InvalidActionError(f"an arm of the kind '{self._arm_spec.kind}' can't pour wanted amounts")
         if self._arm_spec.time_scale > FASTEST_DOSE:
             raise InvalidActionError("wanted amounts are poured in real time; write 'bench: {time_scale: 1}'")
@@ -156,7 +157,7 @@ class PouringBench:
 
     def _checked(self, scene: Scene, action: Action) -> PlannedPour:
         try:
-            return self._arm_spec.plan(scene, action)
+            return arm_kind(self._arm_spec).plan(scene, action)
         except ValueError as error:
             raise InvalidActionError(str(error)) from error
 
@@ -201,11 +202,11 @@ class _Opening:
         return self.devices[-1]
 
     def arm(self, spec: ArmSettings, accepted: str | None = None) -> DeviceArm:
-        cls, args = spec.driver(accepted)
+        cls, args = arm_kind(spec).driver(accepted)
         return DeviceArm(self("arm", cls, *args), spec)
 
     def balance(self, spec: BalanceSettings, name: str, device: str = "balance") -> DeviceBalance:
-        cls, args = spec.driver(name)
+        cls, args = balance_kind(spec).driver(name)
         return DeviceBalance(self(device, cls, *args), spec.time_scale, longest_call=spec.longest_call)
 
     def pump(self, spec: PumpSettings, name: str) -> PumpDevice:

@@ -18,7 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.ur_settings import UrArmSettings
 from actors.dosing.virtual_dosing_bench import LONGEST_DOSE, TIME_STEP, LivePour, TrueCup, TrueScale, VirtualDosingBench
 from actors.interfaces import LaboratoryError
 from sim_engine.liquids import Liquid

@@ -11,19 +11,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import importlib
 import math
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_interface import Executed
-from actors.arm.arm_settings import ArmSettings, UrArmSettings
+from actors.arm.arm_settings import ArmEmulator, ArmSettings, History, arm_kind
+from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_device import DeviceBalance
-from actors.balance.balance_settings import BalanceEmulator, BalanceSettings
+from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, balance_kind
 from actors.balance.scale_model import Load
 from actors.bench.bench_operators import Hands
 from actors.bench.flowing_liquid import FlowEnd, FlowingLiquid, FlowOrder
@@ -77,59 +77,6 @@ class Found:
     true_arm: ArmSettings | None
 
 
-@dataclass(frozen=True)
-class History:
-    """Recorded joint motion of the controller.
-
-    Attributes:
-        times: controller times [s], increasing.
-        joints: six joint angles at each time [rad].
-        now: controller time of the request [s].
-    """
-
-    times: tuple[float, ...]
-    joints: tuple[tuple[float, ...], ...]
-    now: float
-
-
-class ArmEmulator(Protocol):
-    """The emulator that an arm's driver connects to; created from an `ArmSettings`, which names it in `emulator`."""
-
-    @property
-    def arm(self) -> ArmSettings:
-        """The settings, with the emulator's address."""
-        ...
-
-    @property
-    def true_arm(self) -> ArmSettings:
-        """The settings with the emulator's own geometry, which a driver has to read from it."""
-        ...
-
-    def install(self) -> None:
-        """Configure the emulator once, as a person would configure a real controller."""
-        ...
-
-    def history(self, since: float) -> History:
-        """Joint motion since a controller time [s]."""
-        ...
-
-    def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        """Inject a fault, or read the emulator's internal state."""
-        ...
-
-    def close(self) -> None:
-        """End the emulator. May be called again."""
-        ...
-
-
-def emulator_of(arm: ArmSettings) -> ArmEmulator | None:
-    """Start the emulator of an arm; None if the arm's driver is a simulation itself."""
-    if not arm.emulator:
-        return None
-    module, _, name = arm.emulator.partition(":")
-    return cast(ArmEmulator, getattr(importlib.import_module(module), name)(arm))
-
-
 class BenchEmulators:
     """The emulators of arm and balance, in child processes that end with this process.
 
@@ -140,12 +87,12 @@ class BenchEmulators:
 
     def __init__(self, arm: ArmSettings, balance: BalanceSettings | None) -> None:
         self._spec = arm
-        self._arm = emulator_of(arm)
+        self._arm = arm_kind(arm).start_emulator()
         self._weighs = balance
         self._balance: BalanceEmulator | None = None
         self._flow: FlowingLiquid | None = None
         try:
-            self._balance = None if balance is None or balance.typed else balance.start_emulator()
+            self._balance = None if balance is None or balance.typed else balance_kind(balance).start_emulator()
         except BaseException:
             self.close()
             raise

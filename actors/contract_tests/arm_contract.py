@@ -5,7 +5,7 @@
         def bench(self) -> Iterator[ArmBench]:
             spec = MySpec(time_scale=10.0)
             arm = MyArm(spec)
-            yield ArmBench(arm, spec.plan(SCENE, ACTION), time_scale=10.0, true_poses=camera.poses, cut=line.unplug)
+            yield ArmBench(arm, MyKind(spec).plan(SCENE, ACTION), 10.0, true_poses=camera.poses, cut=line.unplug)
             arm.close()
 
 The arm stands at home, holds an empty pourer, and is not connected yet. It moves in most of these tests: use an

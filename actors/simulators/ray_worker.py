@@ -42,7 +42,8 @@ from actors.simulators.pool import (
 )
 from sim_engine.resources import cache_directory
 from sim_engine.scene import PourTask
-from sim_engine.vessel.shapes import MeshShape, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselSpec
 
 NICENESS = 15
 """Priority of simulators, below the arm's driver, the optimiser and other programs [nice]."""

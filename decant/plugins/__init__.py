@@ -31,10 +31,15 @@ if TYPE_CHECKING:
         PathReport,
         PlannedPour,
     )
-    from actors.arm.arm_settings import ArmDiagnostics, ArmSettings
+    from actors.arm.arm_settings import ArmDiagnostics, ArmEmulator, ArmKind, ArmSettings, History
     from actors.arm.planned_pour import ExecutedMotion, MotionPath
     from actors.balance.balance_interface import BalanceDriver, ReferenceLostError, Weight
-    from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, SerialBalanceSettings
+    from actors.balance.balance_settings import (
+        BalanceEmulator,
+        BalanceKind,
+        BalanceSettings,
+        SerialBalanceSettings,
+    )
     from actors.balance.dialects.dialect import Dialect, LineSettings
     from actors.balance.readings import (
         Acknowledgement,
@@ -48,7 +53,6 @@ if TYPE_CHECKING:
     from actors.balance.scale_model import Load
     from actors.balance.serial_balance import SerialBalance
     from actors.bench.pour_feasibility import plan_pour
-    from actors.bench.virtual_bench import ArmEmulator, History
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
     from actors.liquid_devices import (
         Pump,
@@ -139,6 +143,7 @@ __all__ = [
     "ArmEmulator",
     "ArmFacts",
     "ArmFigure",
+    "ArmKind",
     "ArmLostError",
     "ArmNotReleasedError",
     "ArmPose",
@@ -150,6 +155,7 @@ __all__ = [
     "Axis",
     "BalanceDriver",
     "BalanceEmulator",
+    "BalanceKind",
     "BalanceSettings",
     "Bar",
     "Calibration",
@@ -327,7 +333,7 @@ _SOURCES = {
     "orchestrator.strategies.deployment.objectives": ("Objective", "Objectives"),
     # Balances
     "actors.balance.balance_interface": ("BalanceDriver", "ReferenceLostError", "Weight"),
-    "actors.balance.balance_settings": ("BalanceSettings", "BalanceEmulator", "SerialBalanceSettings"),
+    "actors.balance.balance_settings": ("BalanceSettings", "BalanceEmulator", "BalanceKind", "SerialBalanceSettings"),
     "actors.balance.dialects.dialect": ("Dialect", "LineSettings"),
     "actors.balance.readings": (
         "Acknowledgement",
@@ -356,9 +362,8 @@ _SOURCES = {
         "PathReport",
         "PlannedPour",
     ),
-    "actors.arm.arm_settings": ("ArmDiagnostics", "ArmSettings"),
+    "actors.arm.arm_settings": ("ArmDiagnostics", "ArmEmulator", "ArmKind", "ArmSettings", "History"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
-    "actors.bench.virtual_bench": ("ArmEmulator", "History"),
     "actors.bench.pour_feasibility": ("plan_pour",),
     # Pumps and spill sensors
     "actors.liquid_devices": (

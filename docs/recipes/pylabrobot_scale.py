@@ -22,7 +22,7 @@ from collections import deque
 from pkgutil import resolve_name
 from typing import Annotated, Any, Literal
 
-from decant.plugins import BalanceSettings, LaboratoryError, Quantity, ReferenceLostError, Text, Weight
+from decant.plugins import BalanceKind, BalanceSettings, LaboratoryError, Quantity, ReferenceLostError, Text, Weight
 
 ANSWER = 5.0
 """Longest time for one call to the scale [s]; then the connection is lost."""
@@ -49,9 +49,15 @@ class PylabrobotSettings(BalanceSettings):
     deadline: Annotated[float, Quantity("s", "20 s", 1.0, 600.0)] = 20.0
     """Longest wait for a stable weight."""
 
+
+class PylabrobotKind(BalanceKind[PylabrobotSettings]):
+    """Scales of PyLabRobot."""
+
+    settings = PylabrobotSettings
+
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
         """See `BalanceSettings.driver`."""
-        return PylabrobotScale, (self, name)
+        return PylabrobotScale, (self.spec, name)
 
 
 class PylabrobotScale:

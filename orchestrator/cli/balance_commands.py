@@ -338,7 +338,7 @@ def _ask(prompt: str) -> str:
 @contextlib.contextmanager
 def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBalanceSettings, BalanceEmulator | None]]:
     """The balance's settings, and its emulator in a virtual laboratory."""
-    from actors.balance.balance_settings import SerialBalanceSettings
+    from actors.balance.balance_settings import SerialBalanceSettings, balance_kind
     from actors.interfaces import LaboratoryError
     from orchestrator.cli.robot_commands import read_laboratory
 
@@ -354,7 +354,7 @@ def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBala
         yield spec, None
         return
     with Refused(LaboratoryError, code=FAILED):
-        emulator = spec.with_values(time_scale=CHECK_SCALE).start_emulator()
+        emulator = balance_kind(spec.with_values(time_scale=CHECK_SCALE)).start_emulator()
     assert emulator is not None
     try:
         print_message("virtual: no balance; one is started for this, and its loads are simulated")
@@ -407,7 +407,9 @@ def _tap(to: Path | None, target: str, virtual: bool, remarks: str = "") -> Iter
 
 def _driver(spec: SerialBalanceSettings, tap: Recorder | None) -> Any:
     """The driver of the settings; its module is not imported here."""
-    driver, arguments = spec.driver("balance")
+    from actors.balance.balance_settings import balance_kind
+
+    driver, arguments = balance_kind(spec).driver("balance")
     return driver(*arguments, tap)
 
 

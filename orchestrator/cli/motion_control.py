@@ -154,8 +154,10 @@ def connected(spec: LaboratorySettings, accepted: str | None) -> Iterator[tuple[
         RefusalError: the arm isn't ready, or its safety settings are others.
         LaboratoryError: it can't be reached.
     """
+    from actors.arm.arm_settings import arm_kind
+
     assert spec.arm is not None
-    cls, arguments = spec.arm.driver((accepted or "") if spec.mode == "hardware" else None)
+    cls, arguments = arm_kind(spec.arm).driver((accepted or "") if spec.mode == "hardware" else None)
     arm: Arm = cls(*arguments)
     try:
         with Refused(NotAcceptedError):

@@ -132,6 +132,7 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     Raises:
         RefusalError: it can't be made (exit code 2).
     """
+    from actors.arm.arm_settings import arm_kind
     from actors.interfaces import InvalidActionError
     from orchestrator.cli.simulate_command import scene_to_simulate, wanted_in
     from orchestrator.config.action_assignments import assigned_action
@@ -149,7 +150,7 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     planned = None
     if plan.laboratory.arm is not None:
         try:
-            planned = plan.laboratory.arm.plan(scene, action)
+            planned = arm_kind(plan.laboratory.arm).plan(scene, action)
         except (InvalidActionError, ValueError) as error:
             raise RefusalError(f"{action.display()}: {error}", BAD_INPUT) from None
     return Chosen(plan, scene, action, planned)
@@ -161,8 +162,8 @@ def report_json(report: PathReport) -> dict[str, Any]:
 
 
 def _draw(chosen: Chosen, png: Path) -> None:
-    from actors.arm.arm_settings import UrArmSettings
     from actors.arm.planned_pour import PourPath
+    from actors.arm.ur_settings import UrArmSettings
     from orchestrator.results import figure_style
     from orchestrator.results.pour_figures import draw_path
     from sim_engine.vessel.vessel import build_vessel
@@ -221,12 +222,13 @@ def _stands_at_home(chosen: Chosen) -> bool:
     Raises:
         RefusalError: it can't be read.
     """
+    from actors.arm.arm_settings import arm_kind
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
 
     with Refused(LaboratoryError, code=FAILED), reached(chosen.plan.laboratory) as ready:
         assert ready.arm is not None
-        check = ready.arm.diagnostics().at_home()
+        check = arm_kind(ready.arm).diagnostics().at_home()
     print_message(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
     return check.state == "ok"
 
@@ -326,6 +328,7 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
     Raises:
         RefusalError: refused (exit code 2), or stopped on the way (1).
     """
+    from actors.arm.arm_settings import arm_kind
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from orchestrator.cli.motion_control import EmptyCycle, confirm, connected
@@ -353,7 +356,7 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
             with connected(driver, checksum) as (arm, facts):
                 fitted = ready.arm.fitted_to(facts)
                 if fitted != ready.arm:
-                    path = fitted.plan(chosen.scene, action).slowed(slow)
+                    path = arm_kind(fitted).plan(chosen.scene, action).slowed(slow)
                 cycle = EmptyCycle(arm, path, ready.arm.on_clock(laboratory.arm.warning_time), ask=hardware)
                 executed = cycle.run()
     except LaboratoryError as error:

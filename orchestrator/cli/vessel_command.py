@@ -511,7 +511,8 @@ def _written_mesh(
     from orchestrator.results import figure_style
     from orchestrator.results.pour_figures import draw_solid
     from sim_engine.vessel.mesh import rim_tilt
-    from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
+    from sim_engine.vessel.mesh_shape import MeshShape
+    from sim_engine.vessel.shapes import VesselError, VesselSpec
     from sim_engine.vessel.vessel import build_vessel
 
     path = out.with_suffix(".stl")

@@ -209,7 +209,8 @@ def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str])
     import numpy as np
 
     from sim_engine.vessel.mesh import UNITS, scale_of, to_z
-    from sim_engine.vessel.shapes import MeshShape, VesselError
+    from sim_engine.vessel.mesh_shape import MeshShape
+    from sim_engine.vessel.shapes import VesselError
     from sim_engine.vessel_acquisition.mesh_repair import likely_unit
 
     _check_size(path)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from actors.arm.arm_settings import ArmSettings
+from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.bench.pour_feasibility import vessel as built
 from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
@@ -34,7 +34,8 @@ from sim_engine.lip_flow import flow_course
 from sim_engine.motion import plan_motion
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
-from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselError, VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
 
 BESIDE = 0.015
@@ -371,7 +372,7 @@ class _Checker:
         if self.arm is None:
             return ""
         try:
-            self.arm.plan(scene, action)
+            arm_kind(self.arm).plan(scene, action)
         except InvalidActionError as error:
             if isinstance(error, UnreachablePlaceError):
                 barred.add(_place(action))
@@ -392,11 +393,11 @@ class _Checker:
                 except InvalidActionError as error:
                     self.add(role.places(("sources",), ("pourer",)), f"{role.text}: {error}")
             elif self.arm is not None:
-                if not self.arm.doses:
+                if not arm_kind(self.arm).doses:
                     self.add(role.places(), f"an arm of the kind '{self.arm.kind}' can't pour wanted amounts")
                     continue
                 try:
-                    self.arm.plan(scene, scene.action({}))
+                    arm_kind(self.arm).plan(scene, scene.action({}))
                 except InvalidActionError as error:
                     self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {error}")
         full = min(scene.liquid.mass for scene in plan.scenes)

@@ -23,7 +23,8 @@ from orchestrator.config.yaml.yaml_source import Document, Place, Report
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from sim_engine.settings.model import IN_FILE, FieldMark, Settings
 from sim_engine.settings.quantity import Quantity
-from sim_engine.vessel.shapes import MeshShape, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselSpec
 
 
 def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:

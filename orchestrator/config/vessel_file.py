@@ -10,7 +10,8 @@ from pydantic import Field, create_model
 from orchestrator.config.yaml.file_access import missing_file, resolved
 from orchestrator.config.yaml.yaml_source import Place, Report
 from sim_engine.settings.model import Example, FilePath, Name, Problems, Settings
-from sim_engine.vessel.shapes import VESSELS, LengthUnit, MeshShape, ProfileShape, Shape, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VESSELS, LengthUnit, ProfileShape, Shape, VesselSpec
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 

@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from actors.arm.arm_settings import arm_kind
 from actors.dosing.dose_series import check_dose
 from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
@@ -298,7 +299,7 @@ class PlannedOrder:
             vessels = build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)
             contact = touch(self.scene, self.action, *vessels)
             if contact is None and laboratory.arm is not None:
-                laboratory.arm.plan(self.scene, self.action)
+                arm_kind(laboratory.arm).plan(self.scene, self.action)
         except (InvalidActionError, ValueError) as error:
             return [str(error)]
         return [] if contact is None else [contact]
@@ -307,7 +308,7 @@ class PlannedOrder:
         """Return the expected time until the pour is weighed, without waiting for a person [s of bench time]."""
         laboratory = self.plan.laboratory
         if laboratory.arm is not None:
-            return laboratory.arm.plan(self.scene, self.action).report.duration + laboratory.operator.time
+            return arm_kind(laboratory.arm).plan(self.scene, self.action).report.duration + laboratory.operator.time
         motion = plan_motion(
             self.scene, self.action, build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)
         )

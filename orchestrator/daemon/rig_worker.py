@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from actors.arm.arm_settings import ArmSettings
+from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.config.yaml.yaml_errors import ConfigError
@@ -308,7 +308,7 @@ class ArmStatus:
 
 def _readiness(arm: ArmSettings) -> DeviceCheck | None:
     try:
-        return arm.readiness()
+        return arm_kind(arm).readiness()
     except (LaboratoryError, OSError, ValueError) as error:
         return DeviceCheck("motion", "fail", str(error), "see 'decant robot check'")
 

@@ -16,6 +16,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+from actors.arm.arm_settings import arm_kind
 from actors.balance.balance_settings import balance_diagnostics
 from actors.interfaces import LaboratoryError
 from actors.laboratory import reached
@@ -93,7 +94,7 @@ def found_at(spec: LaboratorySettings) -> dict[str, str]:
     try:
         with reached(spec) as ready:
             assert ready.arm is not None
-            checks = ready.arm.diagnostics().checks(None, accept="", virtual=True) + balance_diagnostics(
+            checks = arm_kind(ready.arm).diagnostics().checks(None, accept="", virtual=True) + balance_diagnostics(
                 ready.balance, tare=False
             )
     except (LaboratoryError, OSError, ValueError) as error:

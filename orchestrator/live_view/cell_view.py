@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_interface import ArmFigure
+from actors.arm.arm_settings import arm_kind
 from actors.interfaces import PourProgress
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import Moment, Playback, PlaybackQueue, RecordingSink, Track
@@ -55,7 +56,7 @@ class CellScene:
 
         self._rr, self._sink, self._films = rr, sink, films
         laboratory = plan.laboratory
-        self._figure: ArmFigure | None = None if laboratory.arm is None else laboratory.arm.figure()
+        self._figure: ArmFigure | None = None if laboratory.arm is None else arm_kind(laboratory.arm).figure()
         scales = [one.time_scale for one in (laboratory.bench, laboratory.arm) if one is not None]
         self.time_scale = max(scales, default=1.0) or float("inf")
         self._shown: dict[str, str] = {}

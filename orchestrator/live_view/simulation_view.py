@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.arm_settings import arm_kind
 from orchestrator.journal.run_record import RunPour, read_record
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.blueprints import simulation_blueprint
@@ -204,7 +205,7 @@ def task_of(plan: CampaignPlan, run: Path, pour: RunPour, particles: int | None 
     scene = replace(scene, liquid=scene.liquid.model_copy(update={"mass": measured.loaded}))
     task = PourTask(scene, pour.request.action, theta, pour.request.seed % 2**31, frame_rate=DETAIL)
     arm, record = plan.laboratory.arm, measured.notes.get("executed")
-    figure = None if arm is None else arm.figure()
+    figure = None if arm is None else arm_kind(arm).figure()
     executed = None if figure is None or not record else figure.executed(record)
     if figure is None or executed is None:
         return task

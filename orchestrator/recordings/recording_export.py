@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import unpack
 from actors.arm.planning.kinematics import pourer_motion
+from actors.arm.ur_settings import UrArmSettings
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.journal.run_record import RunPour, read_record

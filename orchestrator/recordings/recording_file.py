@@ -33,7 +33,8 @@ from sim_engine.liquids import Liquid, LiquidSettings
 from sim_engine.scene import Pivot, Scene
 from sim_engine.settings.model import Example, FilePath, PathOr, Settings, Text
 from sim_engine.settings.quantity import Quantity
-from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import ProfileShape, VesselSpec
 
 Floats = NDArray[np.float64]
 

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from actors.arm.arm_settings import UrArmSettings
     from actors.arm.planned_pour import PourPath
     from actors.arm.planning.kinematics import Transforms
     from actors.arm.planning.trajectory import SampledPath
+    from actors.arm.ur_settings import UrArmSettings
     from sim_engine.outcome import SimulatedPour
     from sim_engine.scene import PourTask
     from sim_engine.vessel.vessel import Vessel

@@ -19,7 +19,7 @@ import numpy as np
 
 from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import ArmSettings, SafetyRecord
+from actors.arm.arm_settings import ArmSettings, SafetyRecord, arm_kind
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear
 from orchestrator.run_errors import RunError
@@ -171,7 +171,7 @@ def envelope(arm: ArmSettings, pours: Iterable[tuple[Scene, Action]]) -> Envelop
     reports, refused = [], []
     for scene, action in pours:
         try:
-            reports.append(arm.plan(scene, action).report)
+            reports.append(arm_kind(arm).plan(scene, action).report)
         except (InvalidActionError, ValueError) as error:
             refused.append(f"{action.display()}: {error}")
     return Envelope(tuple(reports), tuple(refused))

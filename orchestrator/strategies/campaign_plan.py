@@ -19,7 +19,6 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from actors.laboratory_settings import LaboratorySettings
@@ -53,6 +52,7 @@ class StrategySettings(Settings):
     """Settings that all strategies have in common."""
 
     tag: ClassVar[str] = "strategy"
+    plugins: ClassVar[str] = "decant.strategies"
 
     strategy: str = ""
     """Name of the strategy: a literal in each class, equal to the name of its entry point."""
@@ -67,12 +67,6 @@ class StrategySettings(Settings):
         """
         shared = cls.model_fields.keys() & type(other).model_fields.keys() - {"strategy", *without}
         return cls().model_copy(update={name: getattr(other, name) for name in shared} | changes)
-
-    @classmethod
-    def unknown_tag(cls, word: str) -> str:
-        """Report which plug-in has this name if it could not be loaded; otherwise an empty text."""
-        strategies = resolve_name("orchestrator.strategies.strategy_registry:STRATEGIES")
-        return next((str(broken) for broken in strategies.broken if broken.name == word), "")
 
 
 class CalibrationSettings(StrategySettings):

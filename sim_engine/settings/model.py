@@ -293,13 +293,11 @@ class Settings(BaseModel):
     default_tag: ClassVar[str] = ""
     """The variant that is meant if that key is missing; empty if the key is required."""
 
+    plugins: ClassVar[str] = ""
+    """Entry-point group of the variants, if installed packages may add some."""
+
     variant: ClassVar[str] = ""
     """For a variant under its own key: the name of the group of variants, so that keys of its siblings are known."""
-
-    @classmethod
-    def unknown_tag(cls, word: str) -> str:
-        """Why no variant has this tag, if the reason is more specific than the list of tags."""
-        return ""
 
     @classmethod
     def tag_word(cls) -> str:

@@ -58,6 +58,7 @@ class PluginRegistry(Generic[T]):
 
     def __init__(self, group: str, what: str, accept: Callable[[object, str], T]) -> None:
         self.group = group
+        _REGISTRIES[group] = self
         self._what = what
         self._accept = accept
 
@@ -120,6 +121,15 @@ class PluginRegistry(Generic[T]):
             else:
                 packages[entry.name] = package
         return dict(sorted(usable.items())), tuple(broken), packages
+
+
+_REGISTRIES: dict[str, PluginRegistry[Any]] = {}
+
+
+def why_unusable(group: str, name: str) -> str:
+    """The plug-in of a group that has this name, with its package, if it could not be loaded; else ''."""
+    broken = _REGISTRIES[group].broken if group in _REGISTRIES else ()
+    return next((str(plugin) for plugin in broken if plugin.name == name), "")
 
 
 def settings_kind(base: type[Any]) -> Callable[[object, str], Any]:

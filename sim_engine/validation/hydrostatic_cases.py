@@ -32,7 +32,8 @@ from sim_engine.simulator import SETTLING, fill, spacing
 from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, within
 from sim_engine.validation.container_runs import Container, run
 from sim_engine.vessel import profile
-from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselSpec, cylinder
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
 from sim_engine.vessel.vessel import Vessel, build_vessel
 
 Floats = NDArray[np.float64]

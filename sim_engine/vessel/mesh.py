@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from sim_engine.vessel.distance_grid import SignedDistanceGrid, choose_spacing
 from sim_engine.vessel.exact_cavity import ExactCavity, exact_cavity, fillers
 from sim_engine.vessel.mesh_distance import GridLayout, cast_rays, crossings, layout_around, signed_distance
 from sim_engine.vessel.mesh_surface import measure_opening, normals_and_areas, trace_meridians
-from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
+from sim_engine.vessel.shapes import LengthUnit, VesselError, VesselSpec
 from sim_engine.vessel.vessel import QUADRATURE_POINTS, Vessel, lattice
 
 Floats = NDArray[np.float64]
@@ -34,7 +34,26 @@ LARGEST_FILE = 300_000_000
 """Largest size of a file [bytes]; the same number of triangles as text needs as much."""
 
 
-def check_size(shape: MeshShape) -> None:
+class MeshFile(Protocol):
+    """What is read of a mesh's settings, `sim_engine.vessel.mesh_shape.MeshShape`."""
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        ...
+
+    @property
+    def unit(self) -> LengthUnit | None:
+        """Unit of its coordinates; None: concluded from the size."""
+        ...
+
+    @property
+    def up(self) -> str:
+        """Axis that points out of the opening."""
+        ...
+
+
+def check_size(shape: MeshFile) -> None:
     """Refuse a file that is too large, before it is read.
 
     Raises:
@@ -48,7 +67,7 @@ def check_size(shape: MeshShape) -> None:
         )
 
 
-def read_mesh(shape: MeshShape) -> tuple[Floats, Integers]:
+def read_mesh(shape: MeshFile) -> tuple[Floats, Integers]:
     """Closed, outward-facing triangles of a mesh file in metres, z up.
 
     Returns:
@@ -128,7 +147,7 @@ def rim_tilt(vessel: Vessel) -> float:
     return float(np.arctan(np.hypot(plane[0], plane[1])))
 
 
-def scale_of(extent: float, shape: MeshShape) -> float:
+def scale_of(extent: float, shape: MeshFile) -> float:
     """Metres in the unit of a file's numbers.
 
     Args:
@@ -183,10 +202,15 @@ SAME_CAVITY = 0.03
 SCALARS = ("spacing", "inner_floor", "rim_height", "opening_radius", "outer_radius", "capacity", "wall_thickness")
 
 
-def build_mesh_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
-    """See `sim_engine.vessel.vessel.build_vessel`."""
-    assert isinstance(spec.shape, MeshShape)
-    check_size(spec.shape)
+def build_mesh_vessel(spec: VesselSpec, shape: MeshFile, *, use_cache: bool = True) -> Vessel:
+    """See `sim_engine.vessel.vessel.build_vessel`.
+
+    Args:
+        spec: the vessel.
+        shape: its shape.
+        use_cache: whether the result is taken from the cache, or stored there.
+    """
+    check_size(shape)
     key = f"vessel-{FORMAT_VERSION}-{spec.content_hash()}"
     if use_cache:
         stored = cache.load_arrays(key)
@@ -195,7 +219,7 @@ def build_mesh_vessel(spec: VesselSpec, *, use_cache: bool = True) -> Vessel:
                 return _unpack(spec, stored)
             except (KeyError, ValueError, IndexError, TypeError):
                 cache.discard(key)  # written by another program, or damaged: compute it again
-    vessel = _measure(spec, spec.shape)
+    vessel = _measure(spec, shape)
     if use_cache:
         cache.store_arrays(key, _pack(vessel))
     return vessel
@@ -232,7 +256,7 @@ def _unpack(spec: VesselSpec, stored: dict[str, NDArray[np.generic]]) -> Vessel:
     )
 
 
-def _measure(spec: VesselSpec, shape: MeshShape) -> Vessel:
+def _measure(spec: VesselSpec, shape: MeshFile) -> Vessel:
     vertices, faces = read_mesh(shape)
     vertices -= [*(vertices[:, :2].min(axis=0) + vertices[:, :2].max(axis=0)) / 2.0, vertices[:, 2].min()]
     wall, spacing, refusal = _spacing(vertices, faces)
@@ -352,7 +376,7 @@ def _wall_samples(vertices: Floats, faces: Integers) -> tuple[Floats, Floats]:
 
 
 def _check_one_body(
-    vertices: Floats, faces: Integers, inside: NDArray[np.bool_], layout: GridLayout, shape: MeshShape
+    vertices: Floats, faces: Integers, inside: NDArray[np.bool_], layout: GridLayout, shape: MeshFile
 ) -> None:
     """Refuse several objects in one file. Bodies that overlap or touch, such as a separate handle, count as one."""
     from scipy import ndimage
@@ -378,7 +402,7 @@ def _check_one_body(
 
 
 def _doubts(
-    vertices: Floats, faces: Integers, inside: NDArray[np.bool_], layout: GridLayout, shape: MeshShape
+    vertices: Floats, faces: Integers, inside: NDArray[np.bool_], layout: GridLayout, shape: MeshFile
 ) -> tuple[str, ...]:
     """Warnings about bodies in the cavity, and about faces that two bodies share.
 
@@ -410,7 +434,7 @@ def _doubts(
     return tuple(found)
 
 
-def _check_cavity(found: CavityFill, shape: MeshShape, spacing: float, vertices: Floats, bottom: float) -> None:
+def _check_cavity(found: CavityFill, shape: MeshFile, spacing: float, vertices: Floats, bottom: float) -> None:
     """Refuse a shape that holds no liquid, with the most likely reason."""
     box = float(np.prod(np.ptp(vertices, axis=0)))
     least = SMALLEST_SHARE * box

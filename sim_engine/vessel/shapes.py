@@ -10,14 +10,12 @@ from __future__ import annotations
 
 import hashlib
 import random
-from pathlib import Path
-from pkgutil import resolve_name
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializeAsAny
 
 from sim_engine.errors import DecantError
-from sim_engine.settings.model import BY_CONTENT, NOT_IN_FINGERPRINT, Example, Number, Problems, Settings
+from sim_engine.settings.model import NOT_IN_FINGERPRINT, Example, Number, Problems, Settings
 from sim_engine.settings.plugin_registry import PluginRegistry
 from sim_engine.settings.quantity import Quantity, parse_quantity
 
@@ -153,31 +151,6 @@ class ProfileShape(Shape):
     def free_fields(self) -> frozenset[str]:
         """Fields that do not affect any request: the uncertainty, if it is not given."""
         return frozenset() if self.uncertain else frozenset({"radius_deviations", "height_deviation"})
-
-
-class MeshShape(Shape):
-    """A closed mesh of the vessel's solid (STL, OBJ, PLY, GLB). `unit` None: metres if the size is then plausible.
-
-    `up` is the mesh axis that points out of the opening.
-    """
-
-    kind: ClassVar[str] = "mesh"
-    path: Annotated[Path, BY_CONTENT]
-    unit: LengthUnit | None = None
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
-
-    def content(self) -> bytes:
-        """See `Shape.content`: the file's bytes, not its path.
-
-        Raises:
-            OSError: it cannot be read.
-        """
-        return f"mesh {self.unit} {self.up}".encode() + self.path.read_bytes()
-
-    def build(self, spec: VesselSpec, *, use_cache: bool) -> Any:
-        """See `Shape.build`."""
-        # Named by text to avoid a circular import: the mesh module imports vessels, which import shapes.
-        return resolve_name("sim_engine.vessel.mesh:build_mesh_vessel")(spec, use_cache=use_cache)
 
 
 def _shape(loaded: object, name: str) -> type[Shape]:

@@ -30,8 +30,9 @@ from sim_engine.vessel.mesh import (
     typical_wall,
     wall_thickness,
 )
+from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.mesh_surface import components
-from sim_engine.vessel.shapes import LengthUnit, MeshShape, VesselError
+from sim_engine.vessel.shapes import LengthUnit, VesselError
 from sim_engine.vessel_acquisition.surface_repair import (
     boundary_loops,
     distinct,

@@ -16,6 +16,7 @@ from actors.arm.planned_pour import MotionPath
 from actors.arm.simulated_arm import POSITION_NOISE, Grip, SimulatedArm, SimulatedArmSettings
 from actors.bench.pour_feasibility import plan_pour
 from actors.contract_tests.arm_contract import ArmBench, ArmContract
+from actors.device_kinds import SimulatedArmKind
 from actors.runtime.remote_object import LocalDevice, RayDevice
 
 
@@ -140,16 +141,16 @@ class Unreachable(SimulatedArm):
         raise ArmLostError("nobody answers at 192.168.0.10")
 
 
-class UnreachableSpec(SimulatedArmSettings):
+class UnreachableKind(SimulatedArmKind):
     def driver(self, accepted):
-        return Unreachable, (self,)
+        return Unreachable, (self.spec,)
 
 
 @pytest.mark.realtime
 def test_any_arm_can_be_looked_at_and_one_that_does_not_answer_says_so():
-    (there,) = SimulatedArmSettings().diagnostics().checks(None, accept="", virtual=True)
+    (there,) = SimulatedArmKind(SimulatedArmSettings()).diagnostics().checks(None, accept="", virtual=True)
     assert (there.state, there.found) == ("ok", "simulated")
-    (lost,) = UnreachableSpec().diagnostics().checks(None, accept="", virtual=True)
+    (lost,) = UnreachableKind(SimulatedArmSettings()).diagnostics().checks(None, accept="", virtual=True)
     assert (lost.state, lost.found) == ("fail", "nobody answers at 192.168.0.10")
 
 

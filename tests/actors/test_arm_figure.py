@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from actors.arm.arm_geometry import Point
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.arm_settings import arm_kind
+from actors.arm.ur_settings import UrArmSettings
 from orchestrator.config.file_loading import load_laboratory
 
 FILE = Path(__file__).parents[2] / "configs" / "laboratories" / "virtual.yaml"
@@ -20,7 +21,7 @@ def _arm() -> UrArmSettings:
 
 
 def test_links_are_joined_and_as_long_as_they_are_whatever_the_joints() -> None:
-    figure = _arm().figure()
+    figure = arm_kind(_arm()).figure()
     joints = np.array(figure.home) + np.random.default_rng(1).uniform(-1.0, 1.0, (20, 6))
     ends = figure.ends(joints)
     assert ends.shape == (20, len(figure.bars), 2, 3)
@@ -33,7 +34,7 @@ def test_links_are_joined_and_as_long_as_they_are_whatever_the_joints() -> None:
 
 
 def test_the_last_link_ends_at_the_tool_and_the_pourer_is_held_by_it() -> None:
-    figure = _arm().figure()
+    figure = arm_kind(_arm()).figure()
     joints = np.array([figure.home])
     tool, pourer = figure.tool(joints), figure.pourer(joints)
     assert np.allclose(figure.ends(joints)[:, -1, 1], tool[:, :3])
@@ -44,6 +45,6 @@ def test_arm_that_is_leant_or_stands_elsewhere_is_drawn_there() -> None:
     spec = _arm()
     there = spec.with_values(cell=spec.cell.with_values(receiver=Point.of(0.75, 0.1, 0.06)))
     home = np.array(spec.home.angles)
-    moved = there.figure().ends(home) - spec.figure().ends(home)
+    moved = arm_kind(there).figure().ends(home) - arm_kind(spec).figure().ends(home)
     # the liquid goes along the base's y, which is the world's x
     assert np.allclose(moved, [-0.1, 0.0, 0.0])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.ur_settings import UrArmSettings
 from actors.bench import flowing_liquid
 from actors.bench.flowing_liquid import FlowingLiquid, FlowOrder
 from actors.dosing.virtual_dosing_bench import TrueCup

@@ -12,7 +12,8 @@ import pytest
 
 from actors.interfaces import SimulationError
 from actors.simulators.ray_worker import Packer, unpack
-from sim_engine.vessel.shapes import MeshShape, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import build_vessel
 
 MUG = Path(__file__).parents[2] / "configs" / "vessels" / "meshes" / "mug.stl"

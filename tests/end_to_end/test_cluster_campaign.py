@@ -227,7 +227,8 @@ from actors.laboratory_settings import LaboratorySettings, RaySettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
-from sim_engine.vessel.shapes import MeshShape, VesselSpec, cylinder
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselSpec, cylinder
 
 address, mesh = sys.argv[1], Path("mug.stl").absolute()
 mug = VesselSpec(name="mug", shape=MeshShape(path=mesh, unit="mm"))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import PathCollection, QuadMesh
 
+from actors.arm.arm_settings import arm_kind
 from actors.interfaces import PourProgress
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.optimizer.suggest import propose, slices
@@ -204,7 +205,7 @@ def test_arm_stands_at_each_moment_where_its_joints_put_it(tmp_path: Path) -> No
     plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml")
     assert plan.laboratory.arm is not None
     assert plan.deployment is not None
-    recording, figure = CampaignRecording(tmp_path / "campaign.rrd", plan), plan.laboratory.arm.figure()
+    recording, figure = CampaignRecording(tmp_path / "campaign.rrd", plan), arm_kind(plan.laboratory.arm).figure()
     scene = plan.deployment.scenes[0]
     pour = Pour(scene.name, scene.action({"angular_velocity": 1.5, "x_offset": 0.1}), 1, 1)
     recording.handle(RequestStarted(time=1e6, stage="deployment", id=1, request=pour))

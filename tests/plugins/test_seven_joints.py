@@ -14,6 +14,7 @@ from decant.plugins.testing import ArmBench, ArmContract
 from tests.plugins.decant_example.seven_joints import (
     HOME,
     SevenJointArm,
+    SevenJointKind,
     SevenJointPour,
     SevenJointSettings,
     SimulatedRobot,
@@ -27,7 +28,7 @@ SETTINGS = SevenJointSettings().in_laboratory(CELL, SCALE)
 
 @pytest.fixture(scope="module")
 def path() -> SevenJointPour:
-    return SETTINGS.plan(SCENE, ACTION)
+    return SevenJointKind(SETTINGS).plan(SCENE, ACTION)
 
 
 @pytest.mark.slow
@@ -83,11 +84,11 @@ def test_its_plan_is_the_pour_that_was_asked_for(path: SevenJointPour) -> None:
 def test_a_pour_beyond_its_reach_is_refused_with_the_cure() -> None:
     far = RobotCell(receiver={"x": "1300 mm", "y": "0 mm", "z": "150 mm"}, direction="90 deg")  # type: ignore[arg-type]
     with pytest.raises(InvalidActionError, match=r"does not reach x = .*; move the receiver nearer"):
-        SETTINGS.in_laboratory(far, SCALE).plan(SCENE, ACTION)
+        SevenJointKind(SETTINGS.in_laboratory(far, SCALE)).plan(SCENE, ACTION)
 
 
 def test_its_figure_draws_the_links_where_the_joints_put_them(path: SevenJointPour) -> None:
-    figure = SETTINGS.figure()
+    figure = SevenJointKind(SETTINGS).figure()
     ends = figure.ends(path.pour.joints[:3])
     assert ends.shape == (3, len(figure.bars), 2, 3)
     lengths = np.linalg.norm(ends[..., 1, :] - ends[..., 0, :], axis=-1)

@@ -24,7 +24,7 @@ from decant.plugins import (
     cylinder,
 )
 from decant.plugins.testing import ArmBench, ArmContract
-from tests.plugins.decant_example.arm import Drive, Stand, StandSettings, poses_of
+from tests.plugins.decant_example.arm import Drive, Stand, StandKind, StandSettings, poses_of
 
 DEG = math.pi / 180.0
 
@@ -41,7 +41,7 @@ def bench_of(cls: type[Stand], *, witness: bool = True, time_scale: float = 4.0)
     """A stand on its bench: its drive is the witness, its cable is cut, its belt slips."""
     spec = StandSettings(time_scale=time_scale)
     drive = Drive(time_scale)
-    path = spec.plan(SCENE, ACTION)
+    path = StandKind(spec).plan(SCENE, ACTION)
 
     def true_poses(since: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         drive.tick()
@@ -76,7 +76,7 @@ class TestStand(ArmContract):
 
 def test_a_pour_too_fast_for_the_motor_is_refused_with_the_key_that_allows_it() -> None:
     with pytest.raises(InvalidActionError, match=r"30 deg/s \(arm.fastest\), 90 deg/s are asked for"):
-        StandSettings(fastest=30 * DEG).plan(SCENE, ACTION)
+        StandKind(StandSettings(fastest=30 * DEG)).plan(SCENE, ACTION)
 
 
 # -- arms that the contract finds --------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ from sim_engine import resources as cache
 from sim_engine.hydrostatics import retained_volume
 from sim_engine.vessel import mesh as mesh_module
 from sim_engine.vessel.mesh_distance import closest_points
-from sim_engine.vessel.shapes import MeshShape, ProfileShape, VesselError, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import ProfileShape, VesselError, VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel
 
 MUG = Path(__file__).parents[2] / "configs" / "vessels" / "meshes" / "mug.stl"

@@ -24,7 +24,8 @@ from orchestrator.cli.vessel_tables import read_points
 from orchestrator.config.file_loading import load_vessel
 from orchestrator.results.pour_figures import section
 from sim_engine.vessel.exact_cavity import exact_cavity
-from sim_engine.vessel.shapes import MeshShape, VesselError, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselError, VesselSpec
 from sim_engine.vessel.vessel import build_vessel
 from sim_engine.vessel_acquisition.mesh_repair import RepairedMesh, mended
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_geometry import Pose
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel
+from actors.arm.ur_settings import UrArmSettings
 from sim_engine.collision import rotations
 from sim_engine.scene import SampledMotion
 

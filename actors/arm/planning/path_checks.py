@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import PathReport
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_receiver
 from actors.arm.planning.kinematics import (
@@ -29,6 +28,7 @@ from actors.arm.planning.kinematics import (
     singularities,
 )
 from actors.arm.planning.trajectory import RacingJointError, SampledPath
+from actors.arm.ur_settings import UrArmSettings
 from actors.interfaces import InvalidActionError
 from sim_engine.vessel.distance_grid import MARGIN
 from sim_engine.vessel.vessel import Vessel

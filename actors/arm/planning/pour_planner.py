@@ -11,7 +11,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath, PourPath
 from actors.arm.planning.path_checks import (
     check_clearance,
@@ -36,6 +35,7 @@ from actors.arm.planning.trajectory import (
     routes,
     travel,
 )
+from actors.arm.ur_settings import UrArmSettings
 from actors.interfaces import InvalidActionError, UnreachablePlaceError
 from sim_engine.collision import rotations
 from sim_engine.motion import Phase, PourMotion, turn

@@ -17,7 +17,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.kinematics import (
     Transforms,
@@ -35,6 +34,7 @@ from actors.arm.planning.kinematics import (
     singularities,
 )
 from actors.arm.ur.robot_models import SAME_PLACE, RobotModel
+from actors.arm.ur_settings import UrArmSettings
 from sim_engine.motion import Phase, PourMotion, Segment, turn
 
 FloatArray = NDArray[np.float64]

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from actors.arm.arm_interface import FULL_SPEED
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath
 from actors.arm.planning.kinematics import cell_transforms, forward, pourer_motion
 from actors.arm.ur.worker_messages import ForceSample, MotionOutcome, Sample
+from actors.arm.ur_settings import UrArmSettings
 
 LONGEST_LAG = 0.3
 """Largest lag that is searched to explain the difference between path and readings [s]."""

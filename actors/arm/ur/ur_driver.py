@@ -29,7 +29,6 @@ from actors.arm.arm_interface import (
     ArmStoppedError,
     NotAcceptedError,
 )
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planned_pour import ExecutedPath, FloatArray, PourPath
 from actors.arm.planning.kinematics import cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
@@ -40,6 +39,7 @@ from actors.arm.ur.robot_comparison import payload_check
 from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import TiltLimits, path_program, tilt_program
 from actors.arm.ur.worker_messages import REDUCED, DataPackage, MotionOrder, MotionOutcome, MotionSettings
+from actors.arm.ur_settings import UrArmSettings
 from actors.interfaces import LaboratoryError
 
 RECOVERY_TIME = 90.0

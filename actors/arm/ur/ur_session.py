@@ -21,7 +21,6 @@ from typing import Any
 
 from actors.arm.arm_geometry import Joints, Pose, Vector
 from actors.arm.arm_interface import ArmError, ArmFacts, ArmLostError, ArmRefusedError
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.ur.robot_comparison import robot_problems
 from actors.arm.ur.robot_models import Calibration
 from actors.arm.ur.worker_messages import (
@@ -33,6 +32,7 @@ from actors.arm.ur.worker_messages import (
     safety_mode,
     why_not_ready,
 )
+from actors.arm.ur_settings import UrArmSettings
 from actors.runtime.child_process import ConnectedProcess
 
 

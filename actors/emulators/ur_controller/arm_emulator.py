@@ -10,8 +10,8 @@ import socket
 import time
 from typing import Any
 
-from actors.arm.arm_settings import UrArmSettings
-from actors.bench.virtual_bench import History
+from actors.arm.arm_settings import History
+from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError
 from actors.emulators.ur_controller.robot import MODELS, calibrated
 from actors.interfaces import LaboratoryError

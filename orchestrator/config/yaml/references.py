@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+from actors.arm.arm_settings import arm_kind
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
@@ -113,7 +114,7 @@ class References:
         if laboratory.arm is None:
             return laboratory
         try:
-            return laboratory.with_values(arm=laboratory.arm.with_stored(at.directory))
+            return laboratory.with_values(arm=arm_kind(laboratory.arm).with_stored(at.directory))
         except ValueError as error:
             self.report.add(at.at("arm"), str(error))
             return None

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import copy
-import inspect
 import typing
 from collections.abc import Iterator
 from typing import Any, TypeVar
@@ -20,6 +19,7 @@ from orchestrator.config.yaml.yaml_source import Loc, Place, Report
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.errors import did_you_mean
 from sim_engine.settings.model import OneOf, Problems, Settings
+from sim_engine.settings.plugin_registry import why_unusable
 from sim_engine.settings.quantity import FROM_FILE
 
 S = TypeVar("S", bound=Settings)
@@ -91,7 +91,7 @@ def _guess_variant(variants: set[type[Settings]], data: dict[str, Any], place: P
         report.broken.add((place.document.path, place.at(key).loc))
     else:
         expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
-        said = next(iter(variants)).unknown_tag(word) if isinstance(word, str) else ""
+        said = why_unusable(next(iter(variants)).plugins, word) if isinstance(word, str) else ""
         report.add(place.at(key), said or _one_of(word, expected))
     by_word = {section.tag_word(): section for section in variants}
     data[key] = max(words, key=lambda word: len(data.keys() & by_word[word].written_keys()))
@@ -274,13 +274,13 @@ def _sections_at(model: type[Settings], loc: Loc, data: Any) -> set[type[Setting
 
 
 def sections_in(annotation: Any) -> set[type[Settings]]:
-    """The sections that a field may hold."""
+    """The sections that a field may hold: of those with variants, only the variants."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return {annotation} if issubclass(annotation, Settings) else set()
     if isinstance(annotation, OneOf):
         return set(annotation.kinds().values())
     found = {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
-    return {section for section in found if not inspect.isabstract(section)}
+    return {section for section in found if not section.tag or section.tag_word()}
 
 
 def _one_of(value: Any, expected: str) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import itertools
 from abc import abstractmethod
 from dataclasses import dataclass
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from sim_engine.action import Action
@@ -41,6 +40,7 @@ class Objective(Settings):
     """
 
     tag: ClassVar[str] = "name"
+    plugins: ClassVar[str] = "decant.objectives"
     required: ClassVar[dict[str, str]] = {"name": "spillage"}
 
     name: str = ""
@@ -63,12 +63,6 @@ class Objective(Settings):
 
     def check(self, scene: Scene, actions: Space, beside: frozenset[str], complaints: Problems) -> None:
         """Add problems that the objective has in a scene or in combination with the other objectives."""
-
-    @classmethod
-    def unknown_tag(cls, word: str) -> str:
-        """Report which plug-in has this name if it could not be loaded; otherwise an empty text."""
-        objectives = resolve_name("orchestrator.strategies.strategy_registry:OBJECTIVES")
-        return next((str(broken) for broken in objectives.broken if broken.name == word), "")
 
 
 class Spillage(Objective):

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from actors.arm.arm_interface import ArmRefusedError
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planning.kinematics import pourer_motion
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.primary_interface import RobotState, robot_state, split
 from actors.arm.ur.robot_comparison import robot_checks, robot_problems
 from actors.arm.ur.robot_models import MODELS, model_named, same_robot
 from actors.arm.ur.ur_driver import UrArm
+from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller import VirtualController
 from actors.emulators.ur_controller.controller import Controller
 from actors.emulators.ur_controller.robot import MODELS as CONTROLLED

@@ -19,6 +19,7 @@ import numpy as np
 import psutil
 import pytest
 
+from actors.arm.arm_settings import arm_kind
 from actors.arm.planning.kinematics import pourer_motion
 from actors.bench.bench_operators import VirtualOperator
 from actors.interfaces import LaboratoryError, NotPouredError, OperatorSettings, UnknownPourError
@@ -150,7 +151,7 @@ class Recorder:
 
 async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any], pour: asyncio.Task[Any]) -> float:
     """Have a fault happen in the middle of a phase; the controller's time then [s]."""
-    spans = {name: (begin, end) for name, begin, end in SPEC.arm.plan(SCENE, SLOWLY).phases}
+    spans = {name: (begin, end) for name, begin, end in arm_kind(SPEC.arm).plan(SCENE, SLOWLY).phases}
     end = time.monotonic() + PATIENCE
     while True:
         assert time.monotonic() < end, f"never came to {phase}"
@@ -267,7 +268,7 @@ def test_a_pour_that_a_person_slowed_is_weighed_and_the_user_is_told(open_stage)
     fault = Fault(controller("slider", fraction=0.5))
     tale = asyncio.run(tell_tale(open_stage, "tilt", fault, mend=set()))
     assert isinstance(tale.outcome, PourMeasurement), tale.outcome
-    planned = SPEC.arm.plan(SCENE, SLOWLY).pour_time
+    planned = arm_kind(SPEC.arm).plan(SCENE, SLOWLY).pour_time
     took = tale.outcome.notes["executed_s"]
     assert 1.2 * planned < took < 2.2 * planned
     assert tale.outcome.notes["executed"]["tracking"]["slider"] == pytest.approx(0.5)

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.arm.arm_settings import UrArmSettings
 from actors.arm.planning.kinematics import pourer_motion
+from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.bench.virtual_bench import BenchEmulators
 from actors.interfaces import DoseSource, DoseTarget, PourProgress, UnknownPourError
@@ -275,14 +275,15 @@ def test_a_stalled_controller_is_noticed_and_the_amount_reported(open_stage: Ope
 
 CLIENT = """
 import sys, threading, time
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.arm_settings import arm_kind
+from actors.arm.ur_settings import UrArmSettings
 from actors.arm.ur.ur_driver import UrArm
 from tests.actors.bench.test_wired_dose import ACTION, SCENE, dosing_spec
 
 spec = dosing_spec(pace=0.25).arm.with_values(address=sys.argv[1])
 arm = UrArm(spec)
 spec = spec.fitted_to(arm.connect())
-path = spec.plan(SCENE, ACTION)
+path = arm_kind(spec).plan(SCENE, ACTION)
 arm.release()
 arm.move_to_start(path)
 threading.Thread(target=arm.dose, args=(path, 60.0), daemon=True).start()

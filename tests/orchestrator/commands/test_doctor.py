@@ -20,6 +20,7 @@ from typer.testing import CliRunner, Result
 
 import decant
 from actors.arm.arm_interface import ArmRefusedError, NotAcceptedError
+from actors.arm.arm_settings import arm_kind
 from actors.arm.ur import controller_readout as look
 from actors.arm.ur.controller_readout import read_exchange
 from actors.arm.ur.robot_models import MODELS
@@ -275,7 +276,7 @@ def test_doctor_fails_for_the_reason_for_which_the_driver_refuses(
         assert (table["motion"]["state"], table["motion"]["found"]) == ("fail", why)
         spec = load_laboratory(path).arm
         assert spec is not None
-        cls, given = spec.driver(None)
+        cls, given = arm_kind(spec).driver(None)
         arm = cls(*given)
         try:
             assert arm.connect().problem == why

@@ -10,7 +10,7 @@ import pytest
 
 from actors.arm.arm_geometry import Pose
 from actors.arm.arm_interface import ArmPose
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError
 from orchestrator.cli.motion_control import JogError, Jogging, JogStep, parse_step, steps_home

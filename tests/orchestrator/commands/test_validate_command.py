@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.ur_settings import UrArmSettings
 from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign, load_laboratory
 from tests.support.cli_inputs import RECORDED, ROOT, invoke, process

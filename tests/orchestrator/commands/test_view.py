@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.arm_settings import arm_kind
+from actors.arm.ur_settings import UrArmSettings
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.view_command import _recording_of, view
@@ -103,7 +104,7 @@ def test_pour_is_simulated_again_as_the_arm_moved_with_the_load_that_was_weighed
     assert (task.parameters.particles, task.parameters.cohesion) == (3000, 0.03)
     assert task.motion is not None
     assert task.motion.duration == pytest.approx(4.9, abs=1e-3)
-    assert np.allclose(task.motion.poses[:, :3], arm.figure().pourer(joints)[:, :3], atol=1e-4)
+    assert np.allclose(task.motion.poses[:, :3], arm_kind(arm).figure().pourer(joints)[:, :3], atol=1e-4)
 
 
 def test_pour_of_an_arm_of_numbers_is_simulated_by_its_action(tmp_path: Path) -> None:

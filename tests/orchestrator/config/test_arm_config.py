@@ -9,7 +9,8 @@ from textwrap import dedent
 import pytest
 
 from actors.arm.arm_geometry import Plane, Pose, RobotCell
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.arm_settings import arm_kind
+from actors.arm.ur_settings import UrArmSettings
 from orchestrator.config.yaml.section_validation import PlacedProblems, validate
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document, Place, Report
@@ -30,7 +31,7 @@ def load(text: str, mode: str = "virtual") -> UrArmSettings:
     place = Place(Document.parse(dedent(text), Path("lab.yaml").resolve()))
     section = validate(Laboratory, place, report)
     if section is not None and section.arm is not None:
-        section.arm.check_laboratory(PlacedProblems(place, report), mode=mode, cell=section.cell)
+        arm_kind(section.arm).check_laboratory(PlacedProblems(place, report), mode=mode, cell=section.cell)
     report.raise_if_any()
     assert section is not None
     assert section.arm is not None

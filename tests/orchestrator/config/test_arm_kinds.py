@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from actors.arm.arm_settings import ARMS, UrArmSettings
+from actors.arm.arm_settings import ARMS
 from actors.arm.simulated_arm import SimulatedArmSettings
+from actors.arm.ur_settings import UrArmSettings
 from orchestrator.config.file_loading import load_laboratory
 from orchestrator.config.yaml.yaml_errors import ConfigError
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from actors.arm.arm_settings import UrArmSettings
+from actors.arm.arm_settings import arm_kind
+from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller.robot import MODELS as CONTROLLED
 from actors.emulators.ur_controller.robot import calibrated
 from actors.runtime.child_process import child_environment
@@ -26,7 +27,7 @@ from orchestrator.config.json_schema import (
 )
 from orchestrator.config.yaml.yaml_source import Document
 from sim_engine.action import DEG, Action
-from sim_engine.vessel.shapes import MeshShape
+from sim_engine.vessel.mesh_shape import MeshShape
 from tests.support.waiting import PATIENCE
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -106,7 +107,7 @@ def test_first_pours_of_a_real_arm_fit_the_limits_of_its_first_day(tmp_path: Pat
     assert plan.deployment is not None
     assert plan.laboratory.arm is not None
     assert (plan.laboratory.mode, plan.deployment.strategy, plan.deployment.pours) == ("hardware", "D2", 3)
-    scene, plan_path = plan.deployment.scenes[0], plan.laboratory.arm.plan
+    scene, plan_path = plan.deployment.scenes[0], arm_kind(plan.laboratory.arm).plan
     speeds, offsets = ([axis.lower, axis.upper] for axis in plan.deployment.actions.axes)
     for speed, offset in itertools.product(speeds, offsets):
         action = Action(**scene.fixed, angular_velocity=speed, x_offset=offset)

@@ -21,7 +21,8 @@ from orchestrator.study.cluster_cells import ClusterCells, packed, unpack_whole
 from orchestrator.study.study_folder import finished_results, opened
 from orchestrator.study.study_plan import StudyPlan, cells_of
 from orchestrator.study.study_runner import CellStatus, run_cell, run_cells
-from sim_engine.vessel.shapes import MeshShape, VesselSpec
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselSpec
 from tests.support.study_files import read, small
 from tests.support.toy_study import TOYS
 

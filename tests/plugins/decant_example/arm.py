@@ -1,6 +1,7 @@
 """A stand as an arm: a slide lifts the pourer, a motor turns it about its lip. All that an arm needs, in one file.
 
-`Stand` is the driver, `Drive` what it moves, `StandSettings` what stands in a laboratory's file:
+`Stand` is the driver, `Drive` what it moves, `StandSettings` what stands in a laboratory's file, and `StandKind` joins
+them:
 
     arm: {kind: stand, fastest: 60 deg/s}
 """
@@ -21,6 +22,7 @@ from decant.plugins import (
     SET_BY_PROGRAM,
     Action,
     ArmFacts,
+    ArmKind,
     ArmLostError,
     ArmNotReleasedError,
     ArmPose,
@@ -55,20 +57,26 @@ class StandSettings(ArmSettings):
     warning_time: Annotated[float, SET_BY_PROGRAM] = 0.5
     """Time from the operator's consent to the first movement [s]."""
 
+
+class StandKind(ArmKind[StandSettings]):
+    """Stands with a motor."""
+
+    settings = StandSettings
+
     def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
-        """See `ArmSettings.check_laboratory`."""
+        """See `ArmKind.check_laboratory`."""
         if mode == "hardware":
             problems.add("this example has no motor; write 'mode: virtual'", "arm")
 
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `ArmSettings.driver`; a stand has no safety settings that could be accepted."""
-        return Stand, (self,)
+        """See `ArmKind.driver`; a stand has no safety settings that could be accepted."""
+        return Stand, (self.spec,)
 
     def plan(self, scene: Scene, action: Action) -> MotionPath:
-        """See `ArmSettings.plan`: the motor makes any motion that isn't too fast for it."""
+        """See `ArmKind.plan`: the motor makes any motion that isn't too fast for it."""
         path = MotionPath(plan_pour(scene, action), approach_time=1.0, retreat_time=1.0)
-        if path.report.tilt_speed > self.fastest * 1.001:
-            asked, most = math.degrees(path.report.tilt_speed), math.degrees(self.fastest)
+        if path.report.tilt_speed > self.spec.fastest * 1.001:
+            asked, most = math.degrees(path.report.tilt_speed), math.degrees(self.spec.fastest)
             raise InvalidActionError(
                 f"the stand turns at most at {most:.0f} deg/s (arm.fastest), {asked:.0f} deg/s are asked for"
             )

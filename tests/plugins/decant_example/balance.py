@@ -1,4 +1,4 @@
-"""A balance with a spring: settings, and a driver that takes its time to come to rest.
+"""A balance with a spring: settings, their kind, and a driver that takes its time to come to rest.
 
 It has no line: on a virtual bench the driver is told what stands on it. A driver of a real balance would open its port
 in `connect`, and be told nothing.
@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from decant.plugins import BalanceSettings, LaboratoryError, Load, Quantity, Weight
+from decant.plugins import BalanceKind, BalanceSettings, LaboratoryError, Load, Quantity, Weight
 
 PATIENCE = 20.0
 """How long it may take to come to rest [s of bench time]."""
@@ -33,9 +33,15 @@ class SpringSettings(BalanceSettings):
     swing: Annotated[float, Quantity("s", "1 s", 0.0, 60.0)] = 1.0
     """How long it swings after a change."""
 
+
+class SpringKind(BalanceKind[SpringSettings]):
+    """Balances with a spring."""
+
+    settings = SpringSettings
+
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `BalanceSettings.driver`."""
-        return SpringBalance, (self, name)
+        """See `BalanceKind.driver`."""
+        return SpringBalance, (self.spec, name)
 
 
 class SpringBalance:

@@ -3,7 +3,7 @@
     arm: {kind: seven-joint, approach_speed: 40 deg/s}
     cell: {receiver: {x: 700 mm, y: 0 mm, z: 150 mm}, direction: 90 deg}
 
-- `SevenJointSettings` are the settings; they plan pours (`SevenJointPour`).
+- `SevenJointSettings` are the settings; `SevenJointKind` joins them with the rest, and plans pours (`SevenJointPour`).
 - `SevenJointArm` is the driver. It sends joint positions over a cable at a steady rate.
 - `SimulatedRobot` is at the other end of the cable; replace it by the interface of your robot.
 - `SevenJointFigure` draws the arm in the live view.
@@ -29,6 +29,7 @@ from decant.plugins import (
     SET_BY_PROGRAM,
     Action,
     ArmFacts,
+    ArmKind,
     ArmLostError,
     ArmNotReleasedError,
     ArmPose,
@@ -263,36 +264,72 @@ class SevenJointSettings(ArmSettings):
     warning_time: Annotated[float, SET_BY_PROGRAM] = 0.5
     """Time from the operator's consent to the first movement [s]."""
 
+    def in_laboratory(self, cell: RobotCell | None, time_scale: float) -> Self:
+        """See `ArmSettings.in_laboratory`."""
+        return self.with_values(cell=cell, time_scale=time_scale)
+
+    # ---- frames
+
+    @property
+    def _cell(self) -> RobotCell:
+        assert self.cell is not None, "`in_laboratory` sets it; `check_laboratory` requires it"
+        return self.cell
+
+    def _flanges(self, poses: FloatArray) -> tuple[Rotation, FloatArray]:
+        """Poses of the flange in the base frame for poses (T, 7) of the pourer in the world."""
+        world = Rotation.from_euler("z", self._cell.direction)
+        held = world * Rotation.from_quat(np.roll(poses[:, 3:], -1, axis=1))
+        rotations = held * GRIP[0].inv()
+        places = world.apply(poses[:, :3]) + self._cell.receiver.vector - rotations.apply(GRIP[1])
+        return rotations, places
+
+    def poses(self, joints: FloatArray) -> FloatArray:
+        """Poses of the pourer in the world, shape (T, 7), for joints (T, 7)."""
+        chain = [frames(q) for q in joints]
+        rotations = Rotation.from_matrix(np.array([rotation for _, _, rotation in chain]))
+        places = np.array([origins[7] for _, origins, _ in chain]) + rotations.apply(GRIP[1])
+        world = Rotation.from_euler("z", self._cell.direction).inv()
+        quaternions = np.roll((world * rotations * GRIP[0]).as_quat(), 1, axis=1)
+        signs = np.cumprod(np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0, -1.0, 1.0))
+        quaternions[1:] *= signs[:, None]  # no jumps between a quaternion and its negative
+        return np.concatenate([world.apply(places - self._cell.receiver.vector), quaternions], axis=1)
+
+    def tilt(self, joints: FloatArray) -> float:
+        """Tilt of the pourer [rad]."""
+        return math.acos(float(np.clip(frames(joints)[2][2] @ UP, -1.0, 1.0)))
+
+
+class SevenJointKind(ArmKind[SevenJointSettings]):
+    """Arms with seven joints."""
+
+    settings = SevenJointSettings
+
     def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
-        """See `ArmSettings.check_laboratory`."""
+        """See `ArmKind.check_laboratory`."""
         if mode == "hardware":
             problems.add("this example has no robot; write 'mode: virtual'", "arm")
         if cell is None:
             problems.add("an arm needs to know what stands where; add 'cell: {receiver: …, direction: …}'", "arm")
 
-    def in_laboratory(self, cell: RobotCell | None, time_scale: float) -> Self:
-        """See `ArmSettings.in_laboratory`."""
-        return self.with_values(cell=cell, time_scale=time_scale)
-
     def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
-        """See `ArmSettings.driver`; this robot has no safety checksum."""
-        return SevenJointArm, (self,)
+        """See `ArmKind.driver`; this robot has no safety checksum."""
+        return SevenJointArm, (self.spec,)
 
     def figure(self) -> SevenJointFigure:
-        """See `ArmSettings.figure`."""
-        return SevenJointFigure(self)
+        """See `ArmKind.figure`."""
+        return SevenJointFigure(self.spec)
 
     def plan(self, scene: Scene, action: Action) -> SevenJointPour:
-        """See `ArmSettings.plan`."""
+        """See `ArmKind.plan`."""
         motion = plan_pour(scene, action)
         count = max(math.ceil(motion.duration / 0.02), 2) + 1
         times = np.linspace(0.0, motion.duration, count)
         poses = motion.sample(times)
-        rotations, places = self._flanges(poses)
+        rotations, places = self.spec._flanges(poses)
         ways, start = self._approach(rotations[0], places[0])
         joints, singular = follow(rotations, places, start)
         path = Way(times, joints)
-        approach = smooth(ways, self.approach_speed)
+        approach = smooth(ways, self.spec.approach_speed)
         tilts = np.asarray(motion.tilt(times))
         self._check(approach, path, singular)
         speeds = np.abs(np.diff(joints, axis=0)).max(axis=0) / times[1]
@@ -340,40 +377,10 @@ class SevenJointSettings(ArmSettings):
         if singular < SINGULAR:
             problems.append("the arm would pass near a singular pose; move the receiver")
         lowest = min(float(frames(q)[1][2:, 2].min()) for q in joints[::5])
-        if lowest < self._cell.table + LINKS[-1].radius:
-            problems.append(f"the arm would come {1e3 * (lowest - self._cell.table):.0f} mm near the table")
+        if lowest < self.spec._cell.table + LINKS[-1].radius:
+            problems.append(f"the arm would come {1e3 * (lowest - self.spec._cell.table):.0f} mm near the table")
         if problems:
             raise InvalidActionError("the arm can't make this pour: " + "; ".join(problems))
-
-    # ---- frames
-
-    @property
-    def _cell(self) -> RobotCell:
-        assert self.cell is not None, "`in_laboratory` sets it; `check_laboratory` requires it"
-        return self.cell
-
-    def _flanges(self, poses: FloatArray) -> tuple[Rotation, FloatArray]:
-        """Poses of the flange in the base frame for poses (T, 7) of the pourer in the world."""
-        world = Rotation.from_euler("z", self._cell.direction)
-        held = world * Rotation.from_quat(np.roll(poses[:, 3:], -1, axis=1))
-        rotations = held * GRIP[0].inv()
-        places = world.apply(poses[:, :3]) + self._cell.receiver.vector - rotations.apply(GRIP[1])
-        return rotations, places
-
-    def poses(self, joints: FloatArray) -> FloatArray:
-        """Poses of the pourer in the world, shape (T, 7), for joints (T, 7)."""
-        chain = [frames(q) for q in joints]
-        rotations = Rotation.from_matrix(np.array([rotation for _, _, rotation in chain]))
-        places = np.array([origins[7] for _, origins, _ in chain]) + rotations.apply(GRIP[1])
-        world = Rotation.from_euler("z", self._cell.direction).inv()
-        quaternions = np.roll((world * rotations * GRIP[0]).as_quat(), 1, axis=1)
-        signs = np.cumprod(np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0.0, -1.0, 1.0))
-        quaternions[1:] *= signs[:, None]  # no jumps between a quaternion and its negative
-        return np.concatenate([world.apply(places - self._cell.receiver.vector), quaternions], axis=1)
-
-    def tilt(self, joints: FloatArray) -> float:
-        """Tilt of the pourer [rad]."""
-        return math.acos(float(np.clip(frames(joints)[2][2] @ UP, -1.0, 1.0)))
 
 
 # ---- the robot

@@ -1,0 +1,215 @@
+"""Decant's own kinds of arms and balances, as `pyproject.toml` registers them: `ArmKind` and `BalanceKind`.
+
+Each joins settings, which are plain values, with driver, planner, diagnostics, figure and emulator. These are imported
+within the methods: this module is loaded wherever a laboratory's file is read. No other module imports it.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from actors.arm.arm_geometry import RobotCell
+from actors.arm.arm_interface import ArmFigure
+from actors.arm.arm_settings import ArmDiagnostics, ArmEmulator, ArmKind
+from actors.arm.planned_pour import MotionPath, PourPath
+from actors.arm.simulated_arm import APPROACH_TIME, SimulatedArm, SimulatedArmSettings
+from actors.arm.ur.robot_models import MODELS, same_robot
+from actors.arm.ur_settings import UrArmSettings
+from actors.balance.balance_settings import BalanceEmulator, BalanceKind, SerialBalanceSettings
+from actors.balance.serial_port import look_at_port
+from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBalance
+from actors.interfaces import DeviceCheck
+from sim_engine.action import Action
+from sim_engine.scene import Scene
+from sim_engine.settings.model import Problems
+
+
+class SimulatedArmKind(ArmKind[SimulatedArmSettings]):
+    """A simulated arm without protocol."""
+
+    settings = SimulatedArmSettings
+
+    def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
+        """See `ArmKind.check_laboratory`."""
+        if mode == "hardware":
+            problems.add("a simulated arm moves nothing; write 'mode: virtual'", "arm")
+        if cell is not None:
+            problems.add("a simulated arm stands nowhere; remove the section", "cell")
+
+    def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `ArmKind.driver`."""
+        return SimulatedArm, (self.spec,)
+
+    def plan(self, scene: Scene, action: Action) -> MotionPath:
+        """See `ArmKind.plan`."""
+        from actors.bench.pour_feasibility import plan_pour
+
+        return MotionPath(plan_pour(scene, action), approach_time=APPROACH_TIME)
+
+
+class UrArmKind(ArmKind[UrArmSettings]):
+    """A UR arm."""
+
+    settings = UrArmSettings
+    doses = emulated = True
+
+    def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
+        """See `ArmKind.check_laboratory`."""
+        arm, spec = problems.within("arm"), self.spec
+        self._check_address(arm, mode)
+        if arm.valid("model", "rate"):
+            fastest = MODELS[spec.model].frequency
+            if spec.rate > fastest:
+                arm.add(f"a {spec.model} answers at most {fastest} times a second; write '{fastest} Hz'", "rate")
+        if arm.valid("model", "payload") and spec.payload > (most := MODELS[spec.model].payload):
+            arm.add(f"a {spec.model} carries at most {most:g} kg", "payload")
+        if cell is None:
+            if problems.valid("cell"):
+                problems.add(
+                    "an arm needs to know what stands where; add 'cell: {receiver: …, direction: …}' beside it", "arm"
+                )
+        elif problems.valid("arm", "cell"):
+            from actors.arm.planning.path_checks import check_limits
+
+            for problem in check_limits(spec.with_values(cell=cell)):
+                key, _, text = problem.partition(": ")
+                owner = problems if key.startswith("cell.") else arm
+                owner.add(text, *key.split("."), more=True)
+
+    def _check_address(self, problems: Problems, mode: str) -> None:
+        if mode != "hardware":
+            if self.spec.address:
+                problems.add("a virtual arm has no address: remove it, or write 'mode: hardware'", "address")
+        elif not self.spec.address:
+            text = "an arm of hardware needs its controller's 'address', for example 'address: 192.168.0.10'"
+            problems.add(text, of="address")
+        elif not _is_address(self.spec.address):
+            problems.add(
+                f"{self.spec.address!r} is neither an IPv4 address nor a host name; write for example '192.168.0.10', "
+                "no port",
+                "address",
+            )
+
+    def driver(self, accepted: str | None) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `ArmKind.driver`."""
+        from actors.arm.ur.ur_driver import AcceptedArm, UrArm
+
+        return (UrArm, (self.spec,)) if accepted is None else (AcceptedArm, (self.spec, accepted))
+
+    def plan(self, scene: Scene, action: Action) -> PourPath:
+        """See `ArmKind.plan`."""
+        from actors.arm.planning.pour_planner import plan_path
+        from actors.bench.pour_feasibility import plan_pour, vessel
+
+        return plan_path(plan_pour(scene, action), self.spec, vessel(scene.pourer), vessel(scene.receiver))
+
+    def with_stored(self, folder: Path) -> UrArmSettings:
+        """See `ArmKind.with_stored`: the calibration of `calibration_file`."""
+        from actors.arm.ur.controller_readout import findings_of
+
+        spec = self.spec
+        if spec.calibration_file is None:
+            return spec
+        path = folder / spec.calibration_file
+        try:
+            recorded = json.loads(path.read_text(encoding="utf-8"))["readout"]
+            found = findings_of(recorded)
+            state, model = found.state, found.model
+        except OSError as error:
+            raise ValueError(f"calibration_file {path}: {error.strerror}") from None
+        except (ValueError, KeyError, TypeError):
+            text = "is no recording of 'decant robot check --record'"
+            raise ValueError(f"calibration_file {path}: {text}") from None
+        if state is None or not same_robot(model, spec.model):
+            kind = f"a {model}" if model else "no robot"
+            raise ValueError(f"calibration_file {path}: records {kind}, and the arm is a {spec.model}")
+        return spec.with_values(calibration=state.calibration)
+
+    def start_emulator(self) -> ArmEmulator:
+        """See `ArmKind.start_emulator`."""
+        from actors.emulators.ur_controller.arm_emulator import UrEmulator
+
+        return UrEmulator(self.spec)
+
+    def figure(self) -> ArmFigure:
+        """See `ArmKind.figure`."""
+        from actors.arm.appearance import LinkFigure
+
+        return LinkFigure(self.spec)
+
+    def missing(self) -> str | None:
+        """See `ArmKind.missing`."""
+        from actors.arm.ur.rtde_client import client_missing
+
+        return client_missing()
+
+    def diagnostics(self) -> ArmDiagnostics:
+        """See `ArmKind.diagnostics`."""
+        from actors.arm.ur.commissioning import UrDiagnostics
+
+        return UrDiagnostics.at(self.spec)
+
+    def diagnostics_of(self, recorded: Mapping[str, Any]) -> ArmDiagnostics:
+        """See `ArmKind.diagnostics_of`."""
+        from actors.arm.ur.commissioning import UrDiagnostics
+
+        return UrDiagnostics.of_record(self.spec, recorded)
+
+    def readiness(self) -> DeviceCheck | None:
+        """See `ArmKind.readiness`."""
+        from actors.arm.ur.commissioning import readiness
+
+        return readiness(self.spec) if self.spec.address else None
+
+
+class SerialBalanceKind(BalanceKind[SerialBalanceSettings]):
+    """A balance on a serial line."""
+
+    settings = SerialBalanceSettings
+
+    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `BalanceKind.driver`."""
+        from actors.balance.serial_balance import SerialBalance
+
+        return SerialBalance, (self.spec, name)
+
+    def start_emulator(self) -> BalanceEmulator | None:
+        """See `BalanceKind.start_emulator`."""
+        from actors.emulators.serial_balance.balance_process import SerialBalanceEmulator
+
+        virtual = self.spec.virtual
+        return None if virtual is None else SerialBalanceEmulator(self.spec, virtual)
+
+    def diagnostics(self, *, tare: bool) -> list[DeviceCheck]:
+        """See `BalanceKind.diagnostics`; checks the port first."""
+        port = look_at_port(self.spec.port)
+        return [port] if port.state == "fail" else [port, *super().diagnostics(tare=tare)]
+
+
+class SimulatedBalanceKind(BalanceKind[SimulatedBalanceSettings]):
+    """A simulated balance without protocol."""
+
+    settings = SimulatedBalanceSettings
+
+    def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
+        """See `BalanceKind.driver`."""
+        return VirtualBalance, (self.spec, name)
+
+
+_LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"
+_HOST = re.compile(rf"(?=.{{1,253}}\Z){_LABEL}(\.{_LABEL})*\.?")
+
+
+def _is_address(text: str) -> bool:
+    if re.fullmatch(r"[\d.]+", text):  # a text of digits and dots can only be meant as an address
+        try:
+            ipaddress.IPv4Address(text)
+        except ValueError:
+            return False
+        return True
+    return _HOST.fullmatch(text) is not None
