@@ -27,7 +27,7 @@ from orchestrator.config.file_loading import load_campaign, load_vessel
 from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.deployment_result import Recommended
 from orchestrator.strategies.deployment.disturbances import RiskSettings
 from sim_engine.action import DEG, described
@@ -167,8 +167,7 @@ def main() -> None:
         plan = base.with_settings(risk=risk)
         losses = []
         for seed in range(asked.plans):
-            strategy = OneShotPlanning if risk is None else RobustPlanning
-            result = bench.plan(strategy(plan, scene, theta, seed))
+            result = bench.plan(OneShotPlanning(plan, scene, theta, seed))
             losses.append(evaluated(bench, costing, result.action_si, fresh_errors(asked.evaluations, seed)))
             said = f"promised {100 * result.predicted_loss:.2f} %, came to {100 * losses[-1].mean():.2f} %"
             actions.append({"way": way, "seed": seed, "action": result.action, "promised": result.predicted_loss})

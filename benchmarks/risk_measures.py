@@ -15,6 +15,7 @@ import argparse
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from machine import describe, pin, say, show
@@ -27,7 +28,9 @@ from actors.optimizer.risk_measures import conditional_value_at_risk, tail_weigh
 from actors.optimizer.suggest import propose
 from orchestrator.requests import Outcome, Request, Simulate, Simulated, Slots, Suggest, Suggested
 from orchestrator.strategies.campaign_plan import DeploymentPlan
-from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment import d1
+from orchestrator.strategies.deployment.action_evaluation import RiskMeasure, SeedMean
+from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.deployment_result import Recommended
 from orchestrator.strategies.deployment.disturbances import RiskSettings
 from sim_engine.action import DEG, Action
@@ -70,33 +73,33 @@ def valleys(v: Floats, x: Floats, y: Floats, tilt: Floats) -> Floats:
 TOYS: dict[str, Callable[[Floats, Floats, Floats, Floats], Floats]] = {"cup": cup, "cliff": cliff, "valleys": valleys}
 
 
-class RawMeasure(RobustPlanning):
+class RawMeasure(RiskMeasure):
     """Observes, for each action, the measure of its m1 losses."""
 
-    def _repeated(self, action: Action, purpose: str, repeats: int) -> tuple[Simulate, ...]:
-        return self._under(action, purpose, self._disturbances.draws(repeats))
+    def simulations(self, action: Action, purpose: str) -> tuple[Simulate, ...]:
+        return self._under(action, purpose, self._disturbances.draws(self._repeats))
 
-    def _simulated(self, *, everything: bool = False) -> Data:
+    def _data(self, *, everything: bool = False) -> Data:
         data = Data()
-        for trial in self._trials.counting(everything=everything):
+        for trial in self._ledger.trials.counting(everything=everything):
             losses = [cost for cost in trial.costs.values() if cost is not None]
-            data = data.added(trial.point, conditional_value_at_risk(losses, self._risk.tail))
+            data = data.added(trial.point, conditional_value_at_risk(losses, self._disturbances.settings.tail))
         return data
 
-    def _search(self, *, everything: bool = False, **parts: Any) -> MinimumQuery | RiskQuery:
-        return OneShotPlanning._search(self, everything=everything, **parts)
+    def search(self, *, everything: bool = False, **parts: Any) -> MinimumQuery | RiskQuery:
+        return SeedMean.search(self, everything=everything, **parts)
 
-    def _regression(self, **parts: Any) -> RegressionQuery | RiskQuery:
-        return OneShotPlanning._regression(self, **parts)
+    def regression(self, **parts: Any) -> RegressionQuery | RiskQuery:
+        return SeedMean.regression(self, **parts)
 
 
-WAYS: dict[str, tuple[type[OneShotPlanning], int]] = {
-    "joint, 2 each": (RobustPlanning, 2),
-    "joint, 4 each": (RobustPlanning, 4),
+WAYS: dict[str, tuple[type[RiskMeasure] | None, int]] = {
+    "joint, 2 each": (RiskMeasure, 2),
+    "joint, 4 each": (RiskMeasure, 4),
     "raw, 4 each": (RawMeasure, 4),
-    "plain, 2 each": (OneShotPlanning, 2),
+    "plain, 2 each": (None, 2),
 }
-"""Strategy, and simulations per action."""
+"""Evaluation under errors (None: without errors), and simulations per action."""
 
 
 def answer(request: Request, toy: Callable[..., Floats]) -> Outcome:
@@ -151,14 +154,15 @@ def main() -> None:
         for level in (0.0, 0.9):
             least = float(truth(TOYS[name], level, grid).min())
             risk = RiskSettings(measure="cvar" if level else "expected", level=level or None, pose_error=DEVIATIONS)
-            for way, (strategy, each) in WAYS.items():
+            for way, (measure, each) in WAYS.items():
                 iterations = asked.simulations // each
-                settings = D1Settings(pours=0, iterations=iterations, simulations_per_iteration=each, risk=risk)
+                settings = D1Settings(pours=0, iterations=iterations, simulations_per_iteration=each)
+                if measure is not None:
+                    settings = settings.model_copy(update={"risk": risk})
                 plan = DeploymentPlan(settings, (SCENE,), SPACE, Loss())
-                chosen = [
-                    SPACE.encode(play(strategy(plan, SCENE, SimulationParameters(), seed), TOYS[name]).action_si)
-                    for seed in range(asked.seeds)
-                ]
+                with patch.object(d1, "RiskMeasure", measure):
+                    strategies = [OneShotPlanning(plan, SCENE, SimulationParameters(), i) for i in range(asked.seeds)]
+                chosen = [SPACE.encode(play(strategy, TOYS[name]).action_si) for strategy in strategies]
                 regrets = truth(TOYS[name], level, np.array(chosen)) - least
                 mean, error = float(regrets.mean()), float(regrets.std(ddof=1) / len(regrets) ** 0.5)
                 rows.append({"toy": name, "measure": risk.measure, "way": way, "least": round(least, 3)})
