@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import ClassVar, Literal
 
 from actors.optimizer.questions import Point, RegressionQuery, RiskQuery, Suggestion
@@ -140,6 +141,7 @@ class OneShotPlanning(Deployment[D1Settings]):
 
     def _next(self) -> None:
         trials, done, wanted = self._trials, self._ledger.spent, self._settings.rounds
+        plan = partial(self._simulate, purpose="plan")
         if self._width_known and trials.all == []:
             # slots count simulations; a trial takes m1 of them
             trials.width = math.ceil(trials.width / self._settings.simulations_per_iteration)
@@ -155,19 +157,16 @@ class OneShotPlanning(Deployment[D1Settings]):
                 self._finish()
         elif len(trials) == 0:
             count = min(max(self._settings.initial_samples, 1), max(wanted - 1, 1))
-            self._questions.put(self._requests.space_filling(count=count), "start", self._plan_with)
+            self._questions.put(self._requests.space_filling(count=count), "start", plan)
         elif done < wanted - 1:
             if trials.ready:
-                self._questions.put(self._evaluation.search(), "plan", self._plan_with)
+                self._questions.put(self._evaluation.search(), "plan", plan)
         elif done < wanted:
             if trials.idle:
                 query = self._evaluation.search(everything=True, acquisition="posterior_minimum")
-                self._questions.put(query, "plan", self._plan_with)
+                self._questions.put(query, "plan", plan)
         elif trials.idle:
             self._ask_for_the_best()
-
-    def _plan_with(self, suggestion: Suggestion) -> None:
-        self._simulate(suggestion, "plan")
 
     def _simulations_of(self, action: Action, purpose: str) -> tuple[Simulate, ...]:
         return self._evaluation.simulations(action, purpose)

@@ -12,19 +12,7 @@ from dataclasses import replace
 from typing import Any, Generic, TypeVar, cast
 
 from actors.optimizer.questions import Data, Point, PourQuery, RegressionQuery, Suggestion
-from orchestrator.requests import (
-    ADDED,
-    Answered,
-    Ask,
-    Decision,
-    Outcome,
-    Pour,
-    Prediction,
-    Request,
-    Simulate,
-    Slots,
-    Suggest,
-)
+from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Prediction, Request, Simulate, Slots, Suggest
 from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings
 from orchestrator.strategies.deployment.deployment_ledger import MAX_REFUSED, DeploymentLedger, DeploymentRequests
 from orchestrator.strategies.deployment.deployment_result import Deployed, Recommended, SimulatedAction
@@ -66,13 +54,6 @@ class DeploymentReport:
         self._ledger, self._plan = ledger, ledger.plan
         self.final: Suggestion | None = None
         self.latest_map: Suggestion | None = None
-
-    @property
-    def best_values(self) -> dict[str, float] | None:
-        """The recommended action, by posterior mean [SI]; None before the end, and without any usable outcome."""
-        if self.final is None or self.final.best_point is None:
-            return None
-        return self._plan.actions.decode(self.final.best_point)
 
     def result(
         self,
@@ -201,10 +182,8 @@ class Deployment(ABC, Generic[S]):
         elif request == self._pouring:
             self._pouring = None
             self._ledger.take(outcome)
-        elif request.purpose == ADDED:
-            self._ledger.add(request.action, outcome)
         else:
-            raise ValueError(f"this pour was not asked for: {request}")
+            self._ledger.add(request, outcome)
 
     @property
     def _may_think(self) -> bool:
@@ -288,7 +267,8 @@ class Deployment(ABC, Generic[S]):
     @property
     def best_values(self) -> dict[str, float] | None:
         """The recommended action, by posterior mean [SI]; None before the end, and without any usable outcome."""
-        return self._report.best_values
+        final = self._report.final
+        return None if final is None or final.best_point is None else self._plan.actions.decode(final.best_point)
 
     def progress(self) -> Progress:
         """Requests done, and their total number."""

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from actors.optimizer.questions import Data, Point, SpaceFillingQuery, SurrogateQuery
-from orchestrator.requests import Decision, Failed, Outcome, Prediction, Simulate
+from orchestrator.requests import ADDED, Decision, Failed, Outcome, Pour, Prediction, Simulate
 from orchestrator.strategies.calibration.calibration_base import Kappa
 from orchestrator.strategies.campaign_plan import DeploymentPlan, DeploymentSettings, Draw
 from orchestrator.strategies.deployment.costing import Costing
@@ -109,10 +109,16 @@ class DeploymentLedger:
         if trial.status == "weighed" and trial.cost is not None:
             self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
 
-    def add(self, action: Action, outcome: Outcome) -> None:
-        """Take a pour that was not requested into the data."""
-        values = {name: float(getattr(action, name)) for name in self.plan.actions.names}
-        trial = PourTrial(0, point_of(action, self.plan.actions), values, None, 0.0)
+    def add(self, request: Pour, outcome: Outcome) -> None:
+        """Take a pour that was added by hand into the data.
+
+        Raises:
+            ValueError: the pour is another one, which was not requested.
+        """
+        if request.purpose != ADDED:
+            raise ValueError(f"this pour was not asked for: {request}")
+        values = {name: float(getattr(request.action, name)) for name in self.plan.actions.names}
+        trial = PourTrial(0, point_of(request.action, self.plan.actions), values, None, 0.0)
         trial.take(outcome, self.scene, self.costing, penalised=False)
         if trial.cost is not None:
             trial.status = "added"
