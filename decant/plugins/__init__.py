@@ -99,7 +99,8 @@ if TYPE_CHECKING:
         DeploymentSettings,
         MeasuredPour,
     )
-    from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
+    from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment
+    from orchestrator.strategies.deployment.deployment_ledger import SearchSettings
     from orchestrator.strategies.deployment.objectives import Objective, Objectives
     from orchestrator.strategies.stage_result import ResultPart, StageResult
     from orchestrator.strategies.strategy import Progress, Strategy
@@ -325,7 +326,8 @@ _SOURCES = {
         "DeploymentSettings",
         "MeasuredPour",
     ),
-    "orchestrator.strategies.deployment.deployment_base": ("MAP_RESOLUTION", "Deployment", "SearchSettings"),
+    "orchestrator.strategies.deployment.deployment_base": ("MAP_RESOLUTION", "Deployment"),
+    "orchestrator.strategies.deployment.deployment_ledger": ("SearchSettings",),
     "orchestrator.strategies.stage_result": ("ResultPart", "StageResult"),
     "orchestrator.strategies.strategy": ("Progress", "Strategy"),
     "orchestrator.strategies.trials": ("OptimizerQueries", "SeedStream", "Trial", "Trials"),

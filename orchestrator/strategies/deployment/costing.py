@@ -59,9 +59,15 @@ class Costing:
         """
         if self.objectives is not None:
             return tuple(2.0 * value for value in self.limits)
-        everything_spilled, nothing_poured = Fractions(1.0, 1.0, 0.0), Fractions(0.0, 0.0, 1.0)
-        losses = [self._loss(everything_spilled), self._loss(nothing_poured)]
+        losses = (self.everything_spilled, self._loss(Fractions(0.0, 0.0, 1.0)))
         return (max(loss for loss in losses if loss is not None),)
+
+    @property
+    def everything_spilled(self) -> float:
+        """The loss of spilling everything, in the unit of the loss."""
+        loss = self._loss(Fractions(1.0, 1.0, 0.0))
+        assert loss is not None
+        return loss
 
     @property
     def worst(self) -> float:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from actors.optimizer.questions import Data, MinimumQuery, RegressionQuery, Suggestion
+from actors.optimizer.questions import Data, MinimumQuery, RegressionQuery
 from orchestrator.strategies.campaign_plan import DeploymentPlan
-from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
+from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.deployment.deployment_ledger import SearchSettings
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import Scene
@@ -37,16 +38,18 @@ class RealOnly(Deployment[D2Settings]):
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D2).
     """
 
-    def _next(self, free_simulations: int) -> None:
+    def _next(self) -> None:
         if self._pouring is not None:
             return
-        self._scalarization.weigh(exploring=self._pours_left)
-        if self._pours_left:
-            made = [p for p in self._pours if p.status != "refused"]
-            known = [*(point for point, _ in self._known), *(p.point for p in made)]
+        ledger = self._ledger
+        self._scalarization.weigh(exploring=ledger.pours_left)
+        if ledger.pours_left:
+            made = [p.point for p in ledger.pours if p.status != "refused"]
+            known = [*(point for point, _ in ledger.known), *made]
             if len(known) < min(self._settings.initial_samples, self._plan.pours):
                 # one Sobol sequence, point by point, each far from the points already poured
-                self._questions.put(self._space_filling(known=tuple(known)), "start", self._start)
+                query = self._requests.space_filling(known=tuple(known))
+                self._questions.put(query, "start", lambda suggestion: self._pour(suggestion.points[0]))
             else:
                 self._questions.put(self._about(MinimumQuery), "pour", self._pour_first)
         else:
@@ -54,10 +57,8 @@ class RealOnly(Deployment[D2Settings]):
 
     def _about(self, kind: type[MinimumQuery | RegressionQuery]) -> MinimumQuery | RegressionQuery:
         """A query about the real cost."""
-        return self._query(kind, self._real(), mean=self._settings.mean, map_resolution=MAP_RESOLUTION)
+        real = self._ledger.real()
+        return self._requests.query(kind, real, mean=self._settings.mean, map_resolution=MAP_RESOLUTION)
 
     def _front_query(self, simulated: Data, poured: Data) -> RegressionQuery:
-        return self._query(RegressionQuery, poured, mean=self._settings.mean)
-
-    def _start(self, suggestion: Suggestion) -> None:
-        self._pour(suggestion.points[0], None)
+        return self._requests.query(RegressionQuery, poured, mean=self._settings.mean)

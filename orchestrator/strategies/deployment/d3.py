@@ -7,15 +7,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from actors.optimizer.questions import (
     Data,
     Limit,
     MinimumQuery,
-    ModelDiscrepancy,
     Point,
     PourQuery,
     SearchEffort,
@@ -24,22 +24,20 @@ from actors.optimizer.questions import (
     SuggestionQuery,
     found_good,
 )
-from orchestrator.requests import Answered, Ask, Decision, Outcome, Pour, Request, Simulate, Simulated, Slots
+from orchestrator.requests import Decision, Outcome, Pour, Request, Simulate, Simulated
 from orchestrator.strategies.campaign_plan import DeploymentPlan, Premises
 from orchestrator.strategies.deployment.costing import Costs, CostSettings
-from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment, SearchSettings
+from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment
+from orchestrator.strategies.deployment.deployment_ledger import SearchSettings
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import (
-    Believed,
     DiscrepancyPolicySettings,
     RiskLimitSettings,
     Rules,
-    SimulatorMonitor,
     StopSettings,
-    offset_priors,
     subsampled,
 )
-from orchestrator.strategies.deployment.real_pours import PourTrial, PredictionCheck
+from orchestrator.strategies.deployment.pour_choice import PourChoice
 from orchestrator.strategies.strategy import Progress, Strategy
 from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters
@@ -134,8 +132,11 @@ class D3Settings(SearchSettings):
         """Whether earlier knowledge of the bench enters the hypotheses."""
         return self.adaptive
 
-    def rules(self, worst: float) -> Rules:
-        """Rules for the consequences of pours, in units of a loss with the given largest value."""
+    def rules(self, worst: float) -> Rules | None:
+        """Rules for the consequences of pours, in units of a loss with the given largest value; None with the paper's
+        model."""
+        if not self.adaptive:
+            return None
         limit = None if self.risk_limit is None else Limit(worst * self.risk_limit.loss, self.risk_limit.probability)
         return Rules(
             discrepancy_policy=self.discrepancy_policy or DiscrepancyPolicySettings(),
@@ -177,182 +178,79 @@ class Hybrid(Deployment[D3Settings]):
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        self._rules = self._settings.rules(self._costing.worst)
-        self._monitor = (
-            SimulatorMonitor(self._rules, plan.actions, self._costing.worst) if self._settings.adaptive else None
-        )
-        self._then: Callable[[str], None] | None = None
-        self._ended: str | None = None
-        self._unasked: Ask | None = None
-        self._asked: Ask | None = None
+        simulated = partial(self._ledger.simulated, everything=True)
+        rules = self._settings.rules(self._ledger.costing.worst)
+        self._choice = PourChoice(self._requests, simulated, rules, self._ask_operator)
 
-    # -- requests and outcomes --------------------------------------------------------------------------------------
-
-    def ask(self, slots: Slots) -> list[Request]:
-        """As in the base class; no new requests while the operator has to decide."""
-        if self._unasked is not None:
-            self._asked, self._unasked = self._unasked, None
-            return [self._asked]
-        return [] if self._asked is not None else super().ask(slots)
-
-    def tell(self, request: Request, outcome: Outcome) -> None:
-        """As in the base class; in addition, the operator's answer about a wrong simulator."""
-        if not isinstance(request, Ask):
-            super().tell(request, outcome)
-            return
-        if request != self._asked or not isinstance(outcome, Answered):
-            raise ValueError(f"this was not asked, or not answered: {request.question}")
-        self._asked, then = None, self._then
-        assert then is not None
-        then(outcome.answer)
-
-    def _next(self, free_simulations: int) -> None:
-        if self._spent < self._settings.prior_simulations and not self._pours:
+    def _next(self) -> None:
+        if self._ledger.spent < self._settings.prior_simulations and not self._ledger.pours:
             self._next_prior()
         elif self._pouring is not None or not self._trials.idle:
             return
-        elif self._pours_left:
+        elif self._choice.left:
             self._next_pour()
         else:
-            self._questions.put(self._pour_query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
+            self._questions.put(self._choice.query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
 
     def _next_prior(self) -> None:
+        settings, choice = self._settings, self._choice
+
         def simulate(suggestion: Suggestion) -> None:
             self._simulate(suggestion, "prior")
 
         if len(self._trials) == 0:
-            count = min(max(self._settings.initial_samples, 1), self._settings.prior_simulations)
-            self._questions.put(self._space_filling(count=count), "start", simulate)
+            count = min(max(settings.initial_samples, 1), settings.prior_simulations)
+            self._questions.put(self._requests.space_filling(count=count), "start", simulate)
         elif self._trials.ready:
             self._scalarization.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
-            known, pending, plain = self._simulated(), self._trials.pending(), not self._settings.adaptive
-            left = self._settings.prior_simulations - self._spent
-            aimed = self._acquisition == "least_loss" and left <= self._settings.prior_simulations // AIMED
+            known, pending, plain = self._ledger.simulated(), self._trials.pending(), not settings.adaptive
+            left = settings.prior_simulations - self._ledger.spent
+            aimed = choice.acquisition == "least_loss" and left <= settings.prior_simulations // AIMED
             if aimed and found_good(known.costs):
                 # those for the first pour: where it may be made, and where it tells the hypotheses apart
-                count = 1 + min(left, TOGETHER)
-                about = self._informed(self._real(), known, count=count, acquisition="least_loss", pending=pending)
+                real, count = self._ledger.real(), 1 + min(left, TOGETHER)
+                about = choice.about(real, known, count=count, acquisition="least_loss", pending=pending)
                 self._questions.put(about, "prior", lambda answer: self._simulate(answer, "prior", first=1))
                 return
-            query = self._query(MinimumQuery, known, everything=False, pending=pending, plain=plain, replicates=plain)
+            parts = {"pending": pending, "plain": plain, "replicates": plain}
+            query = self._requests.query(MinimumQuery, known, everything=False, **parts)
             self._questions.put(query, "prior", simulate)
 
     def _next_pour(self) -> None:
         """Query the next pour, and the simulations that run during it."""
-        query = self._pour_query(
-            count=1 + self._settings.simulations_beside,
-            acquisition=self._acquisition,
-            map_resolution=MAP_RESOLUTION,
-        )
 
         def pour(suggestion: Suggestion) -> None:
             self._pour_first(suggestion)
             self._simulate(suggestion, "refine", first=1)
 
-        self._questions.put(query, "pour", lambda suggestion: self._judged(suggestion, pour))
-
-    def _judged(self, suggestion: Suggestion, pour: Callable[[Suggestion], None]) -> None:
-        """Record the conclusions about the simulator, and make the next pour if they allow it."""
-        if self._monitor is None or suggestion.discrepancy is None:
-            pour(suggestion)
-            return
-        self._monitor.record(suggestion.discrepancy, self._pours)
-        verdict = self._monitor.judge(suggestion, self._pours, self._plan.pours - self._counted)
-        self._take_decisions()
-        if verdict.ask is not None:
-
-            def answered(answer: str) -> None:
-                assert self._monitor is not None
-                end = self._monitor.answer(answer, limit=verdict.limit)
-                self._take_decisions()
-                if end:
-                    self._ended = end
-                else:
-                    self._judged(suggestion, pour)
-
-            self._unasked, self._then = verdict.ask, answered
-        elif verdict.end:
-            self._ended = verdict.end  # conclude with the data so far
-        else:
-            pour(suggestion)
-
-    def _take_decisions(self) -> None:
-        assert self._monitor is not None
-        self.decisions += self._monitor.decisions
-        self._monitor.decisions.clear()
-
-    def _concluded(self, suggestion: Suggestion) -> None:
-        if self._monitor is not None and suggestion.discrepancy is not None:
-            self._monitor.record(suggestion.discrepancy, self._pours)
-            self._take_decisions()
-        self._conclude(suggestion)
-
-    @property
-    def _pours_left(self) -> bool:
-        return super()._pours_left and self._ended is None
-
-    @property
-    def _acquisition(self) -> str:
-        """Acquisition of the next pour."""
-        if self._settings.adaptive and not self._scalarization.exploring:
-            return "least_loss"
-        return "lcb" if self._pours or self._known else "posterior_minimum"
-
-    def _pour_query(self, **parts: Any) -> PourQuery:
-        """A query for the next pour; with a count of 0, about the real cost only."""
-        self._scalarization.weigh(exploring=parts.get("count") != 0)
-        return self._informed(self._real(), self._simulated(everything=True), **parts)
-
-    def _informed(self, poured: Data, simulated: Data, **parts: Any) -> PourQuery:
-        return self._query(PourQuery, poured, simulated=simulated, discrepancy=self._discrepancy, **parts)
-
-    @property
-    def _discrepancy(self) -> ModelDiscrepancy | None:
-        """The ways in which the simulator may be wrong; None with the paper's model."""
-        if not self._settings.adaptive:
-            return None
-        left = max(self._plan.pours - self._counted - 1, 0)
-        limit = self._rules.limit
-        if limit is not None and not any(p.cost is not None and p.cost <= limit.loss for p in self._pours):
-            limit = None  # no poured action keeps it and could be repeated
-        return ModelDiscrepancy(
-            offset_priors(self._plan.actions),
-            self._plan.bench,
-            worst=self._costing.worst,
-            pours_left=left,
-            limit=limit,
-            # an informative first pour may end in a corner, and a limit would keep the following pours there
-            lookahead=self._rules.limit is None or limit is not None,
+        query = self._choice.query(
+            count=1 + self._settings.simulations_beside,
+            acquisition=self._choice.acquisition,
+            map_resolution=MAP_RESOLUTION,
         )
+        self._questions.put(query, "pour", lambda answer: self._choice.judge(answer, pour))
+
+    def _conclude(self, suggestion: Suggestion) -> None:
+        self._choice.record(suggestion)
+        super()._conclude(suggestion)
 
     def _front_query(self, simulated: Data, poured: Data) -> PourQuery:
-        return self._informed(poured, simulated, count=0)
-
-    @property
-    def _warned(self) -> bool:
-        return self._settings.adaptive
+        return self._choice.about(poured, simulated, count=0)
 
     # -- results ---------------------------------------------------------------------------------------------------
 
-    def _trusted(self, weighed: Sequence[PourTrial]) -> PredictionCheck | Believed:
-        return super()._trusted(weighed) if self._monitor is None else self._monitor.result()
-
     def result(self) -> Deployed:
         """The result so far, with the conclusions about the bench."""
-        bench = None if self._monitor is None else self._monitor.bench()
-        return super().result().model_copy(update={"ended": self._ended, "bench": bench})
+        return self._choice.result(self._report)
 
     def progress(self) -> Progress:
-        """Simulations and pours done, and their totals; simulations during pours count only if their number is
-        fixed."""
+        """Simulations and pours done, and their totals."""
         simulations = self._settings.prior_simulations + self._plan.pours * self._settings.simulations_beside
-        answered = self._trials.answered - self._unspent
-        done = min(answered, simulations) if self._settings.beside is None else answered
-        if self._ended is not None:  # no further ones will be made
-            simulations = done
-        pours = self._counted if self._ended is not None else self._plan.pours
-        return Progress(done, simulations, min(self._counted, pours), pours)
+        done = self._trials.answered - self._ledger.unspent
+        ended = self._choice.ended is not None  # no further ones will be made
+        pours = self._ledger.counted if ended else self._plan.pours
+        return Progress(done, done if ended else simulations, min(self._ledger.counted, pours), pours)
 
 
 MOST_SIMULATIONS = 200
@@ -368,7 +266,7 @@ LOST_IN_A_ROW = 20
 """Number of consecutive failed simulations after which no more are requested during a pour."""
 
 
-class FreeHybrid(Hybrid):
+class FreeHybrid(Deployment[D3Settings]):
     """D3 that chooses and ends simulations by their value of information: Dyna with costs.
 
     Every simulation is made where it reduces the least expected real cost most (a `SimulationQuery`). Before the first
@@ -387,7 +285,10 @@ class FreeHybrid(Hybrid):
 
     def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> None:
         super().__init__(plan, scene, parameters, seed)
-        self._costs = Costs(self._settings.costs or CostSettings(), self._costing.worst)
+        worst = self._ledger.costing.worst
+        rules = self._settings.rules(worst)
+        self._choice = PourChoice(self._requests, self._simulated, rules, self._ask_operator)
+        self._costs = Costs(self._settings.costs or CostSettings(), worst)
         self._out: set[str] = set()
         self._awaited: int | None = None
         self._rested_at: int | None = None
@@ -412,9 +313,9 @@ class FreeHybrid(Hybrid):
     def _may_think(self) -> bool:
         return True  # several queries may be pending, one of each purpose
 
-    def _next(self, free_simulations: int) -> None:
+    def _next(self) -> None:
         if self._pouring is None:
-            if not self._pours_left:
+            if not self._choice.left:
                 self._wind_up()
                 return
             if self._may_pour and "pour" not in self._out:
@@ -424,20 +325,20 @@ class FreeHybrid(Hybrid):
     @property
     def _may_pour(self) -> bool:
         """Whether the pour was decided, and the simulations before it are answered."""
-        if self._pours:
+        if self._ledger.pours:
             return True
         return self._awaited is not None and all(trial.closed for trial in self._trials.all[: self._awaited])
 
     def _wind_up(self) -> None:
         self._trials.withdraw()
         if self._trials.idle and not self._out:
-            self._put(self._pour_query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._concluded)
+            self._put(self._choice.query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
 
     def _look_ahead(self) -> None:
         """Choose simulations before a slot is free."""
         if self._out & {"start", "prior", "refine"}:
             return
-        if self._awaited is None and not self._pours:
+        if self._awaited is None and not self._ledger.pours:
             self._next_prior()
         elif self._trials.waiting < self._trials.width and self._rested_at != self._trials.answered:
             self._refine(self._trials.width)
@@ -446,7 +347,11 @@ class FreeHybrid(Hybrid):
         settings, trials = self._settings, self._trials
         if len(trials) == 0 and settings.prior_simulations > 0:
             count = min(max(settings.initial_samples, trials.width), settings.prior_simulations)
-            self._put(self._space_filling(count=count), "start", lambda suggestion: self._simulate(suggestion, "prior"))
+            self._put(
+                self._requests.space_filling(count=count),
+                "start",
+                lambda suggestion: self._simulate(suggestion, "prior"),
+            )
         elif len(trials) >= settings.prior_simulations:
             self._decide_to_pour("all prior simulations are requested")
         elif trials.answered >= min(2, len(trials)) and trials.waiting < trials.width:
@@ -470,10 +375,10 @@ class FreeHybrid(Hybrid):
         """Query more simulations during the pour, as long as they have a value."""
 
         def weighed(suggestion: Suggestion) -> None:
-            if not self._pours_left and self._pouring is None:
+            if not self._choice.left and self._pouring is None:
                 return  # the last pour has finished meanwhile
             if suggestion.surrogate is not None:
-                self._latest_map = suggestion
+                self._report.latest_map = suggestion
             one, pour = (suggestion.values or (0.0,))[0], suggestion.pour_value or 0.0
             exhausted = bool(suggestion.values) and self._costs.is_idle(one, self._trials.width)
             if exhausted and not self._scalarization.exploring:
@@ -501,8 +406,12 @@ class FreeHybrid(Hybrid):
             self._pour_first(suggestion)
             self._rested_at, self._map_due = None, True
 
-        query = self._pour_query(count=1, acquisition=self._acquisition)
-        self._ask_quickly(query, "pour", lambda answer: self._judged(answer, pour))
+        query = self._choice.query(count=1, acquisition=self._choice.acquisition)
+        self._ask_quickly(query, "pour", lambda answer: self._choice.judge(answer, pour))
+
+    def _conclude(self, suggestion: Suggestion) -> None:
+        self._choice.record(suggestion)
+        super()._conclude(suggestion)
 
     # -- queries -------------------------------------------------------------------------------------------------
 
@@ -510,13 +419,13 @@ class FreeHybrid(Hybrid):
         self, count: int, purpose: str, then: Callable[[Suggestion], None], map_resolution: int = 0
     ) -> None:
         self._scalarization.weigh(exploring=True)
-        query = self._query(
+        query = self._requests.query(
             SimulationQuery,
-            self._real(),
-            simulated=self._simulated(everything=True),
+            self._ledger.real(),
+            simulated=self._simulated(),
             count=count,
             pending=self._trials.pending(everything=True),
-            pouring=tuple(pour.point for pour in self._pours[-1:] if pour.status == "pouring"),
+            pouring=tuple(pour.point for pour in self._ledger.pours[-1:] if pour.status == "pouring"),
             coupling="scaled" if self._settings.adaptive else "residual",
             map_resolution=map_resolution,
         )
@@ -549,10 +458,14 @@ class FreeHybrid(Hybrid):
         self._out.add(purpose)
         self._questions.put(query, purpose, answered)
 
-    def _simulated(self, *, everything: bool = False) -> Data:
+    def _simulated(self) -> Data:
         """All answered simulations: during a pour their order does not matter."""
-        around = [pour.point for pour in self._pours[-2:]] + ([self._around] if self._around is not None else [])
-        return subsampled(super()._simulated(everything=True), around, MOST_SIMULATIONS)
+        around = [pour.point for pour in self._ledger.pours[-2:]]
+        around += [self._around] if self._around is not None else []
+        return subsampled(self._ledger.simulated(everything=True), around, MOST_SIMULATIONS)
+
+    def _front_query(self, simulated: Data, poured: Data) -> PourQuery:
+        return self._choice.about(poured, simulated, count=0)
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -568,9 +481,13 @@ class FreeHybrid(Hybrid):
         text = f"{what}  {described(values)}  {self._comparison(one, pour)}"
         self.decisions.append(Decision(text, {"simulation_value": one, "pour_value": pour}))
 
+    def result(self) -> Deployed:
+        """The result so far, with the conclusions about the bench."""
+        return self._choice.result(self._report)
+
     def progress(self) -> Progress:
         """As in D3; simulations that were not needed count as made."""
         simulations = self._settings.prior_simulations
-        begun = self._awaited is not None or bool(self._pours)
+        begun = self._awaited is not None or bool(self._ledger.pours)
         done = simulations if begun else min(self._trials.answered, simulations)
-        return Progress(done, simulations, min(self._counted, self._plan.pours), self._plan.pours)
+        return Progress(done, simulations, min(self._ledger.counted, self._plan.pours), self._plan.pours)

@@ -107,7 +107,7 @@ class Disturbances:
             seed: seed of the draws.
             thetas: equally likely draws of a posterior, used if `risk` selects them.
         """
-        self._tail, self._deviations = risk.tail, risk.errors
+        self.settings, self._tail, self._deviations = risk, risk.tail, risk.errors
         self._actions, self._best, self._seed = actions, best, seed
         self._thetas = thetas if risk.theta == "posterior" else ()
         self.errors = tuple(name for name in ERRORS if getattr(self._deviations, name) > 0.0)

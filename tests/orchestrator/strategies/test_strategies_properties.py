@@ -30,7 +30,7 @@ from orchestrator.strategies.calibration.pointwise_calibration import (
 from orchestrator.strategies.calibration.pour_design import DesignedPours
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.costing import CostSettings
-from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
 from orchestrator.strategies.deployment.objectives import Objectives, Retained, Spillage
@@ -62,7 +62,7 @@ FREE = {
 }
 DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 6}),
-    "D1, risk": (RobustPlanning, {"iterations": 4, "simulations_per_iteration": 2, "risk": RISK}),
+    "D1, risk": (OneShotPlanning, {"iterations": 4, "simulations_per_iteration": 2, "risk": RISK}),
     "D2": (RealOnly, {"pours": 5}),
     "D3": (Hybrid, {"pours": 3, "prior_simulations": 6, "simulations_per_pour": 2}),
     "D3, front": (Hybrid, {"pours": 3, "prior_simulations": 6, "simulations_per_pour": 2, "objectives": BOTH}),

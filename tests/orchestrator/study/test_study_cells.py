@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from orchestrator.config.campaign_checks import touch
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.strategies.deployment.d1 import D1Settings, RobustPlanning
+from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
 from orchestrator.study.study_campaigns import campaign_of
@@ -153,7 +153,7 @@ def test_risk_of_the_campaign_is_that_of_d1_and_what_simulates_draws_from_the_po
             assert plan.deployment is not None
             drawn = [one.cohesion for one in plan.deployment.thetas]
             assert drawn == ([] if cell.arm == "D2" else [0.0, 0.01, 0.02])  # D2 simulates nothing
-    assert {arm: type(one) for arm, one in made.items()} == {"D1-2": RobustPlanning, "D2": RealOnly, "D3": Hybrid}
+    assert {arm: type(one) for arm, one in made.items()} == {"D1-2": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
     with pytest.raises(ConfigError, match="at least 2 are needed"):
         load_study(risky(tmp_path / "few", simulations_per_iteration=1))
 

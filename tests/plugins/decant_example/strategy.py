@@ -50,11 +50,11 @@ class Hypercube(Deployment[HypercubeSettings]):
         inside = np.full(slices.shape, 0.5) if self._settings.centred else rng.random(slices.shape)
         self._points = [tuple(map(float, row)) for row in (slices + inside) / count]
 
-    def _next(self, free_simulations: int) -> None:
+    def _next(self) -> None:
         if self._pouring is not None:
             return
-        if self._points and self._pours_left:
-            self._pour(self._points.pop(0), None)
+        if self._points and self._ledger.pours_left:
+            self._pour(self._points.pop(0))
         else:
-            query = self._query(RegressionQuery, self._real(), map_resolution=MAP_RESOLUTION)
+            query = self._requests.query(RegressionQuery, self._ledger.real(), map_resolution=MAP_RESOLUTION)
             self._questions.put(query, "conclude", self._conclude)

@@ -14,7 +14,7 @@ from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Answered, Ask, Suggest
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.stages import DEPLOYMENT, with_bench
-from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
 from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.strategies.deployment.model_monitoring import (
     Believed,
@@ -42,22 +42,22 @@ def upside_down(action: Any, theta: Any, rng: Any) -> float:
     return 1.0 - 0.8 * narrow_cup(action, theta, rng)
 
 
-def adaptive(seed: int = 1, **changes: Any) -> Hybrid:
+def adaptive(seed: int = 1, **changes: Any) -> Hybrid | FreeHybrid:
     plan = deployment_plan(**{"model": "adaptive", "simulations_per_pour": 1, **changes})
     strategy = plan.settings.build(plan, SCENE, THETA, seed)
-    assert isinstance(strategy, Hybrid)
+    assert isinstance(strategy, Hybrid | FreeHybrid)
     return strategy
 
 
-def losses(strategy: Hybrid) -> list[float]:
+def losses(strategy: Hybrid | FreeHybrid) -> list[float]:
     return [pour.loss for pour in strategy.result().weighed if pour.loss is not None]
 
 
-def said(strategy: Hybrid) -> list[str]:
+def said(strategy: Hybrid | FreeHybrid) -> list[str]:
     return [decision.text for decision in strategy.decisions if decision.urgent]
 
 
-def believed(strategy: Hybrid) -> Believed:
+def believed(strategy: Hybrid | FreeHybrid) -> Believed:
     trust = strategy.result().model_check
     assert isinstance(trust, Believed)
     return trust

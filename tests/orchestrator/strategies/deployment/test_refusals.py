@@ -16,7 +16,7 @@ from orchestrator.requests import Failed, Outcome, Pour, Request, Simulate, Sugg
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.deployment_base import MAX_REFUSED
+from orchestrator.strategies.deployment.deployment_ledger import MAX_REFUSED
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters

@@ -14,7 +14,7 @@ from orchestrator.requests import Failed, Simulate, Suggest
 from orchestrator.run_errors import RunError
 from orchestrator.runs.stages import with_posterior
 from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.disturbances import Disturbances, RiskSettings
 from orchestrator.strategies.single_action import RepeatedSimulation
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed, replay
@@ -30,10 +30,10 @@ from tests.support.toy_spillage import quiet_valleys, two_valleys
 ERRORS = PoseError(x=8e-3, speed_factor=0.03)
 
 
-def risky(seed: int = 0, *, risk: RiskSettings | None = None, **changes: Any) -> RobustPlanning:
+def risky(seed: int = 0, *, risk: RiskSettings | None = None, **changes: Any) -> OneShotPlanning:
     values = {"pours": 0, "iterations": 12, "simulations_per_iteration": 3, **changes}
     plan = deployment_plan(strategy="D1", risk=risk or plans.risk("expected", pose_error=ERRORS), **values)
-    return RobustPlanning(plan, SCENE, THETA, seed)
+    return OneShotPlanning(plan, SCENE, THETA, seed)
 
 
 def place(strategy: OneShotPlanning) -> float:

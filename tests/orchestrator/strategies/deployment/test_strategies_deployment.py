@@ -11,7 +11,7 @@ from orchestrator.strategies.deployment.costing import Costing
 from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.d2 import RealOnly
 from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.deployment_base import MAX_REFUSED
+from orchestrator.strategies.deployment.deployment_ledger import MAX_REFUSED
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, replay
 from sim_engine.outcome import Loss, PourMeasurement

@@ -16,7 +16,7 @@ from orchestrator.requests import Failed, Simulate
 from orchestrator.results.loss_units import loss_unit
 from orchestrator.results.run_figures import draw_figures
 from orchestrator.results.wording import risk_line, window_line
-from orchestrator.strategies.deployment.d1 import OneShotPlanning, RobustPlanning
+from orchestrator.strategies.deployment.d1 import OneShotPlanning
 from orchestrator.strategies.deployment.disturbances import RiskSettings
 from orchestrator.strategies.deployment.safe_window import ROUNDS, SafeWindow
 from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed
@@ -37,7 +37,7 @@ def planned(seed: int, tolerance: float, risk: RiskSettings | None = None, spill
     plan = deployment_plan(
         strategy="D1", pours=0, iterations=12, simulations_per_iteration=3, risk=risk, window=plans.window(tolerance)
     )
-    strategy = (RobustPlanning if risk else OneShotPlanning)(plan, SCENE, THETA, seed)
+    strategy = OneShotPlanning(plan, SCENE, THETA, seed)
     StrategyHarness(spill).run(strategy)
     return strategy.result()
 
