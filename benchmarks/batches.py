@@ -1,9 +1,9 @@
 """Measure pours per minute of one batched call against its number of scenes.
 
-    python benchmarks/batches.py [--particles 1000] [--scenes 1 2 4 8 16] [--backend cpu] [--core 1] [--json]
+    python benchmarks/batches.py [--particles 1000] [--scenes 1 2 4 8 16] [--core 1] [--json]
 
 Each batch has different actions and seeds. The same tasks also run one by one, half before and half after the batch.
-A CPU processes the scenes of a batch in sequence, so the ratio should be 1; a GPU processes them in parallel.
+The scenes of a batch run one after another, so the ratio should be 1.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from machine import describe, pin, say, show
 from standard_pour import check_particles, short_task, standard_task
 
 from sim_engine.action import DEG
-from sim_engine.resources import BACKENDS, BackendError, require_backend
 from sim_engine.scene import PourTask
 from sim_engine.simulator import PourSimulator
 
-SCENES = {"cpu": (1, 2, 4, 8, 16), "cuda": (1, 4, 16, 64, 256, 1024)}
+SCENES = (1, 2, 4, 8, 16)
 
 
 def tasks(particles: int, count: int) -> list[PourTask]:
@@ -67,27 +66,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--particles", type=int, default=1000)
     parser.add_argument("--scenes", type=int, nargs="+", help="sizes of the batches")
-    parser.add_argument("--backend", choices=BACKENDS, default="cpu")
     parser.add_argument("--core", type=int, help="core to run on; default: the least busy one")
     parser.add_argument("--json", action="store_true", help="one line of JSON")
     options = parser.parse_args()
     particles = check_particles(options.particles)
-    sizes = options.scenes or SCENES[options.backend]
+    sizes = options.scenes or SCENES
     if min(sizes) < 1:
         raise SystemExit("--scenes: batches hold one pour or more")
-    try:
-        require_backend(options.backend)
-    except BackendError as error:
-        raise SystemExit(f"--backend: {error}") from None
     core = pin(options.core)
-    simulator = PourSimulator(options.backend)
+    simulator = PourSimulator()
     simulator.simulate(short_task(particles))
     rows = []
     for count in sizes:
         rows.append(compare(simulator, particles, count))
         say(f"{count} scenes: {rows[-1]['pours_per_minute']} pours/min, {rows[-1]['cpu_over_alone']} of one by one")
     simulator.close()
-    result = {"particles": particles, "backend": options.backend, "batches": rows, "core": core, "machine": describe()}
+    result = {"particles": particles, "batches": rows, "core": core, "machine": describe()}
     show(result, options.json)
 
 

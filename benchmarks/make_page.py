@@ -76,7 +76,6 @@ def page_text(records: dict[str, Any]) -> str:
         page_many.plan(records.get("plan")),
         page_many.validate(records.get("validate")),
         page_many.pool(records.get("pool")),
-        page_many.gpu(records.get("gpu")),
     ]
     return "\n".join(parts)
 

@@ -1,8 +1,8 @@
-"""Sections of the performance page about many pours (in one call, in a pool, on a GPU), and about many files."""
+"""Sections of the performance page about many pours (in one call, in a pool), and about many files."""
 
 from __future__ import annotations
 
-from page_sections import Record, facts, missing, prose, seconds, settings, table
+from page_sections import Record, missing, prose, seconds, settings, table
 
 
 def scenes(record: Record | None) -> str:
@@ -24,8 +24,8 @@ def scenes(record: Record | None) -> str:
     ]
     head = ("scenes in a call", "CPU s a pour", "one by one", "ratio", "pours a minute", "process [MB]")
     about = prose(
-        f"""Standard pours with {r["particles"]:,} particles, many in one call and one by one, in the same process
-        ({r["backend"]}). On a CPU the scenes of a call follow each other: a call costs the sum of its pours."""
+        f"""Standard pours with {r["particles"]:,} particles, many in one call and one by one, in the same process.
+        The scenes of a call follow each other: a call costs the sum of its pours."""
     )
     return f"## {title}\n\n{about}\n\n{table(head, rows, 'rrrrrr')}\n{settings([record])}"
 
@@ -99,14 +99,6 @@ def pool(record: Record | None) -> str:
     ]
     shown = table(("", "", "required", ""), rows, "lrll")
     return f"## {title}\n\n{about}\n\n{shown}\n{settings([record])}"
-
-
-def gpu(record: Record | None) -> str:
-    """Return the section on batches on a GPU."""
-    title = "GPU"
-    if record is None:
-        return f"## {title}\n\nNot measured: no GPU was available.\n"
-    return f"## {title}\n\n{facts(record['result'])}\n{settings([record])}"
 
 
 def _met(met: bool) -> str:

@@ -260,20 +260,6 @@ def missing(title: str, command: str) -> str:
     return f"## {title}\n\nNot measured yet: `python benchmarks/{command} --json`\n"
 
 
-def facts(result: Record) -> str:
-    """Return tables of a result of any shape: one for plain values, and one per list of rows."""
-    plain = {key: value for key, value in result.items() if isinstance(value, str | int | float)}
-    parts = [table(("", ""), [(_words(key), _value(value)) for key, value in plain.items()], "lr")] if plain else []
-    for key, value in result.items():
-        if isinstance(value, list) and value and isinstance(value[0], dict):
-            head = tuple(value[0])
-            rows = [tuple(_value(row.get(name)) for name in head) for row in value]
-            parts.append(f"{_words(key)}:\n\n{table(tuple(map(_words, head)), rows, 'r' * len(head))}")
-        elif isinstance(value, dict) and key != "machine":
-            parts.append(f"{_words(key)}:\n\n{facts(value)}")
-    return "\n".join(parts)
-
-
 def settings(records: Sequence[Record]) -> str:
     """Return machine, software, commands and time of one or several measurements, in small print."""
     machines: dict[str, list[str]] = {}
@@ -319,15 +305,3 @@ def _physics(result: Record) -> tuple[str, ...]:
     off = max(abs(value - reference) for value, reference in zip(left, LEFT, strict=True))
     word = "right" if off <= LEFT_LIMIT else "**off**"
     return (*(f"{value:.3f}" for value in left), word, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
-
-
-def _words(key: str) -> str:
-    return key.replace("_", " ")
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return f"{value:,}" if isinstance(value, int) else str(value)

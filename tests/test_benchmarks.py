@@ -233,19 +233,6 @@ def test_a_clock_that_seems_to_save_time_is_called_noise() -> None:
     assert ("within the noise" in cost, "1.25 times as long" in cost) == (False, True)
 
 
-def test_page_shows_a_result_of_any_shape() -> None:
-    import make_page
-
-    rows = [{"batch": 1, "pours_per_min": 30.25}, {"batch": 1024, "pours_per_min": 2100.0}]
-    result = {"busy_fraction": 0.98751, "nodes": {"lost": True}, "rows": rows, "machine": MACHINE}
-    page = make_page.page_text({"gpu": {"command": "python batches", "result": result}})
-    assert "| busy fraction | 0.9875 |" in page
-    assert "nodes:\n\n" in page
-    assert "| lost | yes |" in page
-    assert "| batch | pours per min |" in page
-    assert "| 1,024 | 2100 |" in page
-
-
 def test_page_warns_of_figures_from_different_solvers() -> None:
     import make_page
 

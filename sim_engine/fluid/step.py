@@ -435,9 +435,8 @@ class Stepper:
         kernels compile in less time than one with both parts, and simulations without cohesion never compile the
         second.
 
-        Scenes are independent: on a GPU each has a thread, on a CPU they run one after another. Either all of them are
-        `thick`, liquids with a viscosity in SI, or none is. These are two kernels, so that neither contains code of the
-        other.
+        Scenes are independent and run one after another. Either all of them are `thick`, liquids with a viscosity in
+        SI, or none is. These are two kernels, so that neither contains code of the other.
         """
         f = self.state
         for s in range(s0, s1):
