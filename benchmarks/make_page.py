@@ -30,6 +30,7 @@ PLAN: dict[str, tuple[str, ...]] = {
     "scaling": ("scaling.py", "--repeats=1"),
     "scenes": ("batches.py",),
     "start-up": ("start_up.py", "--repeats=9"),
+    "engines": ("engines.py",),
     "plan": ("plan_speed.py",),
     "validate": ("validate_cost.py",),
     "profile": ("profile_passes.py",),
@@ -73,6 +74,7 @@ def page_text(records: dict[str, Any]) -> str:
         page_many.scenes(records.get("scenes")),
         sections.memory(scaling),
         sections.start_up(records.get("start-up")),
+        sections.engines(records.get("engines")),
         page_many.plan(records.get("plan")),
         page_many.validate(records.get("validate")),
         page_many.pool(records.get("pool")),
@@ -90,7 +92,7 @@ def stale(records: dict[str, Any]) -> list[str]:
     """Return a warning if measurements were made with different solvers."""
     prints: dict[str, list[str]] = {}
     for name, record in records.items():
-        if name == "core-limit":  # does not use the solver
+        if name in ("core-limit", "engines"):  # the first does not use the solver, the second compares in one run
             continue
         prints.setdefault(record["result"]["machine"].get("fingerprint", "?"), []).append(name)
     if len(prints) < 2:

@@ -255,6 +255,42 @@ def start_up(record: Record | None) -> str:
 {settings([record])}"""
 
 
+def engines(record: Record | None) -> str:
+    """Return the section that compares the packages that can compile the solver."""
+    title = "Engines"
+    if record is None:
+        return missing(title, "engines.py")
+    r = record["result"]
+    rows = [
+        (
+            row["engine"],
+            *map(seconds, row["cpu_s"]),
+            ", ".join(f"{value:.3f}" for value in row["left"]),
+            f"{row['warm_cpu_s']:.1f}",
+            f"{row['cold_cpu_s']:.1f}",
+            f"{row['memory_mb']:,}",
+            f"{row['size_mb']:,}",
+        )
+        for row in r["engines"]
+    ]
+    about = prose(
+        """The packages that can compile the solver, in alternating processes. CPU seconds of the standard pour, and of a
+        process up to its first pour, with a warm cache and with an empty one; peak memory; installed size. Taichi is the
+        default where both are installed: it comes with Decant, all other figures here and the golden outcomes are from
+        it, and Quadrants is not faster by more than the difference between two processors."""
+    )
+    head = (
+        "",
+        *(f"N = {n:,}" for n in r["particles"]),
+        "left in the pourer",
+        "start",
+        "cold start",
+        "memory [MB]",
+        "size [MB]",
+    )
+    return f"## {title}\n\n{about}\n\n{table(head, rows, 'lrrlrrrr')}\n{settings([record])}"
+
+
 def missing(title: str, command: str) -> str:
     """Return the section for a benchmark without results."""
     return f"## {title}\n\nNot measured yet: `python benchmarks/{command} --json`\n"
@@ -265,7 +301,7 @@ def settings(records: Sequence[Record]) -> str:
     machines: dict[str, list[str]] = {}
     for record in records:
         m, core = record["result"]["machine"], record["result"].get("core")
-        place = f"{m['processor']}, {m['cores']} cores, {m['system']}, Python {m['python']}, Taichi {m['taichi']}"
+        place = f"{m['processor']}, {m['cores']} cores, {m['system']}, Python {m['python']}, {m['engine'].capitalize()}"
         where = f"core {core}, " if core is not None else ""
         moment = f"solver {m['solver']}, {m['date']}, {where}load {m['load_average'][0]}"
         machines.setdefault(place, []).append(f"`{record['command']}` ({moment})")

@@ -1,6 +1,6 @@
 """PourTask → PourOutcome: sets up the scene, runs the solver until the outcome is final, and counts particles.
 
-`PourSimulator` runs pours. Importing this module is fast; Taichi starts with the first simulation.
+`PourSimulator` runs pours. Importing this module is fast; the engine starts with the first simulation.
 
 - **Initial positions** (`fill`): a jittered lattice that fills the pourer from the bottom.
 - **Time loop** (`TimeLoop`, `follow`): slices of time, recordings between them, the end of the pour, and its outcome.
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from sim_engine.collision import contact_during, describe_contact, rotations
 from sim_engine.dribbling import DribblingCourse, dribbling_course, rivulet_frames
+from sim_engine.engine_package import check_engine, engine_name
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, SolidWalls
 from sim_engine.hydrostatics import GRAVITY, level
@@ -393,9 +394,17 @@ def check_motion(
 
 
 class PourSimulator:
-    """Simulates pours, one by one or many in one call. One per process: Taichi's arrays are shared."""
+    """Simulates pours, one by one or many in one call. One per process: the engine's arrays are shared.
+
+    Before its first pour, an engine that was never checked on this machine is checked (`engine_package.check_engine`).
+
+    Raises:
+        EngineError: the chosen engine is unknown or not installed.
+    """
 
     def __init__(self) -> None:
+        engine_name()  # refuses an unknown one before anything is prepared
+        self._checked = False
         self._vessels: dict[VesselSpec, Vessel] = {}
         self._masks: dict[VesselSpec, NDArray[np.uint8]] = {}
         self._planes: dict[tuple[VesselSpec, float], NDArray[np.float32]] = {}
@@ -446,6 +455,7 @@ class PourSimulator:
         Raises:
             InvalidSceneError: the pour is impossible.
             SimulationCancelled: `cancelled` returned True.
+            WrongOutcomeError: the engine gives wrong outcomes on this machine.
         """
         (run,) = self.simulate_many([task], cancelled=cancelled)
         return run
@@ -467,11 +477,15 @@ class PourSimulator:
         Raises:
             InvalidSceneError: one of the pours is impossible; nothing was simulated.
             SimulationCancelled: `cancelled` returned True.
+            WrongOutcomeError: the engine gives wrong outcomes on this machine.
         """
         from sim_engine.fluid.engine import engine
 
         motions = [self.prepare(task) for task in tasks]
         fluid = engine()
+        if not self._checked:
+            check_engine(lambda task: self._batch(fluid, [task], [self.prepare(task)], None)[0].outcome)
+            self._checked = True
         runs: list[SimulatedPour] = []
         while len(runs) < len(tasks):
             first = len(runs)

@@ -1,4 +1,4 @@
-"""The engine: starts and ends Taichi, and holds the arrays of one process. Only this module calls `ti.init`."""
+"""The engine: starts and ends `ti`, and holds the arrays of one process. Only this module calls `ti.init`."""
 
 import contextlib
 import io
@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_engine.collision import rotations
+from sim_engine.fluid.compiler import KERNELS, NAME, ti
+from sim_engine.fluid.engine_startup import imports, look_up_quickly, uncollected
 from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, pose_at
-from sim_engine.fluid.taichi_startup import imports, look_up_quickly, uncollected
 from sim_engine.outcome import ParticleState
 from sim_engine.resources import cache_directory
 
-with imports():
-    import taichi as ti
-
+with imports(NAME):
     from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState, of_parameters
     from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
 
@@ -259,18 +258,18 @@ class _Pool(Generic[T]):
 
 
 def start() -> None:
-    """Start Taichi on one thread of the CPU.
+    """Start the compiler of the kernels on one thread of the CPU.
 
     There is no option for a GPU: one scene is one thread there, and no device was shown to give the right outcomes.
     """
-    look_up_quickly()
-    # Taichi prints its architecture on stdout, which is reserved for results.
+    look_up_quickly(NAME)
+    # It prints its architecture on stdout, which is reserved for results.
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
             arch=ti.cpu,
             cpu_max_num_threads=1,
             offline_cache=True,
-            offline_cache_file_path=str(cache_directory() / "kernels"),
+            offline_cache_file_path=str(cache_directory() / KERNELS),
             log_level=ti.ERROR,
             enable_fallback=False,
             # These passes over one large kernel take two thirds of its compile time, and do not make a pour faster.

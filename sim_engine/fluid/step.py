@@ -10,8 +10,7 @@ Order of a step:
 Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 """
 
-import taichi as ti
-
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.density import displace, measure, measure_before, measure_first, multiply, multiply_first
 from sim_engine.fluid.kernels import dot, length, square, turned, turned_back
 from sim_engine.fluid.neighbours import rebuild
