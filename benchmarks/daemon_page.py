@@ -1,6 +1,6 @@
 """Write the daemon's measurements into docs/evidence/reliability.md: `python benchmarks/daemon_page.py`.
 
-The figures are in docs/data/daemon.json. `daemon_stops`, `soak` and `idle_time` store them there and call this script.
+The figures are in docs/data/daemon.json. `daemon_stops` and `soak` store them there and call this script.
 """
 
 from __future__ import annotations
@@ -86,7 +86,6 @@ def day(found: Mapping[str, Any]) -> str:
         ("campaigns resumed after a fault", f"{sum(n for name, n in counts.items() if name.startswith('resumed'))}"),
         ("pours declared lost after a kill", f"{counts.get('pours declared lost by the operator', 0)}"),
     ]
-    lost = [(name, count) for name, count in found["lost or doubled"].items()]
     begin, end = found["undisturbed [min]"]
     grown = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
     memory = next(one for one in found["at rest"] if one["what"].startswith("memory of the daemon"))
@@ -94,8 +93,9 @@ def day(found: Mapping[str, Any]) -> str:
         "Two rigs on simulated benches without Ray, in scaled time; in the first part a fault every 90 seconds. Each "
         "order is sent three times or more. If a pour is killed, the operator declares it lost.\n\n"
         + markdown_table(("", ""), rows)
-        + "\nLost or doubled, by the journals, the queue and the account of materials:\n\n"
-        + markdown_table(("", "number"), lost)
+        + "\nLost or doubled, by the journals, the queue and the account of materials: "
+        + ", ".join(f"{name} {count}" for name, count in found["lost or doubled"].items())
+        + ".\n"
         + f"\nBetween campaigns, from minute {begin:.0f} to {end:.0f}, when the daemon was not restarted; "
         f"{100 * found['cpu share']:.0f} % of a core on average:\n\n"
         + markdown_table(("", "after a third", "at the end", "an hour"), grown)
@@ -114,26 +114,9 @@ def _by_state(states: Mapping[str, int]) -> dict[str, int]:
     return found
 
 
-def idle_time(found: Mapping[str, Any]) -> str:
-    """Return the table of wall times with and without speculative simulations."""
-    rows = []
-    times = "once" if found["times"] == 1 else f"the median of {found['times']}"
-    for run in found["runs"]:
-        without = run["ahead"] == "no"
-        seconds = f"{run['wall']:.0f} s", f"{run['arm']:.0f} s", f"{run['wall'] - run['arm']:.0f} s"
-        made = "without" if without else f"{run['made ahead']:.0f} of them"
-        rows.append((run["campaign"], made, *seconds, "yes" if run["same decisions"] else "NO"))
-    return (
-        f"On {found['cores']} cores with a load of {found['load before']} beforehand, in turn, "
-        f"{times}:\n\n"
-        + markdown_table(("campaign", "simulations ahead", "wall", "the arm's own", "the rest", "same decisions"), rows)
-    )
-
-
 TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "stops": stops,
     "day": day,
-    "idle-time": idle_time,
 }
 
 

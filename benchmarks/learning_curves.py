@@ -1,7 +1,7 @@
 """Compare loss against number of pours for D1, D2, D3 and competing methods, on the same benches.
 
     python benchmarks/learning_curves.py [--arms D1 D2 ...] [--seeds 20] [--first 3000] [--pours 15] [--kept FILE]
-                                         [--rivals PYTHON] [--write]
+                                         [--write]
 
 Benches are simulated: the valleys with steep walls of `mismatch_worlds.py`, with a simulator of moderate error. No
 method has prior data of a bench; D1 and D3 have its simulator. Losses are without scatter. Each run is stored in
@@ -11,7 +11,7 @@ writes the table to docs/data/results.json; docs/make_learning_picture.py draws 
     random, Sobol   points without any choice by results
     rule of thumb   the same slow tilt over the middle each time: a fifth of the range of speeds, the middle of others
     BoTorch qNEI    four Sobol points, then noisy expected improvement: `qLogNoisyExpectedImprovement` with a
-                    `SingleTaskGP`, defaults of BoTorch, in the environment of `optimisers.py` (or that of `--rivals`)
+                    `SingleTaskGP`, defaults of BoTorch; made with commit 46022671, only read here
     D1              30 simulations; the planned action is poured every time
     D2              pours only
     D3              37 simulations, and two during each pour
@@ -21,20 +21,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from machine import TABLES, say, single_threaded, write_table
+from machine import TABLES, say, write_table
 from mismatch import campaign
 from mismatch_worlds import Valley
-from optimiser_problems import Floats
-from optimisers import RIVALS_FILE, environment
-from players import SCENE, interval, unit
+from players import SCENE, Floats, interval, unit
 from scipy.stats import qmc
 from threadpoolctl import threadpool_limits
 
@@ -46,29 +41,20 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 
 CURVES = TABLES.with_name("learning-curves.json")
-LEVEL, PRIOR, BESIDE, SLOW, INITIAL = "cliff, moderate", 37, 2, 0.2, 4
-ARMS = ("rule of thumb", "random", "Sobol", "BoTorch qNEI", "D1", "D2", "D3")
-Ask = Callable[[int, list[Floats], list[float]], Floats]
+LEVEL, PRIOR, BESIDE, SLOW = "cliff, moderate", 37, 2, 0.2
+RIVAL = "BoTorch qNEI"
+ARMS = ("rule of thumb", "random", "Sobol", RIVAL, "D1", "D2", "D3")
+PLAYED = tuple(arm for arm in ARMS if arm != RIVAL)
 
 
-def asked_by(arm: str, valley: Valley, seed: int, rival: Ask | None) -> list[float]:
-    """Return losses of pours at the points of an arm without a simulator; the run does not stop early."""
+def without_choice(arm: str, valley: Valley, seed: int) -> list[float]:
+    """Return losses of pours at points that no result influences."""
     dimension = len(valley.space.axes)
-    start = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng(seed)).random(64)
-    rng = np.random.default_rng([seed, 1])
-    points: list[Floats] = []
-    costs: list[float] = []
-    for index in range(15):
-        if arm == "rule of thumb":
-            point = np.array([SLOW, *[0.5] * (dimension - 1)])
-        elif arm == "random":
-            point = rng.random(dimension)
-        elif arm == "Sobol" or rival is None or index < INITIAL:
-            point = start[index]
-        else:
-            point = rival(seed, points, costs)
-        points.append(point)
-        costs.append(valley.observe(point, index))
+    points: Floats = np.tile([SLOW, *[0.5] * (dimension - 1)], (15, 1))
+    if arm == "random":
+        points = np.random.default_rng([seed, 1]).random((15, dimension))
+    elif arm == "Sobol":
+        points = qmc.Sobol(dimension, scramble=True, rng=np.random.default_rng(seed)).random(64)[:15]
     return [valley.true(point) for point in points]
 
 
@@ -89,28 +75,7 @@ def planned(valley: Valley, seed: int) -> list[float]:
     return poured[:1] * 15
 
 
-@contextmanager
-def rival(python: Path) -> Iterator[Ask]:
-    """Run BoTorch in a child process."""
-    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    child = subprocess.Popen([str(python), str(RIVALS_FILE), "BoTorch qLogNEI"], env=single_threaded(), **pipes)
-    assert child.stdin is not None
-    assert child.stdout is not None
-    answers = child.stdout
-
-    def ask(seed: int, points: list[Floats], costs: list[float]) -> Floats:
-        job = {"seed": seed, "points": [point.tolist() for point in points], "costs": costs}
-        print(json.dumps(job), file=child.stdin, flush=True)
-        return np.array(json.loads(answers.readline())["point"])
-
-    try:
-        yield ask
-    finally:
-        child.kill()
-        child.wait()
-
-
-def run(arm: str, seed: int, ask: Ask | None) -> list[float]:
+def run(arm: str, seed: int) -> list[float]:
     """Return the losses of an arm's pours on the bench of a seed."""
     valley = Valley(LEVEL, seed)
     if arm == "D1":
@@ -118,7 +83,7 @@ def run(arm: str, seed: int, ask: Ask | None) -> list[float]:
     if arm in ("D2", "D3"):
         found = campaign("adaptive" if arm == "D3" else arm, LEVEL, seed, 15, PRIOR, 0.005 if arm == "D3" else 0.0)
         return list(found["poured"])
-    return asked_by(arm, valley, seed, ask)
+    return without_choice(arm, valley, seed)
 
 
 SIMULATED = {"D1": "30", "D3": f"{PRIOR}, and {BESIDE} a pour"}
@@ -127,7 +92,7 @@ SIMULATED = {"D1": "30", "D3": f"{PRIOR}, and {BESIDE} a pour"}
 def rows(kept: dict[str, Any], seeds: list[str]) -> list[list[str]]:
     """Return one row per arm."""
     found = []
-    for arm in (arm for arm in ARMS if arm in kept["runs"]):
+    for arm in (arm for arm in ARMS if set(seeds) <= set(kept["runs"].get(arm, {}))):
         losses = np.array([kept["runs"][arm][seed] for seed in seeds])
         cells = []
         for values in (losses[:, 0], losses.mean(axis=1), losses[:, 10:].mean(axis=1), losses.min(axis=1)):
@@ -140,11 +105,10 @@ def rows(kept: dict[str, Any], seeds: list[str]) -> list[list[str]]:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
+    parser.add_argument("--arms", nargs="+", choices=PLAYED, default=list(PLAYED))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=3000)
     parser.add_argument("--kept", type=Path, help="runs of mismatch.py")
-    parser.add_argument("--rivals", type=Path, help="Python of an environment with BoTorch")
     parser.add_argument("--write", action="store_true", help="write the table to docs/data/results.json")
     asked = parser.parse_args()
     kept: dict[str, Any] = {"level": LEVEL, "runs": {}, "seconds": {}}
@@ -159,14 +123,10 @@ def main() -> None:
         for arm in asked.arms:
             done = kept["runs"].setdefault(arm, {})
             missing = [seed for seed in seeds if seed not in done]
-            if arm == "BoTorch qNEI" and missing:
-                with rival(asked.rivals or environment()) as ask:
-                    done |= {seed: [round(x, 5) for x in run(arm, int(seed), ask)] for seed in missing}
-            else:
-                begun = time.process_time()
-                done |= {seed: [round(x, 5) for x in run(arm, int(seed), None)] for seed in missing}
-                if missing:
-                    kept["seconds"][arm] = round((time.process_time() - begun) / len(missing), 2)
+            begun = time.process_time()
+            done |= {seed: [round(x, 5) for x in run(arm, int(seed))] for seed in missing}
+            if missing:
+                kept["seconds"][arm] = round((time.process_time() - begun) / len(missing), 2)
             say(f"{arm}: done")
             CURVES.write_text(json.dumps(kept, indent=1) + "\n")
     table = rows(kept, seeds)

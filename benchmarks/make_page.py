@@ -28,13 +28,11 @@ PLAN: dict[str, tuple[str, ...]] = {
     "pour-5000": ("pour_speed.py", "--particles=5000", "--repeats=3", "--peer=1"),
     "pour-10000": ("pour_speed.py", "--particles=10000", "--repeats=3", "--peer=1"),
     "scaling": ("scaling.py", "--repeats=1"),
-    "scenes": ("batches.py",),
     "start-up": ("start_up.py", "--repeats=9"),
     "engines": ("engines.py",),
     "plan": ("plan_speed.py",),
     "validate": ("validate_cost.py",),
     "profile": ("profile_passes.py",),
-    "core-limit": ("core_limit.py",),
     "pool": ("pool_speed.py",),
 }
 """Measurements by name: script and its arguments."""
@@ -66,18 +64,19 @@ def page_text(records: dict[str, Any]) -> str:
     scaling = records.get("scaling")
     parts = [
         sections.introduction(),
+        sections.machines(records.values()),
         *stale(records),
         sections.targets(pours),
         sections.beside_the_peer(pours),
-        sections.passes(records.get("profile"), records.get("core-limit")),
+        sections.passes(records.get("profile")),
         sections.cost(scaling),
-        page_many.scenes(records.get("scenes")),
         sections.memory(scaling),
         sections.start_up(records.get("start-up")),
         sections.engines(records.get("engines")),
         page_many.plan(records.get("plan")),
         page_many.validate(records.get("validate")),
         page_many.pool(records.get("pool")),
+        sections.finished(),
     ]
     return "\n".join(parts)
 
@@ -92,7 +91,7 @@ def stale(records: dict[str, Any]) -> list[str]:
     """Return a warning if measurements were made with different solvers."""
     prints: dict[str, list[str]] = {}
     for name, record in records.items():
-        if name in ("core-limit", "engines"):  # the first does not use the solver, the second compares in one run
+        if name == "engines":  # compares within one run
             continue
         prints.setdefault(record["result"]["machine"].get("fingerprint", "?"), []).append(name)
     if len(prints) < 2:

@@ -2,13 +2,11 @@
 
     python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--settled 0.005] [--out FILE]
-                                  [--receivers] [--write] [--write-steep [--before FILE]] [--budgets N=FILE ...]
+                                  [--write] [--write-steep] [--budgets N=FILE ...]
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are stored in FILE, so an
 interrupted comparison continues. `--write` makes no runs; it writes the rows of FILE to docs/evidence/results.md.
-`--before` reads runs of an earlier version: its D3 with default settings, played on the present `mismatch_worlds.py`
-(version 0.2 on the levels `milder, …`: commit a4e706ca).
 
 Primary questions, fixed before the first run. Seeds below 1000 are for tuning. Seeds from 1000 on are for answers: 1000
 to 1019; and 2000, 3000, 7000 and 8300 to 8319 for changes made after the previous answers were known (5000 to 5019 were
@@ -19,8 +17,6 @@ also used for tuning). Losses are without scatter, means over at least 20 seeds 
 3. The action that it recommends at the end: never more than 0.01 worse than that of D2?
 4. With an anti-correlated simulator: its pours from the fourth on no worse than D2's; best of the first three at most
    0.4?
-5. (`--receivers`, six pours each.) With data from earlier receivers on the bench: fewer pours into receiver 3 until one
-   loses less than 1 % than without?
 
 Questions on the levels `cliff, …`, fixed before seeds 3000 to 3019 were used; these seeds are used once (`--settled
 0.005`; seeds 1000 to 1031 are for tuning). The same questions were repeated once with seeds from 8120, after simulated
@@ -72,19 +68,15 @@ from unittest.mock import patch
 import numpy as np
 from machine import TABLES, describe, write_table
 from mismatch_worlds import CHANGED_AFTER, CLIFFS, LEVELS, MILDER, STEEP, Valley
-from optimiser_problems import Floats
-from players import SCENE, Numbers, by_turn, coverage, interval, play
+from players import SCENE, Floats, Numbers, by_turn, coverage, interval, play
 
 from actors.optimizer.model_discrepancy import ModelAveragedProcess
 from orchestrator.requests import Outcome, Prediction, Request
-from orchestrator.runs.stages import DEPLOYMENT, with_bench
 from orchestrator.strategies.campaign_plan import DeploymentPlan
 from orchestrator.strategies.deployment import deployment_base
 from orchestrator.strategies.deployment.d2 import D2Settings
 from orchestrator.strategies.deployment.d3 import D3Settings
-from orchestrator.strategies.deployment.deployment_base import Deployment
 from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
-from orchestrator.strategies.stage_result import StageResult
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 
@@ -178,46 +170,6 @@ def campaign(arm: str, level: str, seed: int, pours: int, simulations: int, sett
     }
 
 
-def receivers(level: str, bench: int, carried: bool, pours: int, simulations: int) -> list[dict[str, float]]:
-    """Return the losses of three receivers in sequence on one bench, with or without data from earlier receivers."""
-    results: dict[str, StageResult] = {}
-    found = []
-    for number in range(3):
-        valley = Valley(level, 4 * bench + number, bench)
-        plan = DeploymentPlan(ARMS["adaptive"](pours, simulations), (SCENE,), valley.space, Loss())
-        plan = with_bench(plan, results if carried else {}, SimulationParameters())
-        strategy, world = plan.settings.build(plan, SCENE, SimulationParameters(), bench), numbers(valley)
-        assert isinstance(strategy, Deployment)
-        play(strategy, world.answer)
-        results[f"{DEPLOYMENT}{number}"] = strategy.result()
-        good = [i for i, lost in enumerate(world.poured, start=1) if lost < GOOD]
-        found.append(
-            {
-                "first pour": world.poured[0],
-                "mean": float(np.mean(world.poured)),
-                "pours until below 1 %": float(good[0] if good else pours + 1),
-            }
-        )
-    return found
-
-
-def receivers_table(levels: list[str], benches: range, pours: int, simulations: int) -> str:
-    """Return Markdown: one row per receiver, with and without data from earlier receivers."""
-    lines = ["| simulator | receiver | | first pour | mean | pours until below 1 % |", "|---|---|---|---|---|---|"]
-    for level in levels:
-        for carried in (False, True):
-            runs = [receivers(level, bench, carried, pours, simulations) for bench in benches]
-            for number in range(3):
-                cells = []
-                for key in runs[0][number]:
-                    mean, low, high = interval([run[number][key] for run in runs])
-                    cells.append(f"{mean:.2f} ({low:.2f} … {high:.2f})")
-                begins = "with what was learnt before" if carried else "afresh"
-                lines.append(f"| {level} | {number + 1} | {begins} | {' | '.join(cells)} |")
-            print("\n".join(lines[-3:]), file=sys.stderr)
-    return "\n".join(lines)
-
-
 def figures(run: dict[str, Any]) -> dict[str, float]:
     """Return the summary figures of a campaign."""
     poured = np.array(run["poured"])
@@ -259,22 +211,18 @@ def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
     return "\n".join(lines)
 
 
-def steep_rows(levels: Iterable[str], runs: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[list[str]]:
-    """Return a row per level: means with standard errors of an earlier version and of this one."""
+def steep_rows(levels: Iterable[str], runs: list[dict[str, Any]]) -> list[list[str]]:
+    """Return a row per level with runs: means with standard errors."""
     found = []
     for level in levels:
-        cells: list[list[str]] = []
-        for some in (before, runs):
-            poured = np.array([run["poured"] for run in some if run["level"] == level])
-            cells.append([])
-            for part in (slice(0, 1), slice(None), slice(CHANGED_AFTER, None)):
-                values = poured[:, part].mean(axis=1) if len(poured) else np.empty(0)
-                error = float(values.std(ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 0.0
-                cells[-1].append(f"{values.mean():.3f} ± {error:.3f}" if len(values) else "–")
-        if cells[1] != ["–"] * 3:
-            number = sum(run["level"] == level for run in runs)
-            pairs = zip(*cells, strict=True)
-            found.append([level.split(", ")[1], str(number), *(cell for pair in pairs for cell in pair)])
+        poured = np.array([run["poured"] for run in runs if run["level"] == level])
+        if not len(poured):
+            continue
+        cells = []
+        for part in (slice(0, 1), slice(None), slice(CHANGED_AFTER, None)):
+            values = poured[:, part].mean(axis=1)
+            cells.append(f"{values.mean():.3f} ± {values.std(ddof=1) / len(values) ** 0.5:.3f}")
+        found.append([level.split(", ")[1], str(len(poured)), *cells])
     return found
 
 
@@ -328,20 +276,19 @@ def write_budgets(runs: list[dict[str, Any]], others: dict[int, list[dict[str, A
     write_table("budgets", head, [rows[number] for number in sorted(rows)], command, settings)
 
 
-def write_steep(runs: list[dict[str, Any]], before: list[dict[str, Any]]) -> None:
+def write_steep(runs: list[dict[str, Any]]) -> None:
     """Store the runs in docs/data/steep-walls.json, and their three tables."""
     kept = TABLES.with_name("steep-walls.json")
-    kept.write_text(json.dumps({"machine": describe(), "runs": rounded(runs), "before": rounded(before)}) + "\n")
-    sought = ["first pour", "mean of 15 pours", "pours 9 to 15"]
-    head = ["simulator", "seeds", *(cell for one in sought for cell in (f"{one}, version 0.2", "now"))]
+    kept.write_text(json.dumps({"machine": describe(), "runs": rounded(runs)}) + "\n")
+    head = ["simulator", "seeds", "first pour", "mean of 15 pours", "pours 9 to 15"]
     settings = (
         "37 simulations, 15 pours, two simulations next to each; loss without scatter, ± standard error; a campaign "
         "ends after three pours below 0.5 %; seeds not used for tuning"
     )
     cliffs = _steep_command(CLIFFS, "--first 8120 --seeds 20")
     milder = _steep_command(MILDER, "--first 8500 --seeds 24 and --first 8600 --seeds 24")
-    write_table("cliffs", head, steep_rows(CLIFFS, runs, before), cliffs, settings)
-    write_table("milder", head, steep_rows(MILDER, runs, before), milder, settings)
+    write_table("cliffs", head, steep_rows(CLIFFS, runs), cliffs, settings)
+    write_table("milder", head, steep_rows(MILDER, runs), milder, settings)
     head = ["pours", "number", *(f"in {100 * share:.0f} % (interval score)" for share in SHARES)]
     some = [run for run in runs if run["level"] in CLIFFS]
     write_table("intervals", head, interval_rows(some), cliffs, "all pours of the table above, as observed")
@@ -350,7 +297,7 @@ def write_steep(runs: list[dict[str, Any]], before: list[dict[str, Any]]) -> Non
 def _steep_command(levels: Iterable[str], seeds: str) -> str:
     return (
         f"python benchmarks/mismatch.py --levels '{next(iter(levels))}' … --arms adaptive {seeds} --settled 0.005 "
-        "--out FILE --before FILE --write-steep"
+        "--out FILE --write-steep"
     )
 
 
@@ -391,14 +338,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--write", action="store_true", help="write the table of FILE into docs/evidence/results.md")
     parser.add_argument("--write-steep", action="store_true", help="write the tables of FILE's levels with steep walls")
-    parser.add_argument("--before", type=Path, help="with --write-steep: runs of an earlier version on the same worlds")
     parser.add_argument("--budgets", nargs="+", metavar="N=FILE", help="write the table of runs with N simulations")
-    parser.add_argument("--receivers", action="store_true", help="three receivers in sequence on one bench")
     asked = parser.parse_args()
-    if asked.receivers:
-        benches = range(asked.first, asked.first + asked.seeds)
-        print(receivers_table(asked.levels, benches, asked.pours, asked.simulations))
-        return
     runs: list[dict[str, Any]] = []
     if asked.out is not None and asked.out.exists():
         runs = [json.loads(line) for line in asked.out.read_text().splitlines()]
@@ -409,8 +350,7 @@ def main() -> None:
         write_budgets(runs, others, asked.seeds)
         return
     if asked.write_steep:
-        lines = asked.before.read_text().splitlines() if asked.before is not None else []
-        write_steep([run for run in runs if run["level"] in STEEP], [json.loads(line) for line in lines])
+        write_steep([run for run in runs if run["level"] in STEEP])
         return
     for level in () if asked.write else asked.levels:
         for arm in asked.arms:

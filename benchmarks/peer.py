@@ -1,8 +1,7 @@
-"""Run the peer solver for comparison: SPlisHSPlasH 2.19 in its own environment, on the same scenes.
+"""Run the peer solver for comparison: SPlisHSPlasH 2.19 in its own environment, on the standard pour.
 
 It is not a dependency of Decant. `environment()` creates a virtual environment in the user's cache directory on first
-use (about 250 MB); `simulate()` starts the solver there as a child of this process, on the same core. `pour()` does so
-for the standard pour, and measures it.
+use (about 250 MB); `pour()` starts the solver there as a child of this process, on the same core, and measures it.
 """
 
 from __future__ import annotations
@@ -34,10 +33,8 @@ from standard_pour import (
 
 from actors.runtime.child_process import child_environment
 from sim_engine.collision import rotations
-from sim_engine.motion import PourMotion
 from sim_engine.resources import cache_directory
 from sim_engine.simulator import fill, spacing
-from sim_engine.vessel.vessel import Vessel
 
 NAME, VERSION = "SPlisHSPlasH", "2.19.0"
 REQUIREMENTS = (f"pysplishsplash=={VERSION}", "numpy")
@@ -64,27 +61,8 @@ PATIENCE = 3600.0
 
 
 @dataclass(frozen=True)
-class PeerScene:
-    """What the peer simulates: vessels, the pourer's motion, the volume of the liquid [m³] and the duration [s]."""
-
-    pourer: Vessel
-    receiver: Vessel
-    motion: PourMotion
-    volume: float
-    end: float
-
-
-def standard(end: float = END) -> PeerScene:
-    """Return the standard pour."""
-    return PeerScene(*vessels(), motion(), SCENE.liquid.volume, end)
-
-
-@dataclass(frozen=True)
 class PeerRun:
-    """One standard pour by the peer; attributes as in `standard_pour.Measured`.
-
-    `course`: times [s] and the fraction left in the pourer, for the complete pour; only with a viscosity.
-    """
+    """One standard pour by the peer; attributes as in `standard_pour.Measured`."""
 
     cpu_s: float
     steps: int
@@ -92,7 +70,6 @@ class PeerRun:
     left: tuple[float, ...]
     density: float
     delivered: float
-    course: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
 
 def check_particles(particles: int) -> None:
@@ -174,32 +151,39 @@ def _use_libraries_of_the_system(folder: Path) -> None:
             bundled.symlink_to(own)
 
 
-def simulate(
-    python: Path, scene: PeerScene, particles: int, seed: int, *, viscosity: float = 0.0, particle_walls: bool = False
-) -> dict[str, Floats]:
-    """Run the peer in a child process.
+def pour(python: Path, particles: int, seed: int) -> PeerRun:
+    """Run and measure the standard pour in a child process.
 
     Args:
         python: Python of the peer's environment.
-        scene: what is simulated.
         particles: N, a multiple of four.
         seed: seed of the initial positions.
-        viscosity: kinematic, implicit (Weiler et al. 2018), in the liquid and on walls [m²/s]; 0: water's, explicit.
-        particle_walls: walls sampled by particles (Akinci et al. 2012) instead of volume maps, through which liquid
-            leaks if walls are thin.
-
-    Returns:
-        Times (F,) [s], frames (F, N, 3) [m], and the numbers of steps, iterations and CPU seconds.
 
     Raises:
         SystemExit: the run failed; the message has the end of its output.
     """
+    arrays = _simulate(python, particles, seed)
+    times, frames = arrays["times"], arrays["frames"].astype(float)
+    slack = 0.5 * particle_spacing(particles)
+    judged = (times > min(TIMES) - 0.1) & (times < max(TIMES) + 0.1)
+    curve = [left_in_pourer(x, t, slack) for t, x in zip(times[judged], frames[judged], strict=True)]
+    at_rest = int(np.argmin(np.abs(times - REST)))
+    return PeerRun(
+        cpu_s=float(arrays["cpu_s"]),
+        steps=int(arrays["steps"]),
+        iterations=int(arrays["iterations"]),
+        left=tuple(float(left) for left in np.interp(TIMES, times[judged], curve)),
+        density=density_inside(frames[at_rest], float(times[at_rest]), particles),
+        delivered=delivered(frames[-1], slack),
+    )
+
+
+def _simulate(python: Path, particles: int, seed: int) -> dict[str, Floats]:
+    """Return times (F,) [s], frames (F, N, 3) [m], and the numbers of steps, iterations and CPU seconds."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         job, result = folder / "job.json", folder / "result.npz"
-        wanted = _job(folder, scene, particles, seed)
-        wanted |= {"viscosity": viscosity, "particle_walls": particle_walls}
-        job.write_text(json.dumps(wanted), encoding="utf-8")
+        job.write_text(json.dumps(_job(folder, particles, seed)), encoding="utf-8")
         command = [str(python), str(CHILD), str(job), str(result)]
         try:
             done = subprocess.run(
@@ -220,57 +204,26 @@ def simulate(
             return {key: kept[key] for key in kept.files}
 
 
-def pour(python: Path, particles: int, seed: int, viscosity: float = 0.0, end: float = END) -> PeerRun:
-    """Run and measure the standard pour; arguments and errors as in `simulate`.
-
-    Args:
-        python: Python of the peer's environment.
-        particles: N, a multiple of four.
-        seed: seed of the initial positions.
-        viscosity: [m²/s].
-        end: duration of the pour [s].
-    """
-    arrays = simulate(python, standard(end), particles, seed, viscosity=viscosity)
-    times, frames = arrays["times"], arrays["frames"].astype(float)
-    slack = 0.5 * particle_spacing(particles)
-    judged = (times > min(TIMES) - 0.1) & (times < max(TIMES) + 0.1)
-    curve = [left_in_pourer(x, t, slack) for t, x in zip(times[judged], frames[judged], strict=True)]
-    course: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
-    if viscosity > 0.0:
-        left = tuple(left_in_pourer(x, min(t, END), slack) for t, x in zip(times, frames, strict=True))
-        course = (tuple(times.tolist()), left)
-    at_rest = int(np.argmin(np.abs(times - REST)))
-    return PeerRun(
-        cpu_s=float(arrays["cpu_s"]),
-        steps=int(arrays["steps"]),
-        iterations=int(arrays["iterations"]),
-        left=tuple(float(left) for left in np.interp(TIMES, times[judged], curve)),
-        density=density_inside(frames[at_rest], float(times[at_rest]), particles),
-        delivered=delivered(frames[-1], slack),
-        course=course,
-    )
-
-
-def _job(folder: Path, scene: PeerScene, particles: int, seed: int) -> dict[str, object]:
+def _job(folder: Path, particles: int, seed: int) -> dict[str, object]:
     """Return the job for the child: files in `folder`, and numbers [m, s, rad/s] in the simulator's world frame."""
-    pourer, receiver, moved = scene.pourer, scene.receiver, scene.motion
+    (pourer, receiver), moved, volume = vessels(), motion(), SCENE.liquid.volume
     pose = moved.sample(np.array([0.0]))
     (rotation,) = rotations(pose)
-    lattice = fill(pourer, scene.volume, particles, seed, WALL_DISTANCE)
+    lattice = fill(pourer, volume, particles, seed, WALL_DISTANCE)
     np.save(folder / "positions.npy", (lattice @ rotation.T + pose[0, :3]).astype(np.float32))
     # A body rotates about its mesh's origin, so the pourer's origin is placed at the pivot.
     _write_obj(folder / "pourer.obj", pourer.solid_vertices - np.array(moved.pivot_vessel), pourer.solid_faces)
     _write_obj(folder / "receiver.obj", receiver.solid_vertices, receiver.solid_faces)
     return {
         "particles": particles,
-        "radius": 0.5 * spacing(scene.volume, particles),
+        "radius": 0.5 * spacing(volume, particles),
         "positions": str(folder / "positions.npy"),
         "pourer_mesh": str(folder / "pourer.obj"),
         "receiver_mesh": str(folder / "receiver.obj"),
         "pivot": list(moved.pivot_world),
         "receiver_at": [0.0, 0.0, 0.0],
         "turns": [[s.start, s.start + s.duration, s.velocity] for s in moved.segments],
-        "end_time": scene.end,
+        "end_time": END,
         "frame_every": FRAME_EVERY,
         "freeze_below": FREEZE_BELOW,
     }

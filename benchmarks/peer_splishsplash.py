@@ -6,10 +6,7 @@ Runs in the peer's own environment (`peer.py` creates it and writes the job), so
 Settings: support 2d, CFL factor 1 (0.4 d per step), steps up to 4 ms, density error 0.1 %, viscosity 1e-6 m²/s, no
 surface tension. Spilled particles are frozen, because their speed would otherwise determine the time step.
 
-A job may specify another viscosity, which is then implicit and also acts on walls, and walls of particles instead of
-volume maps, with steps up to 2 ms.
-
-Source: Bender & Koschier 2015 (DFSPH); Bender et al. 2019 (volume maps); Akinci et al. 2012 (walls of particles).
+Source: Bender & Koschier 2015 (DFSPH); Bender et al. 2019 (volume maps).
 """
 
 from __future__ import annotations
@@ -24,18 +21,16 @@ from typing import Any
 import numpy as np
 import pysplishsplash as sph
 
-DFSPH, PARTICLE_WALLS, VOLUME_MAPS = 4, 0, 2
-FIRST_STEP, LONGEST_STEP, LONGEST_BY_PARTICLES = 5e-4, 4e-3, 2e-3
+DFSPH, VOLUME_MAPS = 4, 2
+FIRST_STEP, LONGEST_STEP = 5e-4, 4e-3
 MAP_RESOLUTION = [40, 40, 40]
-WEILER = 6
-"""Implicit viscosity of Weiler et al. 2018, for jobs with a kinematic viscosity [m²/s]."""
 FIXED = sph.ParticleState(2)
 """State of a particle that stays in place; the binding names only two of the states."""
 
 
 def scene(job: dict[str, Any]) -> dict[str, Any]:
     """Return the scene file's content. The liquid is a block of 2 × 2 × N/4, then moved to the job's positions."""
-    d, particle_walls = 2.0 * job["radius"], bool(job.get("particle_walls"))
+    d = 2.0 * job["radius"]
 
     def body(mesh: str, at: list[float], moves: bool) -> dict[str, Any]:
         return {
@@ -56,13 +51,13 @@ def scene(job: dict[str, Any]) -> dict[str, Any]:
         "Configuration": {
             "particleRadius": job["radius"],
             "simulationMethod": DFSPH,
-            "boundaryHandlingMethod": PARTICLE_WALLS if particle_walls else VOLUME_MAPS,
+            "boundaryHandlingMethod": VOLUME_MAPS,
             "gravitation": [0, 0, -9.81],
             "timeStepSize": FIRST_STEP,
             "cflMethod": 1,
             "cflFactor": 1.0,
             "cflMinTimeStepSize": 1e-5,
-            "cflMaxTimeStepSize": LONGEST_BY_PARTICLES if particle_walls else LONGEST_STEP,
+            "cflMaxTimeStepSize": LONGEST_STEP,
             "enableZSort": True,
             "stopAt": -1.0,
             "DFSPH": {
@@ -77,7 +72,7 @@ def scene(job: dict[str, Any]) -> dict[str, Any]:
             {
                 "id": "Fluid",
                 "density0": 1000,
-                "viscosityMethod": WEILER if job.get("viscosity") else 1,
+                "viscosityMethod": 1,
                 "surfaceTensionMethod": 0,
                 "Standard viscosity": {"viscosity": 1e-6, "viscosityBoundary": 0.0},
             }
@@ -106,12 +101,6 @@ class Run:
         self.liquid = self.simulation.getFluidModel(0)
         if self.liquid.numActiveParticles() != job["particles"]:
             raise SystemExit(f"{self.liquid.numActiveParticles()} particles instead of {job['particles']}")
-        if job.get("viscosity"):
-            friction = self.liquid.getViscosityBase()
-            for name in (friction.VISCOSITY_COEFFICIENT, friction.VISCOSITY_COEFFICIENT_BOUNDARY):
-                friction.setValueFloat(name, job["viscosity"])
-                if abs(friction.getValueFloat(name) / job["viscosity"] - 1.0) > 1e-3:
-                    raise SystemExit("the peer did not take the viscosity")
         for i, x in enumerate(np.load(job["positions"]).astype(float).tolist()):
             self.liquid.setPosition(i, x)
             self.liquid.setPosition0(i, x)

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from optimiser_problems import Floats
 
 from actors.optimizer.questions import SpaceFillingQuery
 from actors.optimizer.suggest import propose
@@ -35,6 +34,7 @@ SCENE = Scene(
     fixed={"height": 0.03},
 )
 
+Floats = np.ndarray[Any, np.dtype[np.float64]]
 T = TypeVar("T")
 
 

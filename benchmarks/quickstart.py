@@ -16,8 +16,6 @@ comparison continues.
 - `--arms "all pours"` makes 15 pours per seed and does not stop before, for the coverage of the prediction intervals.
 - `--write` makes no runs; it writes the tables of stored runs to docs/data/results.json, for docs/make_tables.py.
 
-The arm `look-ahead` changes the program, for this benchmark only: there is no such setting.
-
 Questions, fixed before the first run on seeds from 401 on; seeds below 400 are for tuning or were used before:
 
 1. Do fewer than 10 % of random actions lose less than 1 %?
@@ -51,7 +49,6 @@ from machine import ROOT, run_self, say, write_table
 from players import by_turn, coverage, interval
 
 from actors.bench.ground_truth import draw_pose_error
-from actors.optimizer.questions import ModelDiscrepancy
 from actors.simulators.job_runner import Simulator, pour_simulator
 from actors.simulators.local_worker import ThreadWorker
 from actors.simulators.pool import WorkerPool
@@ -67,7 +64,7 @@ from orchestrator.runs.stages import (
 from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan
-from orchestrator.strategies.deployment import d3, deployment_base
+from orchestrator.strategies.deployment import deployment_base
 from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
@@ -85,13 +82,6 @@ PLANNED = 12
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 
-def _with_lookahead(content: dict[str, Any]) -> None:
-    def discrepancy(*args: Any, **changes: Any) -> ModelDiscrepancy:
-        return ModelDiscrepancy(*args, **{**changes, "lookahead": True})
-
-    vars(d3).update(ModelDiscrepancy=discrepancy)
-
-
 def _with_all_pours(content: dict[str, Any]) -> None:
     rules = ("stop", "good_enough")
     kept = {key: value for key, value in content["deployment"].items() if key not in rules}
@@ -103,10 +93,9 @@ ALL_POURS = 15
 
 ARMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "shipped": lambda content: None,
-    "look-ahead": _with_lookahead,
     "all pours": _with_all_pours,
 }
-"""What each arm changes in the content of the campaign, or in the program."""
+"""What each arm changes in the content of the campaign."""
 
 
 class KeptPours(WorkerPool):

@@ -1,15 +1,10 @@
-"""Test predictions of unseen recorded pours seed by seed, and after perturbations on the order of rounding errors.
+"""Test predictions of unseen recorded pours seed by seed.
 
-    python benchmarks/recorded_predictions.py [--seeds 11 12 ...] [--perturbed 10] [--simulations 108] [--draws 5]
-                                              [--write]
+    python benchmarks/recorded_predictions.py [--seeds 11 12 ...] [--simulations 108] [--draws 5] [--write]
 
 For each seed the shipped campaign configs/campaigns/recorded.yaml is calibrated. Each test pour and each pour into the
 other receiver is then simulated with draws of the posterior, one seed each. The prediction is their mean and their 90 %
 interval. Its error is the mean |recorded − predicted|; the goals are 0.02 on both.
-
-`--perturbed` repeats the calibration with the first seed, each time with all recorded masses changed by a relative 1e-7
-up or down. Rounding on another processor changes results by less. The output reports how much θ* and the predictions
-differ, and how many predictions lie in each other's intervals.
 
 Each calibration runs in its own process and is stored in the cache directory, so an interrupted comparison continues.
 `--write` makes no calibrations; it writes the stored ones to docs/data. Seeds that are already there stay, if they were
@@ -21,51 +16,127 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from itertools import permutations
+from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, cast
 
-import numpy as np
-from calibration_power import CAMPAIGN, Answers, Kept, play, recorded
-from machine import TABLES, describe, provenance, run_self, say, write_table
+from machine import ROOT, TABLES, describe, provenance, run_self, say, write_table
 
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.requests import Simulate, Simulated
+from orchestrator.journal.codec import digest
+from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
 from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.runs.stages import CALIBRATION, calibrated_theta, calibration_stages, posterior_draws, stage_seed
-from orchestrator.strategies.campaign_plan import CampaignPlan, RecordSet
+from orchestrator.runs.stage_scheduler import PendingRequest, free_slots, next_to_tell
+from orchestrator.runs.stages import (
+    CALIBRATION,
+    calibrated_theta,
+    calibration_stages,
+    measured_pours,
+    posterior_draws,
+    scenes_of,
+    stage_seed,
+)
+from orchestrator.strategies.calibration.calibration_scores import ScoredPour
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
+from orchestrator.strategies.strategy import Strategy
+from sim_engine.errors import InvalidSceneError
 from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import band
+from sim_engine.resources import cache_directory
+from sim_engine.scene import PourTask
 
-PERTURBATION = 1e-7
-"""Relative change of every recorded mass."""
-
+CAMPAIGN = ROOT / "configs" / "campaigns" / "recorded.yaml"
 PREDICTIONS = TABLES.with_name("recorded-predictions.json")
 GOAL = 0.02
 
 
-def perturbed(plan: CampaignPlan, number: int) -> CampaignPlan:
-    """Return the campaign with all recorded masses changed by ± 1e-7; unchanged for 0."""
-    calibration = plan.calibration
-    assert calibration is not None
-    assert calibration.records is not None
-    if number == 0:
-        return plan
-    rng = np.random.default_rng(number)
+def play(strategy: Strategy, answer: Callable[[Request], Outcome], slots: int, label: str) -> None:
+    """Run the ask–tell loop until the strategy has finished, in the order of a campaign run."""
+    flights: dict[int, PendingRequest] = {}
+    asked, begun, told = 0, time.monotonic(), 0
+    while not strategy.finished:
+        for request in strategy.ask(free_slots(list(flights.values()), slots)):
+            flights[asked] = PendingRequest(asked, request)
+            asked += 1
+        for flight in flights.values():
+            if flight.outcome is None:
+                flight.outcome = answer(flight.request)
+        flight = cast("PendingRequest", next_to_tell(list(flights.values()), "logical"))
+        assert flight.outcome is not None
+        del flights[flight.id]
+        strategy.tell(flight.request, flight.outcome)
+        progress = strategy.progress()
+        done, total = progress.done, progress.total
+        if done >= told + 20 or done == total > told:
+            told = done
+            say(f"{label}: {done}/{total} simulations, {time.monotonic() - begun:.0f} s")
 
-    def changed(mass: float) -> float:
-        return mass * (1.0 + PERTURBATION * float(rng.choice([-1.0, 1.0])))
 
-    records: RecordSet = replace(
-        calibration.records,
-        pours=tuple(
-            replace(pour, poured=changed(pour.poured), spilled=changed(pour.spilled))
-            for pour in calibration.records.pours
-        ),
-    )
-    return replace(plan, calibration=replace(calibration, records=records))
+class Answers:
+    """Evaluates suggestion queries and simulates pours in this process."""
+
+    def __init__(self, plan: CampaignPlan) -> None:
+        from sim_engine.simulator import PourSimulator
+
+        self._simulator = PourSimulator()
+        self._scenes = scenes_of(plan)
+
+    def __call__(self, request: Request) -> Outcome:
+        """Return the outcome of a request."""
+        from actors.optimizer.suggest import propose
+
+        if isinstance(request, Suggest):
+            return Suggested(propose(request.query))
+        assert isinstance(request, Simulate)
+        task = PourTask(self._scenes[request.scene], request.action, request.parameters, request.seed)
+        try:
+            outcome = self._simulator.simulate(task).outcome
+        except InvalidSceneError as error:
+            return Failed("invalid_action", str(error))
+        return Simulated(outcome) if outcome.invalid is None else Failed("simulation", outcome.invalid)
+
+    def close(self) -> None:
+        """Close the simulator; compiled kernels remain cached for the next process."""
+        self._simulator.close()
+
+
+def recorded(plan: CalibrationPlan) -> list[ScoredPour]:
+    """Return all recorded pours, with those of the other receiver last."""
+    transfer = () if plan.transfer is None else plan.transfer.pours
+    others = [ScoredPour(plan.transfer.scene.name, MeasuredPour.from_record(p)) for p in transfer if plan.transfer]
+    return [*measured_pours(plan, {}), *others]
+
+
+class Kept:
+    """Store of finished calibrations, keyed by everything that determines them; one file each."""
+
+    def __init__(self, *, fresh: bool) -> None:
+        self._folder = cache_directory() / "recorded-predictions"
+        self._folder.mkdir(exist_ok=True)
+        if fresh:
+            for path in self._folder.glob("*.json"):
+                path.unlink()
+
+    def find(self, key: Any) -> dict[str, Any] | None:
+        """Return the stored result, or None."""
+        path = self._path(key)
+        return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
+
+    def get(self, key: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Return the stored result, or compute and store it."""
+        found = self.find(key)
+        if found is not None:
+            return found
+        path, result = self._path(key), make()
+        unfinished = path.with_suffix(".tmp")
+        unfinished.write_text(json.dumps(result), encoding="utf-8")
+        unfinished.replace(path)
+        return result
+
+    def _path(self, key: Any) -> Path:
+        return self._folder / f"{digest(key)[:24]}.json"
 
 
 def predictions(plan: CampaignPlan, seed: int, draws: int, label: str) -> dict[str, Any]:
@@ -116,27 +187,7 @@ def seed_rows(found: dict[int, dict[str, Any]]) -> list[list[str]]:
     return rows
 
 
-def rounding_rows(found: Sequence[dict[str, Any]]) -> list[list[str]]:
-    """Return rows with the differences between calibrations of almost equal pours."""
-    rows = []
-    for name in found[0]["theta"]:
-        values = [one["theta"][name] for one in found]
-        rows.append([f"θ\\*, `{name}`", f"{min(values):.3g} … {max(values):.3g}"])
-    for split in ("test", "transfer"):
-        values = [error(one, split) for one in found]
-        rows.append([f"error of the posterior mean, {split}", f"{min(values):.3f} … {max(values):.3f}"])
-    pairs = [
-        (a["predicted"], b)
-        for one, other in permutations(found, 2)
-        for a, b in zip(one["pours"], other["pours"], strict=True)
-    ]
-    held = sum(b["low"] <= value <= b["high"] for value, b in pairs)
-    largest = max(abs(value - b["predicted"]) for value, b in pairs)
-    rows.append(["largest difference of two predictions of a pour", f"{largest:.3f}"])
-    return [*rows, ["predictions inside the 90 % intervals of the others", f"{held} of {len(pairs)}"]]
-
-
-def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]], again: Sequence[dict[str, Any]]) -> None:
+def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]]) -> None:
     """Write predictions and tables to docs/data."""
     settings = (
         f"recorded.yaml with the set of 5,000 particles, C4, {options.simulations} simulations of 1,000 particles, "
@@ -149,9 +200,6 @@ def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]], again: 
     head = ["seed", "test, 4 pours", "another receiver, 16 pours", "pours inside their 90 % intervals"]
     named = " ".join(map(str, sorted(seeds)))
     write_table("recorded", head, seed_rows(seeds), f"{command} --seeds {named}", settings)
-    if len(again) > 1:
-        shown = f"{command} --seeds {options.seeds[0]} --perturbed {len(again) - 1}"
-        write_table("rounding", ["", f"{len(again)} calibrations"], rounding_rows(again), shown, settings)
     predicted = {str(seed): one["pours"] for seed, one in sorted(seeds.items())}
     kept = {"command": command, **provenance(settings), "seeds": predicted}
     PREDICTIONS.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -161,42 +209,38 @@ def main() -> None:
     """Measure, print and store."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(11, 21)))
-    parser.add_argument("--perturbed", type=int, default=0, help="calibrations of slightly changed pours")
     parser.add_argument("--simulations", type=int, default=108, help="budget per calibration")
     parser.add_argument("--draws", type=int, default=5, help="posterior draws per prediction")
     parser.add_argument("--fresh", action="store_true", help="discard stored results")
     parser.add_argument("--write", action="store_true", help="make no calibrations; write the stored ones")
-    parser.add_argument("--one", type=int, nargs=2, help=argparse.SUPPRESS)  # runs one calibration in this process
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # runs one calibration in this process
     options = parser.parse_args()
     plan = load_campaign(CAMPAIGN)
     assert plan.calibration is not None
     plan = replace(plan, calibration=plan.calibration.with_settings(simulations=options.simulations), deployment=None)
     if options.one is not None:
-        seed, number = options.one
-        label = f"seed {seed}, perturbed {number}"
-        print(json.dumps(predictions(perturbed(plan, number), seed, options.draws, label)))
+        print(json.dumps(predictions(plan, options.one, options.draws, f"seed {options.one}")))
         return
-    machine, kept = describe(), Kept("recorded-predictions", fresh=options.fresh)
+    machine, kept = describe(), Kept(fresh=options.fresh)
     same = [f"--simulations={options.simulations}", f"--draws={options.draws}"]
 
-    def find(seed: int, number: int) -> dict[str, Any] | None:
-        key = [machine["fingerprint"], fingerprint(plan), number, seed, options.draws]
+    def find(seed: int) -> dict[str, Any] | None:
+        key = [machine["fingerprint"], fingerprint(plan), seed, options.draws]
         if options.write:
             return kept.find(key)
-        found = kept.get(key, lambda: run_self(__file__, *same, "--one", str(seed), str(number)))
+        found = kept.get(key, lambda: run_self(__file__, *same, "--one", str(seed)))
         errors = ", ".join(f"{split} {error(found, split):.3f}" for split in ("test", "transfer"))
-        say(f"seed {seed}, perturbed {number}: {errors} ({found['cpu_s']:.0f} CPU s)")
+        say(f"seed {seed}: {errors} ({found['cpu_s']:.0f} CPU s)")
         return found
 
-    seeds = {seed: found for seed in options.seeds if (found := find(seed, 0)) is not None}
-    again = [found for k in range(options.perturbed + 1) if (found := find(options.seeds[0], k)) is not None]
-    for row in [*seed_rows(seeds), *(rounding_rows(again) if len(again) > 1 else [])]:
+    seeds = {seed: found for seed in options.seeds if (found := find(seed)) is not None}
+    for row in seed_rows(seeds):
         print(" | ".join(row))
     for split in ("test", "transfer"):
         met = sum(error(one, split) <= GOAL for one in seeds.values())
         print(f"{split}: at most {GOAL} for {met} of {len(seeds)} seeds")
     if options.write:
-        write(options, seeds, again)
+        write(options, seeds)
 
 
 if __name__ == "__main__":

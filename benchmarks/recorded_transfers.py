@@ -26,8 +26,7 @@ from typing import Any
 
 import numpy as np
 from machine import describe, say, show
-from optimiser_problems import Floats
-from players import coverage
+from players import Floats, coverage
 
 from actors.optimizer.gaussian_process import GaussianProcess, constant_mean_process
 from actors.optimizer.prediction_intervals import observation_intervals

@@ -123,6 +123,8 @@ def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float
     Raises:
         SystemExit: the outcome is invalid, so its time is meaningless.
     """
+    from sim_engine.fluid.engine import engine
+
     begun = time.perf_counter()
     run = simulator.simulate(standard_task(particles, seed, frame_rate=10.0, cohesion=cohesion))
     wall = time.perf_counter() - begun
@@ -138,34 +140,23 @@ def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float
     return Measured(
         outcome.cpu_s,
         wall,
-        iterations_of(outcome),
+        engine().iterations(),
         tuple(float(f) for f in left),
         density_inside(at_rest.astype(float), float(frames.times[first]), particles),
         outcome,
     )
 
 
-def iterations_of(outcome: PourOutcome) -> int:
-    """Return the density iterations of the last pour, from the outcome or, if it lacks them, from the engine."""
-    told = getattr(outcome, "iterations", None)
-    if told is not None:
-        return int(told)
-    from sim_engine.fluid.engine import engine
-
-    return engine().iterations()
-
-
-def in_frame(points: Floats, time_: float, moved: PourMotion | None = None) -> Floats:
+def in_frame(points: Floats, time_: float) -> Floats:
     """Transform points from the world to the frame of the pourer at a time [m].
 
     Args:
         points: (N, 3), world [m].
         time_: time [s].
-        moved: motion of the pourer; None: of the standard pour.
     """
     from sim_engine.collision import rotations
 
-    poses = (moved or motion()).sample(np.array([time_]))
+    poses = motion().sample(np.array([time_]))
     (rotation,) = rotations(poses)
     return np.asarray((points - poses[0, :3]) @ rotation, dtype=float)
 

@@ -4,7 +4,8 @@
 
 Figures go to docs/images/study (benches) or docs/images/paper-study. Tables are between
 `<!-- study: NAME/TABLE ... -->` and `<!-- end of study -->`. What follows the table's name selects rows:
-`mismatch=small/large; strategy=D3`. A column with one selected value is left out.
+`mismatch=small/large; strategy=D3`. A column with one selected value is left out, and so are those after `without=`.
+`across=mismatch` gives a column to each value of `mismatch`, in whose cells the figures of a row stand together.
 """
 
 from __future__ import annotations
@@ -29,16 +30,27 @@ FIGURES = {
 
 def table(path: Path, wanted: dict[str, set[str]]) -> str:
     """A CSV of the report as Markdown, a mean and its interval in one cell."""
+    across, without = wanted.pop("across", set()), wanted.pop("without", set())
     with path.open(encoding="utf-8") as file:
         reader = csv.DictReader(file)
         rows = [row for row in reader if all(row[name] in some for name, some in wanted.items())]
         names = list(reader.fieldnames or [])
     shown = [name for name in names if not name.endswith((", low", ", high")) and len(wanted.get(name, "12")) > 1]
+    shown = [name for name in shown if name not in without]
+    found = [[cell(row, name) if f"{name}, low" in names else row[name] for name in shown] for row in rows]
+    if across:
+        shown, found = pivoted(shown, found, shown.index(*across))
     lines = [f"| {' | '.join(shown)} |", f"|{'---|' * len(shown)}"]
+    return "\n".join([*lines, *(f"| {' | '.join(cells)} |" for cells in found)]) + "\n"
+
+
+def pivoted(head: list[str], rows: list[list[str]], at: int) -> tuple[list[str], list[list[str]]]:
+    """A table with a column for each value of column `at`; the cells behind it stand together, divided by ';'."""
+    values = list(dict.fromkeys(row[at] for row in rows))
+    found: dict[tuple[str, ...], dict[str, str]] = {}
     for row in rows:
-        cells = [cell(row, name) if f"{name}, low" in names else row[name] for name in shown]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        found.setdefault(tuple(row[:at]), {})[row[at]] = "; ".join(row[at + 1 :])
+    return [*head[:at], *values], [[*key, *(cells.get(value, "") for value in values)] for key, cells in found.items()]
 
 
 def cell(row: dict[str, str], name: str) -> str:

@@ -246,6 +246,9 @@ def parameters() -> str:
     return _table(("name", "bounds", "default", "meaning"), rows)
 
 
+EFFECTS = {"no effect beyond the seeds' noise": "none", "spillage rises": "rises", "spillage falls": "falls"}
+
+
 def effects() -> str:
     """What each parameter does to the spillage of three pours, as last measured by the case `sensitivity`."""
     found = {(e.parameter, e.pour): e for e in sensitivity.effects(_measured("sensitivity"))}
@@ -256,7 +259,11 @@ def effects() -> str:
         cells = []
         for pour in sensitivity.POURS:
             e = found.get((name, pour))
-            cells.append("not measured yet" if e is None else f"{e.effect} over {e.where}: {e.change:+.3f} ± {e.error}")
+            cells.append(
+                "not measured yet"
+                if e is None
+                else f"{EFFECTS.get(e.effect, e.effect)}, {e.where}: {e.change:+.3f} ± {e.error}"
+            )
         rows.append((f"`{name}`", "" if info.unit == "1" else info.unit, *cells))
     return _table(("name", "unit", *(f"{pour} pour" for pour in sensitivity.POURS)), rows)
 
@@ -362,12 +369,8 @@ SHOWN_SHARES = (20.0, 40.0, 50.0, 60.0, 70.0, 80.0, 90.0, 100.0)
 MEASURED = (
     *(
         "recorded",
-        "recorded-2k",
-        "recorded-run",
-        "bands",
         "limits",
         "convergence",
-        "quickstart-calibration",
         "quickstart-coverage",
     ),
     *(
@@ -385,15 +388,15 @@ MEASURED = (
     ),
 )
 """Tables of docs/data/results.json that a page shows."""
+MACHINE = "AMD EPYC, 2 shared cores, Linux x86_64, Python 3.11"
+"""The machine of tables that name no other one, as docs/evidence/results.md says."""
 
 
 def measured(name: str) -> str:
     """A table of docs/data/results.json, with how it was measured."""
     found = json.loads((FOLDER / "data" / "results.json").read_text(encoding="utf-8"))[name]
-    how = (
-        f"<sub>`{found['command']}`; {found['settings']}. {found['machine']}; {found['date']}, "
-        f"version {found['version']}.</sub>"
-    )
+    machine = "" if found["machine"] == MACHINE else f"{found['machine']}; "
+    how = f"<sub>`{found['command']}`; {found['settings']}. {machine}{found['date']}, version {found['version']}.</sub>"
     return f"{_table(found['head'], found['rows'])}\n{how}\n"
 
 

@@ -2,7 +2,7 @@
 
 `ACTION_DIMENSIONS` declares each `Dimension` once; an `Action` is one complete choice.
 
-Frames and signs (docs/laboratory/frames.md has the picture). The world frame has its origin on the table below the
+Frames and signs (docs/reference/frames.md has the picture). The world frame has its origin on the table below the
 receiver, z up, x horizontal from the pourer towards the receiver. The receiver's axis is the z axis and its underside
 is at z = 0. A positive tilt turns the pourer about +y, so that it tips towards +x.
 """

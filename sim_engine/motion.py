@@ -3,7 +3,7 @@
 `plan_motion` makes a `PourMotion` of `Segment`s; `Motion` is the interface that executed motions share
 (`sim_engine.scene.SampledMotion`).
 
-Frames and signs: `sim_engine.action` (picture in docs/laboratory/frames.md). The pourer stands upright at (−x_offset,
+Frames and signs: `sim_engine.action` (picture in docs/reference/frames.md). The pourer stands upright at (−x_offset,
 y_offset) with its lip `height` above the receiver's rim, turns about a horizontal line along y (the pivot), holds,
 and returns upright.
 """

@@ -111,7 +111,7 @@ def test_named_files_exist(page: Path) -> None:
 
 def test_tables_are_what_the_code_declares(tables: ModuleType) -> None:
     pages = tables.pages()
-    assert {page.name for page in pages} >= {"campaign.md", "laboratory.md", "simulator.md", "results.md"}
+    assert {page.name for page in pages} >= {"campaign.md", "laboratory.md", "liquids.md", "results.md"}
     for page in pages:
         assert tables.render(text_of(page), page) == text_of(page), "run: python docs/make_tables.py"
 
@@ -243,8 +243,9 @@ def test_claims_name_tests_and_pages_that_exist() -> None:
 
 def criteria_of(chapters: str) -> tuple[int, int]:
     """How many criteria are met there, and how many there are."""
-    met = chapters.count("| pass |")
-    return met, met + chapters.count("| **fails** |")
+    verdicts = " ".join(line.rpartition(" | ")[2] for line in chapters.splitlines() if line.startswith("|"))
+    met = verdicts.count("pass")
+    return met, met + verdicts.count("**fails**")
 
 
 def test_counts_of_physical_criteria_are_those_of_the_validation_page() -> None:
@@ -270,7 +271,7 @@ def test_the_site_is_short() -> None:
         part = page.relative_to(ROOT / "docs").parts[0]
         if part not in ("reference", "notes") and page.name not in ("validation.md", "performance.md"):
             words[part] = words.get(part, 0) + hand_written(page)
-    assert sum(words.values()) <= 35_000, words
+    assert sum(words.values()) <= 30_000, words
     assert words["evidence"] <= 3_700, words
 
 

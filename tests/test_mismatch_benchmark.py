@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -46,15 +48,30 @@ def test_a_table_says_where_its_figures_come_from(
     assert {"date", "version", "machine"} <= set(tables["budgets"])
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("level", ["cliff, moderate", "cliff, four axes"])
-def test_one_hypothesis_of_the_ideal_player_is_the_bench(mismatch: ModuleType, level: str, seed: int) -> None:
-    import ideal_player
-
-    rng = np.random.default_rng(seed)
-    valley = mismatch.Valley(level, seed)
-    hypotheses = ideal_player.Hypotheses(valley, "sign", rng)
-    actions = rng.random((200, len(valley.space.axes)))
-    differences = np.abs(hypotheses.losses(actions) - [valley.true(one) for one in actions]).max(axis=1)
-    assert differences.min() < 1e-9
-    assert differences.max() > 0.1, "hypotheses differ"
+def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
+    mismatch: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    kept, page = tmp_path / "runs.jsonl", tmp_path / "page.md"
+    asked = ["--levels", "small", "--arms", "adaptive", "--first", "0", "--seeds", "1", "--pours", "3"]
+    monkeypatch.setattr(sys, "argv", ["mismatch.py", *asked, "--simulations", "8", "--out", str(kept)])
+    mismatch.main()
+    made = kept.read_text()
+    run = json.loads(made)
+    assert (run["level"], run["arm"], run["seed"], len(run["poured"])) == ("small", "adaptive", 0, 3)
+    monkeypatch.setattr(mismatch, "campaign", None)  # nothing is made again
+    mismatch.main()
+    rows = "| small | D3, `adaptive` | old |\n| large | D3, `adaptive` | kept |\n"
+    page.write_text(f"before\n<!-- measured: mismatch -->\n{rows}<!-- end of measured -->\nafter\n")
+    monkeypatch.setattr(mismatch, "PAGE", page)
+    monkeypatch.setattr(mismatch, "FEWEST", 1)
+    monkeypatch.setattr(sys, "argv", ["mismatch.py", "--first", "0", "--seeds", "1", "--out", str(kept), "--write"])
+    mismatch.main()
+    assert kept.read_text() == made
+    written = page.read_text()
+    assert f"| small | D3, `adaptive` | {np.mean(run['poured']):.3f} (" in written
+    inside = [low <= lost <= high for low, high, lost in run["bands"]]
+    assert f"| {int(inside[0])} of 1, then {sum(inside[1:])} of 2 |" in written
+    assert "old" not in written
+    assert "| large | D3, `adaptive` | kept |" in written
+    assert written.startswith("before")
+    assert written.endswith("after\n")

@@ -267,7 +267,7 @@ class BalanceSettings(Settings):
                 said = "not tried; --tare tries it (what is on it counts as nothing then)"
                 checks.append(DeviceCheck("balance tare", "ok", said))
         except LaboratoryError as error:
-            todo = "docs/laboratory/connect-a-balance.md lists causes and remedies"
+            todo = "docs/reference/messages.md lists causes and remedies"
             checks.append(DeviceCheck("balance", "fail", str(error), todo))
         finally:
             driver.close()

@@ -60,10 +60,8 @@ beforehand. This command measures everything and writes the page:
 decant validate-solver --full --write docs
 ```
 
-Measured outside, on recordings that may not be redistributed (Kennedy et al. 2019, precision pouring, University of
-Pennsylvania; four vessels of 184 to 624 mL, slow tilts): particles hold 0.7 to 1.3 % of the capacity more than
-measured, plain hydrostatics 0.6 to 2.0 % less. A robot's pour of 106 g: RMS 2.2 g on a balance with 2 g steps, final
-amount 2 % short, onset within 0.7°. No test repeats this ([real recordings](recordings.md)).
+Comparisons with liquids that were really poured: [real recordings](recordings.md). Quantities without a criterion are
+in the figures and in [validation.json](../data/validation.json).
 
 θ of all cases unless they say otherwise: {theta}.
 N is the number of particles.
@@ -372,8 +370,7 @@ def write_page(
 
 def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint: str) -> str:
     """The page of some records, in their order; see `write_page`."""
-    rows = [m for record in records.values() for m in record["measurements"]]
-    judged = [m for m in rows if m["judged"]]
+    judged = [m for record in records.values() for m in record["measurements"] if m["judged"]]
     failed = sum(not m["passed"] for m in judged)
     parts = [INTRODUCTION.format(theta=theta)]
     parts.append(f"{len(judged) - failed} of {len(judged)} criteria are met.\n")
@@ -383,14 +380,25 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint:
     for name, record in records.items():
         command = f"(`decant validate-solver {name}`){older.get(name, '')}"
         parts.append(f"## {record['title']}\n\n{record['about']} {command}\n")
-        lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]
-        for m in record["measurements"]:
-            word = {"FAIL": "**fails**"}.get(verdict(m), verdict(m))
-            lines.append(
-                f"| {m['name']} | {m['particles']:,} | {shown(m['value'], m['unit'])} | "
-                f"{shown(m['reference'], m['unit'])} | {m['criterion']} | {word} |"
-            )
-        parts.append("\n".join(lines) + "\n")
+        if table := _criteria(record["measurements"]):
+            parts.append(table)
         if record["image"] is not None:
             parts.append(f"![{record['title']}](../{IMAGES}/{record['image']})\n")
     return "\n".join(parts)
+
+
+def _criteria(measurements: Sequence[Mapping[str, Any]]) -> str:
+    """Table of the quantities with a criterion, a row for all numbers of particles; empty if there are none."""
+    rows: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for m in measurements:
+        if m["judged"]:
+            rows.setdefault((m["name"], shown(m["reference"], m["unit"]), m["criterion"]), []).append(m)
+    if not rows:
+        return ""
+    lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]
+    for (quantity, reference, criterion), some in rows.items():
+        numbers = "; ".join(f"{m['particles']:,}" for m in some)
+        values = "; ".join(shown(m["value"], m["unit"]) for m in some)
+        words = ", ".join({"FAIL": "**fails**"}.get(verdict(m), verdict(m)) for m in some)
+        lines.append(f"| {quantity} | {numbers} | {values} | {reference} | {criterion} | {words} |")
+    return "\n".join(lines) + "\n"

@@ -174,7 +174,7 @@ def _cell(under: str = "", name: str = "The cell: planned (orange), done (blue)"
 def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its liquid") -> Any:
     import rerun.blueprint as rrb
 
-    # From the side, slightly above: as in the figure of docs/laboratory/frames.md.
+    # From the side, slightly above: as in the figure of docs/reference/frames.md.
     eye = rrb.EyeControls3D(position=(-0.05, -0.42, 0.22), look_target=(-0.04, 0.0, 0.08), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
         origin=f"{under}/simulation",

@@ -393,9 +393,10 @@ DRAINAGE = "A film of 8 mm, ν = 1,000 mm²/s, drains from a vertical wall of 10
 PUDDLE = "250 mL are let go on a plane: the radius is 0.894 (gV³t/3ν)^⅛ once they are flat (Huppert 1982)."
 CUP = (
     "The standard pour with 0.1 and 1 Pa s, at 1,000 kg/m³. Reference: the volume-of-fluid solver interFoam (OpenFOAM "
-    "1912), no-slip walls, cells of 2 mm (`benchmarks/grid_outflow.py`). With 4, 3 and 2.5 mm it leaves 0.564, 0.580 "
-    "and 0.584 of the thicker liquid at 3.1 s. SPlisHSPlasH 2.19 with the viscosity of Weiler et al. 2018 is no "
-    "reference, because it leaves 0.34 with walls of volume maps and 0.50 with walls of particles."
+    "1912), no-slip walls, cells of 2 mm (made with commit 46022671 by `benchmarks/grid_outflow.py`). With 4, 3 and "
+    "2.5 mm it leaves 0.564, 0.580 and 0.584 of the thicker liquid at 3.1 s. SPlisHSPlasH 2.19 with the viscosity of "
+    "Weiler et al. 2018 is no reference, because it leaves 0.34 with walls of volume maps and 0.50 with walls of "
+    "particles."
 )
 
 SIDE, VOLUME = 0.07, 200e-6
@@ -521,14 +522,14 @@ GRID: dict[float, tuple[float, ...]] = {
     1e-3: (1.000, 0.995, 0.949, 0.856, 0.730, 0.595, 0.468, 0.359),
 }
 """Fraction left in the pourer at `TIMES` by kinematic viscosity [m²/s]: interFoam on a grid of 2 mm, which is 20 cells
-per radius, `benchmarks/grid_outflow.py`."""
+per radius; made with commit 46022671 by `benchmarks/grid_outflow.py`."""
 PEER: dict[float, tuple[float, ...]] = {
     1e-4: (0.985, 0.922, 0.796, 0.632, 0.462, 0.296, 0.149, 0.043),
     1e-3: (0.987, 0.933, 0.822, 0.671, 0.501, 0.339, 0.195, 0.090),
 }
 """The same by SPlisHSPlasH 2.19 (DFSPH, volume maps, viscosity of Weiler et al. 2018 in the liquid and on walls), 2,000
-and 1,000 particles, `benchmarks/peer.py`. Its fractions for water are smaller by at most 0.015: 0.1 Pa s has almost no
-effect there."""
+and 1,000 particles; made with commit 46022671 by `benchmarks/peer.py`. Its fractions for water are smaller by at most
+0.015: 0.1 Pa s has almost no effect there."""
 TIMES = (2.1, 2.3, 2.5, 2.7, 2.9, 3.1, 3.3, 3.5)
 FAR = 0.05
 

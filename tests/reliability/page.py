@@ -122,13 +122,6 @@ def run(targets: Sequence[str], jobs: int, results: Path, limit: int | None = No
 # ---- tables
 
 
-def all_cases(results: Path) -> dict[str, int]:
-    """How many cases there are of each target whose rig was ever ready."""
-    lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
-    heads = [head for head in map(json.loads, lines) if "target" in head]
-    return {head["target"]: head["cases"] for head in heads}
-
-
 def wall(results: Path) -> str:
     """How long all cases took where they were run in one go; else nothing."""
     lines = results.read_text(encoding="utf-8").splitlines() if results.exists() else []
@@ -136,20 +129,6 @@ def wall(results: Path) -> str:
     if not heads or heads[-1]["run"] < len(found(results)):
         return ""
     return f", and {heads[-1]['wall_s'] / 60:.0f} minutes by the clock with {heads[-1]['jobs']} at a time"
-
-
-def overview(rows: Sequence[dict[str, Any]], there_are: dict[str, int]) -> str:
-    """Targets by faults: how many cases were run, and how many there are."""
-    count = Counter((row["case"]["target"], row["case"]["fault"]) for row in rows)
-    lines = [
-        "| struck | " + " | ".join(FAULTS) + " | run | cases |",
-        "|---|" + "---|" * (len(FAULTS) + 2),
-    ]
-    for target in TARGETS:
-        cells = [str(count[target, fault]) if count[target, fault] else "–" for fault in FAULTS]
-        cells += [str(sum(count[target, fault] for fault in FAULTS)), str(there_are.get(target, "?"))]
-        lines.append(f"| {target} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
 
 
 def table(rows: Sequence[dict[str, Any]], took: str) -> str:
@@ -163,17 +142,19 @@ def table(rows: Sequence[dict[str, Any]], took: str) -> str:
         f"{len(rows)} cases were run, {wrong} ended otherwise than they should. They took {cpu:.0f} seconds of a core: "
         f"{cpu / 120:.0f} minutes of two{took}.",
         "",
-        "| struck | fault | cases | the first life of the program | people at the bench were asked about | "
-        "unknown pours, asked about | as undisturbed |",
-        "|---|---|---|---|---|---|---|",
+        "| struck | faults | the first life of the program | questions at the bench | unknown pours | as undisturbed |",
+        "|---|---|---|---|---|---|",
     ]
     order = {name: i for i, name in enumerate((*TARGETS, *FAULTS))}
+    faults: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    """Faults of a target with the same outcome share a row."""
     for (target, fault), some in sorted(groups.items(), key=lambda item: tuple(order[name] for name in item[0])):
         ended = counted(row["ended"] for row in some)
         heard = counted(about for row in some for about in row["heard"]) or "–"
         good = sum(not row["wrong"] for row in some)
         asked = sum(row["asked"] for row in some)
-        lines.append(f"| {target} | {fault} | {len(some)} | {ended} | {heard} | {asked} | {good} of {len(some)} |")
+        faults[target, ended, heard, str(asked), f"{good} of {len(some)}"].append(fault)
+    lines += [f"| {target} | {', '.join(some)} | {' | '.join(cells)} |" for (target, *cells), some in faults.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -199,7 +180,6 @@ def write(results: Path) -> int:
     rows = list(found(results).values())
     page = PAGE.read_text(encoding="utf-8")
     for name, text in (
-        ("all cases", overview(rows, all_cases(results))),
         ("kill matrix", table(rows, wall(results))),
         ("no meaning", reasons()),
     ):

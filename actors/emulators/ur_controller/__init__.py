@@ -3,7 +3,7 @@
     with VirtualController.start(address="127.0.0.2") as controller:
         control = rtde_control.RTDEControlInterface(controller.address)  # in a process of its own
 
-docs/laboratory/virtual-devices.md lists its functions and its limitations.
+docs/reference/virtual-devices.md lists its functions and its limitations.
 """
 
 from actors.emulators.ur_controller.controller_process import VirtualController, VirtualControllerError

@@ -75,7 +75,7 @@ class UrEmulator:
         return History(tuple(answer["times"]), tuple(tuple(q) for q in answer["joints"]), now)
 
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
-        """See `ArmEmulator.fault`, and docs/laboratory/virtual-devices.md."""
+        """See `ArmEmulator.fault`, and docs/reference/virtual-devices.md."""
         try:
             return self._controller.fault(name, **arguments)
         except VirtualControllerError as error:

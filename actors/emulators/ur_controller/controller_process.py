@@ -66,7 +66,7 @@ class VirtualController:
             calibrated: the robot differs from nominal lengths, as a real one does.
             polyscope_x: software 10.14, with a Robot API instead of the dashboard.
             joints: six initial positions [rad]; a pose in the middle of its workspace by default.
-            prioritised: raise the priority of its clock; see docs/laboratory/virtual-devices.md, "Control period".
+            prioritised: raise the priority of its clock; see docs/reference/virtual-devices.md, "Control period".
             patience: longest wait [s].
 
         Raises:
@@ -95,7 +95,7 @@ class VirtualController:
             ) from error
 
     def fault(self, name: str, *, patience: float = 5.0, **arguments: Any) -> dict[str, Any]:
-        """Inject a fault, or read the controller's internal state; see docs/laboratory/virtual-devices.md for names.
+        """Inject a fault, or read the controller's internal state; see docs/reference/virtual-devices.md for names.
 
         Args:
             name: of the fault.

@@ -319,8 +319,7 @@ class RobustPlanning(OneShotPlanning):
     Cups that touch under an error give this draw the worst loss. An action with which the cups touch as planned is
     never recommended.
 
-    Source: Cakmak et al., Bayesian optimization of risk measures, 2020; docs/explanation/method.md compares it with the
-    raw measures of m1 draws.
+    Source: Cakmak et al., Bayesian optimization of risk measures, 2020.
     Limitations: errors are normal and independent, and drawn once for a whole pour. Inaccuracies that the simulator has
     for every θ are not included.
     """

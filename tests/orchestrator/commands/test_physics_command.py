@@ -93,6 +93,18 @@ def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured
     assert "(`decant validate-solver bad`) †\n" in marked
 
 
+def test_the_page_has_one_row_for_all_numbers_of_particles_and_no_quantity_without_a_criterion() -> None:
+    coarse = within("height", 0.05, 0.0398, 0.0008, unit="m", criterion="within 2 %", particles=500)
+    spread = reported("spread", 0.1, particles=500)
+    found = [measurement.as_json() for measurement in (coarse, height(0.0397), spread)]
+    record = {"title": "Rest", "about": "Liquid stands.", "solver": "same", "image": None, "measurements": found}
+    page = physics_command.page_text({"rest": record}, "", "same")
+    assert "1 of 2 criteria are met" in page
+    assert "| height | 500; 2,000 | 50 mm; 39.7 mm | 39.8 mm | within 2 % | **fails**, pass |" in page
+    assert "spread" not in page
+    assert "|" not in physics_command.page_text({"rest": {**record, "measurements": found[2:]}}, "", "same")
+
+
 def test_a_wrong_name_and_a_missing_folder_are_refused_before_anything_runs(tmp_path: Path) -> None:
     wrong = runner.invoke(app, ["validate-solver", "slosh"])
     assert wrong.exit_code == 2

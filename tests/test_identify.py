@@ -1,4 +1,4 @@
-"""`benchmarks/identify_viscosity.py`: its benches hide what its posteriors are compared with."""
+"""`benchmarks/identify.py`: its benches hide what its posteriors are compared with."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from decant.running import build_campaign
 @pytest.fixture
 def study(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
-    import identify_viscosity
+    import identify
 
-    return identify_viscosity
+    return identify
 
 
 @pytest.mark.parametrize("nominal", [0.01, 0.1, 1.0])
