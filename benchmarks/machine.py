@@ -17,6 +17,7 @@ from typing import Any
 import psutil
 
 from actors.runtime.child_process import child_environment
+from sim_engine.engine_package import engine_version
 from sim_engine.resources import ENVIRONMENT_VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -32,7 +33,7 @@ def describe() -> dict[str, Any]:
         "memory_gib": round(psutil.virtual_memory().total / 2**30, 1),
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        "taichi": version("taichi"),
+        "engine": engine_version(),
         "numpy": version("numpy"),
         "solver": _solver(),
         "fingerprint": _fingerprint(),

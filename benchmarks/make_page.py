@@ -29,6 +29,7 @@ PLAN: dict[str, tuple[str, ...]] = {
     "pour-10000": ("pour_speed.py", "--particles=10000", "--repeats=3", "--peer=1"),
     "scaling": ("scaling.py", "--repeats=1"),
     "start-up": ("start_up.py", "--repeats=9"),
+    "engines": ("engines.py",),
     "plan": ("plan_speed.py",),
     "validate": ("validate_cost.py",),
     "profile": ("profile_passes.py",),
@@ -71,6 +72,7 @@ def page_text(records: dict[str, Any]) -> str:
         sections.cost(scaling),
         sections.memory(scaling),
         sections.start_up(records.get("start-up")),
+        sections.engines(records.get("engines")),
         page_many.plan(records.get("plan")),
         page_many.validate(records.get("validate")),
         page_many.pool(records.get("pool")),
@@ -89,6 +91,8 @@ def stale(records: dict[str, Any]) -> list[str]:
     """Return a warning if measurements were made with different solvers."""
     prints: dict[str, list[str]] = {}
     for name, record in records.items():
+        if name == "engines":  # compares within one run
+            continue
         prints.setdefault(record["result"]["machine"].get("fingerprint", "?"), []).append(name)
     if len(prints) < 2:
         return []

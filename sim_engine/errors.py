@@ -22,6 +22,14 @@ class InvalidSceneError(DecantError, ValueError):
     """The pour is impossible: the vessels touch, or the load does not fit. Nothing was simulated."""
 
 
+class EngineError(DecantError, RuntimeError):
+    """The package that compiles the solver cannot be used; the text gives the remedy."""
+
+
+class WrongOutcomeError(EngineError):
+    """The first pour of an engine differs from its stored outcome: every other outcome could be wrong, too."""
+
+
 class SimulationCancelled(Exception):  # noqa: N818 - a notification, not an error
     """The simulation was cancelled, because its result is not needed any more."""
 

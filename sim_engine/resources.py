@@ -1,16 +1,14 @@
-"""Resources of the machine: the cache directory, optional packages and compute backends.
+"""Resources of the machine: the cache directory and optional packages.
 
 - `load_arrays` and `store_arrays` keep results that are slow to compute in one cache directory, which may be deleted at
   any time.
 - `require` checks that the package of an extra is installed.
-- `require_backend` refuses a missing backend before Taichi starts.
 
 This module has no slow imports.
 """
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import getpass
 import importlib.util
@@ -21,7 +19,6 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,42 +196,3 @@ def require(module: str, what_for: str) -> None:
         raise MissingExtraError(
             f"{what_for} needs the package '{package}', which is not installed: pip install '{DISTRIBUTION}[{extra}]'"
         )
-
-
-Backend = Literal["cpu", "cuda"]
-
-BACKENDS: tuple[Backend, ...] = ("cpu", "cuda")
-
-
-class BackendError(DecantError, RuntimeError):
-    """A requested backend is not available."""
-
-
-def require_backend(backend: str) -> None:
-    """Check that this machine has a backend; Taichi itself would silently use another one.
-
-    Args:
-        backend: one of `BACKENDS`.
-
-    Raises:
-        BackendError: with the remedy.
-    """
-    if backend not in BACKENDS:
-        raise BackendError(f"there is no backend '{backend}'; there are {', '.join(BACKENDS)}")
-    if backend == "cuda" and cuda_devices() == 0:
-        raise BackendError(
-            "backend cuda: no CUDA device answers on this machine; use cpu, or install NVIDIA's driver (nvidia-smi "
-            "lists the devices that it finds)"
-        )
-
-
-def cuda_devices() -> int:
-    """Number of devices that NVIDIA's driver finds; 0 without a driver."""
-    try:
-        driver = ctypes.CDLL("libcuda.so.1")
-    except OSError:
-        return 0
-    count = ctypes.c_int(0)
-    if driver.cuInit(0) != 0 or driver.cuDeviceGetCount(ctypes.byref(count)) != 0:
-        return 0
-    return count.value

@@ -1,6 +1,6 @@
 """PourTask → PourOutcome: sets up the scene, runs the solver until the outcome is final, and counts particles.
 
-`PourSimulator` runs pours. Importing this module is fast; Taichi starts with the first simulation.
+`PourSimulator` runs pours. Importing this module is fast; the engine starts with the first simulation.
 
 - **Initial positions** (`fill`): a jittered lattice that fills the pourer from the bottom.
 - **Time loop** (`TimeLoop`, `follow`): slices of time, recordings between them, the end of the pour, and its outcome.
@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 
 from sim_engine.collision import contact_during, describe_contact, rotations
 from sim_engine.dribbling import DribblingCourse, dribbling_course, rivulet_frames
+from sim_engine.engine_package import check_engine, engine_name
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, SolidWalls
 from sim_engine.hydrostatics import GRAVITY, level
 from sim_engine.motion import Motion, plan_motion
 from sim_engine.outcome import ESCAPED_LIMIT, ParticleState, PourOutcome, RecordedFrames, SimulatedPour
-from sim_engine.resources import Backend
 from sim_engine.scene import PoseError, PourTask, Scene
 from sim_engine.vessel.shapes import VesselError, VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel, check_holds, in_cavity
@@ -197,35 +197,25 @@ class TimeLoop:
         self.over = done and self._still_since is not None and self.clock - self._still_since >= QUIET
 
 
-def follow(fluid: FluidEngine, courses: Sequence[TimeLoop], cancelled: Callable[[], bool] | None) -> None:
-    """Advance neighbouring scenes slice by slice until all are over.
+def follow(fluid: FluidEngine, course: TimeLoop, cancelled: Callable[[], bool] | None) -> None:
+    """Advance a scene slice by slice until it is over.
 
     Raises:
         SimulationCancelled: `cancelled` returned True.
     """
-    first, end = courses[0].scene, courses[-1].scene + 1
-    until = np.zeros(end)
-    for course in courses:
-        until[course.scene] = course.start
-    begun = time.process_time()
+    begun, until = time.process_time(), course.start
     while True:
-        fluid.advance_many(until, first, end)
-        counts = fluid.census_all() if end - first > 1 else fluid.census(first)[None]
-        for course in courses:
-            if not course.over:
-                course.look(fluid, counts[course.scene - first])
+        fluid.advance(until, course.scene)
+        course.look(fluid, fluid.census(course.scene))
         now = time.process_time()
-        running = [course for course in courses if not course.over]
-        for course in running or courses[-1:]:
-            course.cpu_s += (now - begun) / max(len(running), 1)
+        course.cpu_s += now - begun
         begun = now
-        if not running:
+        if course.over:
             return
         if cancelled is not None and cancelled():
             raise SimulationCancelled
-        for course in running:
-            course.slices += 1
-            until[course.scene] = course.clock
+        course.slices += 1
+        until = course.clock
 
 
 def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome:
@@ -404,14 +394,17 @@ def check_motion(
 
 
 class PourSimulator:
-    """Simulates pours, one by one or many in one call. One per process: Taichi's arrays are shared.
+    """Simulates pours, one by one or many in one call. One per process: the engine's arrays are shared.
 
-    Args:
-        backend: 'cpu' or 'cuda'.
+    Before its first pour, an engine that was never checked on this machine is checked (`engine_package.check_engine`).
+
+    Raises:
+        EngineError: the chosen engine is unknown or not installed.
     """
 
-    def __init__(self, backend: Backend = "cpu") -> None:
-        self.backend = backend
+    def __init__(self) -> None:
+        engine_name()  # refuses an unknown one before anything is prepared
+        self._checked = False
         self._vessels: dict[VesselSpec, Vessel] = {}
         self._masks: dict[VesselSpec, NDArray[np.uint8]] = {}
         self._planes: dict[tuple[VesselSpec, float], NDArray[np.float32]] = {}
@@ -462,7 +455,7 @@ class PourSimulator:
         Raises:
             InvalidSceneError: the pour is impossible.
             SimulationCancelled: `cancelled` returned True.
-            BackendError: the backend is not available.
+            WrongOutcomeError: the engine gives wrong outcomes on this machine.
         """
         (run,) = self.simulate_many([task], cancelled=cancelled)
         return run
@@ -472,8 +465,7 @@ class PourSimulator:
     ) -> list[SimulatedPour]:
         """Run many pours, of any actions, θ, vessels and seeds, in one set of kernels.
 
-        On a CPU the pours run one after another; on a GPU they run side by side, as many as fit into memory. Every
-        outcome equals that of the pour alone.
+        The pours run one after another. Every outcome equals that of the pour alone.
 
         Args:
             tasks: what to simulate.
@@ -485,12 +477,15 @@ class PourSimulator:
         Raises:
             InvalidSceneError: one of the pours is impossible; nothing was simulated.
             SimulationCancelled: `cancelled` returned True.
-            BackendError: the backend is not available.
+            WrongOutcomeError: the engine gives wrong outcomes on this machine.
         """
         from sim_engine.fluid.engine import engine
 
         motions = [self.prepare(task) for task in tasks]
-        fluid = engine(self.backend)
+        fluid = engine()
+        if not self._checked:
+            check_engine(lambda task: self._batch(fluid, [task], [self.prepare(task)], None)[0].outcome)
+            self._checked = True
         runs: list[SimulatedPour] = []
         while len(runs) < len(tasks):
             first = len(runs)
@@ -517,12 +512,8 @@ class PourSimulator:
             TimeLoop(task, motion, start, scene, dribbling=self._dribbling(task, motion))
             for scene, (task, motion, start) in enumerate(zip(tasks, motions, starts, strict=True))
         ]
-        if fluid.backend == "cpu":
-            # One after the other: a scene's arrays stay in the core's cache.
-            for course in courses:
-                follow(fluid, [course], cancelled)
-        else:
-            follow(fluid, courses, cancelled)
+        for course in courses:  # one after the other: a scene's arrays stay in the core's cache
+            follow(fluid, course, cancelled)
         for course, task, motion in zip(courses, tasks, motions, strict=True):
             if task.frame_rate > 0.0:
                 course.frames[:0] = self._level_frames(task, motion, course.start)

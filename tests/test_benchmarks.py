@@ -160,7 +160,7 @@ MACHINE = {
     "cores": 10,
     "system": "wood",
     "python": "3",
-    "taichi": "1",
+    "engine": "taichi 1",
     "solver": "abc",
     "fingerprint": "f",
     "date": "today",

@@ -165,7 +165,6 @@ def test_every_public_error_is_a_decant_error_and_what_it_was_before() -> None:
     from orchestrator.journal.journal_file import JournalError
     from orchestrator.run_service import RunTaskError
     from sim_engine.errors import InvalidSceneError
-    from sim_engine.resources import BackendError
     from sim_engine.settings.plugin_registry import PluginError
     from sim_engine.vessel.shapes import VesselError
 
@@ -176,7 +175,6 @@ def test_every_public_error_is_a_decant_error_and_what_it_was_before() -> None:
         decant.LaboratoryError: Exception,
         decant.MissingExtraError: ImportError,
         decant.RunError: Exception,
-        BackendError: RuntimeError,
         CodecError: ValueError,
         PluginError: LookupError,
         InvalidSceneError: ValueError,

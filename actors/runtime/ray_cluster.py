@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError, Notice
 from actors.runtime.child_process import python_module, run
+from sim_engine.engine_package import engine_version
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 from sim_engine.solver_fingerprint import ROOT, folder_digest
 
@@ -157,14 +158,14 @@ class Versions:
         python: e.g. '3.11.7'.
         decant: the installed package's.
         simulator: digest of the simulator's sources; a checkout may have changed without a new version.
-        taichi: it compiles the solver.
+        engine: it compiles the solver, e.g. 'taichi 1.7.4'.
         numpy: it makes the initial positions.
     """
 
     python: str
     decant: str
     simulator: str
-    taichi: str
+    engine: str
     numpy: str
 
     def difference(self, other: Versions) -> str | None:
@@ -188,7 +189,7 @@ def versions() -> Versions:
         python=sys.version.split()[0],
         decant=_installed(DISTRIBUTION),
         simulator=folder_digest(ROOT / "sim_engine"),
-        taichi=_installed("taichi"),
+        engine=engine_version(),
         numpy=_installed("numpy"),
     )
 

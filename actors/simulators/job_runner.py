@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from actors.interfaces import InvalidActionError, SimulationError
-from sim_engine.errors import InvalidSceneError, SimulationCancelled
+from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
+from sim_engine.errors import EngineError, InvalidSceneError, SimulationCancelled
 from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
 
@@ -83,6 +83,7 @@ class JobRunner:
         Raises:
             InvalidActionError: the vessels touch, or the motion is impossible.
             JobCancelledError: `cancelled` returned True.
+            LaboratoryError: the engine cannot be used, or gives wrong outcomes on this machine.
             SimulationError: any other error of the engine.
         """
         if cancelled():
@@ -96,6 +97,8 @@ class JobRunner:
             raise InvalidActionError(str(error)) from None
         except SimulationCancelled:
             raise JobCancelledError from None
+        except EngineError as error:
+            raise LaboratoryError(str(error)) from None
         except Exception as error:
             raise SimulationError(f"the simulator failed: {type(error).__name__}: {error}") from error
         if not isinstance(run, SimulatedPour):

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.interfaces import InvalidActionError, SimulationError
+from actors.interfaces import LaboratoryError, SimulationError
 from actors.runtime.ray_cluster import Versions, versions
 from actors.runtime.remote_object import actor_class, kill_actor, mark_retrieved
 from actors.simulators.job_runner import JobCancelledError, JobRunner, Simulator, pour_simulator
@@ -143,7 +143,7 @@ class RayWorker:
         except ray.exceptions.RayActorError as error:
             raise WorkerLostError from error
         except ray.exceptions.RayTaskError as error:
-            if isinstance(error.cause, InvalidActionError | SimulationError | JobCancelledError):
+            if isinstance(error.cause, LaboratoryError | JobCancelledError):
                 raise error.cause from None
             raise SimulationError(f"the simulator failed: {error.cause!r}") from error
         return WorkerReply(reply.result.copied(), reply.seconds)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, fail, set_quiet
+from orchestrator.cli.console import BAD_INPUT, FAILED, INTERRUPTED, RefusalError, fail, set_quiet
 from orchestrator.cli.shell_completion import files_of, local_runs
+from sim_engine.errors import EngineError, WrongOutcomeError
 
 Campaign = Annotated[
     Path,
@@ -151,9 +153,15 @@ def _in_home(value: Any) -> Any:
 def call(work: Callable[..., None], /, *args: Any, **kwargs: Any) -> None:
     """Run a command; a refusal is printed and sets the exit code. `~` in paths is the home directory."""
     try:
+        if os.environ.get("DECANT_ENGINE"):
+            from sim_engine.engine_package import engine_name
+
+            engine_name()  # an unknown one is refused before anything starts
         work(*map(_in_home, args), **{name: _in_home(value) for name, value in kwargs.items()})
     except RefusalError as refusal:
         fail(refusal)
+    except EngineError as error:
+        fail(RefusalError(str(error), FAILED if isinstance(error, WrongOutcomeError) else BAD_INPUT))
     except KeyboardInterrupt:
         fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
 

@@ -10,9 +10,8 @@ import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -50,13 +49,6 @@ if TYPE_CHECKING:
     from sim_engine.simulator import PourSimulator
 
 
-class BackendChoice(StrEnum):
-    """Device that the solver runs on."""
-
-    CPU = "cpu"
-    CUDA = "cuda"
-
-
 def simulate(
     campaign: Campaign,
     assignments: Assignments = None,
@@ -85,7 +77,6 @@ def simulate(
     csv: Annotated[
         Path | None, typer.Option(help="With --from: write a table of the predictions as CSV.", show_default=False)
     ] = None,
-    backend: Annotated[BackendChoice, typer.Option(help="Device that the solver runs on.")] = BackendChoice.CPU,
 ) -> None:
     """Simulate one pour of a campaign's scene with several seeds, and print the fate of the liquid.
 
@@ -98,9 +89,7 @@ def simulate(
     spillage, Spearman's rank correlation, and the number of pours within their intervals. The scene is the one that
     refers to the file, else calibration's, unless `--scene` names another.
     """
-    options = SimulateOptions(
-        assignments, parameters, receiver, thetas, seed, seeds, scene, csv, rrd, png, as_json, backend.value
-    )
+    options = SimulateOptions(assignments, parameters, receiver, thetas, seed, seeds, scene, csv, rrd, png, as_json)
     if source is None:
         if csv is not None:
             raise RefusalError(f"--csv {csv}: goes with --from, a table of weighed pours", BAD_INPUT)
@@ -128,7 +117,6 @@ class SimulateOptions:
     rrd: Path | None
     png: Path | None
     as_json: bool
-    backend: Literal["cpu", "cuda"]
 
 
 def _simulate_pour(path: Path, options: SimulateOptions) -> None:
@@ -139,7 +127,6 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     from orchestrator.config.file_loading import load_vessel
     from orchestrator.config.yaml.yaml_errors import ConfigError
     from sim_engine.prediction_band import band_of, spreads
-    from sim_engine.resources import BackendError, require_backend
     from sim_engine.simulator import InvalidSceneError, PourSimulator
 
     plan = read_campaign(path)
@@ -159,9 +146,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     frame_rate = 20.0 if options.rrd or options.png else 0.0
     tasks = known.tasks(scene, action, options.seed, options.seeds, frame_rate)
-    with Refused(BackendError, at="--backend: "):
-        require_backend(options.backend)
-    simulator = PourSimulator(options.backend)
+    simulator = PourSimulator()
     with Refused(InvalidSceneError, at="with shapes that the vessels may have, " if scene.uncertain else ""):
         for task in tasks if scene.uncertain else tasks[:1]:  # refuse before Taichi starts
             simulator.prepare(task)
@@ -313,7 +298,6 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     from orchestrator.cli.foreground_run import check_output, read_campaign
     from orchestrator.results.prediction_scores import scores
     from sim_engine.prediction_band import LEVEL
-    from sim_engine.resources import BackendError, require_backend
     from sim_engine.simulator import PourSimulator
 
     plan = read_campaign(path)
@@ -322,9 +306,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     table, pours = _pours(scene, records, source)
     check_output(options.csv, "--csv", ".csv")
     check_output(options.png, "--png", ".png")
-    with Refused(BackendError, at="--backend: "):
-        require_backend(options.backend)
-    simulator = PourSimulator(options.backend)
+    simulator = PourSimulator()
     tasks = [known.tasks(scene, pour.action, options.seed, options.seeds) for pour in pours]
     _check(simulator, table, source, [some if scene.uncertain else some[:1] for some in tasks])
     said = known.said(scene)

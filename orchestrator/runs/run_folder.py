@@ -25,6 +25,7 @@ from orchestrator.journal.journal_file import TO_BEGIN, JournalError, require_sp
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
+from sim_engine.engine_package import engine_version
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 RESOLVED, VERSIONS = "resolved.json", "versions.json"
@@ -70,7 +71,7 @@ def write_provenance(directory: Path, plan: CampaignPlan) -> None:
 
 
 def versions() -> dict[str, Any]:
-    """Versions of Python, the platform, Decant, its dependencies, and packages that add plug-ins."""
+    """Versions of Python, the platform, the engine, Decant, its dependencies, and packages that add plug-ins."""
     packages: dict[str, str] = {}
     names = [DISTRIBUTION]
     try:
@@ -88,6 +89,7 @@ def versions() -> dict[str, Any]:
         "python": sys.version.split()[0],
         "platform": platform.platform(),
         "processor": platform.machine(),
+        "engine": engine_version(),
         "packages": packages,
         "plugins": {name: sorted(set(added)) for name, (_, added) in plugins.items()},
     }

@@ -17,8 +17,7 @@ Source: Macklin & Müller 2013 (position based fluids); Macklin, Müller & Chent
 integral: after Bender et al. 2019 (volume maps), see `sim_engine/vessel/wall_correction.py`.
 """
 
-import taichi as ti
-
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.kernels import SIGMA, dot, length, slope, square, turned, wall_density, wall_slope, weight
 from sim_engine.fluid.neighbours import measure_pairs
 from sim_engine.fluid.state import SUPPORT, VESSELS

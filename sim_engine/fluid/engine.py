@@ -1,4 +1,4 @@
-"""The engine: starts and ends Taichi, and holds the arrays of one process. Only this module calls `ti.init`."""
+"""The engine: starts and ends `ti`, and holds the arrays of one process. Only this module calls `ti.init`."""
 
 import contextlib
 import io
@@ -9,19 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_engine.collision import rotations
+from sim_engine.fluid.compiler import KERNELS, NAME, ti
+from sim_engine.fluid.engine_startup import imports, look_up_quickly, uncollected
 from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, pose_at
-from sim_engine.fluid.taichi_startup import imports, look_up_quickly, uncollected
 from sim_engine.outcome import ParticleState
-from sim_engine.resources import BackendError, cache_directory, require_backend
+from sim_engine.resources import cache_directory
 
-with imports():
-    import taichi as ti
-
+with imports(NAME):
     from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState, of_parameters
     from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
 
-POOLS = {"cpu": (50_000, 64), "cuda": (2_500_000, 1_024)}
-"""Capacity of a process, by backend: particles and scenes. The largest scene has 50,000 particles."""
+POOL, MOST_SCENES = 50_000, 64
+"""Capacity of a process: particles and scenes. The largest scene has 50,000 particles."""
 
 FAULTS = {
     0: None,
@@ -37,10 +36,9 @@ class FluidEngine:
     Scenes of one load are independent: each gives bit for bit the results that it gives alone.
     """
 
-    def __init__(self, backend: str = "cpu") -> None:
-        start(backend)
-        self.backend = backend
-        self.pool, self.most_scenes = POOLS[backend]
+    def __init__(self) -> None:
+        start()
+        self.pool, self.most_scenes = POOL, MOST_SCENES
         self.state = FluidState(self.most_scenes, self.pool)
         self.stepper = Stepper(self.state)
         self.scenes = 0
@@ -174,45 +172,20 @@ class FluidEngine:
 
     def advance(self, until: float, scene: int = 0) -> None:
         """Advance one scene until its time reaches `until` [s] or a fault stops it."""
-        self.advance_many(np.full(scene + 1, until), scene, scene + 1)
-
-    def advance_many(self, until: NDArray[np.float64], first: int = 0, end: int | None = None) -> None:
-        """Advance scenes, each until its own time.
-
-        Args:
-            until: [s] for every scene up to `end`.
-            first, end: only the scenes first … end − 1; all of them if there is no end.
-        """
-        end = self.scenes if end is None else end
-        until = np.ascontiguousarray(until, np.float64)
-        while first < end:  # adjacent scenes of the same kind together
-            thick = self._thick[first]
-            last = first + 1
-            while last < end and self._thick[last] == thick:
-                last += 1
-            due = np.ones(last, np.int32)
-            while due[first:].any():
-                self.stepper.advance(
-                    first, last, until, self._grids, self._planes, self._cavities, self._poses, due, thick
-                )
-                if due[first:].any():
-                    self.stepper.cohere(first, last, due)
-            self._facts[first:last] = np.nan
-            first = last
+        times, due = np.full(scene + 1, until), np.ones(scene + 1, np.int32)
+        tables = self._grids, self._planes, self._cavities, self._poses
+        while due[scene]:
+            self.stepper.advance(scene, scene + 1, times, *tables, due, self._thick[scene])
+            if due[scene]:
+                self.stepper.cohere(scene, scene + 1, due)
+        self._facts[scene] = np.nan
 
     def census(self, scene: int = 0) -> NDArray[np.int32]:
         """Particles in each `ParticleState`, shape (5,)."""
-        counts: NDArray[np.int32] = self._counts(scene, scene + 1)[scene]
-        return counts
-
-    def census_all(self) -> NDArray[np.int32]:
-        """Particles in each `ParticleState` of every scene, shape (scenes, 5)."""
-        return self._counts(0, self.scenes)
-
-    def _counts(self, first: int, end: int) -> NDArray[np.int32]:
-        counts = np.zeros((end, len(ParticleState)), np.int32)
-        self.stepper.look(first, end, counts, self._facts)
-        return counts
+        counts = np.zeros((scene + 1, len(ParticleState)), np.int32)
+        self.stepper.look(scene, scene + 1, counts, self._facts)
+        found: NDArray[np.int32] = counts[scene]
+        return found
 
     def _copies(self, scene: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
         begin, end = self._begins[scene : scene + 2]
@@ -232,7 +205,7 @@ class FluidEngine:
 
     def _fact(self, name: str, scene: int) -> float:
         if np.isnan(self._facts[scene, 0]):
-            self._counts(scene, scene + 1)
+            self.census(scene)
         return float(self._facts[scene, FACTS.index(name)])
 
     def time(self, scene: int = 0) -> float:
@@ -284,21 +257,19 @@ class _Pool(Generic[T]):
         return np.ascontiguousarray(np.concatenate(self._parts))
 
 
-def start(backend: str) -> None:
-    """Start Taichi.
+def start() -> None:
+    """Start the compiler of the kernels on one thread of the CPU.
 
-    Raises:
-        BackendError: this machine has no such backend.
+    There is no option for a GPU: one scene is one thread there, and no device was shown to give the right outcomes.
     """
-    require_backend(backend)
-    look_up_quickly()
-    # Taichi prints its architecture on stdout, which is reserved for results.
+    look_up_quickly(NAME)
+    # It prints its architecture on stdout, which is reserved for results.
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
-            arch=ti.cuda if backend == "cuda" else ti.cpu,
+            arch=ti.cpu,
             cpu_max_num_threads=1,
             offline_cache=True,
-            offline_cache_file_path=str(cache_directory() / "kernels"),
+            offline_cache_file_path=str(cache_directory() / KERNELS),
             log_level=ti.ERROR,
             enable_fallback=False,
             # These passes over one large kernel take two thirds of its compile time, and do not make a pour faster.
@@ -311,21 +282,12 @@ def start(backend: str) -> None:
 _engine: FluidEngine | None = None
 
 
-def engine(backend: str | None = None) -> FluidEngine:
-    """The process' engine; the first call starts Taichi and allocates.
-
-    Args:
-        backend: 'cpu' or 'cuda'; None: the running one, else the CPU.
-
-    Raises:
-        BackendError: it is not available, or the process already runs the other one.
-    """
+def engine() -> FluidEngine:
+    """The process' engine; the first call starts Taichi and allocates."""
     global _engine
     if _engine is None:
         with uncollected():
-            _engine = FluidEngine(backend or "cpu")
-    elif backend is not None and backend != _engine.backend:
-        raise BackendError(f"this process already simulates on {_engine.backend}; {backend} needs a process of its own")
+            _engine = FluidEngine()
     return _engine
 
 

@@ -11,7 +11,7 @@ down compiling and cache look-up accordingly.
 
 import math
 
-import taichi as ti
+from sim_engine.fluid.compiler import ti
 
 SIGMA = 21.0 / (2.0 * math.pi)
 """σ h³."""

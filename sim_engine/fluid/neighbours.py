@@ -16,8 +16,7 @@ Source: Green 2010 (counting sort on a grid); Verlet 1967 (lists with a skin); P
 clusters, for the same reason).
 """
 
-import taichi as ti
-
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.kernels import square
 from sim_engine.fluid.state import EIGHT, NEIGHBOURS, STRETCHES, SUPPORT
 from sim_engine.outcome import ParticleState

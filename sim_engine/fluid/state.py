@@ -8,9 +8,9 @@ responded.
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import taichi as ti
 from numpy.typing import ArrayLike, NDArray
 
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.scene_setup import (
     SceneSetup,
     adhesion,

@@ -10,8 +10,7 @@ Order of a step:
 Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 """
 
-import taichi as ti
-
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.density import displace, measure, measure_before, measure_first, multiply, multiply_first
 from sim_engine.fluid.kernels import dot, length, square, turned, turned_back
 from sim_engine.fluid.neighbours import rebuild
@@ -435,9 +434,8 @@ class Stepper:
         kernels compile in less time than one with both parts, and simulations without cohesion never compile the
         second.
 
-        Scenes are independent: on a GPU each has a thread, on a CPU they run one after another. Either all of them are
-        `thick`, liquids with a viscosity in SI, or none is. These are two kernels, so that neither contains code of the
-        other.
+        Scenes are independent and run one after another. Either all of them are `thick`, liquids with a viscosity in
+        SI, or none is. These are two kernels, so that neither contains code of the other.
         """
         f = self.state
         for s in range(s0, s1):

@@ -21,8 +21,7 @@ Range: at 2.2 d, the density's support, drops of 2,000 particles are damped seve
 Source: derived here; total variation as interfacial energy: Modica 1987; forces as exact gradients: Bonet & Lok 1999.
 """
 
-import taichi as ti
-
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.kernels import (
     BULK_BOND,
     HALF_ATTRACTION,

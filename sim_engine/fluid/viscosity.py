@@ -76,8 +76,7 @@ of 100 mm²/s at rest are 0.02 m/s instead of 0.01. Momentum is not conserved to
 Source: derived here; gradients that are exact for linear functions: Randles & Libersky 1996.
 """
 
-import taichi as ti
-
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.density import PACKING
 from sim_engine.fluid.kernels import SIGMA, decayed, dot, length, slope, square, turned, wall_slope, weight
 from sim_engine.fluid.state import SUPPORT, VESSELS

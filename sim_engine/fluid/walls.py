@@ -27,8 +27,7 @@ allows.
 Source: derived here; critical flow over a crest: Henderson 1966, Open Channel Flow, section 2.4.
 """
 
-import taichi as ti
-
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.kernels import dot, length, square, turned, turned_back
 from sim_engine.fluid.state import VESSELS
 from sim_engine.liquids import LARGEST_RIM_CORRECTION

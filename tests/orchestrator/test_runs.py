@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.runs.run_folder import RunNotFoundError, create_run, find_run
+from sim_engine.engine_package import ENGINES, engine_version
 from tests.support.killed_runs import SMALL, die_at, run
 from tests.support.toy_campaign import run_toy, toy_plan
 
@@ -48,3 +49,6 @@ def test_what_reproduces_a_run_is_kept_with_it(tmp_path: Path) -> None:
     assert versions["seed"] == 7
     assert versions["python"] == sys.version.split()[0]
     assert {"numpy", "taichi", "ray", "decant-pouring"} <= set(versions["packages"])
+    assert versions["engine"] == engine_version()
+    name, number = versions["engine"].split()
+    assert (name in ENGINES, versions["packages"][name]) == (True, number)

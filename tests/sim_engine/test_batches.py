@@ -13,7 +13,6 @@ from actors.runtime.child_process import child_environment
 from sim_engine.action import DEG, Action
 from sim_engine.errors import InvalidSceneError, SimulationCancelled
 from sim_engine.liquids import Liquid, SimulationParameters
-from sim_engine.resources import BackendError, cuda_devices, require_backend
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import cylinder
@@ -104,23 +103,6 @@ def test_a_scene_larger_than_the_pool_says_so(simulator: PourSimulator, monkeypa
     monkeypatch.setattr(engine(), "pool", 200)
     with pytest.raises(ValueError, match="300 particles; at most 200"):
         simulator.simulate(task(1))
-
-
-def test_a_backend_that_is_not_there_is_an_error() -> None:
-    with pytest.raises(BackendError, match="there is no backend 'vulkan'; there are cpu, cuda"):
-        require_backend("vulkan")
-    require_backend("cpu")
-    if cuda_devices() == 0:
-        with pytest.raises(BackendError, match="no CUDA device answers"):
-            require_backend("cuda")
-    else:
-        require_backend("cuda")
-
-
-def test_a_process_keeps_to_one_backend(simulator: PourSimulator) -> None:
-    simulator.simulate(task(1))
-    with pytest.raises(BackendError, match="already simulates on cpu"):
-        PourSimulator("cuda").simulate(task(1))
 
 
 def test_recorded_frames_show_the_liquid_from_the_start_of_a_slow_pour(simulator: PourSimulator) -> None:

@@ -8,16 +8,16 @@ import sys
 import textwrap
 
 import pytest
-import taichi as ti
 
 from sim_engine.fluid import density, engine, kernels, neighbours, state, step, tension, viscosity, walls
+from sim_engine.fluid import engine_startup as quick
 from sim_engine.fluid import kernels as vectors
 from sim_engine.fluid import neighbours as columns
 from sim_engine.fluid import state as table
-from sim_engine.fluid import taichi_startup as quick
 from sim_engine.fluid import viscosity as newtonian
 from sim_engine.fluid import viscosity as packing
 from sim_engine.fluid import walls as rims
+from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.engine import FluidEngine
 from sim_engine.simulator import PourSimulator
 

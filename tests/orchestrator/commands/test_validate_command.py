@@ -28,6 +28,13 @@ def test_all_that_is_wrong_with_several_files_is_told_at_once(folder: Path) -> N
     assert result.stderr.splitlines()[-1] == "2 of 4 file(s) can't be used"
 
 
+def test_an_unknown_engine_is_refused_by_every_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECANT_ENGINE", "cuda")
+    result = invoke("validate beaker.yaml")
+    assert result.exit_code == 2
+    assert "DECANT_ENGINE=cuda: there is no such engine; there are taichi and quadrants" in result.stderr
+
+
 def test_files_that_are_right_pass(folder: Path) -> None:
     write_recorded = folder / "recorded.yaml"
     write_recorded.write_text(RECORDED, encoding="utf-8")

@@ -1,7 +1,7 @@
-"""Removes work of Taichi 1.7 at start-up that is not needed here, without any change to computed results.
+"""Removes work of Taichi 1.7 and Quadrants 1.3 at start-up that is not needed here, without a change to results.
 
-Each replacement first checks that its target exists; otherwise Taichi works as usual. `DECANT_KERNEL_PLACES=1` switches
-all replacements off. Use it to get the positions of errors while you change a kernel.
+Each replacement first checks that its target exists in the package; otherwise the package works as usual.
+`DECANT_KERNEL_PLACES=1` switches all replacements off. Use it to get the positions of errors while you change a kernel.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ENVIRONMENT_VARIABLE = "DECANT_KERNEL_PLACES"
 
 
 def as_it_is() -> bool:
-    """Whether Taichi must be left unchanged."""
+    """Whether the package must be left unchanged."""
     return bool(os.environ.get(ENVIRONMENT_VARIABLE))
 
 
@@ -42,16 +42,19 @@ def uncollected() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def imports() -> Iterator[None]:
-    """Context in which Taichi, and modules with kernels, are imported quickly.
+def imports(package: str) -> Iterator[None]:
+    """Context in which a package, and modules with kernels, are imported quickly.
 
-    For every function Taichi checks whether it is written inside a class. To find that line it searches all modules.
+    For every function it checks whether it is written inside a class. To find that line it searches all modules.
+
+    Args:
+        package: 'taichi' or 'quadrants'.
     """
     if as_it_is():
         yield
         return
     # Empty modules replace the one for source typed at a prompt and the one that checks for a newer version.
-    prompt, version = ModuleType("dill"), ModuleType("taichi._version_check")
+    prompt, version = ModuleType("dill"), ModuleType(f"{package}._version_check")
     version.start_version_check_thread = _nothing  # type: ignore[attr-defined]
     for module in prompt, version:
         sys.modules.setdefault(module.__name__, module)
@@ -59,7 +62,7 @@ def imports() -> Iterator[None]:
         with uncollected(), _lines_read():
             yield
     finally:
-        _replace(sys.modules.get("taichi.lang.kernel_impl"), "_inside_class", _quick_look)
+        _replace(sys.modules.get(f"{package}.lang.kernel_impl"), "_inside_class", _quick_look)
         if sys.modules.get("dill") is prompt:  # remove the replacement, so that a later import gets the real module
             del sys.modules["dill"]
 
@@ -90,35 +93,49 @@ def _line_of(frame: FrameType, context: int = 1) -> inspect.Traceback:
     return inspect.Traceback(code.co_filename, frame.f_lineno, code.co_name, [line], 0)
 
 
-def look_up_quickly() -> None:
-    """Remove the work that takes most of the time when compiled kernels are looked up in Taichi's cache."""
+def look_up_quickly(package: str) -> None:
+    """Remove the work that takes most of the time when compiled kernels are looked up in the package's cache.
+
+    Args:
+        package: 'taichi' or 'quadrants'.
+    """
     if as_it_is():
         return
-    with imports():
-        _part("matrix_ops")  # the first kernel would import it, more slowly
-    expr, impl, kernel_impl, builder = (_part(n) for n in ("expr", "impl", "kernel_impl", "ast.ast_transformer_utils"))
+    part = functools.partial(_part, package)
+    with imports(package):
+        part("matrix_ops")  # the first kernel would import it, more slowly
+    expr, impl, builder = (part(name) for name in ("expr", "impl", "ast.ast_transformer_utils"))
     # For each of a kernel's thousands of nodes Taichi finds the method by name, stores the position, …
-    if hasattr(impl, "get_runtime") and isinstance(getattr(impl.get_runtime(), "src_info_stack", None), list):
+    # (Quadrants' builder has more to do for a node, so it stays.)
+    context = getattr(builder, "ASTTransformerContext", None)
+    runtime = impl.get_runtime() if context is not None and hasattr(impl, "get_runtime") else None
+    if isinstance(getattr(runtime, "src_info_stack", None), list):
         _replace(getattr(builder, "Builder", None), "__call__", functools.partial(_quick_builder, impl.get_runtime))
     # … formats the line and carets of an error message, …
-    _replace(getattr(builder, "ASTTransformerContext", None), "get_pos_info", lambda _: _nothing)
+    _replace(context, "get_pos_info", lambda _: _nothing)
+    _replace(getattr(builder, "ASTTransformerFuncContext", None), "memoized_get_pos_info", lambda _: _nothing)
     # … stores the stack for each field, for the case that it is not placed, …
-    for module in impl, _part("snode"):
+    for module in impl, part("snode"):
         _replace(module, "get_traceback", lambda _: _nothing)
     # … searches a function's source again for every call, and wraps each of its lines at 9,999 characters.
-    _replace(kernel_impl, "getsourcefile", functools.cache)
-    _replace(kernel_impl, "getsourcelines", lambda search: functools.cache(functools.partial(_source, search)))
-    _replace(kernel_impl, "textwrap", lambda _: _Text)
+    for module in part("kernel_impl"), part("_wrap_inspect"):
+        # Taichi calls the names that its first module has imported; its second one must keep its own.
+        if module is not None and (hasattr(module, "textwrap") or hasattr(module, "get_source_info_and_src")):
+            _replace(module, "getsourcefile", functools.cache)
+            _replace(module, "getsourcelines", lambda search: functools.cache(functools.partial(_source, search)))
+    for module in part("kernel_impl"), part("_func_base"):
+        _replace(module, "textwrap", lambda _: _Text)
     # For each integer it queries the range of its type from numpy, …
     _replace(expr, "_check_in_range", lambda _: _in_range)
     # … and its objects for a kernel form cycles, none of which ends before the kernel is built.
-    _replace(getattr(kernel_impl, "Kernel", None), "materialize", _uncollected_call)
+    for module in part("kernel_impl"), part("kernel"):
+        _replace(getattr(module, "Kernel", None), "materialize", _uncollected_call)
 
 
-def _part(name: str) -> Any:
-    """A module of Taichi's language, if one of that name exists."""
+def _part(package: str, name: str) -> Any:
+    """A module of a package's language, if one of that name exists."""
     try:
-        return importlib.import_module(f"taichi.lang.{name}")
+        return importlib.import_module(f"{package}.lang.{name}")
     except ImportError:
         return None
 
@@ -202,7 +219,7 @@ def _last_line(code: CodeType) -> int:
 
 
 class _Text:
-    """The part of `textwrap` that Taichi uses."""
+    """The part of `textwrap` that the packages use."""
 
     dedent = staticmethod(textwrap.dedent)
 

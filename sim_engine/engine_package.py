@@ -1,0 +1,139 @@
+"""The package that compiles the solver: its choice, its version, and a check of its first pour.
+
+- `engine_name` chooses Taichi or Quadrants, the maintained fork of Taichi: `DECANT_ENGINE`, else the first one that is
+  installed. Outcomes of the two agree within the spread of seeds, not bit for bit.
+- `engine_version` names the package and its version. Runs record it, and nodes of a cluster compare it.
+- `check_engine` compares one small pour with a stored outcome, once for each version. Compiled for some devices, the
+  kernels report no error and leave all liquid in the cup; such an engine is refused.
+
+This module has no slow imports.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from sim_engine.errors import EngineError, WrongOutcomeError
+from sim_engine.settings.plugin_registry import DISTRIBUTION
+
+if TYPE_CHECKING:
+    from sim_engine.outcome import PourOutcome
+    from sim_engine.scene import PourTask
+
+VARIABLE = "DECANT_ENGINE"
+
+ENGINES = ("taichi", "quadrants")
+"""Supported packages; without `DECANT_ENGINE` the first one that is installed is used."""
+
+
+def engine_name() -> str:
+    """The package that compiles the solver.
+
+    Raises:
+        EngineError: `DECANT_ENGINE` names an unknown package, or the package is not installed.
+    """
+    chosen = os.environ.get(VARIABLE)
+    if not chosen:
+        found = next((name for name in ENGINES if _is_installed(name)), None)
+        if found is None:
+            raise EngineError("no engine is installed: pip install taichi, or quadrants")
+        return found
+    if chosen not in ENGINES:
+        raise EngineError(f"{VARIABLE}={chosen}: there is no such engine; there are {' and '.join(ENGINES)}")
+    if not _is_installed(chosen):
+        wanted = f"'{DISTRIBUTION}[{chosen}]'" if chosen == "quadrants" else chosen
+        raise EngineError(f"{VARIABLE}={chosen}: the package '{chosen}' is not installed: pip install {wanted}")
+    return chosen
+
+
+def engine_version() -> str:
+    """Name and version of the package that compiles the solver, for example 'taichi 1.7.4'; 'none' without one."""
+    try:
+        name = engine_name()
+        return f"{name} {importlib.metadata.version(name)}"
+    except (EngineError, importlib.metadata.PackageNotFoundError):
+        return "none"
+
+
+def _is_installed(name: str) -> bool:
+    return importlib.util.find_spec(name) is not None
+
+
+EXPECTED = {
+    "retained": (0.51, 0.05),
+    "received": (0.47, 0.10),
+    "spilled": (0.025, 0.075),
+    "compression": (0.004, 0.016),
+}
+"""Outcome of `check_task`, and the largest accepted deviations: fractions of the load, and the mean compression.
+
+Means over 12 seeds; the standard deviations are 0.005, 0.013, 0.013 and below 0.0001. A scene that does not flow
+retains 1.0; without density iterations the liquid is compressed."""
+
+
+def check_task() -> PourTask:
+    """The pour of the check: a straight cup is turned to 80° within half a second, and half of the liquid stays."""
+    from sim_engine.action import DEG, Action
+    from sim_engine.liquids import Liquid, SimulationParameters
+    from sim_engine.scene import PourTask, Scene
+    from sim_engine.vessel.shapes import cylinder
+
+    scene = Scene(
+        "check of the engine",
+        cylinder("cup", inner_radius=0.04, inner_height=0.1),
+        cylinder("glass", inner_radius=0.045, inner_height=0.09),
+        Liquid(mass=0.2),
+    )
+    action = Action(angular_velocity=180 * DEG, x_offset=0.08, height=0.11, max_angle=80 * DEG, hold_time=0.1)
+    return PourTask(scene, action, SimulationParameters(particles=200), seed=1)
+
+
+def check_engine(pour: Callable[[PourTask], PourOutcome]) -> None:
+    """Compare a pour with its stored outcome, unless a record in the cache says that this version has passed.
+
+    A changed solver or another version of the package is checked again.
+
+    Args:
+        pour: simulates with the engine of this process.
+
+    Raises:
+        WrongOutcomeError: the outcome lies outside the accepted deviations.
+    """
+    from sim_engine.resources import cache_directory
+    from sim_engine.solver_fingerprint import ROOT, folder_digest
+
+    version = engine_version()
+    solver = folder_digest(ROOT / "sim_engine" / "fluid")
+    record = cache_directory() / f"checked-{version.replace(' ', '-')}-{solver}.txt"
+    if record.exists():
+        return
+    outcome = pour(check_task())
+    problem = outcome.invalid or _deviation(outcome)
+    if problem is not None:
+        raise WrongOutcomeError(
+            f"{version} gives a wrong outcome on this machine, so that nothing is simulated with it: {problem}. Delete "
+            f"its compiled kernels in {cache_directory()}; if that does not help, use another engine ({VARIABLE}, one "
+            f"of: {', '.join(ENGINES)}) or the version that Decant requires"
+        )
+    try:
+        record.write_text(f"{outcome.received:.4f} received, {outcome.retained:.4f} retained\n", encoding="utf-8")
+    except OSError:  # a full or read-only disk costs time on the next start, not now
+        return
+
+
+def _deviation(outcome: PourOutcome) -> str | None:
+    """The first quantity of the check that deviates too much, as a message."""
+    values = {
+        "retained": outcome.retained,
+        "received": outcome.received,
+        "spilled": outcome.spilled,
+        "compression": outcome.density_error,
+    }
+    for name, (expected, most) in EXPECTED.items():
+        if not abs(values[name] - expected) <= most:  # NaN deviates, too
+            return f"{name} {values[name]:.3g} in the check's pour instead of {expected:g} ± {most:g}"
+    return None
