@@ -290,6 +290,7 @@ def test_a_fit_finds_grip_and_lag_and_predicts_another_pour() -> None:
     assert found.replay_values.fitted_on == ("dose-1", "dose-2", "dose-3")
 
 
+@pytest.mark.slow
 def test_a_grip_and_a_lag_that_are_changed_are_found() -> None:
     doses = [
         replace(one, tilts=one.tilts - math.radians(2.0), read_times=one.read_times + 0.3) for one in samples()[:3]
@@ -315,6 +316,7 @@ def test_the_end_of_a_fitted_recording_is_judged_apart_from_its_beginning() -> N
 # ---- commands and runs
 
 
+@pytest.mark.slow
 def test_fit_and_replay_on_the_command_line(tmp_path: Path) -> None:
     for name in ("dose-1", "dose-2"):
         for suffix in (".yaml", ".csv"):
