@@ -39,7 +39,7 @@ from scipy.special import ndtr
 
 from actors.balance.step_response import FILTERS, LAGS, step_response
 from actors.dosing.cup_flow import CupFlow
-from actors.dosing.display_belief import DisplayBelief, Repeats
+from actors.dosing.display_belief import REPEATS, DisplayBelief, Repeats
 from actors.interfaces import DoseKnowledge
 from sim_engine.liquids import SimulationParameters
 
@@ -278,6 +278,7 @@ class DoseEstimator:
         self.zero = step * rng.permutation((np.arange(count) + 0.5) / count - 0.5)
         self.repeats = Repeats(belief.display.repeats)
         self.noise, self._jitter = belief.display.noise, belief.display.jitter
+        self._age = belief.display.interval / math.sqrt(12.0)
         self._last: float | None = None
         self._log_weight = np.zeros(count)
         self._squares = [0.0, 0.0]
@@ -387,8 +388,10 @@ class DoseEstimator:
     def _scatter(self) -> float:
         """The same before the display rounds [kg]."""
         falls = max(self._recent_flow - self._middle_flow, 0.0)
+        # a display that repeats most readings converts at times of its own
+        age = self._age * float(self.repeats.weights(0) @ REPEATS)
         return math.sqrt(self.noise) * math.hypot(
-            self._sigma, math.hypot(FLOW_NOISE, self._jitter) * self._middle_flow, END_NOISE * falls
+            self._sigma, math.hypot(FLOW_NOISE, self._jitter, age) * self._middle_flow, END_NOISE * falls
         )
 
     def seen(self, reading: DoseReading) -> Seen:
