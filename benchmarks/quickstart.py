@@ -1,7 +1,7 @@
 """Measure the quickstart: benefit of its calibration, losses of its pours, and number of pours until it stops.
 
     python benchmarks/quickstart.py [--seeds 10] [--first 401] [--arms shipped ...] [--calibration-only] [--random 256]
-                                    [--plans 4] [--laboratory FILE] [--into build/quickstart] [--write]
+                                    [--plans 4] [--fits 10] [--laboratory FILE] [--into build/quickstart] [--write]
 
 The benchmark runs the shipped campaign unchanged, on a simulated bench with the ground truth of its own laboratory. It
 only skips the scores of random θ, on which the deployment does not depend. Each seed runs in its own process, which
@@ -14,6 +14,10 @@ comparison continues.
 - `--plans` pours this number of plans of the uncalibrated simulator.
 - With `--seeds 0` only `--random` and `--plans` are done.
 - `--arms "all pours"` makes 15 pours per seed and does not stop before, for the coverage of the prediction intervals.
+- `--fits` compares calibrations only, for this number of seeds from `--first` on, on two benches: that of the
+  laboratory file, and one whose receiver stands 14 mm farther away. θ* of `simulations: auto` is compared with θ* of 30
+  simulations, with the uncalibrated θ, and with the best θ of a 10 × 10 grid, which has the same seeds as the first.
+  Further pours with new actions test all of them, and the prediction intervals.
 - `--write` makes no runs; it writes the tables of stored runs to docs/data/results.json, for docs/make_tables.py.
 
 Questions, fixed before the first run on seeds from 401 on; seeds below 400 are for tuning or were used before:
@@ -24,12 +28,16 @@ Questions, fixed before the first run on seeds from 401 on; seeds below 400 are 
 4. Is no pour above 10 % after the first below 1 %? Is the median number of pours until it stops four or fewer?
 5. (`all pours`.) Are 85 to 95 % of at least 300 pours in their 90 % intervals? Is the mean interval score better than
    that of intervals that are not scaled by a campaign's earlier pours?
+6. (`--fits`.) Is θ* on the training pours in the mean at most 0.3 points above the best of the grid, and never above
+   the uncalibrated θ? Is its mean error on 12 further pours at most 2 points? Do 85 to 95 % of these lie in their 90 %
+   intervals?
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import json
 import math
 import os
@@ -52,25 +60,29 @@ from actors.bench.ground_truth import draw_pose_error
 from actors.simulators.job_runner import Simulator, pour_simulator
 from actors.simulators.local_worker import ThreadWorker
 from actors.simulators.pool import WorkerPool
-from orchestrator.journal.codec import digest, from_json, to_json
+from orchestrator.journal.codec import digest, from_json, result_of, to_json
 from orchestrator.requests import Prediction
 from orchestrator.runs.stages import (
+    CALIBRATION,
     EVALUATION,
     StageDefinition,
     calibrated_theta,
     calibration_stages,
     measured_pours,
+    posterior_draws,
 )
 from orchestrator.strategies.calibration.action_prior import Contexts
-from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation
-from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan
+from orchestrator.strategies.calibration.calibration_base import Calibrated
+from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation, shift_left_over
+from orchestrator.strategies.calibration.pour_design import stratified
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
 from orchestrator.strategies.deployment import deployment_base
 from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import PourOutcome, SimulatedPour
-from sim_engine.prediction_band import LEVEL
-from sim_engine.scene import PourTask
+from sim_engine.outcome import PourOutcome, SimulatedPour, normalised_spillage
+from sim_engine.prediction_band import LEVEL, band
+from sim_engine.scene import PoseError, PourTask, Scene
 
 GOOD, BAD = 0.01, 0.10
 TRUTH = ("liquid", "pose_error", "pose_noise")
@@ -177,6 +189,162 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
             "ended": found.ended,
         }
     return {**run, "cpu_s": round(time.process_time(), 1), "simulated": pool.simulated}
+
+
+PROGRAMS: dict[str, int | str] = {"auto": "auto", "30 simulations": 30}
+"""Numbers of simulations that are compared."""
+
+BENCHES = {"twin": None, "14 mm": "14 mm"}
+"""Benches of the comparison, with the offset of the receiver if it is not that of the laboratory file."""
+
+FURTHER, DRAWN, CELLS = 12, 6, 10
+"""Number of further pours, of posterior draws that predict each, and of the grid's values per axis."""
+
+
+def fitted(seed: int, bench: str, laboratory: Path, into: Path) -> list[dict[str, Any]]:
+    """Calibrate with each program; return errors on the training, test and further pours, one row per program."""
+    from decant.running import build_campaign, load_campaign
+    from orchestrator.results.stage_views import evaluation_of
+    from orchestrator.run_service import RunRequest, RunResources, RunService
+
+    pool, rows = kept_pours(f"fit-{seed}", into), []
+    for program, simulations in PROGRAMS.items():
+        with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
+            content = {**load_campaign(CAMPAIGN, laboratory).resolved, "seed": seed}
+            content["outputs"] = {"directory": folder, "recording": False, "figures": False}
+            content["laboratory"]["bench"]["time_scale"] = 3000
+            if (offset := BENCHES[bench]) is not None:
+                content["laboratory"]["bench"]["pose_error"]["x"] = offset
+            content["calibration"] |= {"random_baseline": 0, "simulations": simulations}
+            campaign = build_campaign(content, folder)
+            plan = campaign.calibration
+            assert plan is not None
+            request = RunRequest(replace(campaign, deployment=None), tuple(calibration_stages(plan)))
+            begun = time.process_time()
+            handle = RunService().start(request, RunResources(in_process=True, simulators=pool))
+            results = asyncio.run(handle.wait()).results
+        scores, calibrated = evaluation_of(results), result_of(results, CALIBRATION, Calibrated)
+        assert scores is not None
+        assert calibrated.found is not None
+        assert calibrated.found.posterior is not None
+        row: dict[str, Any] = {
+            "seed": seed,
+            "bench": bench,
+            "program": program,
+            "simulations": calibrated.simulations,
+            "cpu_s": round(time.process_time() - begun, 1),
+            "ended": calibrated.ended,
+            "errors": scores.discrepancy,
+            "recommended": None if scores.gain is None else scores.gain.recommended,
+            "theta": {name: getattr(calibrated.found.theta, name) for name in calibrated.found.searched},
+            "region": calibrated.found.posterior.region,
+            "correlation": calibrated.found.posterior.correlation,
+        }
+        if calibrated.pour_seeds:
+            train = [one.pour for one in measured_pours(plan, results) if one.pour.split == "train"]
+            row["grid"] = asyncio.run(best_of_grid(plan, train, calibrated.pour_seeds, pool, row["errors"]))
+        thetas = {"theta": calibrated.found.theta, "uncalibrated": plan.uncalibrated}
+        drawn = posterior_draws(calibrated.found, DRAWN)
+        left = shift_left_over(scores, len(calibrated.found.searched))
+        row["further"] = asyncio.run(further(campaign, seed, thetas, drawn, left, pool))
+        rows.append(row)
+    asyncio.run(pool.close())
+    return rows
+
+
+async def best_of_grid(
+    plan: CalibrationPlan,
+    train: Sequence[MeasuredPour],
+    seeds: Sequence[int],
+    pool: KeptPours,
+    known: dict[str, dict[str, float | None]],
+) -> float:
+    """Return the lowest mean error of a grid of θ on the training pours.
+
+    A θ is left as soon as its errors add up to those of the best one so far. Initially this is θ* with one point more,
+    so a grid whose best is worse than that yields this number.
+    """
+    best = (known["theta"]["train"] or 0.0) + 0.01
+    pours = [(pour, seed) for pour, seed in zip([p for p in train if p.spillage is not None], seeds, strict=True)]
+    middles = [(i + 0.5) / CELLS for i in range(CELLS)]
+    for point in itertools.product(middles, repeat=plan.parameters.dimension):
+        theta = SimulationParameters.from_values({**plan.fixed_parameters, **plan.parameters.decode(point)})
+        total = 0.0
+        for pour, seed in pours:
+            assert pour.spillage is not None
+            found = await spilled(pool, plan.scene, pour.action, theta, seed)
+            total += abs(pour.spillage - found)
+            if total >= best * len(pours):
+                break
+        best = min(best, total / len(pours))
+    return best
+
+
+async def spilled(
+    pool: KeptPours,
+    scene: Scene,
+    action: Action,
+    theta: SimulationParameters,
+    seed: int,
+    error: PoseError | None = None,
+) -> float:
+    """Return the simulated spillage; 1 if it is undefined, which no pour of this campaign is."""
+    outcome = (await pool.simulate(PourTask(scene, action, theta, seed, pose_error=error))).outcome
+    found = normalised_spillage(outcome.fractions)
+    return 1.0 if found is None else found
+
+
+async def further(
+    campaign: CampaignPlan,
+    seed: int,
+    thetas: dict[str, SimulationParameters],
+    drawn: Sequence[SimulationParameters],
+    left: float | None,
+    pool: KeptPours,
+) -> dict[str, Any]:
+    """Return mean errors on further pours of new actions, and the number of pours in their 90 % intervals."""
+    plan, bench, rng = campaign.calibration, campaign.laboratory.bench, np.random.default_rng([seed, FURTHER])
+    assert plan is not None
+    assert bench is not None
+    errors: dict[str, list[float]] = {name: [] for name in (*thetas, "posterior")}
+    inside = 0
+    for stratum in stratified(FURTHER, plan.actions.dimension, rng):
+        action = plan.scene.action(plan.actions.decode(stratum.draw(rng)))
+        own = int(rng.integers(2**31))
+        truth = await spilled(pool, plan.scene, action, bench.theta, own, draw_pose_error(bench, own))
+        for name, theta in thetas.items():
+            errors[name].append(abs(truth - await spilled(pool, plan.scene, action, theta, own + 1)))
+        values = [await spilled(pool, plan.scene, action, theta, own + 2 + k) for k, theta in enumerate(drawn)]
+        errors["posterior"].append(abs(truth - sum(values) / len(values)))
+        inside += band(values, drawn[0].particles, left).holds(truth)
+    return {**{name: sum(values) / len(values) for name, values in errors.items()}, "inside": inside, "of": FURTHER}
+
+
+def fits_table(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return head and rows of the comparison: one row per bench, seed and program, and the means."""
+
+    def cells(row: dict[str, Any]) -> list[float]:
+        train, unseen = row["errors"], row["further"]
+        grid = row.get("grid", math.nan)
+        return [train["theta"]["train"], train.get("uncalibrated", train["theta"])["train"], grid,
+                unseen["theta"], unseen["posterior"], unseen["uncalibrated"]]  # fmt: skip
+
+    def shown(values: Sequence[float]) -> list[str]:
+        return ["" if math.isnan(value) else f"{100 * value:.2f}" for value in values]
+
+    lines = []
+    for bench, program in itertools.product(BENCHES, PROGRAMS):
+        chosen = [row for row in rows if (row["bench"], row["program"]) == (bench, program)]
+        for row in chosen:
+            held = f"{row['further']['inside']} of {row['further']['of']}"
+            lines.append([bench, program, str(row["seed"]), str(row["simulations"]), *shown(cells(row)), held])
+        if chosen:
+            inside, of = (sum(row["further"][key] for row in chosen) for key in ("inside", "of"))
+            means = np.array([cells(row) for row in chosen]).mean(axis=0)
+            made = f"{np.mean([row['simulations'] for row in chosen]):.0f}"
+            lines.append([bench, program, "mean", made, *shown(means), f"{100 * inside / of:.0f} %"])
+    head = ["bench", "program", "seed", "simulations", "training pours: θ\\*", "uncalibrated", "best of the grid"]
+    return {"head": [*head, "further pours: θ\\*", "posterior", "uncalibrated", "in 90 % intervals"], "rows": lines}
 
 
 def calibration_and_test(plan: CalibrationPlan) -> tuple[StageDefinition, ...]:
@@ -415,6 +583,30 @@ def _run_missing(asked: argparse.Namespace, runs: list[dict[str, Any]], file: Pa
             )
 
 
+def _compare_fits(asked: argparse.Namespace) -> None:
+    """Make the missing comparisons, one process for each seed and bench, and print or write their table."""
+    file = asked.into / "fits.jsonl"
+    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
+    places = [f"--{name}={getattr(asked, name).resolve()}" for name in ("laboratory", "into")]
+    wanted = range(asked.first, asked.first + asked.fits)
+    for seed, bench in itertools.product(wanted, () if asked.write else BENCHES):
+        if any((row["seed"], row["bench"]) == (seed, bench) for row in rows):
+            continue
+        new = run_self(__file__, f"--one={seed}", f"--bench={bench}", *places)["rows"]
+        rows += new
+        with file.open("a", encoding="utf-8") as kept:
+            kept.writelines(json.dumps(row) + "\n" for row in new)
+        say(f"seed {seed}, {bench}: {[(row['program'], row['simulations'], row['cpu_s']) for row in new]}")
+    shown = fits_table(sorted((row for row in rows if row["seed"] in wanted), key=lambda row: row["seed"]))
+    print(
+        "\n".join(f"| {' | '.join(cells)} |" for cells in (shown["head"], ["---"] * len(shown["head"]), *shown["rows"]))
+    )
+    if asked.write:
+        command = f"python benchmarks/quickstart.py --fits {asked.fits} --first {asked.first}"
+        settings = "calibration of quickstart.yaml on the bench of twin.yaml; mean errors in points"
+        write_table("quickstart-fits", **shown, command=command, settings=settings)
+
+
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -424,6 +616,8 @@ def main() -> None:
     parser.add_argument("--calibration-only", action="store_true", help="skip the deployment")
     parser.add_argument("--random", type=int, default=0, help="number of random actions to pour on the bench")
     parser.add_argument("--plans", type=int, default=0, help="number of uncalibrated plans to pour on the bench")
+    parser.add_argument("--fits", type=int, default=0, help="number of seeds to compare calibrations on")
+    parser.add_argument("--bench", choices=list(BENCHES), help=argparse.SUPPRESS)
     parser.add_argument("--laboratory", type=Path, default=ROOT / "configs" / "laboratories" / "twin.yaml")
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "quickstart")
     parser.add_argument("--write", action="store_true", help="write the tables into docs/data/results.json")
@@ -432,8 +626,14 @@ def main() -> None:
     asked.into.mkdir(parents=True, exist_ok=True)
     if asked.one is not None:
         _end_with_parent()
+        if asked.bench is not None:
+            print(json.dumps({"rows": fitted(asked.one, asked.bench, asked.laboratory, asked.into)}))
+            return
         only = asked.calibration_only
         print(json.dumps(one(asked.one, asked.arms[0], asked.laboratory, asked.into, calibration_only=only)))
+        return
+    if asked.fits:
+        _compare_fits(asked)
         return
     if asked.random:
         losses = random_losses(asked.random, asked.first, asked.laboratory, asked.into)

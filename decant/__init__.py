@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from orchestrator.catalogue.vessel_account import VesselAccount, VesselContent
     from orchestrator.config.action_assignments import AssignmentError
     from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.journal import events
+    from orchestrator.journal.events import Event
     from orchestrator.recordings.recording_export import export_recordings
     from orchestrator.recordings.recording_file import PourRecording, load_recording, load_recordings
     from orchestrator.recordings.recording_fit import Fit, Judgement, fit_recordings, judge_recording
@@ -43,8 +45,6 @@ if TYPE_CHECKING:
     from orchestrator.results.recording_figures import replay_figure
     from orchestrator.run_errors import RunError
     from orchestrator.run_service import CheckReport
-    from orchestrator.runs import events
-    from orchestrator.runs.events import Event
     from orchestrator.strategies.campaign_plan import CampaignPlan
     from sim_engine.errors import DecantError, InvalidArgumentError
     from sim_engine.liquids import SimulationParameters
@@ -125,7 +125,7 @@ _HOMES = {
     "orchestrator.run_errors": ("RunError",),
     "orchestrator.run_service": ("CheckReport",),
     "orchestrator.added_pours": ("add_pour",),
-    "orchestrator.runs.events": ("Event",),
+    "orchestrator.journal.events": ("Event",),
     "orchestrator.strategies.campaign_plan": ("CampaignPlan",),
     "orchestrator.recordings.recording_export": ("export_recordings",),
     "orchestrator.recordings.recording_file": ("PourRecording", "load_recording", "load_recordings"),
@@ -148,7 +148,7 @@ if not TYPE_CHECKING:  # else a type checker would take a misspelt name for Any
     def __getattr__(name: str) -> Any:
         """Import a name when it is asked for (PEP 562)."""
         if name == "events":
-            return import_module("orchestrator.runs.events")
+            return import_module("orchestrator.journal.events")
         if name not in _HOME_OF:
             raise AttributeError(f"module 'decant' has no attribute '{name}'; it has {', '.join(__all__)}")
         return getattr(import_module(_HOME_OF[name]), name)

@@ -40,12 +40,11 @@ from actors.laboratory_settings import LaboratorySettings
 from decant.run_results import Run, html_table
 from decant.running import checked
 from orchestrator.added_pours import weighed_by_hand
+from orchestrator.journal.events import Subscriber as Watch
 from orchestrator.journal.run_record import read_record
 from orchestrator.requests import Pour, Prediction
 from orchestrator.results.stage_views import receiver_names
 from orchestrator.run_service import RunHandle, RunResources, RunService, RunTaskError, task_request
-from orchestrator.runs.events import Event, RequestStarted
-from orchestrator.runs.events import Subscriber as Watch
 from orchestrator.runs.resume import LOST
 from orchestrator.runs.stages import scenes_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -130,7 +129,7 @@ class AskTell:
             request,
             RunResources(
                 in_process=in_process,
-                subscribers=(*watch, self._note),
+                subscribers=watch,
                 ask_operator=self._settle,
                 laboratory=self._external_laboratory,
             ),
@@ -142,7 +141,6 @@ class AskTell:
         self._campaign, self._folder, self._answer = campaign, request.folder, answer
         self._names = receiver_names(campaign)
         self._unknown = read_record(request.folder).unknown_pours if request.resume == "yes" else []
-        self._started: RequestStarted | None = None
         self._waiting: queue.SimpleQueue[_Waiting | None] = queue.SimpleQueue()
         self._current: _Waiting | None = None
         self._handle: RunHandle | None = None
@@ -298,18 +296,14 @@ class AskTell:
         if self._handle is not None:
             self._handle.pause()
 
-    def _note(self, event: Event) -> None:
-        if isinstance(event, RequestStarted) and isinstance(event.request, Pour):
-            self._started = event
-
     def _external_laboratory(self, spec: LaboratorySettings, need_bench: bool) -> Laboratory:
         return _ExternalLaboratory(open_laboratory(spec, need_bench=False), self._outcome)
 
     async def _outcome(self, scene: Scene, action: Action) -> PourMeasurement:
         """Hand a pour to the caller and wait for its outcome."""
-        started = self._started
+        assert self._handle is not None
+        started = self._handle.state.pour
         assert started is not None
-        assert isinstance(started.request, Pour)
         waiting = self._hand_out(started.stage, started.request, scene.liquid.mass)
         measured, _ = await waiting.outcome
         if isinstance(measured, BaseException):

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.codec import Results
 from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.run_record import CampaignResult, Row, answers, pour_row, read_record, read_result
-from orchestrator.requests import Failed, Pour, Poured, Simulate, Simulated
+from orchestrator.journal.run_record import CampaignResult, Row, answers, read_record, read_result
+from orchestrator.requests import Failed, Simulate, Simulated
 from orchestrator.results.loss_units import loss_of_pour
 from orchestrator.results.publishing import Published, report_on, summary_of
 from orchestrator.results.publishing import publish as write
@@ -183,14 +183,13 @@ class Run:
 
     def _pours(self) -> Iterator[Row]:
         names = receiver_names(self.campaign)
-        for one in answers(self.directory, Pour):
-            request, outcome = one.request, one.outcome
-            assert isinstance(request, Pour)
-            row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(request.scene, request.scene)}
-            row |= pour_row(request, outcome)
-            if isinstance(outcome, Poured):
-                row["loss"] = loss_of_pour(self.campaign, request, outcome.measurement)
-            yield {**row, "seconds": one.seconds}
+        for one in read_record(self.directory).pours:
+            if one.outcome is not None:
+                scene = one.request.scene
+                row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(scene, scene), **one.row()}
+                if one.measured is not None:
+                    row["loss"] = loss_of_pour(self.campaign, one.request, one.measured)
+                yield {**row, "seconds": one.seconds}
 
     def _simulations(self) -> Iterator[Row]:
         names = receiver_names(self.campaign)

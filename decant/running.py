@@ -25,6 +25,7 @@ from orchestrator.bench_check import BenchReport, check_bench
 from orchestrator.config.file_loading import campaign_from, load_campaign, load_laboratory, load_vessel
 from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.config.yaml.yaml_source import Document
+from orchestrator.journal.events import Subscriber as Watch
 from orchestrator.live_view.live_server import recorder_of
 from orchestrator.progress.progress_state import ProgressState
 from orchestrator.results.publishing import not_simulated
@@ -42,7 +43,6 @@ from orchestrator.run_service import (
     read_theta,
     task_request,
 )
-from orchestrator.runs.events import Subscriber as Watch
 from orchestrator.runs.motion_approval import read_record
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import POSTERIOR_DRAWS, posterior_draws

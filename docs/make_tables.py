@@ -6,6 +6,7 @@ page is not current. Run from the project's root: python docs/make_tables.py
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import itertools
 import json
@@ -615,17 +616,15 @@ def rest() -> str:
 
 def events() -> str:
     """The events of a run with their fields."""
-    from orchestrator.runs import events as module
+    from orchestrator.journal import events as module
 
     parts = []
     for name, kind in vars(module).items():
         if isinstance(kind, type) and issubclass(kind, module.Event) and kind.__module__ == module.__name__:
             text, _, fields = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
-            own = [
-                field
-                for field in typing.get_type_hints(kind)
-                if kind is module.Event or field not in typing.get_type_hints(module.Event)
-            ]
+            base = [field.name for field in dataclasses.fields(module.Event)]
+            fields_of = [field.name for field in dataclasses.fields(kind)]
+            own = base if kind is module.Event else [field for field in fields_of if field not in base]
             described = dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", fields, re.MULTILINE))
             rows = [(f"`{field}`", _one_line(described.get(field, ""))) for field in own]
             parts.append(f"## {name}\n\n{_one_line(text)}\n")

@@ -14,8 +14,9 @@ from typing import Any
 
 from orchestrator.config.action_assignments import assigned_action
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.codec import Results, decode_outcome, decode_results, encode_outcome, encode_request
-from orchestrator.journal.journal import JOURNAL_NAME, Draft, Journal, Kind
+from orchestrator.journal.codec import Results, decode_outcome, encode_outcome
+from orchestrator.journal.events import Requested, RequestFinished, Told
+from orchestrator.journal.journal import JOURNAL_NAME, Journal
 from orchestrator.journal.run_record import read_header
 from orchestrator.requests import ADDED, Outcome, Pour, Poured
 from orchestrator.runs.prior_data import fitting
@@ -86,15 +87,13 @@ def add_pour(
                 f"the deployment into {name} {when} in {folder}; begin a run with "
                 "'deployment: {data: {run: …}}' to learn from pours that were made before it"
             )
-        outcome = encode_outcome(Poured(measured))
-        _try(campaign, stage, history, decode_results(journal.stage_results()), pour, decode_outcome(outcome))
+        outcome = decode_outcome(encode_outcome(Poured(measured)))
+        _try(campaign, stage, history, journal.stage_results(), pour, outcome)
         key = journal.last_id() + 1
-        journal.append_all(
-            [
-                Draft(Kind.REQUESTED, {"id": key, "request": encode_request(pour)}, stage),
-                Draft(Kind.POUR_FINISHED, {"id": key, "outcome": outcome, "seconds": 0.0}, stage),
-                Draft(Kind.TOLD, {"id": key}, stage),
-            ]
+        journal.append(
+            Requested(stage=stage, id=key, request=pour),
+            RequestFinished(stage=stage, id=key, request=pour, outcome=outcome),
+            Told(stage=stage, id=key),
         )
 
 

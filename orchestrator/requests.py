@@ -7,6 +7,7 @@ A strategy returns `Simulate`, `Pour`, `Suggest` or `Ask` and receives `Simulate
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import Literal
@@ -26,6 +27,9 @@ ADDED = "added"
 
 WRITTEN_IF_SET = {"written": "if set"}
 """Metadata of a field that journal and events leave out while it is None."""
+
+NOT_WRITTEN = {"written": False}
+"""Metadata of a field that the journal leaves out."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,14 @@ class Pour:
     predicted: Prediction | None = None
     purpose: str = "pour"
     dose: DoseTarget | None = field(default=None, metadata=WRITTEN_IF_SET)
+
+    def calibrates(self, deployed: Iterable[str]) -> bool:
+        """Whether it serves calibration: it is compared with simulations, not minimised.
+
+        Args:
+            deployed: scenes that a deployment pours into.
+        """
+        return self.dose is None and (self.purpose == "calibration" or self.scene not in deployed)
 
 
 @dataclass(frozen=True)

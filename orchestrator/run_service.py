@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings, RaySettings
 from orchestrator.catalogue.vessel_account import VesselAccount
+from orchestrator.journal.events import Event, Subscriber
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_check import check_journal, has_begun
-from orchestrator.journal.run_record import CampaignResult, read_result
-from orchestrator.requests import Pour
+from orchestrator.journal.journal_file import Header
+from orchestrator.journal.run_record import CampaignResult, RunState, read_result
 from orchestrator.run_errors import RunError
-from orchestrator.runs.events import CampaignStateChanged, Event, PourProgressed, RequestFinished, Subscriber
 from orchestrator.runs.resume import AskOperator
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import (
@@ -267,7 +267,7 @@ class RunHandle:
 
     Attributes:
         folder: of the run.
-        checkpoint: of the pour that is under way; '' between pours.
+        state: what the run's events say so far.
     """
 
     def __init__(
@@ -279,7 +279,7 @@ class RunHandle:
         recorder: RerunMonitor | None,
     ) -> None:
         self._request, self._laboratory, self._recorder = request, laboratory, recorder
-        self.folder, self.checkpoint = folder, ""
+        self.folder, self.state = folder, RunState(Header(request.campaign.name, {}))
         self._ask_operator = resources.ask_operator
         self._subscribers: list[Subscriber] = [*resources.subscribers, self._note]
         if recorder is not None:
@@ -291,15 +291,15 @@ class RunHandle:
         self._result: CampaignResult | None = None
         self._task: asyncio.Task[CampaignResult] | None = None
 
+    @property
+    def checkpoint(self) -> str:
+        """Checkpoint of the pour that is under way; '' between pours."""
+        return self.state.checkpoint
+
     def _note(self, event: Event) -> None:
-        match event:
-            case PourProgressed():
-                self.checkpoint = event.progress.checkpoint
-            case RequestFinished(request=Pour()):
-                self.checkpoint = ""
-            case CampaignStateChanged(after=after):
-                if after in (State.PAUSING, State.PAUSED, State.UNKNOWN, State.FAILED, State.STOPPING):
-                    self._winding_down.set()
+        self.state.take(event)
+        if self.state.state in (State.PAUSING, State.PAUSED, State.UNKNOWN, State.FAILED, State.STOPPING):
+            self._winding_down.set()
 
     async def wait(self) -> CampaignResult:
         """Run to the end. Cancelling the waiting task pauses the run; cancelling it again abandons a pour.

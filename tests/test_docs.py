@@ -192,7 +192,7 @@ def test_quickstart_is_what_the_tutorial_says() -> None:
     page = " ".join(text_of(ROOT / "docs" / "tutorials" / "first-pour.md").split())
     assert (calibration.pour_count, deployment.pours) == (12, 6)
     assert "weighs twelve pours into a tumbler" in page
-    assert f"with {calibration.simulations} simulations" in page
+    assert (calibration.settings.model_dump()["simulations"], "simulations: auto" in page) == ("auto", True)
     assert f"{deployment.settings.simulations_before} simulations first, then at most six pours" in page
 
 

@@ -80,6 +80,11 @@ class CupFlow:
         """
         return np.interp(head, self._head_grid, self._row(tilt))
 
+    def flow_at(self, head: Floats, tilt: Floats) -> Floats:
+        """`flow` for tilts of their own, elementwise [m³/s]."""
+        column = (len(self._head_grid) - 1) * np.sqrt(np.maximum(head, 0.0) / LARGEST_HEAD)
+        return _bilinear(self._flows, tilt / self._tilt_step, column)
+
     def head_for(self, flow: Floats, tilt: float) -> Floats:
         """Inverse of `flow` [m]."""
         return np.interp(flow, self._row(tilt), self._head_grid)

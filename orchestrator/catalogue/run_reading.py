@@ -17,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from orchestrator.catalogue.annotations import Annotations, AnnotationsError, Note, read_annotations
 from orchestrator.journal.codec import CodecError, from_json
-from orchestrator.journal.run_record import RecordedPour, Row, pour_row, read_record
+from orchestrator.journal.events import StageClosed
+from orchestrator.journal.run_record import Row, RunPour, read_record
 from orchestrator.run_errors import RunError
 from orchestrator.runs.prior_data import scenes_in
 from orchestrator.strategies.stage_result import displayed_action
@@ -225,14 +226,13 @@ def _rows(directory: Path) -> tuple[Row, list[Row]]:
         "spilled_g": sum(row.get("spilled_g") or 0.0 for row in pours),
     }
     receivers = {name: scene["receiver"]["name"] for name, scene in scenes.items()}
-    return run | _result_columns(record.results, receivers), pours
+    return run | _result_columns(record.closed.values(), receivers), pours
 
 
-def _pour(pour: RecordedPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> Row:
+def _pour(pour: RunPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> Row:
     request, deployment = pour.request, plan.get("deployment") or {}
     scene = scenes.get(request.scene, {})
-    deployed = any(scene["name"] == request.scene for scene in deployment.get("scenes", ()))
-    calibrating = request.purpose == "calibration" or not deployed
+    calibrating = request.calibrates(scene["name"] for scene in deployment.get("scenes", ()))
     minimised = not calibrating and request.dose is None
     # The loss of weighted objectives needs the plan: use `decant.open_run(run).pours`.
     loss = None if not minimised or deployment.get("objectives") is not None else Loss(**deployment["loss"])
@@ -240,7 +240,7 @@ def _pour(pour: RecordedPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]
     if loss is not None and pour.measured is not None:
         particles = int((plan.get("parameters") or {}).get("particles", 0))
         measured = loss(pour.measured.fractions, loaded_mass=pour.measured.loaded, particles=particles)
-    row = pour_row(request, pour.outcome)
+    row = pour.row()
     return {
         **row,
         "predicted_loss": row.pop("predicted"),
@@ -269,11 +269,11 @@ def _different(names: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _result_columns(results: Mapping[str, Mapping[str, Any]], receivers: Mapping[str, str]) -> Row:
+def _result_columns(closed: Iterable[StageClosed], receivers: Mapping[str, str]) -> Row:
     """θ*, its discrepancy, and recommendations, from encoded results; their kinds need not be installed."""
     row: Row = {"theta": None, "test_discrepancy": None, "recommended": {}}
-    for written in results.values():
-        result = from_json(written)
+    for event in closed:
+        result = from_json(event.encoded)
         match result.get("kind"):
             case "calibration":
                 row["theta"] = (result.get("found") or {}).get("theta")

@@ -9,8 +9,8 @@ content uncertain by its amount; one with unknown outcome makes it unknown until
     account.content("virtual/beaker")
 
 The command line, the library, runs and the daemon share the file. A vessel of the station has its id as its name, the
-source of a campaign 'LABORATORY/VESSEL'. `VesselAccount.follow` is a subscriber of a run (`orchestrator.runs.events`).
-Entries have a key, so that the events of a resumed run are written once.
+source of a campaign 'LABORATORY/VESSEL'. `VesselAccount.follow` is a subscriber of a run
+(`orchestrator.journal.events`). Entries have a key, so that the events of a resumed run are written once.
 
 Limitations: liquids that were poured together become a mixture. Evaporation is not estimated. Of a campaign, the doses
 of `dispense` are in the account; the pourer of other campaigns is refilled by an operator.
@@ -29,8 +29,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from orchestrator.catalogue.run_registry import make_state_directory, state_directory
+from orchestrator.journal.events import CampaignOpened, Event, RequestFinished, RequestStarted
 from orchestrator.requests import Failed, Outcome, Pour, Poured
-from orchestrator.runs.events import CampaignOpened, Event, RequestFinished, RequestStarted
 from orchestrator.strategies.campaign_plan import DispensePlan
 from orchestrator.strategies.dispense import KnownSource, left_after
 from sim_engine.errors import InvalidArgumentError

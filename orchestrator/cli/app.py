@@ -16,6 +16,7 @@ from orchestrator.cli import (
     campaign_commands,
     dose_command,
     file_commands,
+    first_day_command,
     materials_commands,
     physics_command,
     pour_command,
@@ -260,7 +261,7 @@ _add(
 
 _recording = _group(
     "recording",
-    "Recorded pours: export them from runs, replay them, and fit unknown quantities.",
+    "Recorded pours: export them from runs, replay them, fit unknown quantities, and record a first day.",
     "decant recording replay configs/recordings/dose-1.yaml",
     "decant recording export runs/dispense-20300131-1",
 )
@@ -281,6 +282,15 @@ _add(
     recording_commands.fit,
     "decant recording fit day-one/ --unknown grip --unknown lag --judge day-two/ --output fit.json",
     "decant recording fit configs/recordings/dose-1.yaml --until '5 s'   # judged on the rest",
+    to=_recording,
+    quiet=True,
+)
+_add(
+    first_day_command.first_day,
+    "decant recording first-day day-one --campaign configs/campaigns/first-day.yaml",
+    "decant recording first-day practice --practise --wrong grip   # in minutes, without a laboratory",
+    "decant recording first-day day-one   # explain the recordings of a folder again",
+    name="first-day",
     to=_recording,
     quiet=True,
 )

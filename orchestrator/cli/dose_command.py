@@ -67,7 +67,7 @@ def dose(
     in a journal and weighed, as a small run. A whole series belongs to the section 'dispense' of a campaign: 'decant
     run' pours it, 'decant dose --dry-run' predicts it.
     """
-    plan = _chosen(campaign, laboratory, receiver, amount, tolerance, as_left=as_left, dry_run=dry_run)
+    plan = dose_plan(campaign, laboratory, receiver, amount, tolerance, as_left=as_left, dry_run=dry_run)
     plan = dataclasses.replace(plan, seed=plan.seed if seed is None else seed)
     if dry_run:
         _predict(plan, as_json=as_json)
@@ -79,7 +79,7 @@ def dose(
         if value is not None
     )
     again = f"Another dose: decant dose {campaign}{options} --amount '{amount[0]}'"
-    _pour(plan, in_process=in_process, as_json=as_json, again=again)
+    pour_doses(plan, in_process=in_process, as_json=as_json, again=again)
 
 
 def _planned_doses(amounts: Sequence[str], tolerance: str, receiver: str) -> tuple[PlannedDose, ...]:
@@ -95,7 +95,7 @@ def _planned_doses(amounts: Sequence[str], tolerance: str, receiver: str) -> tup
     return tuple(PlannedDose(amount, limit, receiver) for amount in wanted)
 
 
-def _chosen(
+def dose_plan(
     path: Path,
     laboratory: Path | None,
     receiver: str | None,
@@ -106,6 +106,14 @@ def _chosen(
     dry_run: bool,
 ) -> CampaignPlan:
     """The campaign with nothing but a series of doses.
+
+    Args:
+        path: of the campaign.
+        laboratory: another laboratory.
+        receiver: name of the receiver; the first unless given.
+        amounts, tolerance: with units.
+        as_left: the source holds what earlier doses have left.
+        dry_run: the campaign's own series is possible.
 
     Raises:
         RefusalError: the campaign can't be read, it has no bench, or a dose is impossible (exit code 2).
@@ -252,8 +260,21 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
     return "\n".join(lines)
 
 
-def _pour(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: str) -> None:
-    """As a small run of its own: journalled and weighed."""
+def pour_doses(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: str) -> Path:
+    """Pour a series of doses as a small run of its own: journalled and weighed.
+
+    Args:
+        plan: a campaign with nothing but the series.
+        in_process: without Ray.
+        as_json: print the doses as JSON.
+        again: the next command, for the message after an interruption.
+
+    Returns:
+        The folder of the run.
+
+    Raises:
+        RefusalError: refused (exit code 2), or not every dose was poured (1).
+    """
     from orchestrator.cli.campaign_commands import run_directory
     from orchestrator.cli.foreground_run import (
         check_laboratory_answers,
@@ -306,6 +327,7 @@ def _pour(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: str) ->
     print_note(f"run: {directory}")
     if any(one.received_g is None for one in result.doses):
         raise RefusalError("not every dose was poured", FAILED)
+    return directory
 
 
 def dose_text(dose: Dose) -> str:

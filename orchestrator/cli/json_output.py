@@ -634,6 +634,30 @@ class RecordingFitOutput(_Output):
     """Predicted and measured mass, RMS and coverage of each judged recording."""
 
 
+class FirstDayOutput(_Output):
+    """What the recordings of a first day show."""
+
+    main: str | None
+    """Quantity that explains the pours best; null if none does better than the tolerances of a rig in order."""
+
+    describes: bool
+    """Whether half of the doses or more are as predicted from the pours."""
+
+    explanations: list[dict[str, Any]]
+    """Name, evidence and value of each quantity; empty if fewer than four pours have readings while they flow."""
+
+    doses: list[dict[str, Any]]
+    """Predicted mass with its 90 % interval, weighed and wanted mass of each dose."""
+
+    missed_g: float | None
+    """Mass in the receiver after the deliberate miss."""
+
+    dose_error_g: list[float] | None
+    """Mean and largest distance of the weighed from the wanted amount."""
+
+    replays: list[RecordingReplayOutput]
+
+
 OUTPUTS: dict[str, Any] = {
     "run": RunOutput,
     "calibrate": CalibrateOutput,
@@ -660,6 +684,7 @@ OUTPUTS: dict[str, Any] = {
     "recording export": RecordingExportOutput,
     "recording replay": RecordingReplaysOutput,
     "recording fit": RecordingFitOutput,
+    "recording first-day": FirstDayOutput,
     "queue submit": CampaignOut,
     "queue list": QueueOutput,
     "queue show": CampaignDetailOut,

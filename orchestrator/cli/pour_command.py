@@ -84,7 +84,7 @@ def pour(
         assert chosen.path is not None
         pour_empty(chosen, chosen.path.slowed(slow), slow=slow, as_json=as_json)
         return
-    _pour(chosen, in_process=in_process, again=f"Another pour: {again} …", as_json=as_json)
+    pour_weighed(chosen, in_process=in_process, again=f"Another pour: {again} …", as_json=as_json)
 
 
 @dataclass(frozen=True)
@@ -115,18 +115,28 @@ def _check_options(*, dry_run: bool, connect: bool, empty: bool, slow: float) ->
 
 
 def _chosen(path: Path, laboratory: Path | None, assignments: list[str], scene_name: str | None) -> Chosen:
+    """`chosen_pour` of a campaign's file."""
+    from orchestrator.cli.foreground_run import read_campaign
+
+    return chosen_pour(read_campaign(path, laboratory), assignments, scene_name)
+
+
+def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | None = None) -> Chosen:
     """The pour that is asked for, its path planned and checked.
+
+    Args:
+        plan: of the campaign.
+        assignments: `name=value` texts.
+        scene_name: see `scene_to_simulate`.
 
     Raises:
         RefusalError: it can't be made (exit code 2).
     """
     from actors.interfaces import InvalidActionError
-    from orchestrator.cli.foreground_run import read_campaign
     from orchestrator.cli.simulate_command import scene_to_simulate, wanted_in
     from orchestrator.config.action_assignments import assigned_action
     from orchestrator.config.campaign_checks import check_vessels
 
-    plan = read_campaign(path, laboratory)
     scene, space = scene_to_simulate(plan, scene_name)
     with Refused(ValueError, at="--set: "):
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
@@ -221,8 +231,21 @@ def _stands_at_home(chosen: Chosen) -> bool:
     return check.state == "ok"
 
 
-def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> None:
-    """As a small run of its own: journalled, with the operator's questions, weighed."""
+def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Path:
+    """Pour as a small run of its own: journalled, with the operator's questions, weighed.
+
+    Args:
+        chosen: campaign, scene and action.
+        in_process: without Ray.
+        again: the next command, for the message after an interruption.
+        as_json: print the weights as JSON.
+
+    Returns:
+        The folder of the run.
+
+    Raises:
+        RefusalError: refused (exit code 2), or nothing was poured (1).
+    """
     from orchestrator.cli.campaign_commands import run_directory
     from orchestrator.cli.foreground_run import (
         check_laboratory_answers,
@@ -267,6 +290,7 @@ def _pour(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Non
         print_json({**about, **result.weighed.model_dump()})
     else:
         print(told(result.weighed))
+    return directory
 
 
 def plan_of_scene(plan: CampaignPlan, scene: Scene, pours: int = 1) -> CampaignPlan:

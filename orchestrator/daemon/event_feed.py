@@ -22,8 +22,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from orchestrator.requests import WRITTEN_IF_SET, Suggest, Suggested
-from orchestrator.runs.events import (
+from orchestrator.journal.events import (
     CampaignOpened,
     Event,
     PourProgressed,
@@ -32,6 +31,7 @@ from orchestrator.runs.events import (
     SpeculationProgressed,
     StrategyProgressed,
 )
+from orchestrator.requests import WRITTEN_IF_SET, Suggest, Suggested
 
 PASSING = (PourProgressed, StrategyProgressed, SpeculationProgressed)
 """Progress events. Each replaces the one before it, so they are not stored on disk."""
@@ -43,10 +43,8 @@ def event_json(event: Event) -> dict[str, Any]:
     Recorded particles are left out, since the recording contains them. A suggestion query is reduced to its purpose and
     its outcome to the points. A strategy's stage result is part of the event that closes the stage.
     """
-    left_out = {"frames"}
-    if isinstance(event, StrategyProgressed):
-        left_out.add("result")
-    table = {f.name: plain(getattr(event, f.name)) for f in dataclasses.fields(event) if f.name not in left_out}
+    sent = [f.name for f in dataclasses.fields(event) if f.metadata.get("sent") is not False]
+    table = {name: plain(getattr(event, name)) for name in sent}
     if isinstance(event, CampaignOpened):
         table["run_directory"] = event.run_directory.name
     if isinstance(event, RequestStarted | RequestFinished) and isinstance(event.request, Suggest):
@@ -110,7 +108,7 @@ class SentEvent:
     Attributes:
         id: larger than that of any earlier event.
         campaign: campaign of the event; '' if it concerns the daemon.
-        type: name of its class in `orchestrator.runs.events`, or the name of one of the daemon's own events.
+        type: name of its class in `orchestrator.journal.events`, or the name of one of the daemon's own events.
         data: JSON on one line.
     """
 
@@ -154,6 +152,8 @@ class Feed:
         """Return a subscriber that adds a campaign's events to the feed."""
 
         def receive(event: Event) -> None:
+            if event.internal:
+                return
             data = event_json(event)
             self.publish(data.pop("type"), data, campaign, kept=not isinstance(event, PASSING), t=event.time)
 

@@ -31,7 +31,7 @@ from orchestrator.config.action_assignments import AssignmentError, assigned_act
 from orchestrator.config.campaign_checks import check_vessels, touch
 from orchestrator.daemon.daemon_store import QueueItem, Store
 from orchestrator.daemon.materials import Materials, mass_of
-from orchestrator.journal.run_record import RecordedPour, read_record
+from orchestrator.journal.run_record import RunPour, read_record
 from orchestrator.requests import Failed, Simulated, Slots
 from orchestrator.run_errors import RunError
 from orchestrator.run_service import RunRequest
@@ -445,7 +445,7 @@ class SettledPour:
     """A pour as its journal records it, with the deviation of one weighing [kg]."""
 
     order: PourOrder
-    pour: RecordedPour
+    pour: RunPour
     deviation: float
 
 

@@ -26,6 +26,7 @@ from orchestrator.daemon.pour_orders import POUR, OrderBook, OrderError, PourOrd
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
 from orchestrator.daemon.submissions import CAMPAIGN, run_request
+from orchestrator.journal.events import CampaignStateChanged, Event
 from orchestrator.journal.journal_file import MB, JournalError, free_space
 from orchestrator.journal.run_record import CampaignResult
 from orchestrator.live_view.live_server import LiveView, recorder_of
@@ -35,7 +36,6 @@ from orchestrator.results.publishing import not_simulated
 from orchestrator.run_clock import run_time
 from orchestrator.run_errors import RunError
 from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService
-from orchestrator.runs.events import CampaignStateChanged, StageOpened
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.stages import scenes_of
@@ -89,7 +89,6 @@ class Running:
     def __init__(self, common: SharedServices, item: QueueItem, rig: Rig) -> None:
         self._shared, self.item, self._rig = common, item, rig
         self._progress: ProgressState | None = None
-        self._stage = StageOpened(stage="", index=0, count=0)
         self._handle: RunHandle | None = None
         self._asked_to_end = False
 
@@ -170,10 +169,8 @@ class Running:
     def _log_warning(self, text: str) -> None:
         self._shared.feed.publish("LogLine", {"level": "warning", "text": text, "stage": ""}, self.item.id)
 
-    def _note_state(self, event: Any) -> None:
-        if isinstance(event, StageOpened):
-            self._stage = event
-        elif isinstance(event, CampaignStateChanged):
+    def _note_state(self, event: Event) -> None:
+        if isinstance(event, CampaignStateChanged):
             # Finished is what has been published: killed before that, it is taken up again for it.
             done = event.after == State.FINISHED
             state, reason = ("running", "being published") if done else (event.after, event.reason)
@@ -243,13 +240,14 @@ class Running:
         progress = self._progress
         if progress is None:
             return None
-        stage = progress.stages.get(self._stage.stage)
+        opened = progress.run.opened
+        stage = progress.run.stages.get(opened.stage)
         done = stage.progress if stage is not None else None
-        pour = progress.pour
+        pour = progress.run.pour
         return {
-            "stage": self._stage.stage,
-            "stage_index": self._stage.index,
-            "stage_count": self._stage.count,
+            "stage": opened.stage,
+            "stage_index": opened.index,
+            "stage_count": opened.count,
             "simulations": done.simulations if done else 0,
             "of_simulations": done.of_simulations if done else 0,
             "pours": done.pours if done else 0,

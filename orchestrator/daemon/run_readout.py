@@ -23,7 +23,7 @@ from actors.laboratory_settings import LaboratorySettings
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.journal.codec import CodecError
 from orchestrator.journal.journal_file import JournalError
-from orchestrator.journal.run_record import RecordReader
+from orchestrator.journal.run_record import RunState, read_record
 from orchestrator.results.html_report import REPORT_NAME as REPORT
 from orchestrator.results.run_summary import PourSummary
 from orchestrator.results.summarise import pour_summaries
@@ -43,7 +43,7 @@ class Pours:
 
     def __init__(self, keep: int = 16) -> None:
         self._keep = keep
-        self._read: OrderedDict[Path, tuple[CampaignPlan, RecordReader]] = OrderedDict()
+        self._read: OrderedDict[Path, tuple[CampaignPlan, RunState]] = OrderedDict()
         self._guard = Lock()
 
     def of(self, directory: Path, plan: Callable[[], CampaignPlan], *, live: bool) -> list[PourSummary]:
@@ -55,15 +55,16 @@ class Pours:
             live: whether the run is in progress.
         """
         with self._guard:
-            known = self._read.pop(directory, None) or (plan(), RecordReader())
+            before = self._read.pop(directory, None)
+            made, known = (plan(), None) if before is None else before
             try:
-                record = known[1].read(directory)
+                record = read_record(directory, known=known)
             except (JournalError, CodecError, OSError):
                 return []  # being created, or of another version: read from its start at the next call
-            self._read[directory] = known
+            self._read[directory] = made, record
             if len(self._read) > self._keep:
                 self._read.popitem(last=False)
-            return pour_summaries(known[0], record, live=live)
+            return pour_summaries(made, record, live=live)
 
 
 def summary_of(directory: Path) -> dict[str, Any] | None:

@@ -119,10 +119,12 @@ def to_json(value: Any, hint: Any = Any) -> Any:
         raise CodecError(f"expected {hint.__name__}, got {type(value).__name__}")
     if issubclass(hint, Path | StrEnum):
         return str(value)
+    if issubclass(hint, StageResult):
+        return encode_result(cast(StageResult, value))
     if issubclass(hint, BaseModel):
         return cast(BaseModel, value).model_dump(mode="json")
     if dataclasses.is_dataclass(hint):
-        values = {name: (getattr(value, name), h) for name, h in _fields(hint).items()}
+        values = {name: (getattr(value, name), h) for name, h in written_fields(hint).items()}
         absent = {name for name in _written_if_set(hint) if values[name][0] is None}
         return {name: to_json(one, h) for name, (one, h) in values.items() if name not in absent}
     if dataclasses.is_dataclass(value):  # only a base class is annotated
@@ -147,6 +149,8 @@ def from_json(data: Any, hint: Any = Any) -> Any:
         return data
     if origin is tuple:
         _expect(data, list)
+        if get_args(hint) == (float, Ellipsis) and all(type(v) is float for v in data):  # most of what a journal has
+            return tuple(data)
         return tuple(from_json(v, h) for v, h in zip(data, _element_hints(hint, len(data)), strict=True))
     if origin is list:
         _expect(data, list)
@@ -173,7 +177,7 @@ def from_json(data: Any, hint: Any = Any) -> Any:
 
 def _dataclass_from_json(data: Any, hint: type[Any]) -> Any:
     _expect(data, dict)
-    hints = _fields(cast(Hashable, hint))
+    hints = written_fields(cast(Hashable, hint))
     if unknown := set(data) - set(hints) - {_TYPE}:
         raise CodecError(
             f"{hint.__name__} has no field {', '.join(sorted(unknown))}; was it written by a newer version?"
@@ -224,9 +228,11 @@ def _union_from_json(data: Any, arguments: tuple[Any, ...]) -> Any:
 
 
 @functools.cache
-def _fields(cls: Any) -> dict[str, Any]:
+def written_fields(cls: Any) -> dict[str, Any]:
+    """The fields of a dataclass that are written, with their types."""
     hints = get_type_hints(cls)
-    return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
+    fields = (field for field in dataclasses.fields(cls) if field.init)
+    return {field.name: hints[field.name] for field in fields if field.metadata.get("written") is not False}
 
 
 @functools.cache
@@ -354,11 +360,6 @@ def decode_result(data: Mapping[str, Any]) -> StageResult:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise RunError(f"a result of the kind '{kind}' can't be read: {place}: {first['msg']}") from None
-
-
-def decode_results(data: Mapping[str, Mapping[str, Any]]) -> dict[str, StageResult]:
-    """Results by the names of their stages. Raises RunError as `decode_result` does."""
-    return {name: decode_result(result) for name, result in data.items()}
 
 
 def result_of(results: Results, stage: str, kind: type[L]) -> L:

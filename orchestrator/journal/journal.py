@@ -1,9 +1,10 @@
 """The write-ahead record of a run: one SQLite file, append-only, with one writer and any number of readers.
 
-Each `Entry` is one row: sequence number, stage, time, kind, JSON body. `Journal` writes, `JournalReader` reads.
+Each `Entry` is one row: sequence number, stage, time, kind, JSON body. `Journal` writes events
+(`orchestrator.journal.events`) and then passes them to the subscribers, `JournalReader` reads them.
 
 - Entries are never changed or deleted; triggers refuse it.
-- Entries written together (`append_all`) are all present or all absent, whenever the process dies.
+- Entries written together are all present or all absent, whenever the process dies.
 - Pours are flushed to the disk before the arm moves and before their outcome is used (synchronous=FULL). All other
   entries survive the death of the process; a power cut can lose the most recent ones.
 - At a pour, the write-ahead log is copied into the file, and the entry is repeated in a ledger. A lost or changed
@@ -15,17 +16,28 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import sqlite3
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
-from orchestrator.journal.codec import canonical, digest, first_difference
+from orchestrator.journal.codec import CodecError, canonical, digest, first_difference
+from orchestrator.journal.events import (
+    CampaignStateChanged,
+    Event,
+    Kind,
+    Level,
+    LogLine,
+    Requested,
+    StageClosed,
+    Subscriber,
+    event_of,
+)
 from orchestrator.journal.journal_check import (
     BEGUN,
     LEDGER_NAME,
@@ -53,30 +65,13 @@ from orchestrator.journal.journal_file import (
     lay_out,
     take_lock,
 )
-from orchestrator.run_clock import begin_run, end_run, run_time
+from orchestrator.run_clock import begin_run, end_run
 from orchestrator.states import State
+from orchestrator.strategies.stage_result import StageResult
 
 JOURNAL_NAME = "journal.sqlite"
 
-
-class Kind(StrEnum):
-    """Kind of an entry. The comments list the keys of each body."""
-
-    CAMPAIGN_STATE = "campaign.state"  # before, after, reason, pid
-    STAGE_OPENED = "stage.opened"  # seed
-    STAGE_CLOSED = "stage.closed"  # result
-    ASKED = "asked"  # simulations, pours (the free slots), ids (of the new requests)
-    REQUESTED = "requested"  # id, request
-    STARTED = "started"  # id
-    FINISHED = "finished"  # id, outcome, seconds
-    POUR_STARTED = "pour.started"  # id, attempt, number
-    POUR_WITHDRAWN = "pour.withdrawn"  # id, reason: nothing was poured, the pour may be made later
-    POUR_FINISHED = "pour.finished"  # id, outcome, seconds
-    TOLD = "told"  # id
-    DECISION = "decision"  # text, values
-    OPERATOR_ASKED = "operator.asked"  # id, question, options
-    OPERATOR_ANSWERED = "operator.answered"  # id, answer
-    NOTE = "note"  # text
+_log = logging.getLogger(__name__)
 
 
 _IN_LEDGER = frozenset({Kind.POUR_STARTED, Kind.POUR_WITHDRAWN, Kind.POUR_FINISHED})
@@ -92,15 +87,6 @@ class Entry:
     t: float
     kind: str
     body: dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Draft:
-    """An entry that is not written yet."""
-
-    kind: Kind
-    body: dict[str, Any]
-    stage: str = ""
 
 
 class JournalReader:
@@ -160,24 +146,48 @@ class JournalReader:
         except (sqlite3.DatabaseError, _BodyError) as error:
             raise JournalError(f"{self.path}: is damaged ({error}); see `decant runs check`") from error
 
-    def state(self) -> State:
-        """The campaign's last recorded state."""
-        last = State.QUEUED
-        for entry in self.entries(kinds=[Kind.CAMPAIGN_STATE]):
+    def events(
+        self,
+        requests: dict[int, Requested] | None = None,
+        *,
+        after: int = 0,
+        stage: str | None = None,
+        kinds: Iterable[Kind] | None = None,
+    ) -> Iterator[tuple[int, Event]]:
+        """The events that the entries record, with their sequence numbers.
+
+        Args:
+            requests: unfinished requests before `after`; updated.
+            after, stage, kinds: see `entries`.
+
+        Raises:
+            JournalError: the file is damaged.
+        """
+        requests = {} if requests is None else requests
+        for entry in self.entries(after=after, stage=stage, kinds=kinds):
             try:
-                last = State(entry.body["after"])
-            except (KeyError, ValueError) as error:
+                yield entry.seq, event_of(entry.kind, entry.body, requests, time=entry.t, stage=entry.stage)
+            except (CodecError, ValueError) as error:
                 raise JournalError(
                     f"{self.path}: entry {entry.seq} is damaged ({error}); see `decant runs check`"
                 ) from None
+
+    def state(self) -> State:
+        """The campaign's last recorded state."""
+        last = State.QUEUED
+        for _, event in self.events(kinds=[Kind.CAMPAIGN_STATE]):
+            assert isinstance(event, CampaignStateChanged)
+            last = event.after
         return last
 
-    def stage_results(self) -> dict[str, dict[str, Any]]:
+    def stage_results(self) -> dict[str, StageResult]:
         """Results of the closed stages by name, in the order in which the stages were closed.
 
-        See `orchestrator.journal.codec`.
+        Raises:
+            RunError: a result can't be decoded.
         """
-        return {entry.stage: entry.body["result"] for entry in self.entries(kinds=[Kind.STAGE_CLOSED])}
+        closed = (event for _, event in self.events(kinds=[Kind.STAGE_CLOSED]))
+        return {event.stage: event.result for event in closed if isinstance(event, StageClosed)}
 
     def last_id(self) -> int:
         """The largest request id in use; 0 before the first request."""
@@ -217,8 +227,11 @@ def _body(seq: int, text: str) -> dict[str, Any]:
 class Journal(JournalReader):
     """The only writer of a journal. Created by `Journal.create` and `Journal.resume`."""
 
-    def __init__(self, path: Path, lock: IO[str], connection: sqlite3.Connection) -> None:
+    def __init__(
+        self, path: Path, lock: IO[str], connection: sqlite3.Connection, subscribers: Sequence[Subscriber]
+    ) -> None:
         self.path = path
+        self._subscribers = list(subscribers)
         self._lock = lock
         self._connection = connection
         self._durable = False
@@ -230,7 +243,7 @@ class Journal(JournalReader):
         self._runs = False
 
     @classmethod
-    def create(cls, path: Path, header: Header) -> Journal:
+    def create(cls, path: Path, header: Header, subscribers: Sequence[Subscriber] = ()) -> Journal:
         """Begin a new journal.
 
         Raises:
@@ -251,13 +264,13 @@ class Journal(JournalReader):
             if has_tables(connection, path):
                 raise JournalError(f"{path}: holds a run already; resume that one, or begin in another directory")
             lay_out(connection, header, path)
-            journal = cls(path, lock, connection)
+            journal = cls(path, lock, connection, subscribers)
             journal._ledger = journal._open_ledger()
             opened.pop_all()
             return journal._begun()
 
     @classmethod
-    def resume(cls, path: Path, header: Header) -> Journal:
+    def resume(cls, path: Path, header: Header, subscribers: Sequence[Subscriber] = ()) -> Journal:
         """Continue a journal. If its process died before it wrote anything, the journal is begun again.
 
         Raises:
@@ -273,7 +286,7 @@ class Journal(JournalReader):
             connection = opened.enter_context(closing(connect_writer(path)))
             if not has_tables(connection, path):
                 lay_out(connection, header, path)
-            journal = cls(path, lock, connection)
+            journal = cls(path, lock, connection, subscribers)
             journal._check_same_campaign(header)
             journal._ledger = journal._open_ledger()
             opened.pop_all()
@@ -295,31 +308,55 @@ class Journal(JournalReader):
         """
         self._reserve.check_pour()
 
-    def append(self, kind: Kind, body: dict[str, Any], *, stage: str = "") -> None:
-        """Write one entry; it is in the file when this returns."""
-        self.append_all([Draft(kind, body, stage)])
+    def append(self, *events: Event) -> None:
+        """Write the events that have a kind, in one transaction, then publish all of them.
 
-    def append_all(self, drafts: Sequence[Draft]) -> None:
-        """Write several entries in one transaction: all or none. On a full disk the reserved space is used.
+        They are in the file when this returns. On a full disk the reserved space is used. Of a `replayed` event, the
+        subscribers hear when its stage is replayed.
 
         Raises:
-            JournalError: the file can't be written.
+            JournalError: the file can't be written; then nothing is published.
         """
-        durable = any(draft.kind in _DURABLE for draft in drafts)
+        if written := [event for event in events if event.kind is not None]:
+            self._write(written)
+        self.publish(*(event for event in events if not event.replayed))
+
+    def publish(self, *events: Event) -> None:
+        """Pass events to the subscribers, without writing them. Never raises."""
+        for event in events:
+            failed: list[tuple[Subscriber, Exception]] = []
+            for subscriber in self._subscribers:
+                try:
+                    subscriber(event)
+                except Exception as error:
+                    failed.append((subscriber, error))
+            for subscriber, problem in failed:
+                self._subscribers.remove(subscriber)
+                name = getattr(subscriber, "__qualname__", type(subscriber).__qualname__)
+                text = f"{name} can't watch any longer: {type(problem).__name__}: {problem}"
+                _log.warning(text, exc_info=problem)
+                self.log("warning", text)
+
+    def log(self, level: Level, text: str, *, stage: str = "", kept: bool = False) -> None:
+        """Append a `LogLine`."""
+        self.append(LogLine(level=level, text=text, stage=stage, kept=kept))
+
+    def _write(self, events: Sequence[Event]) -> None:
+        durable = any(event.kind in _DURABLE for event in events)
         if durable != self._durable:
             self._connection.execute(f"pragma synchronous = {'full' if durable else 'normal'}")
             self._durable = durable
-        now, (seq, digest) = run_time(), self._last
+        now, (seq, digest) = events[0].time, self._last  # entries that were written together have one time
         rows: list[EventRow] = []
         links: list[tuple[int, bytes]] = []
         lines: list[LedgerLine] = []
-        for draft in drafts:
-            seq += 1
-            rows.append((seq, draft.stage, now, str(draft.kind), canonical(draft.body)))
+        for event in events:
+            seq, kind, body = seq + 1, str(event.kind), event.body()
+            rows.append((seq, event.stage, now, kind, canonical(body)))
             digest = chained(digest, rows[-1])
             links.append((seq, digest))
-            if draft.kind in _IN_LEDGER:
-                lines.append(LedgerLine(seq, digest.hex(), now, str(draft.kind), draft.stage, draft.body))
+            if event.kind in _IN_LEDGER:
+                lines.append(LedgerLine(seq, digest.hex(), now, kind, event.stage, body))
         try:
             self._with_reserve(lambda: self._insert(rows, links))
             self._last = seq, digest

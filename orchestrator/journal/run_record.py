@@ -1,8 +1,9 @@
-"""The only reader of journals outside the engine: the history of a run, finished or not, in readable form.
+"""The state of a run, counted from its events, and the only reader of journals outside the engine.
 
-- `read_record` returns a `RunRecord`: stages, pours, questions, notes, decisions and times. `RecordReader` goes on
-  where it stopped, for pages that ask again at every event.
-- `answers` yields finished requests with their outcomes; `pour_row` is a pour as a table row in display units.
+- `RunState.take` counts an event; displays, daemon and library give it events as they happen. `read_record` gives it
+  those of a journal, and goes on where it stopped for pages that ask again at every event.
+- `RunPour.row` is the one row of a pour, for report, catalogue, API and library.
+- `answers` yields finished requests with their outcomes.
 - `read_result` returns the `CampaignResult`: state, counts, costs, and the results of the stages.
 
 Nothing here checks the journal (`orchestrator.journal.journal_check`).
@@ -10,18 +11,44 @@ Nothing here checks the journal (`orchestrator.journal.journal_check`).
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from orchestrator.journal.codec import Results, decode_outcome, decode_request, decode_results
-from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
+from actors.interfaces import PourProgress
+from orchestrator.journal.codec import Results
+from orchestrator.journal.events import (
+    CampaignClosed,
+    CampaignOpened,
+    CampaignStateChanged,
+    DecisionMade,
+    Event,
+    Kind,
+    LogLine,
+    OperatorAnswered,
+    OperatorAsked,
+    PourProgressed,
+    PourWithdrawn,
+    Requested,
+    RequestFinished,
+    RequestStarted,
+    SpeculationProgressed,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal.journal_file import Header
-from orchestrator.requests import Ask, Failed, Outcome, Pour, Poured, Request, Simulate
+from orchestrator.requests import Ask, Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggested
 from orchestrator.states import RESTING, State
+from orchestrator.strategies.dispense import spilled_mass
 from orchestrator.strategies.stage_result import displayed_action
+from orchestrator.strategies.strategy import Progress
 from sim_engine.outcome import PourMeasurement, normalised_spillage
+
+Row = dict[str, Any]
 
 PourState = Literal["asked", "under way", "unknown", "weighed", "failed"]
 
@@ -30,29 +57,59 @@ POOL_RESTS = "pool_rests"
 
 
 @dataclass
-class RecordedPour:
+class RunPour:
     """A requested pour and its outcome.
 
     Attributes:
         state: 'under way': it has begun; 'unknown': the run ended during the pour, so it has no outcome.
         outcome: as recorded; None without one.
-        measured: the measurement, if it was weighed.
-        reason: why it failed.
         answer: the operator's answer about it; '' without one.
         time: when it began, or ended; None before (seconds since 1970).
         seconds: duration, operator and balance included; None if unknown.
+        progress: last reported, while the run is followed.
     """
 
     stage: str
     id: int
     request: Pour
     state: PourState = "asked"
-    measured: PourMeasurement | None = None
-    reason: str = ""
     outcome: Outcome | None = None
     answer: str = ""
     time: float | None = None
     seconds: float | None = None
+    progress: PourProgress | None = None
+
+    @property
+    def measured(self) -> PourMeasurement | None:
+        """The measurement, if it was weighed."""
+        return self.outcome.measurement if isinstance(self.outcome, Poured) else None
+
+    @property
+    def reason(self) -> str:
+        """Why it failed."""
+        return self.outcome.reason if isinstance(self.outcome, Failed) else ""
+
+    def row(self) -> Row:
+        """The one row of a pour in numbers: action in display units, prediction, masses [g] and spillage r.
+
+        A mass that nobody has weighed is None; without an outcome there are no masses.
+        """
+        row: Row = {"number": self.request.number, **displayed_action(self.request.action.values())}
+        row["predicted"] = None if self.request.predicted is None else self.request.predicted.mean
+        match self.outcome:
+            case Poured(weighed):
+                spilled = spilled_mass(weighed)
+                row |= {"loaded_g": 1e3 * weighed.loaded, "spilled_g": None if spilled is None else 1e3 * spilled}
+                row["retained_g"] = 1e3 * weighed.retained
+                row["spillage"] = None if spilled is None else normalised_spillage(weighed.fractions)
+            case Failed(kind, reason):
+                row["failed"] = f"{kind}: {reason}"
+        return row
+
+    def finish(self, event: RequestFinished) -> None:
+        """Take the outcome."""
+        self.time, self.seconds, self.outcome = event.time, event.seconds, event.outcome
+        self.state = "weighed" if isinstance(event.outcome, Poured) else "failed"
 
 
 @dataclass
@@ -138,16 +195,20 @@ class RecordedStage:
     Attributes:
         simulations, failed_simulations, pours: numbers of finished ones.
         simulations_asked, pours_asked: numbers of requested ones.
+        progress: last reported by the strategy, while the run is followed.
+        opened_at, closed_at: times of its first event that was not replayed, and of its end.
     """
 
     name: str
     occupancy: Occupancy
-    closed: bool = False
     simulations: int = 0
     failed_simulations: int = 0
     pours: int = 0
     simulations_asked: int = 0
     pours_asked: int = 0
+    progress: Progress = field(default_factory=Progress)
+    opened_at: float | None = None
+    closed_at: float | None = None
 
 
 @dataclass
@@ -167,44 +228,79 @@ class RecordedDecision:
     time: float
     stage: str
     text: str
-    values: dict[str, Any]
+    values: dict[str, float]
     simulations_asked: int
 
 
 @dataclass
-class RunRecord:
-    """The content of a run's journal.
+class RunState:
+    """What a run has done, and what it is doing: all counting of its events, read from its journal or as they happen.
 
     Attributes:
         header: name of the campaign, its fingerprint, and when the run was begun.
-        ended: when the last entry was written, seconds since 1970.
+        slots: maximum number of simulations at a time, for the use of the pool.
+        ended: time of the last event, seconds since 1970.
         reason: why the state was entered.
-        at_work_s: seconds during which a process had the run; without pauses.
         cpu_s: CPU seconds of all simulations and suggestions.
-        results: JSON of the results of the closed stages by name, in the order in which the stages were closed.
-        notes: messages for the operator: time and text.
+        closed: the events that closed stages by name, in order, with their results.
+        opened: the stage that was opened last.
+        notes: messages for the operator that the journal has: time and text.
+        running: ids of running simulations.
+        pour: the pour that was begun last.
+        checkpoint: of the pour that is under way; '' without one.
+        question: that is open at the operator's terminal.
+        entries, open_requests: number of entries that were read, and the unfinished requests among them.
+        simulators, ahead: as last told; only of a run that is followed.
     """
 
     header: Header
+    slots: int = 1
     ended: float = 0.0
     state: State = State.QUEUED
     reason: str = ""
-    at_work_s: float = 0.0
     cpu_s: float = 0.0
     stages: dict[str, RecordedStage] = field(default_factory=dict)
-    results: dict[str, dict[str, Any]] = field(default_factory=dict)
-    pours: list[RecordedPour] = field(default_factory=list)
+    closed: dict[str, StageClosed] = field(default_factory=dict)
+    opened: StageOpened = field(default_factory=StageOpened)
+    pours: list[RunPour] = field(default_factory=list)
     questions: list[RecordedQuestion] = field(default_factory=list)
     notes: list[tuple[float, str]] = field(default_factory=list)
     decisions: list[RecordedDecision] = field(default_factory=list)
+    failures: Counter[str] = field(default_factory=Counter)
+    running: set[int] = field(default_factory=set)
+    pour: RunPour | None = None
+    checkpoint: str = ""
+    question: str = ""
+    simulators: int = 0
+    entries: int = 0
+    open_requests: dict[int, Requested] = field(default_factory=dict)
+    ahead: SpeculationProgressed = field(default_factory=lambda: SpeculationProgressed(running=0, waiting=0))
+
+    _worked: float = 0.0
+    _process: tuple[int, float] | None = None
+    _pours: dict[int, RunPour] = field(default_factory=dict)
+    _questions: dict[int, RecordedQuestion] = field(default_factory=dict)
 
     @property
-    def unknown_pours(self) -> list[RecordedPour]:
+    def at_work_s(self) -> float:
+        """Seconds during which a process had the run, without pauses.
+
+        A process that still has the run, or died with it, is counted until its last entry.
+        """
+        return self._worked + (0.0 if self._process is None else self.ended - self._process[1])
+
+    @property
+    def results(self) -> Results:
+        """Results of the closed stages by name, in order. Raises RunError for one that can't be decoded."""
+        return {name: event.result for name, event in self.closed.items()}
+
+    @property
+    def unknown_pours(self) -> list[RunPour]:
         """Pours that had begun and have no outcome."""
         return [pour for pour in self.pours if pour.state in ("under way", "unknown")]
 
     @property
-    def weighed(self) -> list[RecordedPour]:
+    def weighed(self) -> list[RunPour]:
         """Pours that were weighed."""
         return [pour for pour in self.pours if pour.measured is not None]
 
@@ -214,162 +310,168 @@ class RunRecord:
         return sum(stage.simulations for stage in self.stages.values())
 
     @property
+    def simulated(self) -> int:
+        """Number of simulations that can be used."""
+        return self.simulations - self.failures.total()
+
+    @property
+    def finished_pours(self) -> int:
+        """Number of finished pours, including failed ones."""
+        return sum(stage.pours for stage in self.stages.values())
+
+    @property
     def occupancies(self) -> dict[str, Occupancy]:
         """Use of the pool in every stage with both simulations and pours."""
         both = (one for one in self.stages.values() if one.simulations_asked and one.pours_asked)
         return {one.name: one.occupancy for one in both if one.occupancy.useful > 0.0}
 
+    def take(self, event: Event) -> None:
+        """Count an event."""
+        stage = self._stage(event.stage) if event.stage else None
+        match event:
+            case CampaignOpened():
+                self.simulators = event.simulators
+                for name in event.stages:
+                    self._stage(name)
+            case CampaignStateChanged():
+                self._enter(event)
+            case CampaignClosed():
+                self.state = State(event.state)
+            case LogLine():
+                if event.kept:
+                    self.notes.append((event.time, event.text))
+                if event.asked:
+                    self.question = event.text
+            case SpeculationProgressed():
+                self.ahead = event
+            case PourProgressed():
+                self.checkpoint = event.progress.checkpoint
+                if self.checkpoint not in ("operator", "tare"):
+                    self.question = ""
+                if self.pour is not None:
+                    self.pour.progress = event.progress
+            case _ if stage is not None:
+                self._take_of_stage(stage, event)
+        self.ended = event.time
 
-class RecordReader:
-    """Reads a run's journal, and later the entries that were added since the last call.
+    def _stage(self, name: str) -> RecordedStage:
+        if name not in self.stages:
+            self.stages[name] = RecordedStage(name, Occupancy(self.slots))
+        return self.stages[name]
 
-    Args:
-        slots: maximum number of simulations at a time, for the use of the pool.
-    """
-
-    def __init__(self, slots: int = 1) -> None:
-        self._slots, self._last, self._worked = slots, 0, 0.0
-        self._record: RunRecord | None = None
-        self._pours: dict[int, RecordedPour] = {}
-        self._simulations: set[int] = set()
-        self._questions: dict[int, RecordedQuestion] = {}
-        self._process: tuple[int, float] | None = None
-
-    def read(self, directory: Path) -> RunRecord:
-        """The record of a run, the same object at every call.
-
-        Raises:
-            JournalError: there is no journal, or it is damaged.
-            CodecError: a pour can't be decoded.
-        """
-        with JournalReader(directory / JOURNAL_NAME) as journal:
-            record = self._record = self._record or RunRecord(journal.header, journal.header.created)
-            for entry in journal.entries(after=self._last):
-                self._take(record, entry)
-                self._last, record.ended = entry.seq, entry.t
-        # A process that still has the run, or died with it, is counted until its last entry.
-        record.at_work_s = self._worked + (0.0 if self._process is None else record.ended - self._process[1])
-        return record
-
-    def _take(self, record: RunRecord, entry: Entry) -> None:
-        body, key = entry.body, entry.body.get("id", -1)
-        if entry.kind == Kind.CAMPAIGN_STATE:
-            self._enter(record, entry)
-            return
-        if entry.kind == Kind.STAGE_OPENED:
-            record.stages[entry.stage] = RecordedStage(entry.stage, Occupancy(self._slots))
-            return
-        stage = record.stages.get(entry.stage) or RecordedStage(entry.stage, Occupancy(self._slots))
-        match entry.kind:
-            case Kind.STAGE_CLOSED:
-                stage.closed = True
+    def _take_of_stage(self, stage: RecordedStage, event: Event) -> None:
+        match event:
+            case StageOpened():
+                self.opened = event
+                # A replayed stage has no known duration; the first live event starts its clock.
+                stage.opened_at = None if event.replayed else event.time
+            case StageClosed():
+                stage.closed_at = event.time
                 stage.occupancy.finish()
-                record.results[entry.stage] = body["result"]
-            case Kind.REQUESTED:
-                self._requested(record, stage, entry)
-            case Kind.STARTED if key in self._simulations:
-                stage.occupancy.simulation_started(entry.t)
-            case Kind.FINISHED:
-                self._finished(record, stage, entry)
-            case Kind.POUR_STARTED:
-                stage.occupancy.pour_started(entry.t)
-                self._pours[key].state, self._pours[key].time = "under way", entry.t
-            case Kind.POUR_WITHDRAWN:
-                self._pours[key].state, self._pours[key].time = "asked", entry.t
-            case Kind.POUR_FINISHED:
-                stage.occupancy.pour_finished(entry.t)
+                self.closed[event.stage] = event
+            case StrategyProgressed():
+                stage.progress = event.progress
+                stage.opened_at = event.time if stage.opened_at is None else stage.opened_at
+            case Requested(request=Simulate()):
+                stage.simulations_asked += 1
+            case Requested(request=Pour()):
+                self._pour(event)
+                stage.pours_asked += 1
+            case Requested(request=Ask(question)):
+                self._ask(event, question)
+            case RequestStarted(request=Simulate()):
+                self.running.add(event.id)
+                stage.occupancy.simulation_started(event.time)
+            case RequestStarted(request=Pour()):
+                stage.occupancy.pour_started(event.time)
+                self.pour = self._pour(event)
+                self.pour.state, self.pour.time = "under way", event.time
+            case PourWithdrawn():
+                self._pours[event.id].state, self._pours[event.id].time = "asked", event.time
+            case RequestFinished(request=Pour()):
+                stage.occupancy.pour_finished(event.time)
                 stage.pours += 1
-                self._poured(self._pours[key], entry)
-            case Kind.OPERATOR_ASKED:
-                self._asked(record, entry, body["question"])
-            case Kind.OPERATOR_ANSWERED:
-                if key in self._questions:
-                    self._questions[key].answer = body["answer"]
-                if key in self._pours:
-                    self._pours[key].answer = body["answer"]
-            case Kind.NOTE:
-                record.notes.append((entry.t, body["text"]))
-            case Kind.DECISION:
-                values = body.get("values") or {}
-                if POOL_RESTS in values:
-                    stage.occupancy.rests(entry.t)
-                record.decisions.append(
-                    RecordedDecision(entry.t, entry.stage, body["text"], values, stage.simulations_asked)
+                self.checkpoint = ""
+                self._pour(event).finish(event)
+            case RequestFinished():
+                self._finished(stage, event)
+            case OperatorAsked():
+                self._ask(event, event.question)
+            case OperatorAnswered():
+                for known in (self._questions.get(event.id), self._pours.get(event.id)):
+                    if known is not None:
+                        known.answer = event.answer
+            case DecisionMade(decision=decision):
+                if POOL_RESTS in decision.values:
+                    stage.occupancy.rests(event.time)
+                self.decisions.append(
+                    RecordedDecision(event.time, event.stage, decision.text, decision.values, stage.simulations_asked)
                 )
 
-    def _enter(self, record: RunRecord, entry: Entry) -> None:
-        body = entry.body
+    def _enter(self, event: CampaignStateChanged) -> None:
         if self._process is not None:
             pid, since = self._process
             # For a process that died, the last entry before the next process's first entry counts as its end.
-            until = entry.t if body.get("pid") == pid else max(record.ended, since)
+            until = event.time if event.pid == pid else max(self.ended, since)
             self._worked += until - since
-        record.state, record.reason = State(body["after"]), body.get("reason", "")
-        self._process = None if record.state in RESTING else (body.get("pid", 0), entry.t)
-        if record.state is not State.RUNNING:
-            for stage in record.stages.values():
+        self.state, self.reason = event.after, event.reason
+        self._process = None if self.state in RESTING else (event.pid, event.time)
+        if self.state is not State.RUNNING:
+            for stage in self.stages.values():
                 stage.occupancy.interrupted()
-        if record.state in RESTING or record.state is State.PREPARING:  # the process that poured has ended
-            for pour in record.unknown_pours:
+        if self.state in RESTING or self.state is State.PREPARING:  # the process that poured has ended
+            self.running.clear()
+            for pour in self.unknown_pours:
                 pour.state = "unknown"
 
-    def _requested(self, record: RunRecord, stage: RecordedStage, entry: Entry) -> None:
-        key, request = entry.body["id"], entry.body["request"]
-        match request["type"]:
-            case Simulate.__name__:
-                self._simulations.add(key)
-                stage.simulations_asked += 1
-            case Pour.__name__:
-                decoded = decode_request(request)
-                assert isinstance(decoded, Pour)
-                self._pours[key] = RecordedPour(entry.stage, key, decoded)
-                record.pours.append(self._pours[key])
-                stage.pours_asked += 1
-            case Ask.__name__:
-                self._asked(record, entry, request["question"])
+    def _pour(self, event: Requested | RequestStarted | RequestFinished) -> RunPour:
+        if event.id not in self._pours:
+            assert isinstance(event.request, Pour)
+            self._pours[event.id] = RunPour(event.stage, event.id, event.request)
+            self.pours.append(self._pours[event.id])
+        return self._pours[event.id]
 
-    def _asked(self, record: RunRecord, entry: Entry, text: str) -> None:
+    def _ask(self, event: Requested | OperatorAsked, text: str) -> None:
         # A strategy's question is written when it is requested and again when it is answered.
-        if (key := entry.body["id"]) not in self._questions:
-            self._questions[key] = RecordedQuestion(entry.t, entry.stage, text)
-            record.questions.append(self._questions[key])
+        if event.id not in self._questions:
+            self._questions[event.id] = RecordedQuestion(event.time, event.stage, text)
+            self.questions.append(self._questions[event.id])
 
-    def _finished(self, record: RunRecord, stage: RecordedStage, entry: Entry) -> None:
-        outcome = entry.body["outcome"]
-        if entry.body["id"] in self._simulations:
-            stage.occupancy.simulation_finished(entry.t)
-        if outcome["type"] == "Suggested":
-            record.cpu_s += outcome["suggestion"]["seconds"]
-            return
+    def _finished(self, stage: RecordedStage, event: RequestFinished) -> None:
+        match event.outcome:
+            case Suggested(suggestion):
+                self.cpu_s += suggestion.seconds
+                return
+            case Simulated(outcome):
+                self.cpu_s += outcome.cpu_s
+                failed = outcome.invalid
+            case outcome:
+                failed = outcome.reason if isinstance(outcome, Failed) else ""
+        stage.occupancy.simulation_finished(event.time)
+        self.running.discard(event.id)
         stage.simulations += 1
-        if outcome["type"] == "Simulated":
-            record.cpu_s += outcome["outcome"]["cpu_s"]
-            stage.failed_simulations += outcome["outcome"].get("invalid") is not None
-        else:
+        if failed is not None:
             stage.failed_simulations += 1
-
-    @staticmethod
-    def _poured(pour: RecordedPour, entry: Entry) -> None:
-        pour.time, pour.seconds = entry.t, entry.body.get("seconds")
-        pour.outcome = decode_outcome(entry.body["outcome"])
-        match pour.outcome:
-            case Poured(measurement):
-                pour.state, pour.measured = "weighed", measurement
-            case Failed(_, reason):
-                pour.state, pour.reason = "failed", reason
+            self.failures[failed.partition(":")[0]] += 1
 
 
-def read_record(directory: Path, *, slots: int = 1) -> RunRecord:
+def read_record(directory: Path, *, slots: int = 1, known: RunState | None = None) -> RunState:
     """Read the journal of a run, finished or not.
 
     Args:
         directory: folder of the run.
         slots: maximum number of simulations at a time, for the use of the pool.
+        known: what was read before; it takes the events that were added since, and is returned.
 
     Raises:
         RunError: there is no journal, it is damaged, or a pour can't be decoded.
     """
-    return RecordReader(slots).read(directory)
+    with JournalReader(directory / JOURNAL_NAME) as journal:
+        record = known or RunState(journal.header, slots, journal.header.created)
+        for seq, event in journal.events(record.open_requests, after=record.entries):
+            record.take(event)
+            record.entries = seq
+    return record
 
 
 def read_header(directory: Path) -> Header:
@@ -378,52 +480,12 @@ def read_header(directory: Path) -> Header:
         return journal.header
 
 
-Row = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class RequestOutcome:
-    """A request and its outcome.
-
-    Attributes:
-        id: unique within the campaign.
-        time: when it finished (seconds since 1970).
-        seconds: duration from start to end.
-    """
-
-    stage: str
-    id: int
-    request: Request
-    outcome: Outcome
-    time: float
-    seconds: float
-
-
-def answers(directory: Path, kind: type[Request]) -> Iterator[RequestOutcome]:
+def answers(directory: Path, kind: type[Request]) -> Iterator[RequestFinished]:
     """Finished requests of one kind, in the order in which they finished."""
-    requests: dict[int, Request] = {}
     with JournalReader(directory / JOURNAL_NAME) as journal:
-        for entry in journal.entries(kinds=(Kind.REQUESTED, Kind.FINISHED, Kind.POUR_FINISHED)):
-            key, body = entry.body["id"], entry.body
-            if entry.kind == Kind.REQUESTED:
-                if body["request"]["type"] == kind.__name__:
-                    requests[key] = decode_request(body["request"])
-            elif key in requests:
-                outcome = decode_outcome(body["outcome"])
-                yield RequestOutcome(entry.stage, key, requests[key], outcome, entry.t, body["seconds"])
-
-
-def pour_row(pour: Pour, outcome: Outcome | None) -> Row:
-    """Number, action in display units, prediction, masses [g] and spillage r of a pour; None: it has no outcome yet."""
-    row: Row = {"number": pour.number, **displayed_action(pour.action.values())}
-    row["predicted"] = None if pour.predicted is None else pour.predicted.mean
-    match outcome:
-        case Poured(weighed):
-            row |= {"loaded_g": 1e3 * weighed.loaded, "spilled_g": 1e3 * weighed.spilled}
-            row |= {"retained_g": 1e3 * weighed.retained, "spillage": normalised_spillage(weighed.fractions)}
-        case Failed(kind, reason):
-            row["failed"] = f"{kind}: {reason}"
-    return row
+        for _, event in journal.events(kinds=(Kind.REQUESTED, Kind.FINISHED, Kind.POUR_FINISHED)):
+            if isinstance(event, RequestFinished) and isinstance(event.request, kind):
+                yield event
 
 
 @dataclass(frozen=True)
@@ -455,8 +517,13 @@ def read_result(directory: Path, *, seconds: float = 0.0) -> CampaignResult:
         RunError: there is no journal, it is damaged, or a result can't be decoded.
     """
     record = read_record(directory)
-    pours = sum(stage.pours for stage in record.stages.values())
-    results = decode_results(record.results)
     return CampaignResult(
-        record.header.name, directory, record.state, results, record.simulations, pours, record.cpu_s, seconds
+        record.header.name,
+        directory,
+        record.state,
+        record.results,
+        record.simulations,
+        record.finished_pours,
+        record.cpu_s,
+        seconds,
     )

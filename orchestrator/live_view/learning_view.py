@@ -22,7 +22,8 @@ from actors.optimizer.questions import (
     SurrogateQuery,
 )
 from actors.optimizer.suggest import slices
-from orchestrator.journal.run_record import RecordedPour
+from orchestrator.journal.events import RequestFinished
+from orchestrator.journal.run_record import RunPour
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.requests import Pour, Poured, Suggest, Suggested
@@ -39,7 +40,6 @@ from orchestrator.results.loss_units import (
 )
 from orchestrator.results.stage_views import receiver_names
 from orchestrator.results.summarise import pour_summary
-from orchestrator.runs.events import RequestFinished
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.deployment_result import Deployed
@@ -114,7 +114,7 @@ class LearningStage:
     def poured(self, stage: str, request: Pour, outcome: Poured) -> str:
         """Log a weighed pour; return a description."""
         measured, unit = outcome.measurement, unit_of_pour(self._plan, request)
-        said = pour_summary(self._plan, RecordedPour(stage, 0, request, "weighed", measured)).line
+        said = pour_summary(self._plan, RunPour(stage, 0, request, "weighed", outcome)).line
         value = loss_of_pour(self._plan, request, measured)
         if value is None:
             return said

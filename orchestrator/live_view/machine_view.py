@@ -1,7 +1,7 @@
 """Rows of the machine: activity of each worker, queue, simulation times, waits and dropped events; log and status page.
 
-`MachineView` writes the rows. `StatusView` shows the progress of a campaign on a page with a few large lines, which can
-be read from a distance.
+`MachineView` writes the rows. `status_page` shows the progress of a campaign in a few large lines, which can be read
+from a distance.
 """
 
 from __future__ import annotations
@@ -12,21 +12,10 @@ from actors.laboratory_settings import MODE_LABELS
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
-from orchestrator.requests import Pour
 from orchestrator.results import figure_style as style
 from orchestrator.results.figure_style import safe_name
 from orchestrator.results.stage_views import receiver_name
-from orchestrator.runs.events import (
-    CampaignClosed,
-    CampaignStateChanged,
-    Event,
-    LogLine,
-    PourProgressed,
-    RequestFinished,
-    StageOpened,
-)
-from orchestrator.states import RESTING
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.states import RESTING, State
 
 PLACE = "/machine"
 
@@ -154,69 +143,40 @@ class MachineView:
         self._sink.number(f"{PLACE}/{name}", float(value))
 
 
-class StatusView:
-    """The status page: the progress of a campaign in a few large lines.
+def status_page(progress: ProgressState, trust: str = "") -> str:
+    """Return the status page as Markdown: the progress of a campaign in a few large lines.
 
     Args:
-        plan: plan of the campaign.
+        progress: of the campaign.
+        trust: result of the model check.
     """
-
-    def __init__(self, plan: CampaignPlan) -> None:
-        self._plan, self._progress = plan, ProgressState(plan)
-        self._reason = self._stage = self._question = ""
-        self._pours = 0
-
-    @property
-    def reality(self) -> str:
-        """'VIRTUAL', 'REAL' or 'EXTERNAL'."""
-        return MODE_LABELS[self._plan.laboratory.mode]
-
-    def take(self, event: Event) -> None:
-        """Process an event."""
-        self._progress(event)
-        match event:
-            case CampaignStateChanged():
-                self._reason = event.reason
-            case CampaignClosed():
-                self._stage = ""
-            case StageOpened():
-                self._stage = f"{event.stage} ({event.index} of {event.count})"
-            case LogLine() if event.asked:
-                self._question = event.text
-            case PourProgressed() if event.progress.checkpoint not in ("operator", "tare"):
-                self._question = ""
-            case RequestFinished(request=Pour()):
-                self._pours += 1
-
-    def page(self, trust: str = "") -> str:
-        """Return the page as Markdown.
-
-        Args:
-            trust: result of the model check.
-        """
-        now = self._progress
-        lines = [f"# {self.reality}: {_plain(now.state or 'preparing')}"]
-        lines.append(f"## {_plain(self._stage or self._plan.name)}")
-        if self._question:
-            lines.append(f"## A question is open\n\n{_plain(self._question)}")
-        pour = None if now.pour is None or now.pour.result or now.state in RESTING else now.pour
-        if now.state in ("running", "pausing") or pour or now.running:
-            if pour is not None:
-                at = "preparing" if pour.progress is None else pour.progress.checkpoint
-                lines.append(f"**Pour {pour.number}**: {CHECKPOINT_WORDS.get(at, at)}")
-            if count := len(now.running):
-                lines.append(f"**{count} simulation{'s' if count > 1 else ''}** under way")
-            if pour is None and not now.running:
-                lines.append("The next step is being chosen")
-        elif self._reason:
-            lines.append(_plain(self._reason))
-        lines += [f"{_plain(one.name)}: {said}" for one in now.stages.values() if (said := str(one.progress))]
-        for scene, best in now.best.items():
-            lines.append(f"**Best into {_plain(receiver_name(self._plan, scene))}: {best.unit.text(best.loss)}**")
-        if trust:
-            lines.append(f"Model check: {_plain(trust)}")
-        lines.append(f"{self._pours} pours and {now.simulations} simulations so far")
-        return "\n\n".join(lines) + "\n"
+    plan, run, opened = progress.plan, progress.run, progress.run.opened
+    lines = [
+        f"# {MODE_LABELS[plan.laboratory.mode]}: {_plain('preparing' if run.state is State.QUEUED else run.state)}"
+    ]
+    ended = run.state in RESTING and run.state is not State.QUEUED
+    stage = f"{opened.stage} ({opened.index} of {opened.count})" if opened.stage and not ended else plan.name
+    lines.append(f"## {_plain(stage)}")
+    if run.question:
+        lines.append(f"## A question is open\n\n{_plain(run.question)}")
+    pour = None if ended else progress.pour
+    if run.state in (State.RUNNING, State.PAUSING) or pour or run.running:
+        if pour is not None:
+            at = "preparing" if pour.progress is None else pour.progress.checkpoint
+            lines.append(f"**Pour {pour.request.number}**: {CHECKPOINT_WORDS.get(at, at)}")
+        if count := len(run.running):
+            lines.append(f"**{count} simulation{'s' if count > 1 else ''}** under way")
+        if pour is None and not run.running:
+            lines.append("The next step is being chosen")
+    elif run.reason:
+        lines.append(_plain(run.reason))
+    lines += [f"{_plain(one.name)}: {said}" for one in run.stages.values() if (said := str(one.progress))]
+    for scene, best in progress.best.items():
+        lines.append(f"**Best into {_plain(receiver_name(plan, scene))}: {best.unit.text(best.loss)}**")
+    if trust:
+        lines.append(f"Model check: {_plain(trust)}")
+    lines.append(f"{run.finished_pours} pours and {run.simulated} simulations so far")
+    return "\n\n".join(lines) + "\n"
 
 
 def _plain(text: str) -> str:

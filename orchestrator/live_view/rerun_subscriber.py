@@ -25,9 +25,9 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Generic, TypeVar
 
 from actors.runtime.child_process import ChildProcess
+from orchestrator.journal.events import Event
 from orchestrator.live_view.recording_sink import SENDING
 from orchestrator.live_view.viewer_server import environment
-from orchestrator.runs.events import Event
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 if TYPE_CHECKING:
@@ -151,7 +151,8 @@ class RerunMonitor:
 
     def __call__(self, event: Event) -> None:
         """Queue an event. Returns at once."""
-        self._worker.put(event)
+        if not event.internal:
+            self._worker.put(event)
 
     @property
     def pid(self) -> int:

@@ -13,18 +13,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.live_view.balance_view import BalanceStage
-from orchestrator.live_view.blueprints import Moment, campaign_blueprint
-from orchestrator.live_view.cell_view import CellScene
-from orchestrator.live_view.learning_view import MAPPED, LearningStage
-from orchestrator.live_view.machine_view import MachineView, StatusView
-from orchestrator.live_view.recording_sink import PlaybackQueue, RecordingSink
-from orchestrator.live_view.simulation_view import SimulatedStage
-from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
-from orchestrator.results.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
-from orchestrator.results.stage_views import receiver_names
-from orchestrator.run_clock import run_time
-from orchestrator.runs.events import (
+from actors.laboratory_settings import MODE_LABELS
+from orchestrator.journal.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
@@ -38,6 +28,18 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.live_view.balance_view import BalanceStage
+from orchestrator.live_view.blueprints import Moment, campaign_blueprint
+from orchestrator.live_view.cell_view import CellScene
+from orchestrator.live_view.learning_view import MAPPED, LearningStage
+from orchestrator.live_view.machine_view import MachineView, status_page
+from orchestrator.live_view.recording_sink import PlaybackQueue, RecordingSink
+from orchestrator.live_view.simulation_view import SimulatedStage
+from orchestrator.progress.progress_state import ProgressState
+from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
+from orchestrator.results.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
+from orchestrator.results.stage_views import receiver_names
+from orchestrator.run_clock import run_time
 from orchestrator.runs.stages import scenes_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
@@ -62,9 +64,9 @@ class CampaignRecording:
 
         self.path, self._plan = path, plan
         self._scenes = scenes_of(plan)
-        self.status = StatusView(plan)
+        self._progress, reality = ProgressState(plan), MODE_LABELS[plan.laboratory.mode]
         sink = self._sink = RecordingSink(
-            path, application=f"decant {plan.name}", name=f"{plan.name} · {self.status.reality}", url=url
+            path, application=f"decant {plan.name}", name=f"{plan.name} · {reality}", url=url
         )
         self._moment: Moment | None = None
         sink.keep(blueprint_of(plan, "replaying"))
@@ -78,7 +80,7 @@ class CampaignRecording:
         self._learning = LearningStage(sink, plan)
         self._machine = MachineView(sink)
         self._machine.outcome(
-            f"# {self.status.reality}: no end\n\nThe run is under way, or its process was killed before it ended.\n"
+            f"# {reality}: no end\n\nThe run is under way, or its process was killed before it ended.\n"
         )
         self._step = 0
         self._decided = ""
@@ -114,7 +116,7 @@ class CampaignRecording:
         if isinstance(event, RequestFinished):
             self._step += 1
         self._sink.times(wall=event.time, step=self._step, sim_time=self._films.end)
-        self.status.take(event)
+        self._progress(event)
         match event:
             case CampaignOpened():
                 self._machine.opened(event.simulators, arm=self._plan.laboratory.bench is not None)
@@ -125,7 +127,7 @@ class CampaignRecording:
             case CampaignClosed():
                 self._learning.flush(event.time)
                 self._say(f"ended: {event.state}")
-                self._machine.outcome(self.status.page(self._learning.trust))
+                self._machine.outcome(status_page(self._progress, self._learning.trust))
                 self._show("replaying")
             case StageOpened():
                 self._say(f"stage {event.stage} begins", source=event.stage)
@@ -149,7 +151,7 @@ class CampaignRecording:
                 self._say(event.decision.text, level, event.stage)
             case LogLine():
                 self._say(event.text, event.level, event.stage)
-        self._machine.status(self.status.page(self._learning.trust))
+        self._machine.status(status_page(self._progress, self._learning.trust))
 
     def _say(self, text: str, level: str = "info", source: str = "") -> None:
         self._machine.line(text, level, source or "campaign")
@@ -191,7 +193,7 @@ class CampaignRecording:
     def _finished(self, event: RequestFinished) -> None:
         match event.request:
             case Simulate():
-                self._machine.simulation_finished(event.id, event.seconds)
+                self._machine.simulation_finished(event.id, 0.0 if event.replayed else event.seconds)
             case Suggest():
                 self._machine.activity("optimiser", None)
             case Pour():

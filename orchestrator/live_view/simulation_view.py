@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestrator.journal.run_record import RecordedPour, read_record
+from orchestrator.journal.run_record import RunPour, read_record
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.blueprints import simulation_blueprint
 from orchestrator.live_view.recording_sink import Playback, PlaybackQueue, RecordingSink, Track, columns_of
@@ -159,7 +159,7 @@ class NoSuchPourError(ValueError):
     """The journal has no such pour; the message lists the pours it has."""
 
 
-def find_pour(run: Path, number: int, stage: str | None = None) -> RecordedPour:
+def find_pour(run: Path, number: int, stage: str | None = None) -> RunPour:
     """Find a weighed pour of a run. Doses are not found: their motions were not those of an action.
 
     Args:
@@ -184,7 +184,7 @@ def find_pour(run: Path, number: int, stage: str | None = None) -> RecordedPour:
     return fitting[-1]
 
 
-def task_of(plan: CampaignPlan, run: Path, pour: RecordedPour, particles: int | None = None) -> PourTask:
+def task_of(plan: CampaignPlan, run: Path, pour: RunPour, particles: int | None = None) -> PourTask:
     """Make the task that simulates a pour again, with the arm's executed motion, if it was recorded, and the run's θ*.
 
     Args:

@@ -15,10 +15,7 @@ from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState, StageProgressState
-from orchestrator.requests import Pour
-from orchestrator.run_clock import run_time
-from orchestrator.runs.events import (
+from orchestrator.journal.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
@@ -29,6 +26,10 @@ from orchestrator.runs.events import (
     StageClosed,
     StageOpened,
 )
+from orchestrator.journal.run_record import RecordedStage, RunPour
+from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
+from orchestrator.requests import Pour
+from orchestrator.run_clock import run_time
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ class ProgressDisplay:
             case CampaignClosed():
                 self._print(f"campaign {event.state}; {self._progress_state.counts_line()}")
             case LogLine():
-                if not event.asked:
+                if not event.asked and not event.internal:
                     self._print(event.text, _LEVEL_STYLE[event.level])
             case _ if event.replayed:
                 return  # an earlier process has displayed it
@@ -147,7 +148,7 @@ class ProgressDisplay:
         now = self._clock()
         if now - self._last_line < INTERVAL:
             return
-        stage = self._progress_state.stages.get(event.stage)
+        stage = self._progress_state.run.stages.get(event.stage)
         if stage is None or stage.progress.total == 0:
             return
         self._last_line = now
@@ -175,10 +176,9 @@ class ProgressDisplay:
         with self._lock:
             state = self._progress_state
             rows: list[RenderableType] = [self._stages()]
-            pour = state.pour
-            if pour is not None and not pour.result:
+            if state.pour is not None:
                 rows.append(Text(state.pour_line() or "", style="bold"))
-                rows.append(self._pour_bar())
+                rows.append(self._pour_bar(state.pour))
             left = state.forecast.left(run_time())
             eta = f" · about {_duration(left)} left in all" if left is not None else ""
             rows.append(Text(f"  {state.pool_line()}{eta}", style="dim"))
@@ -190,7 +190,7 @@ class ProgressDisplay:
         from rich.text import Text
 
         table = Table.grid(padding=(0, 2))
-        for stage in self._progress_state.stages.values():
+        for stage in self._progress_state.run.stages.values():
             progress = stage.progress
             waiting = stage.opened_at is None and progress.total == 0
             total = max(progress.total, 1)
@@ -203,7 +203,7 @@ class ProgressDisplay:
             )
         return table
 
-    def _stage_note(self, stage: StageProgressState) -> str:
+    def _stage_note(self, stage: RecordedStage) -> str:
         if stage.closed_at is not None:
             return "done"
         now = run_time()
@@ -214,16 +214,14 @@ class ProgressDisplay:
         spent = _duration(now - stage.opened_at)
         return f"{spent}, {about} left" if about else spent
 
-    def _pour_bar(self) -> RenderableType:
+    def _pour_bar(self, pour: RunPour) -> RenderableType:
         from rich.progress_bar import ProgressBar
         from rich.table import Table
         from rich.text import Text
 
-        pour = self._progress_state.pour
-        assert pour is not None
         progress = pour.progress
         fraction = 0.0 if progress is None else progress.fraction
-        note = [f"{100 * fraction:3.0f} %", f"{max(run_time() - pour.started_at, 0.0):.1f} s"]
+        note = [f"{100 * fraction:3.0f} %", f"{max(run_time() - (pour.time or 0.0), 0.0):.1f} s"]
         if progress is not None and progress.tilt is not None:
             note.append(f"tilt {math.degrees(progress.tilt):.0f} deg")
         if (dose := self._progress_state.dose_line()) is not None:

@@ -23,8 +23,7 @@ from dataclasses import dataclass, field
 from statistics import median_low
 
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.requests import Failed, Pour, Simulate, Simulated
-from orchestrator.runs.events import (
+from orchestrator.journal.events import (
     Event,
     RequestFinished,
     RequestStarted,
@@ -32,6 +31,7 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.runs.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, DOSES, EVALUATION, POURS
 from orchestrator.strategies.calibration.calibration_scores import DRAWS
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan

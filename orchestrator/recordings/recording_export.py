@@ -19,7 +19,7 @@ from actors.arm.planned_pour import unpack
 from actors.arm.planning.kinematics import pourer_motion
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.journal.run_record import RecordedPour, read_record
+from orchestrator.journal.run_record import RunPour, read_record
 from orchestrator.recordings.recording_file import write_recording
 from orchestrator.run_errors import RunError
 from orchestrator.runs.run_folder import RESOLVED
@@ -75,7 +75,7 @@ def export_recordings(
     return written, left_out
 
 
-def _export(path: Path, pour: RecordedPour, scene: Scene, plan: CampaignPlan, run: str) -> Path:
+def _export(path: Path, pour: RunPour, scene: Scene, plan: CampaignPlan, run: str) -> Path:
     """Write one pour.
 
     Raises:

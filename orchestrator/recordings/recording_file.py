@@ -370,9 +370,9 @@ def _begin(times: Floats, tilts: Floats) -> float:
 
 
 def _smallest_step(values: Floats) -> float:
-    """The smallest difference of two readings that differ [kg]."""
+    """The smallest difference of readings that differ [kg]; 0.1 g for two weights, whose difference is the pour."""
     differences = np.abs(np.diff(np.unique(np.round(values, 9))))
-    return float(differences.min()) if len(differences) else 1e-4
+    return float(differences.min()) if len(differences) > 1 else 1e-4
 
 
 def write_recording(

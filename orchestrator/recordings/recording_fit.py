@@ -259,8 +259,8 @@ def fit_recordings(
     if not recordings:
         raise InvalidArgumentError("there is no recording to fit")
     names = tuple(name for name in UNKNOWNS if name in {*unknowns, *ALWAYS})
-    lag = _lag_before(recordings)
-    problem = _Problem(names, lag, [_Readings.of(one, until) for one in recordings])
+    lag = lag_before(recordings)
+    problem = _Problem(names, lag, [FittedReadings.of(one, until) for one in recordings])
     found = problem.solved(np.zeros(problem.size), problem.noise)
     weight = problem.effective_noise(found)
     found = problem.solved(found, weight)
@@ -304,7 +304,7 @@ def judge_recording(found: Fit, recording: PourRecording) -> Judgement:
             f"{recording.name}: all its readings were fitted, and none is left to judge; fit only its beginning, or "
             "judge another recording"
         )
-    readings = _Readings.of(recording, None)
+    readings = FittedReadings.of(recording, None)
     problem = _Problem(found._names, found._lag, [readings])
     shared = problem.shared
     mean, covariance = np.zeros(problem.size), np.eye(problem.size)
@@ -366,7 +366,7 @@ OWN = 3
 
 
 @dataclass(frozen=True, eq=False)
-class _Readings:
+class FittedReadings:
     """Readings of a recording that are fitted; a repeated reading while the mass rises is no new one."""
 
     recording: PourRecording
@@ -374,7 +374,8 @@ class _Readings:
     used: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, recording: PourRecording, until: float | None) -> _Readings:
+    def of(cls, recording: PourRecording, until: float | None) -> FittedReadings:
+        """Those up to a time [s], or all. Raises InvalidArgumentError: fewer than five."""
         net, times = recording.net, recording.read_times
         later = np.interp(times + 0.5, times, net) - np.interp(times - 0.5, times, net)
         repeats = np.concatenate([[False], np.abs(np.diff(net)) < 0.5 * recording.step])
@@ -394,7 +395,7 @@ class _Problem:
     It has the unknowns, then the shape of the balance's filter, then `OWN` for each recording.
     """
 
-    def __init__(self, names: Sequence[str], lag: Unknown, readings: Sequence[_Readings]) -> None:
+    def __init__(self, names: Sequence[str], lag: Unknown, readings: Sequence[FittedReadings]) -> None:
         self._names, self._readings = tuple(names), readings
         self.unknowns = UNKNOWNS | {"lag": lag}
         self.shared = len(names) + 1
@@ -493,7 +494,7 @@ class _Problem:
         return rows
 
 
-def _lag_before(recordings: Sequence[PourRecording]) -> Unknown:
+def lag_before(recordings: Sequence[PourRecording]) -> Unknown:
     """The lag before a fit: from the placing of the receiver, if a recording has it."""
     unknown = UNKNOWNS["lag"]
     one = next((one for one in recordings if len(one.placed) > 5), None)

@@ -172,7 +172,7 @@ def _while_it_flows(recording: PourRecording) -> tuple[Floats, Floats]:
     return times[: max(end, 2)], tilts[: max(end, 2)]
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=32)
 def cup_flow(pourer: VesselSpec, liquid: Liquid) -> CupFlow:
     """The flow of a vessel.
 

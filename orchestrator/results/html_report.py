@@ -33,7 +33,10 @@ LARGEST_VECTOR = 1_500_000
 
 _THETA_FIGURES = ("discrepancy", "posterior", "test discrepancy")
 
-_NARROW = ("test discrepancy", "spillage", "posterior")
+_FIRST_FIGURES = ("spillage", "loss map")
+"""Figures at the top of the page."""
+
+_NARROW = ("test discrepancy", "spillage", "loss map", "posterior")
 """Figures that can be placed next to each other."""
 
 _FIGURES: dict[str, tuple[str, str]] = {
@@ -109,10 +112,12 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         cost=wording.cost_table(summary),
         questions=wording.question_table(summary),
         theta=wording.theta_table(summary) if summary.parameters else None,
+        theta_fixed=wording.fixed_parameters(summary),
         scores=wording.score_table(summary),
         theta_figures=[one for name, one in pictures.items() if name.startswith(_THETA_FIGURES)],
         receivers=wording.receiver_table(summary),
-        figures=[one for name, one in pictures.items() if not name.startswith(_THETA_FIGURES)],
+        first=[one for name, one in pictures.items() if name.startswith(_FIRST_FIGURES)],
+        figures=[one for name, one in pictures.items() if not name.startswith((*_THETA_FIGURES, *_FIRST_FIGURES))],
         pours=wording.pour_tables(summary),
         not_simulated=wording.validity_table(summary),
         notes=[(_date(one.time), one.text) for one in summary.notes],

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import cast, get_args
 
+from orchestrator.journal.run_record import RunPour
 from orchestrator.requests import Pour, Prediction
 from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.costing import Costing
@@ -115,11 +116,8 @@ DOSE = LossUnit("|received − wanted| [g]", "g", 1e3)
 
 
 def is_calibration(plan: CampaignPlan, pour: Pour) -> bool:
-    """Whether a pour serves calibration: it is compared with simulations, not minimised."""
-    if pour.dose is not None:
-        return False
-    deployed = {scene.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
-    return pour.purpose == "calibration" or pour.scene not in deployed
+    """Whether a pour of a campaign serves calibration, see `Pour.calibrates`."""
+    return pour.calibrates(() if plan.deployment is None else [scene.name for scene in plan.deployment.scenes])
 
 
 def unit_of_pour(plan: CampaignPlan, pour: Pour) -> LossUnit:
@@ -129,6 +127,13 @@ def unit_of_pour(plan: CampaignPlan, pour: Pour) -> LossUnit:
     if plan.deployment is None or is_calibration(plan, pour):
         return SPILLAGE
     return deployment_unit(plan.deployment)
+
+
+def minimised_loss(plan: CampaignPlan, pour: RunPour) -> float | None:
+    """Measured loss of a pour that a deployment minimises; None for others, and if it is undefined."""
+    if pour.measured is None or pour.request.dose is not None or is_calibration(plan, pour.request):
+        return None
+    return loss_of_pour(plan, pour.request, pour.measured)
 
 
 def loss_of_pour(plan: CampaignPlan, pour: Pour, measured: PourMeasurement) -> float | None:

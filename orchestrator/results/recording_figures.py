@@ -8,6 +8,7 @@ import numpy as np
 
 from orchestrator.recordings.recording_fit import Judgement
 from orchestrator.recordings.recording_replay import QUANTILE, PourReplay
+from orchestrator.recordings.rig_diagnosis import RigDiagnosis
 from orchestrator.results.figure_style import BEST, GREY, INK, MEASURED, PREDICTED, dress, entitle, new_figure
 
 if TYPE_CHECKING:
@@ -53,4 +54,32 @@ def replay_figure(found: PourReplay, judged: Judgement | None = None) -> Figure:
     tilt.plot(recording.tilt_times, np.degrees(recording.tilts), color=INK, lw=1.2)
     dress(tilt, x="time [s]", y="tilt [deg]")
     tilt.set_xlim(recording.tilt_times[0], max(recording.tilt_times[-1], times[-1]))
+    return figure
+
+
+def diagnosis_figure(found: RigDiagnosis) -> Figure:
+    """Evidence of each explanation, and the doses as predicted from the pours next to the weighed ones.
+
+    Args:
+        found: of a first day.
+    """
+    figure, (evidence, doses) = new_figure(1, 2, size=(8.6, 3.4))
+    shown = [one for one in reversed(found.explanations) if np.isfinite(one.evidence)]
+    values = [float(np.clip(one.evidence, -10.0, 30.0)) for one in shown]
+    evidence.barh([one.name for one in shown], values, color=[BEST if one.stands_out else GREY for one in shown])
+    for row, one in enumerate(shown):
+        if one.evidence > 30.0:
+            evidence.text(29.5, row, f"{one.evidence:.0f}", ha="right", va="center", color="white", fontsize=8.5)
+    evidence.axvline(0.0, color=INK, lw=0.8)
+    evidence.set_xlim(-10.0, 30.0)
+    dress(evidence, title="Which quantity is wrong?", x="evidence (above 0: likelier than no error)", grid=None)
+    for row, dose in enumerate(found.doses):
+        low, high, middle = (1e3 * (one - dose.weighed) for one in (dose.low, dose.high, dose.predicted))
+        doses.plot([low, high], [row, row], color=PREDICTED, lw=3.0, label="predicted, 90 %" if row == 0 else None)
+        doses.plot(middle, row, ".", color=PREDICTED, ms=9.0)
+    doses.axvline(0.0, color=MEASURED, lw=1.2, label="weighed")
+    doses.set_yticks(range(len(found.doses)), [dose.name for dose in found.doses])
+    doses.invert_yaxis()
+    doses.legend(frameon=False, fontsize=8.5, loc="best")
+    dress(doses, title="Doses, predicted from the pours", x="predicted − weighed [g]", grid=None)
     return figure

@@ -166,6 +166,10 @@ class LogEntry(ResultPart):
     text: str
 
 
+NOT_SEARCHED = "not searched"
+"""`ParameterSummary.searched` of a parameter with a fixed value."""
+
+
 class ParameterSummary(ResultPart):
     """A parameter of θ* in words with units."""
 

@@ -10,7 +10,7 @@ from actors.laboratory_settings import MODE_LABELS
 from orchestrator.journal.codec import Results
 from orchestrator.journal.journal_check import JournalCheck
 from orchestrator.journal.journal_file import Header
-from orchestrator.journal.run_record import Occupancy, RecordedPour, RunRecord
+from orchestrator.journal.run_record import Occupancy, RunPour, RunState
 from orchestrator.results import figure_style as style
 from orchestrator.results import wording
 from orchestrator.results.loss_units import (
@@ -19,9 +19,11 @@ from orchestrator.results.loss_units import (
     deployment_unit,
     is_calibration,
     loss_of_pour,
+    minimised_loss,
     unit_of_pour,
 )
 from orchestrator.results.run_summary import (
+    NOT_SEARCHED,
     LogEntry,
     NotSimulated,
     ParameterSummary,
@@ -36,6 +38,7 @@ from orchestrator.results.run_summary import (
 from orchestrator.results.stage_views import (
     SPLITS,
     calibrated_label,
+    calibration_of,
     confirmations_of,
     deployments_of,
     evaluation_of,
@@ -50,7 +53,6 @@ from orchestrator.strategies.calibration.calibration_base import CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import Scores
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.dispense import spilled_mass
 from orchestrator.strategies.single_action import Confirmed, PredictedPour
 from sim_engine.model_validity import NotCovered
 from sim_engine.outcome import normalised_spillage
@@ -63,7 +65,7 @@ def summarise(
     plan: CampaignPlan,
     results: Results,
     *,
-    record: RunRecord | None = None,
+    record: RunState | None = None,
     run: str = "",
     live: bool = False,
     versions: Mapping[str, Any] | None = None,
@@ -92,13 +94,15 @@ def summarise(
         best_not_covered: the same for the recommended actions.
         totals: costs of the run.
     """
-    record = record or RunRecord(Header(plan.name, {}))
+    record = record or RunState(Header(plan.name, {}))
     found, evaluation, gain = theta_of(results), evaluation_of(results), gain_of(results)
+    calibration = calibration_of(results)
     posterior = None if found is None or found.posterior is None else found.posterior.summary()
     space = None if plan.calibration is None else plan.calibration.parameters
     liquid = None if plan.calibration is None else plan.calibration.scene.liquid
     expected = None if found is None else found.predicted_discrepancy
     deviation = None if found is None else found.predicted_deviation
+    ended = None if calibration is None else calibration.ended
     discrepancy = _discrepancies(evaluation)
     receivers = _receivers(plan, results, best_not_covered or {})
     advised = wording.advice(plan, receivers)
@@ -126,7 +130,7 @@ def summarise(
         predicted_deviation=deviation,
         posterior=posterior,
         parameters=() if found is None else _parameters(plan.calibration, found),
-        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain, liquid)),
+        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain, liquid, ended)),
         discrepancy=discrepancy,
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,
@@ -140,7 +144,7 @@ def summarise(
 
 
 def summarise_record(
-    record: RunRecord,
+    record: RunState,
     run: str,
     *,
     reason: str,
@@ -191,7 +195,7 @@ def _plain(values: Mapping[str, float | None]) -> str:
 
 
 def _of_record(
-    plan: CampaignPlan | None, record: RunRecord, run: str, live: bool, check: JournalCheck | None
+    plan: CampaignPlan | None, record: RunState, run: str, live: bool, check: JournalCheck | None
 ) -> dict[str, Any]:
     """The fields that come from the journal."""
     standing = wording.standing(record, run) if run else []
@@ -204,7 +208,7 @@ def _of_record(
         "stages": tuple(
             StageSummary(
                 stage=one.name,
-                state="closed" if one.closed else "open",
+                state="open" if one.closed_at is None else "closed",
                 pours=one.pours,
                 simulations=one.simulations,
                 unusable_simulations=one.failed_simulations,
@@ -236,7 +240,7 @@ def _damage(check: JournalCheck) -> list[str]:
 # ---- pours
 
 
-def pour_summaries(plan: CampaignPlan | None, record: RunRecord, *, live: bool = False) -> list[PourSummary]:
+def pour_summaries(plan: CampaignPlan | None, record: RunState, *, live: bool = False) -> list[PourSummary]:
     """The requested pours of a run, in order.
 
     Args:
@@ -245,18 +249,13 @@ def pour_summaries(plan: CampaignPlan | None, record: RunRecord, *, live: bool =
     """
     best: dict[str, tuple[float, int]] = {}
     for pour in record.pours:
-        if plan is None or pour.measured is None or is_calibration(plan, pour.request) or pour.request.dose is not None:
-            continue
-        loss = loss_of_pour(plan, pour.request, pour.measured)
-        if loss is not None:
+        if plan is not None and (loss := minimised_loss(plan, pour)) is not None:
             best[pour.stage] = min(best.get(pour.stage, (loss, pour.id)), (loss, pour.id))
     chosen = {key for _, key in best.values()}
     return [pour_summary(plan, pour, live=live, best=pour.id in chosen) for pour in record.pours]
 
 
-def pour_summary(
-    plan: CampaignPlan | None, pour: RecordedPour, *, live: bool = False, best: bool = False
-) -> PourSummary:
+def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False, best: bool = False) -> PourSummary:
     """A pour in numbers and words; see `pour_summaries`."""
     request, measured, values = pour.request, pour.measured, pour.request.action.values()
     calibrating, unit, names = True, SPILLAGE, tuple(name for name, value in values.items() if value is not None)
@@ -266,7 +265,8 @@ def pour_summary(
         section: CalibrationPlan | DeploymentPlan | None = plan.calibration if calibrating else plan.deployment
         names = ("angular_velocity", "x_offset") if section is None else section.actions.names
         loss = None if measured is None else loss_of_pour(plan, request, measured)
-    spilled = None if measured is None else spilled_mass(measured)
+    row = pour.row()
+    spilled = row.get("spilled_g")
     state = "unknown" if pour.state == "under way" and not live else pour.state
     came = "" if measured is None else "too little was poured" if loss is None else unit.text(loss)
     if measured is not None and spilled is None:
@@ -288,17 +288,17 @@ def pour_summary(
         loss=unit.meaning,
         best=best,
         remark=_remark(state, pour),
-        loaded_g=None if measured is None else 1e3 * measured.loaded,
-        spilled_g=None if spilled is None else 1e3 * spilled,
-        retained_g=None if measured is None else 1e3 * measured.retained,
+        loaded_g=row.get("loaded_g"),
+        spilled_g=spilled,
+        retained_g=row.get("retained_g"),
         spillage=None if measured is None or spilled is None else measured.fractions.spilled,
-        spilled_of_poured=None if measured is None or spilled is None else normalised_spillage(measured.fractions),
+        spilled_of_poured=row.get("spillage"),
         time=pour.time,
         seconds=pour.seconds,
     )
 
 
-def _remark(state: str, pour: RecordedPour) -> str:
+def _remark(state: str, pour: RunPour) -> str:
     said = {
         "unknown": "UNKNOWN: it had begun, and its outcome is not known",
         "under way": "under way",
@@ -341,7 +341,7 @@ def _parameters(calibration: CalibrationPlan | None, found: CalibratedTheta) -> 
                 name=style.PARAMETER_NAMES.get(name, name.replace("_", " ")),
                 value=style.display_value(name, value),
                 region=region,
-                searched="not searched" if axis is None else style.display_interval(name, axis.lower, axis.upper),
+                searched=NOT_SEARCHED if axis is None else style.display_interval(name, axis.lower, axis.upper),
             )
         )
     return tuple(rows)

@@ -11,17 +11,16 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from orchestrator.journal.run_record import RunRecord
+from orchestrator.journal.run_record import RunState
 from orchestrator.results import figure_style as style
 from orchestrator.results.loss_units import (
     DISCREPANCY,
     LossUnit,
     at_least_nothing,
     deployment_unit,
-    is_calibration,
-    loss_of_pour,
+    minimised_loss,
 )
-from orchestrator.results.run_summary import Advice, PoolUse, PourSummary, ReceiverSummary, RunSummary
+from orchestrator.results.run_summary import NOT_SEARCHED, Advice, PoolUse, PourSummary, ReceiverSummary, RunSummary
 from orchestrator.results.stage_views import SPLITS
 from orchestrator.states import State
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
@@ -243,7 +242,7 @@ def _poured_again(row: ReceiverSummary) -> list[str]:
 
 
 def open_questions(
-    plan: CampaignPlan, record: RunRecord, theta: Sequence[str], *, calibrated: bool, dropped_events: int
+    plan: CampaignPlan, record: RunState, theta: Sequence[str], *, calibrated: bool, dropped_events: int
 ) -> list[str]:
     """Open questions after a run that do not depend on the receiver.
 
@@ -314,10 +313,12 @@ def theta_sentences(
     space: Space | None,
     gain: CalibrationGain | None,
     liquid: Liquid | None = None,
+    ended: str | None = None,
 ) -> list[str]:
     """The knowledge of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified.
 
     Args:
+        ended: reason of the end of an automatic calibration.
         liquid: of the pours, as declared; its viscosity is stated if the pours determine it.
     """
     said = []
@@ -327,7 +328,19 @@ def theta_sentences(
         said += map(_sentence, posterior_lines(posterior, space))
         if liquid is not None and liquid.is_thick:
             said += _identified_viscosity(posterior, liquid)
-    return said if gain is None else [*said, _sentence(gain.text)]
+    if ended is not None:
+        said.append(f"The calibration ended because {ended}.")
+    if gain is not None:
+        said.append(_sentence(gain.text))
+        if posterior is not None and gain.recommended == "calibrated":
+            said.append(POSTERIOR_ADVICE)
+    return said
+
+
+POSTERIOR_ADVICE = (
+    "Plan and predict with theta.json, as the run itself does: it averages over the θ that fit, and transfers better "
+    "to other vessels than θ* alone."
+)
 
 
 def _identified_viscosity(posterior: PosteriorSummary, liquid: Liquid) -> list[str]:
@@ -365,7 +378,7 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
     return [*lines, *posterior.directions]
 
 
-def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -> list[str]:
+def without_advice(plan: CampaignPlan, record: RunState, *, calibrated: bool) -> list[str]:
     """The outcome of a run that recommends no action.
 
     Args:
@@ -373,9 +386,8 @@ def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -
     """
     if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
         said = ["No action is recommended yet: the result of a deployment is written when its stage ends."]
-        poured = [pour for pour in record.weighed if not is_calibration(plan, pour.request)]
-        losses = {loss_of_pour(plan, p.request, m): p for p in poured if (m := p.measured) is not None}
-        known = [loss for loss in losses if loss is not None]
+        losses = {loss: pour for pour in record.weighed if (loss := minimised_loss(plan, pour)) is not None}
+        known = list(losses)
         if known:
             action = losses[min(known)].request.action.values()
             best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
@@ -395,7 +407,7 @@ def without_advice(plan: CampaignPlan, record: RunRecord, *, calibrated: bool) -
     return ["This run recommends no action."]
 
 
-def cost(record: RunRecord, occupancy: Mapping[str, PoolUse], time_scale: float | None = None) -> dict[str, str]:
+def cost(record: RunState, occupancy: Mapping[str, PoolUse], time_scale: float | None = None) -> dict[str, str]:
     """Costs of a run: pours, grams, minutes.
 
     Args:
@@ -436,7 +448,7 @@ def minutes(seconds: float) -> str:
     return f"{seconds / 60:.1f} min" if seconds < 5400.0 else f"{seconds / 3600:.1f} h"
 
 
-def standing(record: RunRecord, run: str) -> list[str]:
+def standing(record: RunState, run: str) -> list[str]:
     """State of an unfinished run and the next steps; empty for a finished one.
 
     Args:
@@ -473,7 +485,7 @@ def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
-def what_was_asked(plan: CampaignPlan, record: RunRecord) -> dict[str, str]:
+def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
     """Names and values: the liquid, and the calibration of the simulator and the search for pours, or the doses."""
     found: list[tuple[str, str]] = []
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
@@ -608,10 +620,16 @@ def question_table(summary: RunSummary) -> ResultTable:
 
 
 def theta_table(summary: RunSummary) -> ResultTable:
-    """θ* with its region."""
+    """θ* with its region: the searched parameters."""
     level = "region" if summary.posterior is None else f"{100 * summary.posterior.level:.0f} % of the θ that fit"
-    rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in summary.parameters]
+    searched = [one for one in summary.parameters if one.searched != NOT_SEARCHED]
+    rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in searched]
     return ResultTable("θ* with its region", ["parameter", "θ*", level, "searched"], rows).filled()
+
+
+def fixed_parameters(summary: RunSummary) -> str:
+    """The parameters that were not searched, with their values; empty if all were."""
+    return ", ".join(f"{one.name} {one.value}" for one in summary.parameters if one.searched == NOT_SEARCHED)
 
 
 def score_table(summary: RunSummary) -> ResultTable:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from orchestrator.journal.codec import Results, decode_results
+from orchestrator.journal.codec import Results
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.run_record import read_record
 from orchestrator.runs.fingerprint import scene_by_content
@@ -56,7 +56,7 @@ def read_former_run(directory: Path) -> PreviousRun:
         CodecError: an entry can't be decoded.
     """
     record = read_record(directory)
-    header, splits = record.header.fingerprint, _splits(decode_results(record.results))
+    header, splits = record.header.fingerprint, _splits(record.results)
     weighed = [
         pour
         for pour in record.pours

@@ -1,8 +1,7 @@
 """Resuming an interrupted run: replay of its stages from the journal, and pours whose outcome is unknown.
 
 - `read_history` reads a stage into a `StageHistory`. `replay` repeats the recorded sequence of ask and tell on a new
-  strategy, which must make the recorded requests again. `replayed_events` repeats the events for subscribers. None of
-  these runs a request.
+  strategy, which must make the recorded requests again. Neither runs a request.
 - A pour that had begun when the run was interrupted has an unknown outcome, which software must not guess.
   `settle_unknown_pours` asks the operator for each one (lost, weighed, or repeat on a virtual bench) and records it.
   `settle_open_questions` does the same for questions of strategies. `parse_answer` converts an answer to an outcome.
@@ -11,23 +10,27 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
-from orchestrator.journal.codec import (
-    canonical,
-    decode_outcome,
-    decode_request,
-    decode_result,
-    encode_outcome,
-    encode_request,
-    first_difference,
+from orchestrator.journal.codec import canonical, encode_request, first_difference
+from orchestrator.journal.events import (
+    Asked,
+    DecisionMade,
+    Event,
+    OperatorAnswered,
+    OperatorAsked,
+    PourWithdrawn,
+    Requested,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    Told,
 )
-from orchestrator.journal.journal import Draft, Journal, JournalReader, Kind
+from orchestrator.journal.journal import Journal, JournalReader
 from orchestrator.requests import Answered, Ask, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.run_errors import RunError
-from orchestrator.runs.events import RequestFinished
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Strategy
@@ -39,21 +42,6 @@ class ReplayError(RunError):
     """The strategy's requests differ from those in the journal."""
 
 
-@dataclass(frozen=True)
-class AskedStep:
-    """A call of `ask` with these slots, which returned the requests with these ids."""
-
-    slots: Slots
-    ids: tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class ToldStep:
-    """A call of `tell` with the outcome of a request, or of a pour that was added by hand."""
-
-    id: int
-
-
 @dataclass
 class StageHistory:
     """The journal's content for one stage.
@@ -61,9 +49,9 @@ class StageHistory:
     Attributes:
         seed: seed of the stage; None if the stage was never opened.
         steps: asks and tells in their order.
-        requests: JSON of each request by id, in the order in which they were made.
-        outcomes: outcome by id, in the order in which the requests finished.
-        finished_at: time at which each request finished, by id (seconds since 1970).
+        requests: by id, in the order in which they were made.
+        outcomes: by id, in the order in which the requests finished.
+        finished: the finished requests to the laboratory, in the same order.
         pour_attempts: how often each pour was begun.
         withdrawn: pours whose last attempt ended without pouring anything.
         decisions: number of decisions written.
@@ -71,10 +59,10 @@ class StageHistory:
     """
 
     seed: int | None = None
-    steps: list[AskedStep | ToldStep] = field(default_factory=list)
-    requests: dict[int, dict[str, Any]] = field(default_factory=dict)
+    steps: list[Asked | Told] = field(default_factory=list)
+    requests: dict[int, Request] = field(default_factory=dict)
     outcomes: dict[int, Outcome] = field(default_factory=dict)
-    finished_at: dict[int, float] = field(default_factory=dict)
+    finished: list[RequestFinished] = field(default_factory=list)
     pour_attempts: dict[int, int] = field(default_factory=dict)
     withdrawn: set[int] = field(default_factory=set)
     decisions: int = 0
@@ -83,11 +71,7 @@ class StageHistory:
     @property
     def ask_is_due(self) -> bool:
         """Whether the next step is `ask`: the last step was a tell, or there is no step yet."""
-        return not self.steps or isinstance(self.steps[-1], ToldStep)
-
-    def request(self, key: int) -> Request:
-        """The request with this id."""
-        return decode_request(self.requests[key])
+        return not self.steps or isinstance(self.steps[-1], Told)
 
     def unknown_pours(self) -> list[int]:
         """Pours that had begun and have no outcome."""
@@ -95,8 +79,7 @@ class StageHistory:
 
     def open_questions(self) -> dict[int, Ask]:
         """Questions to the operator without an answer."""
-        asked = {key: self.request(key) for key, body in self.requests.items() if body["type"] == Ask.__name__}
-        return {key: ask for key, ask in asked.items() if isinstance(ask, Ask) and key not in self.outcomes}
+        return {key: ask for key, ask in self.requests.items() if isinstance(ask, Ask) and key not in self.outcomes}
 
 
 def read_history(journal: JournalReader, stage: str) -> StageHistory:
@@ -106,47 +89,29 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
         RunError: an outcome or a result can't be decoded.
     """
     history = StageHistory()
-    for entry in journal.entries(stage=stage):
-        body = entry.body
-        match entry.kind:
-            case Kind.STAGE_OPENED:
-                history.seed = body["seed"]
-            case Kind.ASKED:
-                history.steps.append(AskedStep(Slots(body["simulations"], body["pours"]), tuple(body["ids"])))
-            case Kind.REQUESTED:
-                history.requests[body["id"]] = body["request"]
-            case Kind.POUR_STARTED:
-                history.pour_attempts[body["id"]] = body["attempt"]
-                history.withdrawn.discard(body["id"])
-            case Kind.POUR_WITHDRAWN:
-                history.withdrawn.add(body["id"])
-            case Kind.FINISHED | Kind.POUR_FINISHED:
-                history.outcomes[body["id"]] = decode_outcome(body["outcome"])
-                history.finished_at[body["id"]] = entry.t
-            case Kind.OPERATOR_ANSWERED if "outcome" in body:
-                history.outcomes[body["id"]] = decode_outcome(body["outcome"])
-            case Kind.TOLD:
-                history.steps.append(ToldStep(body["id"]))
-            case Kind.DECISION:
+    for _, event in journal.events(stage=stage):
+        match event:
+            case StageOpened():
+                history.seed = event.seed
+            case Asked() | Told():
+                history.steps.append(event)
+            case Requested():
+                history.requests[event.id] = event.request
+            case RequestStarted(request=Pour()):
+                history.pour_attempts[event.id] = event.attempt
+                history.withdrawn.discard(event.id)
+            case PourWithdrawn():
+                history.withdrawn.add(event.id)
+            case RequestFinished():
+                history.outcomes[event.id] = event.outcome
+                history.finished.append(event)
+            case OperatorAnswered(outcome=outcome) if outcome is not None:
+                history.outcomes[event.id] = outcome
+            case DecisionMade():
                 history.decisions += 1
-            case Kind.STAGE_CLOSED:
-                history.result = decode_result(body["result"])
+            case StageClosed():
+                history.result = event.result
     return history
-
-
-def replayed_events(history: StageHistory, stage: str) -> Iterator[RequestFinished]:
-    """The finished requests of the interrupted run as events, for the subscribers of the resumed run."""
-    for key, outcome in history.outcomes.items():
-        if isinstance(outcome, Answered):  # not a request to the laboratory
-            continue
-        yield RequestFinished(
-            time=history.finished_at[key],
-            stage=stage,
-            replayed=True,
-            id=key,
-            request=history.request(key),
-            outcome=outcome,
-        )
 
 
 def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, Request]:
@@ -160,13 +125,13 @@ def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, R
     """
     undelivered: dict[int, Request] = {}
     for step in history.steps:
-        if isinstance(step, ToldStep):
-            request = undelivered.pop(step.id, None) or history.request(step.id)
+        if isinstance(step, Told):
+            request = undelivered.pop(step.id, None) or history.requests[step.id]
             strategy.tell(request, history.outcomes[step.id])
             continue
-        requests = strategy.ask(step.slots)
+        requests = strategy.ask(Slots(step.simulations, step.pours))
         for key, request in zip(step.ids, requests, strict=False):
-            _check_same(history.requests[key], encode_request(request), key, stage)
+            _check_same(history.requests[key], request, key, stage)
             undelivered[key] = request
         if len(requests) != len(step.ids):
             raise ReplayError(
@@ -182,13 +147,12 @@ _ADVICE = (
 )
 
 
-def _check_same(written: dict[str, Any], now: dict[str, Any], key: int, stage: str) -> None:
-    if canonical(written) == canonical(now):
-        return
-    # A field that was added later, with a default that changes nothing, does not make the request different.
-    if canonical(encode_request(decode_request(written))) != canonical(now):
+def _check_same(written: Request, now: Request, key: int, stage: str) -> None:
+    # Decoded and encoded again: a later field with a default that changes nothing does not make a request different.
+    before, after = encode_request(written), encode_request(now)
+    if canonical(before) != canonical(after):
         raise ReplayError(
-            f"stage {stage}: request {key} differs from the journal's at {first_difference(written, now)}. {_ADVICE}"
+            f"stage {stage}: request {key} differs from the journal's at {first_difference(before, after)}. {_ADVICE}"
         )
 
 
@@ -232,7 +196,7 @@ async def settle_unknown_pours(
     """
     virtual = plan.laboratory.mode == "virtual"
     for key in history.unknown_pours():
-        pour = history.request(key)
+        pour = history.requests[key]
         assert isinstance(pour, Pour)
         scene = scenes[pour.scene]
         what = f"pour {pour.number} of stage {stage} ({pour.action.display(*_searched(scene, pour))})"
@@ -243,19 +207,18 @@ async def settle_unknown_pours(
                     "on a real one the liquid may be in the receiver already. Set on_unknown: ask"
                 )
             text = f"{what} had begun and has no outcome; it is repeated with the same seed on the virtual bench"
-            journal.append(Kind.NOTE, {"text": text}, stage=stage)
+            journal.log("note", text, stage=stage, kept=True)
             continue
         options = (*((REPEAT,) if virtual else ()), LOST, WEIGHED)
         question = f"{what} had begun when the run was interrupted; what was its outcome?"
         answer, outcome = await _ask(ask, question, options, scene.liquid.mass, on_waiting)
-        drafts = [
-            Draft(Kind.OPERATOR_ASKED, {"id": key, "question": question, "options": list(options)}, stage),
-            Draft(Kind.OPERATOR_ANSWERED, {"id": key, "answer": answer}, stage),
+        events: list[Event] = [
+            OperatorAsked(stage=stage, id=key, question=question, options=options),
+            OperatorAnswered(stage=stage, id=key, answer=answer),
         ]
         if outcome is not None:
-            body = {"id": key, "outcome": encode_outcome(outcome), "seconds": 0.0}
-            drafts.append(Draft(Kind.POUR_FINISHED, body, stage))
-        journal.append_all(drafts)
+            events.append(RequestFinished(stage=stage, id=key, request=pour, outcome=outcome, replayed=True))
+        journal.append(*events)
 
 
 async def settle_open_questions(
@@ -285,9 +248,10 @@ async def settle_open_questions(
             text = f"{request.question}\n'{answer}' is not an answer; answer with one of: {'; '.join(request.options)}"
         else:
             raise needs_answer(request)
-        asked = {"id": key, "question": request.question, "options": list(request.options)}
-        answered = {"id": key, "answer": meant, "outcome": encode_outcome(Answered(meant))}
-        journal.append_all([Draft(Kind.OPERATOR_ASKED, asked, stage), Draft(Kind.OPERATOR_ANSWERED, answered, stage)])
+        journal.append(
+            OperatorAsked(stage=stage, id=key, question=request.question, options=request.options),
+            OperatorAnswered(stage=stage, id=key, answer=meant, outcome=Answered(meant)),
+        )
 
 
 def needs_answer(request: Ask) -> OperatorNeededError:

@@ -16,12 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from actors.interfaces import Laboratory, Notice, Telling
-from orchestrator.journal.codec import Results, decode_results
-from orchestrator.journal.journal import JOURNAL_NAME, Journal, Kind
-from orchestrator.journal.journal_file import Header, JournalError, NoSpaceError
-from orchestrator.journal.run_record import CampaignResult, read_result
-from orchestrator.run_errors import RunError
-from orchestrator.runs.events import (
+from orchestrator.journal.codec import Results
+from orchestrator.journal.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
@@ -30,8 +26,11 @@ from orchestrator.runs.events import (
     StageClosed,
     StageOpened,
     Subscriber,
-    Subscribers,
 )
+from orchestrator.journal.journal import JOURNAL_NAME, Journal
+from orchestrator.journal.journal_file import Header, JournalError, NoSpaceError
+from orchestrator.journal.run_record import CampaignResult, read_result
+from orchestrator.run_errors import RunError
 from orchestrator.runs.fingerprint import fingerprint
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor, RequestExecutorError
 from orchestrator.runs.request_forecast import RequestForecast
@@ -40,7 +39,6 @@ from orchestrator.runs.resume import (
     OperatorNeededError,
     StageHistory,
     read_history,
-    replayed_events,
     settle_open_questions,
     settle_unknown_pours,
 )
@@ -87,7 +85,7 @@ async def run_campaign(
         plan,
         laboratory,
         run_directory,
-        Subscribers(subscribers),
+        subscribers,
         ask_operator,
         tuple(stages_of(plan) if stages is None else stages),
         deadlines or _default_deadlines(plan),
@@ -114,7 +112,7 @@ class _Run:
     _plan: CampaignPlan
     _laboratory: Laboratory
     _directory: Path
-    _subscribers: Subscribers
+    _subscribers: Sequence[Subscriber]
     _ask_operator: AskOperator | None
     _stages: tuple[StageDefinition, ...]
     _deadlines: Deadlines
@@ -130,7 +128,7 @@ class _Run:
 
     async def run(self, resume: bool) -> CampaignResult:
         path, header = self._directory / JOURNAL_NAME, Header(self._plan.name, fingerprint(self._plan))
-        self._journal = Journal.resume(path, header) if resume else Journal.create(path, header)
+        self._journal = (Journal.resume if resume else Journal.create)(path, header, self._subscribers)
         try:
             if not resume:
                 write_provenance(self._directory, self._plan)
@@ -150,7 +148,7 @@ class _Run:
                 raise
             except Exception as error:
                 if self._is_finished():  # the results are complete; only the cleanup failed
-                    self._subscribers.log("warning", f"while closing the laboratory: {error}")
+                    self._journal.log("warning", f"while closing the laboratory: {error}")
                 else:
                     self._come_to_rest(State.FAILED, f"{type(error).__name__}: {error}")
                     raise
@@ -174,7 +172,7 @@ class _Run:
                 laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
             executor = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.frame_rate)
-            executor.speculation.changed = lambda running, waiting: self._subscribers.emit(
+            executor.speculation.changed = lambda running, waiting: self._journal.append(
                 SpeculationProgressed(running=running, waiting=waiting)
             )
             opened = CampaignOpened(
@@ -185,7 +183,7 @@ class _Run:
                 simulators=laboratory.simulators.size,
                 resumed=resume,
             )
-            self._subscribers.emit(opened)
+            self._journal.append(opened)
             self._log_idle_simulators(laboratory.simulators.size)
             self._enter(State.RUNNING)
             results: dict[str, StageResult] = {}
@@ -204,29 +202,21 @@ class _Run:
         results: Results,
         executor: RequestExecutor,
     ) -> StageResult:
-        done = history.result is not None
-        opened = StageOpened(
-            stage=stage.name,
-            index=index,
-            count=len(self._stages),
-            resumed=history.seed is not None,
-            replayed=done,
-        )
-        self._subscribers.emit(opened)
-        if history.result is not None:
-            for event in replayed_events(history, stage.name):
-                self._subscribers.emit(event)
-            self._subscribers.emit(StageClosed(stage=stage.name, replayed=True, result=history.result))
-            return history.result
         seed = stage_seed(self._plan.seed, stage.name)
-        if history.seed is None:
-            self._journal.append(Kind.STAGE_OPENED, {"seed": seed}, stage=stage.name)
+        resumed, done = history.seed is not None, history.result is not None
+        opened = StageOpened(
+            stage=stage.name, index=index, count=len(self._stages), seed=seed, resumed=resumed, replayed=done
+        )
+        (self._journal.publish if resumed else self._journal.append)(opened)
+        if history.result is not None:
+            closed = StageClosed(stage=stage.name, replayed=True, result=history.result)
+            self._journal.publish(*history.finished, closed)
+            return history.result
         scheduler = StageScheduler(
             stage.name,
             stage.build(results, seed),
             journal=self._journal,
             executor=executor,
-            subscribers=self._subscribers,
             capacity=self._plan.parallel_simulations,
             order=stage.order,
             recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.frame_rate > 0.0 else 0,
@@ -243,8 +233,7 @@ class _Run:
         if executor.speculation.used > used:
             count = executor.speculation.used - used
             text = f"{count} simulation(s) of {stage.name} were made while the arm was pouring before"
-            self._journal.append(Kind.NOTE, {"text": text}, stage=stage.name)
-        self._subscribers.emit(StageClosed(stage=stage.name, result=result))
+            self._journal.log("note", text, stage=stage.name, kept=True)
         return result
 
     @contextmanager
@@ -308,30 +297,25 @@ class _Run:
     def _log_idle_simulators(self, simulators: int) -> None:
         slots = self._plan.parallel_simulations
         if simulators > slots:
-            self._subscribers.log(
+            self._journal.log(
                 "info",
                 f"{simulators} simulators, but this campaign keeps at most {slots} simulation(s) in flight: "
                 f"{simulators - slots} will have nothing to do; 'parallel_simulations' in the campaign changes that",
             )
 
     def _on_notice(self, notice: Notice) -> None:
-        """Write a notice of the laboratory to the journal and emit it."""
+        """Write a notice of the laboratory to the journal and publish it."""
         try:
-            self._journal.append(Kind.NOTE, {"text": notice.text})
+            self._journal.append(LogLine(level=notice.level, text=notice.text, asked=notice.asked, kept=True))
         except JournalError:  # the next important write ends the run; until then the display shows everything
-            self._subscribers.log("error", f"can't be written down: {notice.text}")
-            return
-        if notice.level != "note":
-            self._subscribers.emit(LogLine(level=notice.level, text=notice.text, asked=notice.asked))
+            self._journal.log("error", f"can't be written down: {notice.text}")
 
     def _enter(self, state: State, reason: str = "") -> None:
         if state is self._state:
             return
         check_transition(self._state, state)
         before, self._state = self._state, state
-        body = {"before": str(before), "after": str(state), "reason": reason, "pid": os.getpid()}
-        self._journal.append(Kind.CAMPAIGN_STATE, body)
-        self._subscribers.emit(CampaignStateChanged(before=str(before), after=str(state), reason=reason))
+        self._journal.append(CampaignStateChanged(before=before, after=state, reason=reason, pid=os.getpid()))
 
     def _is_finished(self) -> bool:
         return self._state is State.FINISHED
@@ -342,11 +326,10 @@ class _Run:
         try:
             self._enter(state, reason)
         except JournalError as problem:  # the next process finds the run interrupted
-            self._subscribers.log("error", f"can't write that the run is {state}: {problem}")
-        results = decode_results(self._journal.stage_results())
-        self._subscribers.emit(CampaignClosed(state=str(self._state), results=results))
+            self._journal.log("error", f"can't write that the run is {state}: {problem}")
+        self._journal.append(CampaignClosed(state=str(self._state), results=self._journal.stage_results()))
 
     def _close(self) -> CampaignResult:
         result = read_result(self._directory, seconds=time.monotonic() - self._begin)
-        self._subscribers.emit(CampaignClosed(state=str(result.state), results=result.results))
+        self._journal.append(CampaignClosed(state=str(result.state), results=result.results))
         return result

@@ -20,24 +20,28 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 from actors.interfaces import PourProgress
-from orchestrator.journal.codec import decode_outcome, encode_outcome, encode_request, encode_result, to_json
-from orchestrator.journal.journal import Draft, Journal, Kind
-from orchestrator.journal.journal_file import JournalError
-from orchestrator.requests import Ask, Decision, Order, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
-from orchestrator.run_errors import RunError
-from orchestrator.runs.events import (
+from orchestrator.journal.codec import decode_outcome, encode_outcome
+from orchestrator.journal.events import (
+    Asked,
     DecisionMade,
+    Event,
     PourProgressed,
+    PourWithdrawn,
+    Requested,
     RequestFinished,
     RequestStarted,
+    StageClosed,
     StrategyProgressed,
-    Subscribers,
+    Told,
 )
+from orchestrator.journal.journal import Journal
+from orchestrator.journal.journal_file import JournalError
+from orchestrator.requests import Ask, Order, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.run_errors import RunError
 from orchestrator.runs.request_executor import RequestExecutor
-from orchestrator.runs.resume import StageHistory, needs_answer, replay, replayed_events, weighed_by_hand
+from orchestrator.runs.resume import StageHistory, needs_answer, replay, weighed_by_hand
 from orchestrator.strategies.stage_result import StageResult
 from orchestrator.strategies.strategy import Strategy
 from sim_engine.outcome import RecordedFrames
@@ -115,7 +119,6 @@ class StageScheduler:
         *,
         journal: Journal,
         executor: RequestExecutor,
-        subscribers: Subscribers,
         capacity: int,
         order: Order,
         recordings: int = 0,
@@ -134,7 +137,6 @@ class StageScheduler:
         self._strategy = strategy
         self._journal = journal
         self._executor = executor
-        self._subscribers = subscribers
         self._capacity = capacity
         self._order = order
         self._recordings = recordings
@@ -160,7 +162,7 @@ class StageScheduler:
             ReplayError: the strategy's requests differ from those in the journal.
         """
         undelivered = replay(self._strategy, history, self._stage)
-        simulations = [key for key, written in history.requests.items() if written["type"] == Simulate.__name__]
+        simulations = [key for key, request in history.requests.items() if isinstance(request, Simulate)]
         numbers = {key: number for number, key in enumerate(simulations, start=1)}
         order = {key: place for place, key in enumerate(history.outcomes, start=1)}
         self._simulations, self._finished = len(numbers), len(order)
@@ -175,8 +177,7 @@ class StageScheduler:
             )
         self._decisions = history.decisions
         self._ask_is_due = history.ask_is_due
-        for event in replayed_events(history, self._stage):
-            self._subscribers.emit(event)
+        self._journal.publish(*history.finished)
         if history.steps:
             self._report_progress()
 
@@ -209,7 +210,7 @@ class StageScheduler:
             await self._wind_down(error)
             raise
         result = self._strategy.result()
-        self._journal.append(Kind.STAGE_CLOSED, {"result": encode_result(result)}, stage=self._stage)
+        self._journal.append(StageClosed(stage=self._stage, result=result))
         return result
 
     def _ask(self) -> None:
@@ -224,11 +225,11 @@ class StageScheduler:
                 record = is_recorded(self._simulations, self._recordings)
             pending_requests.append(PendingRequest(self._next_id, request, record=record))
             self._next_id += 1
-        asked = {"simulations": slots.simulations, "pours": slots.pours, "ids": [f.id for f in pending_requests]}
-        drafts = [Draft(Kind.ASKED, asked, self._stage)]
-        for f in pending_requests:
-            drafts.append(Draft(Kind.REQUESTED, {"id": f.id, "request": encode_request(f.request)}, self._stage))
-        self._write_with_decisions(drafts)
+        ids = tuple(f.id for f in pending_requests)
+        self._append_with_decisions(
+            Asked(stage=self._stage, simulations=slots.simulations, pours=slots.pours, ids=ids),
+            *(Requested(stage=self._stage, id=f.id, request=f.request) for f in pending_requests),
+        )
         self._ask_is_due = False
         for pending in pending_requests:
             self._pending[pending.id] = pending
@@ -254,13 +255,10 @@ class StageScheduler:
         def started() -> None:
             nonlocal begin
             begin = time.monotonic()
-            if isinstance(request, Pour):
-                body = {"id": pending.id, "attempt": pending.attempt, "number": request.number}
-                self._append(Kind.POUR_STARTED, body)
-            else:
-                self._append(Kind.STARTED, {"id": pending.id})
+            self._journal.append(
+                RequestStarted(stage=self._stage, id=pending.id, request=request, attempt=pending.attempt)
+            )
             pending.started = True
-            self._subscribers.emit(RequestStarted(stage=self._stage, id=pending.id, request=request))
 
         match request:
             case Simulate():
@@ -268,11 +266,12 @@ class StageScheduler:
             case Pour():
 
                 def progress(p: PourProgress) -> None:
-                    event = PourProgressed(stage=self._stage, id=pending.id, number=request.number, progress=p)
-                    self._subscribers.emit(event)
+                    self._journal.append(
+                        PourProgressed(stage=self._stage, id=pending.id, number=request.number, progress=p)
+                    )
 
                 def withdrawn(reason: str) -> None:
-                    self._append(Kind.POUR_WITHDRAWN, {"id": pending.id, "reason": reason})
+                    self._journal.append(PourWithdrawn(stage=self._stage, id=pending.id, reason=reason))
                     pending.started = False
 
                 self._journal.check_space_for_pour()
@@ -280,8 +279,7 @@ class StageScheduler:
             case Suggest():
 
                 def retrying(text: str) -> None:
-                    self._append(Kind.NOTE, {"text": text})
-                    self._subscribers.log("warning", text, self._stage)
+                    self._journal.log("warning", text, stage=self._stage, kept=True)
 
                 outcome = await self._executor.suggest(request, started=started, retrying=retrying)
             case Ask():
@@ -290,27 +288,20 @@ class StageScheduler:
         self._finish(pending, outcome, time.monotonic() - begin, frames)
 
     def _finish(self, pending: PendingRequest, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:
-        written = encode_outcome(outcome)
-        kind = Kind.POUR_FINISHED if isinstance(pending.request, Pour) else Kind.FINISHED
+        # The strategy receives the outcome as decoded from the journal, so that a replay delivers the same.
+        same = decode_outcome(encode_outcome(outcome))
+        event = RequestFinished(
+            stage=self._stage, id=pending.id, request=pending.request, outcome=same, seconds=seconds, frames=frames
+        )
         try:
-            self._append(kind, {"id": pending.id, "outcome": written, "seconds": seconds})
+            self._journal.append(event)
         except JournalError as error:
             if isinstance(pending.request, Pour) and isinstance(outcome, Poured):
                 raise JournalError(f"{error}. {weighed_by_hand(pending.request, outcome.measurement)}") from error
             raise
-        # The strategy receives the outcome as decoded from the journal, so that a replay delivers the same.
-        pending.outcome = decode_outcome(written)
+        pending.outcome = same
         self._finished += 1
         pending.finished = self._finished
-        event = RequestFinished(
-            stage=self._stage,
-            id=pending.id,
-            request=pending.request,
-            outcome=pending.outcome,
-            seconds=seconds,
-            frames=frames,
-        )
-        self._subscribers.emit(event)
 
     async def _next(self) -> PendingRequest:
         """Wait until the next request to deliver has an outcome, and return it."""
@@ -335,20 +326,16 @@ class StageScheduler:
         assert pending.outcome is not None
         del self._pending[pending.id]
         self._strategy.tell(pending.request, pending.outcome)
-        self._write_with_decisions([Draft(Kind.TOLD, {"id": pending.id}, self._stage)])
+        self._append_with_decisions(Told(stage=self._stage, id=pending.id))
         self._ask_is_due = True
         self._report_progress(urgent=isinstance(pending.request, Pour) or self._strategy.finished)
 
-    def _write_with_decisions(self, drafts: list[Draft]) -> None:
-        """Write entries together with the decisions that belong to them, so that a replay has the same number of
+    def _append_with_decisions(self, *events: Event) -> None:
+        """Write events together with the decisions that belong to them, so that a replay has the same number of
         decisions."""
-        decisions: Sequence[Decision] = getattr(self._strategy, "decisions", ())[self._decisions :]
-        for decision in decisions:
-            drafts.append(Draft(Kind.DECISION, cast("dict[str, Any]", to_json(decision, Decision)), self._stage))
-        self._journal.append_all(drafts)
+        decisions = getattr(self._strategy, "decisions", ())[self._decisions :]
+        self._journal.append(*events, *(DecisionMade(stage=self._stage, decision=decision) for decision in decisions))
         self._decisions += len(decisions)
-        for decision in decisions:
-            self._subscribers.emit(DecisionMade(stage=self._stage, decision=decision))
 
     def _report_progress(self, *, urgent: bool = True) -> None:
         """Emit the strategy's progress; limited in frequency unless urgent, because results grow large."""
@@ -356,10 +343,7 @@ class StageScheduler:
             return
         self._reported = time.monotonic()
         result = self._strategy.result()
-        self._subscribers.emit(StrategyProgressed(stage=self._stage, progress=self._strategy.progress(), result=result))
-
-    def _append(self, kind: Kind, body: dict[str, Any]) -> None:
-        self._journal.append(kind, body, stage=self._stage)
+        self._journal.append(StrategyProgressed(stage=self._stage, progress=self._strategy.progress(), result=result))
 
     async def _wind_down(self, error: BaseException) -> None:
         """Cancel simulations and suggestions, which can be repeated, and wait for a pour that has begun.
@@ -381,13 +365,12 @@ class StageScheduler:
         try:
             self._on_pausing(reason)
         except Exception as problem:  # for example a full disk: the pour must be awaited nevertheless
-            self._subscribers.log("error", f"can't write that the run is pausing: {problem}", self._stage)
+            self._journal.log("error", f"can't write that the run is pausing: {problem}", stage=self._stage)
         try:
             if pours:
                 grace = self._executor.deadlines.pour_grace
-                self._subscribers.log(
-                    "info", f"a pour is under way; it is finished first (up to {grace:g} s)", self._stage
-                )
+                text = f"a pour is under way; it is finished first (up to {grace:g} s)"
+                self._journal.log("info", text, stage=self._stage)
                 await asyncio.wait(pours, timeout=grace)
             if others:
                 await asyncio.wait(others, timeout=self._executor.deadlines.cleanup)
@@ -400,4 +383,4 @@ class StageScheduler:
             await asyncio.wait(unfinished, timeout=self._executor.deadlines.cleanup)
         for task in (pending.task for pending in self._pending.values() if pending.task is not None):
             if task.done() and not task.cancelled() and (late := task.exception()) is not None and late is not error:
-                self._subscribers.log("warning", f"while winding down: {type(late).__name__}: {late}", self._stage)
+                self._journal.log("warning", f"while winding down: {type(late).__name__}: {late}", stage=self._stage)

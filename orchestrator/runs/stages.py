@@ -25,6 +25,7 @@ from orchestrator.strategies.calibration.active_design import ActivePours
 from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.strategies.calibration.calibration_scores import (
     DRAWS,
+    UNCALIBRATED,
     CalibrationEvaluation,
     ScoredPour,
     Scores,
@@ -167,7 +168,7 @@ def calibrated_sources(
     if calibration is None or CALIBRATION not in results:
         return {}
     found = calibrated_theta(results)
-    if found.posterior is None or "tilt_zero" not in found.searched or deployed_theta(results) != found.theta:
+    if found.posterior is None or "tilt_zero" not in found.searched or not _justified(results):
         return {}
     knowledge = calibrated_knowledge([row["tilt_zero"] for row in found.posterior.thetas])
     pourer = calibration.scene.pourer
@@ -203,13 +204,20 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
         return plan.settings.build(replace(plan, known=known_simulations(plan, results)), pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
-        theta = calibrated_theta(results).theta
+        theta, plain = calibrated_theta(results).theta, plan.uncalibrated
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
-        measured = {prior.name: prior.mean for prior in plan.parameter_prior}
-        plain = SimulationParameters.from_values(plan.fixed_parameters | measured)
         drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()
-        return CalibrationEvaluation(theta, rivals, pours, Contexts.of(plan), seed, uncalibrated=plain, drawn=drawn)
+        return CalibrationEvaluation(
+            theta,
+            rivals,
+            pours,
+            Contexts.of(plan),
+            seed,
+            uncalibrated=plain,
+            drawn=drawn,
+            train_seeds=result_of(results, CALIBRATION, Calibrated).pour_seeds,
+        )
 
     found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
     return [*stages, found, StageDefinition(EVALUATION, evaluation)]
@@ -313,7 +321,7 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     elif (
         found is None
         or not posterior
-        or deployed_theta(results) != found.theta
+        or not _justified(results)
         or (
             deployment.settings.learns_of_benches and set(SimulationParameters.nuisances()).intersection(found.searched)
         )
@@ -381,6 +389,12 @@ def deployed_theta(results: Results) -> SimulationParameters:
     """
     scores = result_of(results, EVALUATION, Scores) if EVALUATION in results else None
     return recommended_theta(calibrated_theta(results).theta, scores)
+
+
+def _justified(results: Results) -> bool:
+    """Whether the weighed pours justify θ*, or this was not compared."""
+    gain = result_of(results, EVALUATION, Scores).gain if EVALUATION in results else None
+    return gain is None or gain.recommended != UNCALIBRATED
 
 
 def calibrated_theta(results: Results) -> CalibratedTheta:

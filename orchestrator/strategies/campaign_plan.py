@@ -398,6 +398,12 @@ class CalibrationPlan(StagePlan):
         return (*self.scenes, *self.tested)
 
     @property
+    def uncalibrated(self) -> SimulationParameters:
+        """θ that is used without a calibration: the fixed values, and those that were measured before."""
+        measured = {prior.name: prior.mean for prior in self.parameter_prior}
+        return SimulationParameters.from_values(self.fixed_parameters | measured)
+
+    @property
     def simulations(self) -> int:
         """Number of single simulated pours that the strategy may spend. Pours that are still to be made may partly be
         lost."""

@@ -120,6 +120,14 @@ class Trials:
             for _ in self.all.pop().requests:
                 self._unissued.pop()
 
+    def abandon(self, trial: Trial) -> int:
+        """Remove the simulations of a trial that have not been requested yet, and return their number."""
+        number = next(i for i, one in enumerate(self.all) if one is trial)
+        queued = [place for place in self._unissued if place[0] == number]
+        self._unissued = deque(place for place in self._unissued if place[0] != number)
+        trial.requests = trial.requests[: len(trial.requests) - len(queued)]
+        return len(queued)
+
     @property
     def ready(self) -> bool:
         """Whether everything that the choice of the next trial depends on has been answered."""

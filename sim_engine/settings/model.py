@@ -142,19 +142,34 @@ Seed = Annotated[int, Strict(), Field(ge=0, le=LARGEST_SEED)]
 """The seed of random choices."""
 
 
-def _count_form(value: Any) -> str | None:
-    if value == "free":
-        return "word"
-    return "number" if isinstance(value, int | float) else None
+def _number_or(word: str) -> Callable[[Any], str | None]:
+    def form(value: Any) -> str | None:
+        if value == word:
+            return "word"
+        return "number" if isinstance(value, int | float) else None
+
+    return form
 
 
 CountOrFree = Annotated[
     Annotated[SimulationCount, Tag("number")] | Annotated[Literal["free"], Tag("word")],
     Discriminator(
-        _count_form, custom_error_type="count_or_free", custom_error_message="should be a whole number, or 'free'"
+        _number_or("free"),
+        custom_error_type="count_or_free",
+        custom_error_message="should be a whole number, or 'free'",
     ),
 ]
 """A whole number, 0 or more, or 'free'."""
+
+CountOrAuto = Annotated[
+    Annotated[PositiveSimulationCount, Tag("number")] | Annotated[Literal["auto"], Tag("word")],
+    Discriminator(
+        _number_or("auto"),
+        custom_error_type="count_or_auto",
+        custom_error_message="should be a whole number, or 'auto'",
+    ),
+]
+"""A whole number, 1 or more, or 'auto'."""
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 """A plain number without a unit."""

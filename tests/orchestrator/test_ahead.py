@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
+from orchestrator.journal.events import Event, RequestFinished, StageClosed
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Outcome, Pour, Simulate
-from orchestrator.runs.events import Event, RequestFinished, StageClosed
 from orchestrator.runs.request_executor import SpeculativeExecution
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from sim_engine.scene import PourTask
-from tests.orchestrator.test_stages import Optimizer, campaign
+from tests.orchestrator.test_stages import Optimizer, calibration, campaign
 from tests.support.scripted_strategy import simulate
 from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToySimulators, logical_record, run_toy
 
@@ -57,6 +57,20 @@ def test_first_simulations_and_rivals_are_there_when_the_calibration_pours_are_m
     with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
         notes = [entry.body["text"] for entry in journal.entries(kinds=[Kind.NOTE])]
     assert any("were made while the arm was pouring" in note for note in notes)
+
+
+def test_the_first_simulations_of_an_automatic_calibration_are_made_while_the_arm_pours(tmp_path: Path) -> None:
+    bench = laboratory(separate=True, pour=0.2)
+    made: dict[str, int] = {}
+
+    def watch(event: Event) -> None:
+        if isinstance(event, StageClosed):
+            made[event.stage] = len(bench.simulators.tasks)
+
+    plan = campaign(tmp_path, calibration=calibration(simulations="auto", random_baseline=0), deployment=None)
+    run(tmp_path / "run", bench, plan=plan, subscribers=[watch])
+    # the uncalibrated θ and 10 others for each of two searched parameters, on the 4 training pours
+    assert made[POURS] >= 4 * (1 + 10 * 2)
 
 
 def test_the_next_receivers_prior_is_made_beside_this_ones_pours(tmp_path: Path) -> None:

@@ -21,10 +21,7 @@ from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from actors.interfaces import DoseProgress, PourProgress
 from orchestrator.config.file_loading import load_campaign
-from orchestrator.live_view.rerun_subscriber import RerunMonitor
-from orchestrator.requests import Pour, Poured, Slots
-from orchestrator.run_service import RunResources, RunService, task_request
-from orchestrator.runs.events import (
+from orchestrator.journal.events import (
     CampaignClosed,
     CampaignOpened,
     Event,
@@ -33,6 +30,9 @@ from orchestrator.runs.events import (
     RequestStarted,
     StageOpened,
 )
+from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.requests import Pour, Poured, Slots
+from orchestrator.run_service import RunResources, RunService, task_request
 from orchestrator.strategies.dispense import Dispense, Dispensed
 from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.vessel import build_vessel

@@ -9,9 +9,7 @@ from itertools import pairwise
 import pytest
 
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
-from orchestrator.progress.time_estimate import PRICE, Forecast, WorkEstimate, pour_time, work_of
-from orchestrator.requests import Failed, Pour, Simulate, Simulated
-from orchestrator.runs.events import (
+from orchestrator.journal.events import (
     Event,
     RequestFinished,
     RequestStarted,
@@ -19,6 +17,8 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.progress.time_estimate import PRICE, Forecast, WorkEstimate, pour_time, work_of
+from orchestrator.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.strategies.strategy import Progress
 from sim_engine.liquids import SimulationParameters
 from tests.support import example_run

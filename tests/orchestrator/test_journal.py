@@ -12,6 +12,7 @@ import sys
 import textwrap
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,14 +22,36 @@ from actors.runtime.child_process import child_environment
 from orchestrator.cli.app import app
 from orchestrator.daemon.daemon_store import FORMAT as STORE_FORMAT
 from orchestrator.daemon.daemon_store import Store, StoreError
-from orchestrator.journal.journal import JOURNAL_NAME, Draft, Journal, JournalReader, Kind
+from orchestrator.journal.codec import CodecError
+from orchestrator.journal.events import (
+    CampaignStateChanged,
+    LogLine,
+    Requested,
+    RequestFinished,
+    RequestStarted,
+    Told,
+)
+from orchestrator.journal.journal import JOURNAL_NAME, Journal, JournalReader, Kind
 from orchestrator.journal.journal_check import BEGUN, LEDGER_NAME, JournalDamagedError, check_journal, read_ledger
 from orchestrator.journal.journal_file import FORMAT, Header, JournalError, JournalLockedError
+from orchestrator.requests import Failed, Pour, Poured, Simulate
 from orchestrator.states import State
 from orchestrator.study.study_folder import StudyError, opened
+from sim_engine.action import Action
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import PourMeasurement
 from tests.support.study_files import small
 
 HEADER = Header("toy", {"seed": 7, "deployment": {"pours": 3}})
+POUR = Pour("narrow cup", Action(angular_velocity=0.7, x_offset=0.09, height=0.05), 1, 1)
+
+
+class SlowPour:
+    """Nothing that a strategy may request."""
+
+
+def note(text: str, stage: str = "") -> LogLine:
+    return LogLine(text=text, stage=stage, kept=True)
 
 
 def bodies(path: Path) -> list[dict[str, object]]:
@@ -43,8 +66,8 @@ def path(tmp_path: Path) -> Path:
 
 def test_entries_come_back_in_order_with_their_stage(path: Path) -> None:
     journal = Journal.create(path, HEADER)
-    journal.append(Kind.NOTE, {"text": "größer"}, stage="pours")
-    journal.append_all([Draft(Kind.TOLD, {"id": 1}, "calibration"), Draft(Kind.TOLD, {"id": 2}, "calibration")])
+    journal.append(note("größer", "pours"))
+    journal.append(Told(stage="calibration", id=1), Told(stage="calibration", id=2))
     journal.close()
     with JournalReader(path) as reader:
         entries = list(reader.entries())
@@ -61,7 +84,7 @@ def test_a_reader_sees_entries_while_the_run_writes_them(path: Path) -> None:
     journal = Journal.create(path, HEADER)
     with JournalReader(path) as reader:
         assert reader.state() is State.QUEUED
-        journal.append(Kind.CAMPAIGN_STATE, {"before": "queued", "after": "preparing", "reason": "", "pid": 1})
+        journal.append(CampaignStateChanged(before=State.QUEUED, after=State.PREPARING, pid=1))
         assert reader.state() is State.PREPARING
     journal.close()
 
@@ -69,7 +92,7 @@ def test_a_reader_sees_entries_while_the_run_writes_them(path: Path) -> None:
 @pytest.mark.parametrize("statement", ["delete from event", "update event set body = '{}'"])
 def test_nothing_written_can_be_changed_or_deleted(path: Path, statement: str) -> None:
     journal = Journal.create(path, HEADER)
-    journal.append(Kind.NOTE, {"text": "it happened"})
+    journal.append(note("it happened"))
     journal.close()
     connection = sqlite3.connect(path)
     with pytest.raises(sqlite3.DatabaseError, match="append-only"):
@@ -80,8 +103,8 @@ def test_nothing_written_can_be_changed_or_deleted(path: Path, statement: str) -
 
 def test_entries_written_together_are_there_together_or_not_at_all(path: Path) -> None:
     journal = Journal.create(path, HEADER)
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        journal.append_all([Draft(Kind.TOLD, {"id": 1}), Draft(Kind.TOLD, {"id": float("nan")})])
+    with pytest.raises(CodecError, match="got SlowPour"):
+        journal.append(Told(id=1), Requested(id=2, request=SlowPour()))  # type: ignore[arg-type]
     connection = sqlite3.connect(path)
     connection.execute(
         "create trigger no_seven before insert on event when json_extract(new.body, '$.id') = 7 "
@@ -89,8 +112,8 @@ def test_entries_written_together_are_there_together_or_not_at_all(path: Path) -
     )
     connection.close()
     with pytest.raises(sqlite3.DatabaseError, match="disk full"):
-        journal.append_all([Draft(Kind.ASKED, {"ids": [7]}), Draft(Kind.REQUESTED, {"id": 7})])
-    journal.append(Kind.NOTE, {"text": "still usable"})
+        journal.append(Told(id=6), Told(id=7))
+    journal.append(note("still usable"))
     journal.close()
     assert bodies(path) == [{"text": "still usable"}]
 
@@ -98,9 +121,16 @@ def test_entries_written_together_are_there_together_or_not_at_all(path: Path) -
 def test_pours_are_flushed_to_the_disk_and_simulations_need_not_be(path: Path) -> None:
     journal = Journal.create(path, HEADER)
     level = {}
-    for kind in (Kind.STARTED, Kind.POUR_STARTED, Kind.POUR_FINISHED, Kind.FINISHED):
-        journal.append(kind, {"id": 1})
-        level[kind] = journal._connection.execute("pragma synchronous").fetchone()[0]
+    simulation = Simulate("narrow cup", POUR.action, SimulationParameters(), 1)
+    failed = Failed("simulation", "diverged")
+    for request in (simulation, POUR):
+        started, finished = (
+            RequestStarted(id=1, request=request),
+            RequestFinished(id=1, request=request, outcome=failed),
+        )
+        for event in (started, finished):
+            journal.append(event)
+            level[event.kind] = journal._connection.execute("pragma synchronous").fetchone()[0]
     journal.close()
     assert level == {Kind.STARTED: 1, Kind.POUR_STARTED: 2, Kind.POUR_FINISHED: 2, Kind.FINISHED: 1}
 
@@ -108,11 +138,12 @@ def test_pours_are_flushed_to_the_disk_and_simulations_need_not_be(path: Path) -
 def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal.journal import Journal, Kind
+        from orchestrator.journal.events import LogLine
+        from orchestrator.journal.journal import Journal
         from orchestrator.journal.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         for number in range(10**6):
-            journal.append(Kind.NOTE, {{"number": number}})
+            journal.append(LogLine(text=str(number), kept=True))
             print(number, flush=True)
     """
     process = subprocess.Popen(
@@ -125,7 +156,7 @@ def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) ->
     process.send_signal(signal.SIGKILL)
     acknowledged = int((process.stdout.read().split() or [line])[-1])
     process.wait()
-    numbers = [body["number"] for body in bodies(path)]
+    numbers = [int(str(body["text"])) for body in bodies(path)]
     assert numbers[: acknowledged + 1] == list(range(acknowledged + 1))
     journal = Journal.resume(path, HEADER)  # the lock went with the process
     journal.close()
@@ -253,12 +284,12 @@ def test_a_refused_journal_is_not_kept_open(path: Path) -> None:
 
 def test_a_full_disk_is_named_and_nothing_written_is_lost(path: Path) -> None:
     journal = Journal.create(path, HEADER)
-    journal.append(Kind.NOTE, {"text": "before"})
+    journal.append(note("before"))
     pages = journal._connection.execute("pragma page_count").fetchone()[0]
     journal._connection.execute(f"pragma max_page_count = {pages}")
     with pytest.raises(JournalError, match=r"can't be written \(database or disk is full;.*resume the run"):
-        journal.append(Kind.NOTE, {"text": "x" * 100_000})
-    journal.append(Kind.NOTE, {"text": "after"})  # there is room for little things
+        journal.append(note("x" * 100_000))
+    journal.append(note("after"))  # there is room for little things
     assert [entry.body["text"] for entry in journal.entries()] == ["before", "after"]
     journal.close()
 
@@ -268,10 +299,9 @@ def test_a_full_disk_is_named_and_nothing_written_is_lost(path: Path) -> None:
 
 def pour(journal: Journal, number: int) -> None:
     """One pour, from its intent to its outcome."""
-    measurement = {"loaded": 0.2, "spilled": 0.003, "retained": 0.001}
-    journal.append(Kind.POUR_STARTED, {"id": number, "attempt": 1, "number": number}, stage="pours")
-    outcome = {"type": "Poured", "measurement": measurement}
-    journal.append(Kind.POUR_FINISHED, {"id": number, "outcome": outcome}, stage="pours")
+    journal.append(RequestStarted(stage="pours", id=number, request=replace(POUR, number=number)))
+    outcome = Poured(PourMeasurement(0.2, 0.003, 0.001))
+    journal.append(RequestFinished(stage="pours", id=number, request=POUR, outcome=outcome))
 
 
 def poured(path: Path, *, between: Callable[[Journal], object] = lambda _: None) -> None:
@@ -364,8 +394,8 @@ def test_a_changed_ledger_is_detected(path: Path, edit: tuple[bytes, bytes]) -> 
 def test_a_changed_removed_or_inserted_entry_is_detected(path: Path, change: str) -> None:
     journal = Journal.create(path, HEADER)
     pour(journal, 1)
-    journal.append(Kind.NOTE, {"text": "one"})
-    journal.append(Kind.NOTE, {"text": "two"})
+    journal.append(note("one"))
+    journal.append(note("two"))
     journal.close()
     assert check_journal(path).verdict == "complete and unchanged (4 entries)"
     with closing(sqlite3.connect(path)) as connection:
@@ -414,7 +444,7 @@ def test_a_run_can_be_checked_while_it_is_written(path: Path) -> None:
     journal = Journal.create(path, HEADER)
     for number in range(1, 20):
         pour(journal, number)
-        journal.append(Kind.NOTE, {"text": "between"})
+        journal.append(note("between"))
         assert check_journal(path).problems == ()
     journal.close()
 

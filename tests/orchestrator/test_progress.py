@@ -10,10 +10,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from orchestrator.progress.console_progress import ProgressDisplay
-from orchestrator.progress.progress_state import ProgressState
-from orchestrator.requests import Failed, Pour, Poured, Simulate
-from orchestrator.runs.events import (
+from orchestrator.journal.events import (
     CampaignClosed,
     CampaignOpened,
     LogLine,
@@ -24,6 +21,9 @@ from orchestrator.runs.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.progress.console_progress import ProgressDisplay
+from orchestrator.progress.progress_state import ProgressState
+from orchestrator.requests import Failed, Pour, Poured, Simulate
 from orchestrator.strategies.strategy import Progress
 from sim_engine.outcome import PourMeasurement
 from tests.support.example_run import LEARNT, campaign, events
@@ -169,9 +169,9 @@ def test_best_so_far_is_kept_per_receiver_and_ignores_calibration_pours() -> Non
         e for e in told if isinstance(e, RequestFinished) and isinstance(e.request, Pour) and e.request.number == 3
     )
     assert isinstance(calibration_pour.request, Pour)
-    tally(replace(calibration_pour, request=replace(calibration_pour.request, scene="tumbler", number=9)))
+    tally(replace(calibration_pour, id=91, request=replace(calibration_pour.request, scene="tumbler", number=9)))
     worse = PourMeasurement(loaded=0.2, spilled=0.1, retained=0.0)
-    tally(replace(calibration_pour, request=replace(calibration_pour.request, number=4), outcome=Poured(worse)))
+    tally(replace(calibration_pour, id=92, request=replace(calibration_pour.request, number=4), outcome=Poured(worse)))
     assert {scene: best.pour for scene, best in tally.best.items()} == {"narrow cup": 3}
 
 

@@ -16,6 +16,7 @@ from actors.optimizer.suggest import propose
 from decant.run_results import open_run
 from orchestrator.config.file_loading import predicts_with_posterior
 from orchestrator.journal.codec import canonical
+from orchestrator.journal.events import Event, RequestFinished
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.progress.time_estimate import work_of
 from orchestrator.requests import Pour, Simulate
@@ -23,7 +24,6 @@ from orchestrator.results.console_view import summary_table
 from orchestrator.results.publishing import publish
 from orchestrator.results.summarise import summarise
 from orchestrator.run_errors import RunError
-from orchestrator.runs.events import Event, RequestFinished
 from orchestrator.runs.motion_approval import pour_count
 from orchestrator.runs.stages import deployed_theta, scenes_of, stages_of
 from orchestrator.strategies.campaign_plan import (

@@ -12,10 +12,10 @@ import pytest
 
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.journal.codec import decode_outcome, encode_outcome
+from orchestrator.journal.events import Event, RequestFinished
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Poured
 from orchestrator.run_errors import RunError
-from orchestrator.runs.events import Event, RequestFinished
 from orchestrator.runs.resume import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
 from tests.support import toy_campaign
 from tests.support.killed_runs import SMALL, killed_when_last, run

@@ -8,16 +8,22 @@ from typing import Any
 
 import pytest
 
-from orchestrator.requests import Pour, Simulate
-from orchestrator.runs.events import (
+from orchestrator.journal.codec import CodecError
+from orchestrator.journal.events import (
     CampaignClosed,
     DecisionMade,
     Event,
+    Kind,
     LogLine,
     RequestFinished,
     RequestStarted,
     StageClosed,
+    event_of,
 )
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
+from orchestrator.journal.journal_file import Header
+from orchestrator.journal.run_record import RunState, read_record
+from orchestrator.requests import Pour, Simulate
 from orchestrator.runs.stage_scheduler import is_recorded
 from sim_engine.outcome import RecordedFrames
 from sim_engine.scene import PourTask
@@ -53,6 +59,40 @@ def test_watchers_see_the_whole_run(tmp_path: Path) -> None:
     assert any(isinstance(e, DecisionMade) for e in events)
     assert isinstance(events[-1], CampaignClosed)
     assert events[-1].state == "finished"
+
+
+def test_the_journal_has_what_watchers_see_and_gives_it_back(tmp_path: Path) -> None:
+    seen: list[Event] = []
+    run(tmp_path / "run", subscribers=[seen.append])
+    written = [event for event in seen if event.kind is not None]
+    with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
+        assert [(e.kind, e.stage, e.body) for e in journal.entries()] == [(e.kind, e.stage, e.body()) for e in written]
+        read = [event for _, event in journal.events()]
+    not_written = {"index": 0, "count": 0, "resumed": False, "frames": None}
+    for before, after in zip(written, read, strict=True):
+        lost = {name: value for name, value in not_written.items() if hasattr(before, name)}
+        assert after == replace(before, time=after.time, replayed=True, **lost)  # type: ignore[arg-type]
+
+
+def test_a_run_that_is_followed_has_the_state_that_its_journal_has(tmp_path: Path) -> None:
+    followed = RunState(Header("toy", {}), slots=2)
+    run(tmp_path / "run", subscribers=[followed.take])
+    read = read_record(tmp_path / "run", slots=2)
+    for name in ("state", "reason", "cpu_s", "simulations", "simulated", "finished_pours", "running", "results"):
+        assert getattr(followed, name) == getattr(read, name), name
+    assert [replace(pour, progress=None, time=None) for pour in followed.pours] == [
+        replace(pour, time=None) for pour in read.pours
+    ]
+    assert len(read.weighed) == 6
+
+
+def test_a_read_event_needs_its_request_and_the_fields_that_have_no_default() -> None:
+    with pytest.raises(CodecError, match="request 7 has no entry"):
+        event_of(Kind.FINISHED, {"id": 7, "outcome": {}}, {}, time=0.0, stage="s")
+    with pytest.raises(CodecError, match="Requested lacks request"):
+        event_of(Kind.REQUESTED, {"id": 7}, {}, time=0.0, stage="s")
+    with pytest.raises(CodecError, match="the kind 'spilled' is not known"):
+        event_of("spilled", {}, {}, time=0.0, stage="s")
 
 
 @pytest.mark.slow

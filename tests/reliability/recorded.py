@@ -8,9 +8,9 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
+from orchestrator.journal.events import Subscriber
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
-from orchestrator.runs.events import Subscriber
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.reliability import clock, strikes
 from tests.reliability.case import AHEAD, BACK, CUT, FULL, KILLED, STOPPED, Case, every, first_of_kind

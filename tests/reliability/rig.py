@@ -25,8 +25,8 @@ from typing import Any, NoReturn
 import psutil
 
 from orchestrator.config.file_loading import load_campaign
+from orchestrator.journal.events import Event, PourProgressed, Subscriber
 from orchestrator.journal.journal import Journal, Kind
-from orchestrator.runs.events import Event, PourProgressed, Subscriber
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -386,26 +386,26 @@ class Moments:
     @contextlib.contextmanager
     def noted(self) -> Iterator[None]:
         """Every write of a journal is such a moment."""
-        write = Journal.append_all
+        write = Journal._write
 
-        def noted(journal: Journal, drafts: Any) -> None:
-            hit = self.comes(label_of(drafts))
-            write(journal, drafts)
+        def noted(journal: Journal, events: Any) -> None:
+            hit = self.comes(label_of(events))
+            write(journal, events)
             if hit:
                 self._strike(True)
 
-        Journal.append_all = noted  # type: ignore[method-assign]
+        Journal._write = noted  # type: ignore[method-assign]
         try:
             yield
         finally:
-            Journal.append_all = write  # type: ignore[method-assign]
+            Journal._write = write  # type: ignore[method-assign]
 
 
-def label_of(drafts: Any) -> str:
+def label_of(events: Any) -> str:
     """Stage and kind of a write's first entry; a note's first words."""
-    draft = drafts[0]
-    words = f": {draft.body['text'].partition(':')[0]}" if draft.kind == Kind.NOTE else ""
-    return f"{draft.stage or 'campaign'}: {draft.kind}{words}"
+    first = events[0]
+    words = f": {first.text.partition(':')[0]}" if first.kind == Kind.NOTE else ""
+    return f"{first.stage or 'campaign'}: {first.kind}{words}"
 
 
 # ---- from outside

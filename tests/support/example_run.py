@@ -14,6 +14,19 @@ from actors.interfaces import PourProgress
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery, SurrogateMap
 from actors.optimizer.suggest import propose
+from orchestrator.journal.events import (
+    CampaignClosed,
+    CampaignOpened,
+    DecisionMade,
+    Event,
+    LogLine,
+    PourProgressed,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
 from orchestrator.requests import (
     Decision,
     Failed,
@@ -27,19 +40,6 @@ from orchestrator.requests import (
     Slots,
     Suggest,
     Suggested,
-)
-from orchestrator.runs.events import (
-    CampaignClosed,
-    CampaignOpened,
-    DecisionMade,
-    Event,
-    LogLine,
-    PourProgressed,
-    RequestFinished,
-    RequestStarted,
-    StageClosed,
-    StageOpened,
-    StrategyProgressed,
 )
 from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
 from orchestrator.strategies.single_action import PredictedPour

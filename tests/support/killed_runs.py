@@ -43,18 +43,18 @@ def killed_at(point: int, *, after_commit: bool, directory: Path, resume: bool =
 
 
 def die_at(point: int, after_commit: bool) -> None:
-    write, count = Journal.append_all, 0
+    write, count = Journal._write, 0
 
-    def dying(self: Journal, drafts: Any) -> None:
+    def dying(self: Journal, events: Any) -> None:
         nonlocal count
         count += 1
         if count == point and not after_commit:
             os.kill(os.getpid(), signal.SIGKILL)
-        write(self, drafts)
+        write(self, events)
         if count == point:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    Journal.append_all = dying  # type: ignore[method-assign]
+    Journal._write = dying  # type: ignore[method-assign]
 
 
 def killed_when_last(kind: Kind, parent: Path, earliest: int = 10) -> Path:

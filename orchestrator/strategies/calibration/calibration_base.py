@@ -117,6 +117,12 @@ class Calibrated(StageResult):
     found: CalibratedTheta | None = None
     """θ*; None until the end."""
 
+    ended: str | None = None
+    """Reason of the end of an automatic calibration."""
+
+    pour_seeds: tuple[int, ...] = ()
+    """Seeds of the simulations of the usable training pours, if the evaluation repeats these simulations."""
+
 
 class Calibration(ABC, Generic[S]):
     """Base of C1 to C4. Subclasses choose the next trial (`_next`) and convert a simulation to a cost (`_discrepancy`).

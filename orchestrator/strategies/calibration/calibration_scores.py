@@ -129,7 +129,7 @@ class Scores(StageResult):
     """Mean |r − m| by split; m is a GP regression of the training pours."""
 
     gain: CalibrationGain | None = None
-    """Comparison with the uncalibrated θ; None if θ* equals it or was not compared with it."""
+    """Comparison with the uncalibrated θ; None if θ* was not compared with it."""
 
 
 @dataclass
@@ -152,20 +152,28 @@ class Evaluation:
     Source: Lopez-Guevara et al., CoRL 2017, section 4.1 (test discrepancy).
     """
 
-    def __init__(self, thetas: Mapping[str, SimulationParameters], pours: Sequence[ScoredPour], seed: int) -> None:
+    def __init__(
+        self,
+        thetas: Mapping[str, SimulationParameters],
+        pours: Sequence[ScoredPour],
+        seed: int,
+        *,
+        train_seeds: Sequence[int] = (),
+    ) -> None:
         """Plan the simulations.
 
         Args:
             thetas: θ by label. 'random 1', 'random 2' … form the baseline; their median is reported. 'posterior 1',
                 'posterior 2' … are draws; the mean of their simulations is scored as well.
+            train_seeds: seeds on the usable training pours; empty: new ones.
         """
-        seeds = SeedStream(seed, "evaluation")
+        seeds, known = SeedStream(seed, "evaluation"), iter(train_seeds)
         self._cases: list[_Case] = []
         self._thetas = dict(thetas)
         for scored in pours:
             if scored.pour.spillage is None:
                 continue
-            seed_of_pour = seeds.next()
+            seed_of_pour = next(known) if train_seeds and scored.pour.split == "train" else seeds.next()
             for label, theta in thetas.items():
                 request = Simulate(scored.scene, scored.pour.action, theta, seed_of_pour, "evaluate")
                 self._cases.append(_Case(label, scored, request))
@@ -394,7 +402,7 @@ def recommended_theta(theta: SimulationParameters, scores: Scores | None) -> Sim
             returned.
     """
     plain = scores is not None and scores.gain is not None and scores.gain.recommended == UNCALIBRATED
-    return scores.thetas[UNCALIBRATED] if plain and scores is not None else theta
+    return scores.thetas.get(UNCALIBRATED, theta) if plain and scores is not None else theta
 
 
 def shift_left_over(scores: Scores, fitted: int) -> float | None:
@@ -405,10 +413,11 @@ def shift_left_over(scores: Scores, fitted: int) -> float | None:
         fitted: number of parameters that were searched.
     """
     plain = scores.gain is not None and scores.gain.recommended == UNCALIBRATED
+    used = UNCALIBRATED if plain and UNCALIBRATED in scores.thetas else CALIBRATED
     pairs = [
         (pair.measured, pair.simulated)
         for pair in scores.pairs
-        if pair.theta == (UNCALIBRATED if plain else CALIBRATED) and pair.split == "train"
+        if pair.theta == used and pair.split == "train"
         if pair.measured is not None and pair.simulated is not None
     ]
     return left_over(pairs, 0 if plain else fitted)
@@ -438,6 +447,7 @@ class CalibrationEvaluation:
         *,
         uncalibrated: SimulationParameters | None = None,
         drawn: Sequence[SimulationParameters] = (),
+        train_seeds: Sequence[int] = (),
     ) -> None:
         """Plan the simulations.
 
@@ -445,18 +455,21 @@ class CalibrationEvaluation:
             random_thetas: θ by label, 'random 1' … .
             pours: pours of the splits 'train', 'test' and 'transfer'.
             contexts: contexts of the regression.
-            uncalibrated: θ that is used without a calibration; it is not scored if it is None or equals θ*.
+            uncalibrated: θ that is used without a calibration; it is not scored if it is None. If θ* equals it, no
+                change is recommended.
             drawn: draws from θ's posterior.
+            train_seeds: seeds of simulations on the usable training pours; empty: new ones.
         """
         unseen = [scored for scored in pours if scored.pour.split != "train"]
         train = [scored for scored in pours if scored.pour.split == "train"]
         # Unseen pours come first in both, so that θ* and random θ have the same seeds on them.
-        self._calibrated = Evaluation({CALIBRATED: theta}, [*unseen, *train], seed)
+        self._calibrated = Evaluation({CALIBRATED: theta}, [*unseen, *train], seed, train_seeds=train_seeds)
         self._parts = [self._calibrated, Evaluation(random_thetas, unseen, seed)]
-        self._uncalibrated: Evaluation | None = None
+        self._plain: Evaluation | None = self._calibrated if uncalibrated == theta else None
         if uncalibrated is not None and uncalibrated != theta:
-            self._uncalibrated = Evaluation({UNCALIBRATED: uncalibrated}, [*unseen, *train], seed)
-            self._parts.append(self._uncalibrated)
+            plain = {UNCALIBRATED: uncalibrated}
+            self._plain = Evaluation(plain, [*unseen, *train], seed, train_seeds=train_seeds)
+            self._parts.append(self._plain)
         if drawn:  # with other seeds: a draw can be θ* itself
             draws = {f"posterior {k}": theta for k, theta in enumerate(drawn, 1)}
             self._parts.append(Evaluation(draws, unseen, seed + 1))
@@ -498,10 +511,10 @@ class CalibrationEvaluation:
         if part is None:
             raise ValueError(f"this simulation was not asked for: {request}")
         part.tell(request, outcome)
-        if self.finished and self._uncalibrated is not None:
+        if self.finished and self._plain is not None:
             compared = [
                 [pair for pair in one.result().pairs if pair.split != "transfer"]
-                for one in (self._calibrated, self._uncalibrated)
+                for one in (self._calibrated, self._plain)
             ]
             self._gain = calibration_gain(*compared)
 

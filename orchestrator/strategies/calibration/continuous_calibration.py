@@ -23,6 +23,7 @@ from actors.optimizer.questions import (
 from orchestrator.requests import Decision, Simulate
 from orchestrator.run_errors import LearningError
 from orchestrator.strategies.calibration.action_prior import Contexts
+from orchestrator.strategies.calibration.automatic_calibration import AutomaticCalibration, simulation_limit
 from orchestrator.strategies.calibration.calibration_base import (
     THETA_MAP_RESOLUTION,
     Calibration,
@@ -42,7 +43,7 @@ from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSe
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.strategies.trials import Trial
 from sim_engine.outcome import MINIMUM_POURED
-from sim_engine.settings.model import PositiveSimulationCount, Problems
+from sim_engine.settings.model import CountOrAuto, PositiveSimulationCount, Problems
 
 CONTEXT_SIZE = 24
 """Number of actions over which the surrogate is averaged."""
@@ -61,8 +62,8 @@ class C4Settings(CalibrationSettings):
     strategy: Literal["C4"] = "C4"
     """Bayesian optimisation of the mean discrepancy over the actions, one simulation per iteration."""
 
-    simulations: PositiveSimulationCount | None = None
-    """Single simulated pours."""
+    simulations: CountOrAuto = "auto"
+    """Single simulated pours; 'auto': as many as still change the posterior of the parameters."""
 
     initial_samples: PositiveSimulationCount = 8
     """Random parameters before the surrogate is used."""
@@ -75,8 +76,8 @@ class C4Settings(CalibrationSettings):
 
     @property
     def budget(self) -> int:
-        """Number of simulations, once the settings are settled."""
-        assert self.simulations is not None, "settled settings have a budget"
+        """Number of simulations that is given."""
+        assert self.simulations != "auto", "only a given number is a budget"
         return self.simulations
 
     @property
@@ -86,19 +87,22 @@ class C4Settings(CalibrationSettings):
 
     def settled(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
         """Check the settings; they are returned unchanged."""
-        if self.simulations is None:
-            text = "key 'simulations' is missing; add for example 'simulations: 108'"
-            complaints.add(text, key=True, of="simulations")
-            return None
-        check_initial(self, self.initial_samples, self.simulations, "simulations", "simulations", complaints)
+        if self.simulations != "auto":
+            check_initial(self, self.initial_samples, self.simulations, "simulations", "simulations", complaints)
+        elif not self.makes_posterior:
+            text = "'noise' has no posterior, so 'simulations' needs a number; add for example 'simulations: 108'"
+            complaints.add(text, "averaging")
         return None if complaints.any else self
 
     def simulations_on(self, train: int) -> int:
-        """Number of simulations: one per iteration, independent of the number of pours."""
-        return self.budget
+        """Number of simulations: one per iteration, independent of the number of pours; with 'auto' the largest
+        number."""
+        return simulation_limit(train) if self.simulations == "auto" else self.simulations
 
     def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
         """Build the strategy."""
+        if self.simulations == "auto":
+            return AutomaticCalibration(plan, pours, seed, kappa=self.kappa)
         return ContinuousBayesianCalibration(plan, pours, seed)
 
 

@@ -4,8 +4,8 @@
 - C2 (`StratifiedSampling`): a stratified sample.
 - C3 (`BayesianCalibration`): Bayesian optimisation, every iteration on all training pours.
 
-`DiscrepancyOverPours` is their base, `BestOfDesign` that of C1 and C2. C4, which minimises O2, is in
-`continuous_calibration`.
+`DiscrepancyOverPours` is their base and that of `automatic_calibration`, `BestOfDesign` that of C1 and C2. C4, which
+minimises O2, is in `continuous_calibration`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from orchestrator.strategies.calibration.calibration_base import (
     described,
 )
 from orchestrator.strategies.calibration.pour_design import stratified
-from orchestrator.strategies.campaign_plan import CalibrationPlan, MeasuredPour
+from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
 from orchestrator.strategies.strategy import Strategy
 from orchestrator.strategies.trials import Trial
 from sim_engine.settings.model import PositiveSimulationCount, Problems, Text
@@ -40,12 +40,15 @@ MOST_MAPPED = 1_000
 """Maximum number of θ for which a map is made: a Gaussian process of more observations takes minutes."""
 
 
-S = TypeVar("S", bound=DesignSettings)
-"""Settings of a strategy that tries a number of θ on all pours."""
+S = TypeVar("S", bound=CalibrationSettings)
+"""Settings of a strategy that tries θ on all pours."""
+
+D = TypeVar("D", bound=DesignSettings)
+"""Settings of a strategy that tries a given number of θ."""
 
 
 class DiscrepancyOverPours(Calibration[S]):
-    """Base of C1, C2 and C3: O1(θ) = 1/n Σ_i |r_i − c_s(a_i, θ)| over the n training pours.
+    """Base of strategies that simulate θ on all n training pours: O1(θ) = 1/n Σ_i |r_i − c_s(a_i, θ)|.
 
     A pour has the same seed under every θ, so that two θ do not differ by initial positions. A θ that failed, or poured
     too little, on more than half of the pours is never θ*, because the mean over the few others is unreliable.
@@ -64,18 +67,22 @@ class DiscrepancyOverPours(Calibration[S]):
 
     @property
     def _budget(self) -> int:
-        return self._settings.thetas * len(self._usable)
+        return self._settings.simulations_on(len(self._usable))
 
     def _trials_at_once(self, slots: int) -> int:
         return math.ceil(slots / len(self._usable))
 
-    def _try(self, point: Point, predicted: tuple[float, float] | None = None) -> None:
-        """Queue a θ on all training pours."""
+    def _try(
+        self, point: Point, predicted: tuple[float, float] | None = None, only: Sequence[int] | None = None
+    ) -> None:
+        """Queue a θ on all training pours, or on those with the given indices."""
         theta = self.parameters_at(point)
         requests = tuple(
             Simulate(pour.scene or self._plan.scene.name, pour.action, theta, seed, "calibrate")
             for pour, seed in zip(self._usable, self._seed_of_pour, strict=True)
         )
+        if only is not None:
+            requests = tuple(requests[i] for i in only)
         self._trials.add(Trial(point, requests))
         if predicted is not None:
             text = f"θ {described(self._values(point))}: expected |Δ| {max(predicted[0], 0.0):.3f}"
@@ -89,24 +96,46 @@ class DiscrepancyOverPours(Calibration[S]):
         """O1 of the θ that count. A θ without a valid O1 gets the worst value, so that the search leaves its
         neighbourhood."""
         trials = self._trials.counting(everything=everything)
-        scores = [(trial.point, _score(trial)) for trial in trials]
+        scores = [(trial.point, self._score(trial)) for trial in trials]
         known = [score for _, score in scores if score is not None]
         if not known:
             return Data()
         costs = tuple(max(known) if score is None else score for _, score in scores)
         return Data(tuple(point for point, _ in scores), costs)
 
+    def _score(self, trial: Trial) -> float | None:
+        """O1 of a θ; None if it is defined on too few pours."""
+        known = discrepancies(trial)
+        return sum(known) / len(known) if known and len(known) >= LEAST_DEFINED * len(self._usable) else None
+
+    def _settle_at_lowest(self) -> None:
+        """Set θ* to the simulated θ with the lowest O1, with the standard error of this mean over the pours."""
+        scored = [(score, trial) for trial in self._compared() if (score := self._score(trial)) is not None]
+        if not scored:
+            raise self._no_discrepancies()
+        mean, best = min(scored, key=lambda pair: pair[0])
+        known = discrepancies(best)
+        variance = sum((cost - mean) ** 2 for cost in known) / max(len(known) - 1, 1)
+        self._settle(best.point, mean, math.sqrt(variance / len(known)))
+
+    def _compared(self) -> Sequence[Trial]:
+        """The trials that θ* is chosen from."""
+        return self._trials.all
+
+    def _mapped(self, suggestion: Suggestion) -> None:
+        self._final = suggestion
+
     def _row(self, number: int, trial: Trial) -> TriedOnPours:
-        known = [cost for cost in trial.costs.values() if cost is not None]
+        known = discrepancies(trial)
         return TriedOnPours(
             theta=self._values(trial.point),
-            discrepancy=_score(trial),
+            discrepancy=self._score(trial),
             defined=len(known),
             largest=max(known, default=None),
         )
 
 
-class BestOfDesign(DiscrepancyOverPours[S]):
+class BestOfDesign(DiscrepancyOverPours[D]):
     """Base of C1 and C2: all θ are chosen in advance, and θ* is the one with the smallest O1.
 
     The optimiser is queried only for the map. `predicted_deviation` is the standard error of θ*'s mean over the pours.
@@ -129,26 +158,17 @@ class BestOfDesign(DiscrepancyOverPours[S]):
             self._conclude()
 
     def _conclude(self) -> None:
-        scored = [(score, trial) for trial in self._trials.all if (score := _score(trial)) is not None]
-        if not scored:
-            raise self._no_discrepancies()
-        mean, best = min(scored, key=lambda pair: pair[0])
-        known = [cost for cost in best.costs.values() if cost is not None]
-        variance = sum((cost - mean) ** 2 for cost in known) / max(len(known) - 1, 1)
-        self._settle(best.point, mean, math.sqrt(variance / len(known)))
+        self._settle_at_lowest()
+        scored = [(score, trial) for trial in self._trials.all if (score := self._score(trial)) is not None]
         if 2 <= len(scored) <= MOST_MAPPED:
             data = Data(tuple(trial.point for _, trial in scored), tuple(score for score, _ in scored))
             query = RegressionQuery(self._plan.parameters, data, map_resolution=THETA_MAP_RESOLUTION)
             self._questions.put(query, "map", self._mapped)
 
-    def _mapped(self, suggestion: Suggestion) -> None:
-        self._final = suggestion
 
-
-def _score(trial: Trial) -> float | None:
-    """O1 of a θ; None if it is defined on too few pours."""
-    known = sum(cost is not None for cost in trial.costs.values())
-    return trial.cost if known >= LEAST_DEFINED * len(trial.requests) else None
+def discrepancies(trial: Trial) -> list[float]:
+    """|r_i − c_s(a_i, θ)| of the pours that have one."""
+    return [abs(cost) for _, cost in sorted(trial.costs.items()) if cost is not None]
 
 
 class C1Settings(DesignSettings):

@@ -145,6 +145,25 @@ def region(points: Array) -> tuple[Array, Array]:
     return np.minimum(low, ordered[first, axes]), np.maximum(high, ordered[first + held - 1, axes])
 
 
+def posterior_change(before: Posterior, after: Posterior) -> float:
+    """Largest distance of two posteriors over all axes and principal axes, in standard deviations.
+
+    The distance along an axis is the 1-Wasserstein distance of the draws, which reacts to position, width and shape.
+    The principal axes include the direction across a ridge along which parameters compensate each other.
+
+    Args:
+        before, after: equal numbers of draws in the unit cube.
+
+    Source: Vallender, Calculation of the Wasserstein distance between probability distributions on the line, 1974.
+    """
+    old, new = np.array(before.points), np.array(after.points)
+    both = np.concatenate([old - old.mean(axis=0), new - new.mean(axis=0)])
+    axes = np.concatenate([np.eye(old.shape[1]), np.linalg.svd(both, full_matrices=False)[2]])
+    spread = np.maximum((both @ axes.T).std(axis=0), 1e-9)
+    distances = np.abs(np.sort(old @ axes.T, axis=0) - np.sort(new @ axes.T, axis=0)).mean(axis=0)
+    return float((distances / spread).max())
+
+
 def central(posterior: Posterior) -> Point:
     """The medoid: the draw in the region that is nearest to all other draws, each axis in its own standard deviation.
 

@@ -18,8 +18,8 @@ from orchestrator.cli.app import app
 from orchestrator.config.campaign_checks import check_campaign
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.config.yaml.yaml_errors import Problem
+from orchestrator.journal.events import LogLine
 from orchestrator.progress.console_progress import ProgressDisplay
-from orchestrator.runs.events import LogLine
 from tests.support import small_campaign
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, VESSEL, report, write, write_good
 

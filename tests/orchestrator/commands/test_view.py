@@ -17,8 +17,8 @@ from actors.laboratory_settings import LaboratorySettings
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.view_command import _recording_of, view
 from orchestrator.config.file_loading import load_laboratory
-from orchestrator.journal.codec import encode_outcome, encode_request
-from orchestrator.journal.journal import JOURNAL_NAME, Header, Journal, Kind
+from orchestrator.journal.events import Requested, RequestFinished
+from orchestrator.journal.journal import JOURNAL_NAME, Header, Journal
 from orchestrator.live_view.blueprints import put_beside
 from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, task_of
@@ -46,10 +46,11 @@ def _journal(run: Path, notes: dict[str, object] | None = None) -> None:
     with Journal.create(run / JOURNAL_NAME, Header("narrow-cup", {})) as journal:
         for key, stage in ((1, "pours"), (2, "deployment:narrow cup")):
             pour = Pour("narrow cup", example_run.ACTION, 1, 70 + key)
-            journal.append(Kind.REQUESTED, {"id": key, "request": encode_request(pour)}, stage=stage)
-            measured = PourMeasurement(0.199, 0.01 * key, 0.001, dict(notes or {}))
-            outcome = encode_outcome(Poured(measured))
-            journal.append(Kind.POUR_FINISHED, {"id": key, "outcome": outcome, "seconds": 1.0}, stage=stage)
+            outcome = Poured(PourMeasurement(0.199, 0.01 * key, 0.001, dict(notes or {})))
+            journal.append(
+                Requested(stage=stage, id=key, request=pour),
+                RequestFinished(stage=stage, id=key, request=pour, outcome=outcome, seconds=1.0),
+            )
 
 
 @pytest.mark.slow

@@ -78,7 +78,13 @@ def test_budgets_count_single_simulated_pours(
         ("strategy: C5", "calibration.strategy: 'C5' is not known here; should be 'C1', 'C2', 'C3' or 'C4'"),
         ("strategy: C1", "calibration: key 'points_per_axis' is missing; add for example 'points_per_axis: 10'"),
         ("strategy: C2", "calibration: key 'samples' is missing; add for example 'samples: 18'"),
-        ("strategy: C4", "calibration: key 'simulations' is missing; add for example 'simulations: 108'"),
+        ("strategy: C4\n  simulations: many", "calibration.simulations: should be a whole number, or 'auto'"),
+        (
+            "strategy: C4\n  averaging: noise",
+            "calibration.averaging: 'noise' has no posterior, so 'simulations' needs a number; add for example "
+            "'simulations: 108'",
+        ),
+        ("strategy: C3\n  simulations: auto", "calibration.simulations: "),
         ("strategy: C2\n  points_per_axis: 4", "calibration.points_per_axis: belongs to C1, not to C2; remove it"),
         (
             "strategy: C1\n  points_per_axis: 4\n  kappa: 1",

@@ -21,6 +21,7 @@ from orchestrator.cli.foreground_run import report_of_what_stands
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.journal.journal_check import JournalCheck
 from orchestrator.journal.run_record import CampaignResult, RecordedDecision, read_record
+from orchestrator.requests import Failed
 from orchestrator.results import figure_style as style
 from orchestrator.results.console_view import summary_table
 from orchestrator.results.html_report import run_page
@@ -135,6 +136,16 @@ def test_ranges_of_theta_have_the_unit_of_their_value(made: Made) -> None:
     assert style.display_interval("receiver_x", -0.0244, -0.00273) == "-24.4 … -2.73 mm"
 
 
+def test_pictures_come_first_and_parameters_that_were_not_searched_in_one_line(made: Made) -> None:
+    assert made.page.index("<figure") < made.page.index("<h2>Summary</h2>")
+    shown = texts(made.page)
+    table = shown[shown.index("θ* with its region") : shown.index("Not searched: ")]
+    assert "not searched" not in table
+    fixed = [f"{one.name} {one.value}" for one in made.published.summary.parameters if one.searched == "not searched"]
+    assert fixed
+    assert f"Not searched: {', '.join(fixed)}." in shown
+
+
 def test_every_pour_stands_in_a_table_with_its_grams(made: Made) -> None:
     pours = read_record(made.result.directory).pours
     assert len(pours) == 5
@@ -156,7 +167,7 @@ def test_names_and_reasons_that_are_html_stay_text(made: Made) -> None:
     ]
     plan = replace(plan, deployment=replace(plan.deployment, scenes=tuple(scenes)))
     record = read_record(made.result.directory)
-    record.pours[0].state, record.pours[0].reason = "failed", SCRIPT
+    record.pours[0].state, record.pours[0].outcome = "failed", Failed("pour_failed", SCRIPT)
     record.notes.append((0.0, SCRIPT))
     record.decisions.append(RecordedDecision(0.0, SCRIPT, SCRIPT, {}, 0))
     summary = summarise(

@@ -9,7 +9,7 @@ from typing import Any
 import jsonschema
 import pytest
 
-from orchestrator.journal.codec import decode_results
+from orchestrator.journal.codec import decode_result
 from orchestrator.results.console_view import print_summary, summary_table
 from orchestrator.results.figure_style import display_value, display_values
 from orchestrator.results.run_summary import NotSimulated, PoolUse, RunSummary, Totals, summary_schema, write_summary
@@ -69,7 +69,7 @@ def test_summary_file_has_what_was_summarised_and_the_results_read_back(
     assert path.name == "summary.json"
     written = json.loads(path.read_text(encoding="utf-8"))
     assert RunSummary.model_validate({**written, "results": results}) == summary
-    assert decode_results(written["results"]) == results
+    assert {name: decode_result(one) for name, one in written["results"].items()} == results
     assert [p.name for p in path.parent.iterdir()] == ["summary.json"]
 
 

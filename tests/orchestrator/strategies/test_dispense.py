@@ -11,8 +11,8 @@ from actors.dosing.dose_estimator import ONSET
 from actors.interfaces import DoseSource
 from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.journal.codec import decode_request, decode_result, encode_request, encode_result
+from orchestrator.journal.events import CampaignOpened, RequestFinished, RequestStarted
 from orchestrator.requests import Failed, Pour, Poured, Slots
-from orchestrator.runs.events import CampaignOpened, RequestFinished, RequestStarted
 from orchestrator.runs.stages import CALIBRATION, DOSES, SOURCES, dispense_stages
 from orchestrator.strategies.calibration.calibration_base import Calibrated
 from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose

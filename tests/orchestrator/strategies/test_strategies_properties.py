@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from actors.optimizer.questions import Data, Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.journal.codec import encode_result
+from orchestrator.journal.events import Event, RequestFinished
 from orchestrator.requests import Outcome, Pour, Poured, Request, Suggest
 from orchestrator.run_errors import LearningError
-from orchestrator.runs.events import Event, RequestFinished
 from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.strategies.calibration.pointwise_calibration import (
     BayesianCalibration,
