@@ -51,7 +51,8 @@ from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.submissions import Files, pack
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.journal.events import Kind
+from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
 from orchestrator.journal.journal_check import check_journal
 from orchestrator.results import figure_style as style
 
