@@ -402,39 +402,56 @@ def measured(name: str) -> str:
     return f"{_table(found['head'], found['rows'])}\n{how}\n"
 
 
-DOSING = {
-    "dosing-spout": "spout, water, lag 0.1 to 0.5 s",
-    "dosing-round": "round rim",
-    "dosing-oil": "oil",
-    "dosing-slow": "lag 1 s",
-}
-"""Tables of docs/data/dosing.json, and their groups."""
+HARDER = {"round rim": "round rim", "oil": "rapeseed oil", "lag 1 s": "lag of 0.9 to 1.1 s"}
+"""Groups of docs/data/dosing.json that are harder than the first one, and what is different in them."""
+
+DOSE_COLUMNS = (
+    *("mean error g", "bias g", "95 % g", "worst g", "over +1 g", "first dose, 95 % g", "spilled g"),
+    *("50 g weighed, 95 % s", "200 g, 95 % s"),
+)
 
 
-def dosing(group: str) -> str:
-    """The figures of one group of doses, with how they were measured."""
+def _dose_figures(f: Mapping[str, float]) -> tuple[str, ...]:
+    figures = (
+        *(f"{f[key]:.2f}" for key in ("mean", "bias", "p95", "worst")),
+        f"{100 * f['over_1g']:.1f} %",
+        *(f"{f[key]:.2f}" for key in ("first_p95", "spill_mean")),
+        *(f"{f[key]:.1f}" for key in ("time_50_p95", "time_200_p95")),
+    )
+    return tuple(text.replace("-", "−") for text in figures)
+
+
+def _poured(found: Mapping[str, Any]) -> str:
+    doses = f"{found['particles']['doses']} doses of each controller"
+    how = f"{doses}, same seeds from {found['seeds'][0]}; {found['machine']['date']}"
+    return f"<sub>`python benchmarks/dosing.py --final --json`; {how}.</sub>\n"
+
+
+def dosing() -> str:
+    """The figures of the first group of doses, with how they were measured."""
     data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))
-    found = data["groups"][group]
+    found = data["groups"]["spout, water, lag 0.1 to 0.5 s"]
     rows = []
     for name, f in found.items():
         if name in ("paired", "machine", "seeds"):
             continue
         more = found["paired"].get(name)
-        figures = (
-            *(f"{f[key]:.2f}" for key in ("mean", "bias", "p95", "worst")),
-            f"{100 * f['over_1g']:.1f} %",
-            *(f"{f[key]:.2f}" for key in ("first_p95", "spill_mean")),
-            *(f"{f[key]:.1f}" for key in ("time_50_p95", "time_200_p95")),
-            "–" if more is None else f"{more[0]:+.2f} ({more[1]:+.2f} … {more[2]:+.2f})",
-        )
-        rows.append((f"**{name}**" if more is None else name, *(text.replace("-", "−") for text in figures)))
-    head = (
-        *("controller", "mean error g", "bias g", "95 % g", "worst g", "over +1 g", "first dose, 95 % g", "spilled g"),
-        *("50 g weighed, 95 % s", "200 g, 95 % s", "mean error more than particles g"),
-    )
-    doses = f"{found['particles']['doses']} doses of each controller"
-    how = f"{doses}, same seeds from {found['seeds'][0]}; {found['machine']['date']}"
-    return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing.py --final --json`; {how}.</sub>\n"
+        than = "–" if more is None else f"{more[0]:+.2f} ({more[1]:+.2f} … {more[2]:+.2f})".replace("-", "−")
+        rows.append((f"**{name}**" if more is None else name, *_dose_figures(f), than))
+    head = ("controller", *DOSE_COLUMNS, "mean error more than particles g")
+    return f"{_table(head, rows)}\n{_poured(found)}"
+
+
+def dosing_harder() -> str:
+    """The figures of Decant's controller in the other groups, beside the rivals' mean errors."""
+    data = json.loads((FOLDER / "data" / "dosing.json").read_text(encoding="utf-8"))["groups"]
+    rivals = ("learned preact", "PID")
+    rows = [
+        (text, *_dose_figures(data[name]["particles"]), *(f"{data[name][one]['mean']:.2f}" for one in rivals))
+        for name, text in HARDER.items()
+    ]
+    head = ("", *DOSE_COLUMNS, *(f"{one}: mean error g" for one in rivals))
+    return f"{_table(head, rows)}\n{_poured(data['oil'])}"
 
 
 def dosing_balances() -> str:
@@ -663,7 +680,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "compared-calibration": partial(variants, _arms(study.CalibrationsSettings), Settings),
     "compared-deployment": partial(variants, _arms(study.DeploymentsSettings), Settings),
     **{f"result-{name}": partial(measured, name) for name in MEASURED},
-    **{name: partial(dosing, group) for name, group in DOSING.items()},
+    "dosing-spout": dosing,
+    "dosing-harder": dosing_harder,
     "dosing-balances": dosing_balances,
     "dosing-faults": dosing_faults,
     "dosing-particles": dosing_particles,

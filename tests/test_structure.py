@@ -23,8 +23,9 @@ def modules() -> dict[str, Path]:
 PROCESSES = ("python_module", "ConnectedProcess")
 """Functions that start the module which their first argument names, in a process of its own."""
 
-JOURNAL = "orchestrator.journal.codec"
-"""Names by text the modules that declare results, which import the journal's types."""
+NAMED_ONLY = ("orchestrator.journal.codec", "sim_engine.solver_fingerprint")
+"""Modules whose texts are no imports of theirs: the codec names the modules that declare results, which import the
+journal's types; the fingerprint reads the sources that it names."""
 
 
 def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:
@@ -36,7 +37,7 @@ def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:
     for node in nodes:
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in started:
             text = node.value.partition(":")[0]
-            found |= {text} if "." in text and name != JOURNAL else set()
+            found |= {text} if "." in text and name not in NAMED_ONLY else set()
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module is not None:

@@ -28,7 +28,7 @@ SPOILT: dict[str, tuple[str, str, str]] = {
         "receiver_x: [-25 mm, 25 mm]",
         "receiver_x: {measured: .nan mm, tolerance: 3 mm}",
     ),
-    "campaigns/many.yaml": (QUICKSTART, "simulations: 30", "simulations: 1000000000000"),
+    "campaigns/many.yaml": (QUICKSTART, "simulations: auto", "simulations: 1000000000000"),
     "campaigns/long.yaml": (QUICKSTART, "name: quickstart", f"name: {'x' * 300}"),
     "campaigns/name.yaml": (QUICKSTART, "name: quickstart", "name: 注ぐ"),
     "campaigns/two.yaml": (QUICKSTART, "name: quickstart", "name: a\n---\nname: quickstart"),
