@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from actors.interfaces import LaboratoryError
+from actors.runtime.child_process import child_environment
 from actors.simulators.job_runner import JobRunner
 from sim_engine import engine_package
 from sim_engine.engine_package import ENGINES, EXPECTED, check_engine, check_task, engine_name, engine_version
@@ -103,11 +104,13 @@ def test_a_pour_checks_its_engine_and_a_wrong_one_ends_the_run(tmp_path: Path, m
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
-def test_both_engines_pour_the_same_and_pass_quick_cases(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_engines_pour_the_same_and_pass_quick_cases(engine: str) -> None:
     if not installed(engine):
         pytest.skip(f"{engine} is not installed")
-    monkeypatch.setenv("DECANT_ENGINE", engine)
-    poured = subprocess.run([sys.executable, "-c", POUR], capture_output=True, text=True, timeout=PATIENCE * 10)
+    env = child_environment({"DECANT_ENGINE": engine})
+    poured = subprocess.run(
+        [sys.executable, "-c", POUR], env=env, capture_output=True, text=True, timeout=PATIENCE * 10
+    )
     assert poured.returncode == 0, poured.stderr
     found = json.loads(poured.stdout)  # stdout has the result alone: no header of the package
     assert found["engine"].startswith(f"{engine} ")
@@ -116,5 +119,5 @@ def test_both_engines_pour_the_same_and_pass_quick_cases(engine: str, monkeypatc
     assert abs(found["retained"] - expected) <= most
     code = "from orchestrator.cli.app import main; main()"
     command = [sys.executable, "-c", code, "validate-solver", "rest", "outflow"]
-    judged = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    judged = subprocess.run(command, env=env, capture_output=True, text=True, timeout=900)
     assert judged.returncode == 0, judged.stdout + judged.stderr
