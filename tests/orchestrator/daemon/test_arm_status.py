@@ -13,6 +13,7 @@ import pytest
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import DeviceCheck
 from orchestrator.config.file_loading import load_laboratory
+from orchestrator.daemon import rig_worker
 from orchestrator.daemon.daemon_settings import Rig
 from tests.support.hardware_laboratory import hardware_rig
 from tests.support.toy_daemon import Served, held, run, serving
@@ -95,10 +96,13 @@ class ArmThatIsRead:
         return DeviceCheck("motion", "ok", "the arm is ready to move")
 
 
-def test_an_arm_is_not_read_during_a_run_and_no_run_begins_during_a_reading(tmp_path: Path) -> None:
+def test_an_arm_is_not_read_during_a_run_and_no_run_begins_during_a_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     laboratory = tmp_path / "numbers.yaml"
     laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")
     arm = ArmThatIsRead()
+    monkeypatch.setattr(rig_worker, "arm_kind", lambda spec: spec)
     spec = load_laboratory(laboratory).model_copy(update={"mode": "hardware", "arm": arm})
 
     async def work() -> None:
