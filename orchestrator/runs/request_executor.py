@@ -242,7 +242,8 @@ class RequestExecutor:
         self._frame_rate = frame_rate
         self._real = asyncio.Lock()
         self._optimiser = asyncio.Lock()
-        self.speculation = SpeculativeExecution(self._speculate, laboratory.simulators.size)
+        # one processor is left for the drivers of arm and balance, which keep deadlines while the arm pours
+        self.speculation = SpeculativeExecution(self._speculate, max(laboratory.simulators.size - 1, 1))
 
     async def _speculate(self, request: Simulate) -> Outcome:
         return (await self._simulated(request))[0]
