@@ -11,6 +11,7 @@ same request gives the same outcome at any time, so wrong predictions are discar
 from __future__ import annotations
 
 import asyncio
+import os
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -242,8 +243,10 @@ class RequestExecutor:
         self._frame_rate = frame_rate
         self._real = asyncio.Lock()
         self._optimiser = asyncio.Lock()
-        # one processor is left for the drivers of arm and balance, which keep deadlines while the arm pours
-        self.speculation = SpeculativeExecution(self._speculate, max(laboratory.simulators.size - 1, 1))
+        size = laboratory.simulators.size
+        # while the arm pours, a pool of all processors leaves one to the drivers, which keep deadlines
+        spare = 1 if 1 < size >= (os.cpu_count() or 1) else 0
+        self.speculation = SpeculativeExecution(self._speculate, size - spare)
 
     async def _speculate(self, request: Simulate) -> Outcome:
         return (await self._simulated(request))[0]

@@ -11,7 +11,7 @@ import pytest
 from orchestrator.journal.events import Event, RequestFinished, StageClosed
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.requests import Failed, Outcome, Pour, Simulate
-from orchestrator.runs.request_executor import SpeculativeExecution
+from orchestrator.runs.request_executor import Deadlines, RequestExecutor, SpeculativeExecution
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from sim_engine.scene import PourTask
 from tests.orchestrator.test_stages import Optimizer, calibration, campaign
@@ -128,6 +128,27 @@ def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:
         assert given_up == [2, 1, 1, 2]
 
     asyncio.run(check())
+
+
+@pytest.mark.parametrize(("processors", "at_once"), [(3, 2), (2, 2), (4, 3), (None, 2), (8, 3)])
+def test_a_pool_of_all_processors_leaves_one_to_the_drivers(
+    monkeypatch: pytest.MonkeyPatch, processors: int | None, at_once: int
+) -> None:
+    """Otherwise the arm's driver misses its deadlines on a machine with as many simulators as processors."""
+    monkeypatch.setattr("os.cpu_count", lambda: processors)
+    seen = [0]
+
+    async def check() -> None:
+        bench = laboratory(separate=True)
+        bench.simulators.size = 3
+        ahead = RequestExecutor(bench, {}, Deadlines(), 0.0).speculation
+        ahead.changed = lambda running, waiting: seen.append(running)
+        for seed in range(5):
+            ahead.predict(simulate(seed))
+        await ahead.close()
+
+    asyncio.run(check())
+    assert max(seen) == at_once
 
 
 def test_one_that_is_being_made_is_waited_for_and_not_made_twice() -> None:
