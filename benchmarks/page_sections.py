@@ -281,8 +281,6 @@ def finished() -> str:
 
 Made with commit 46022671, on the same machine:
 
-- Many scenes in one call (`benchmarks/batches.py`): on a CPU they follow each other, so that a call costs the sum of
-  its pours (0.98 to 1.00 of single pours with 2 to 16 scenes).
 - The core's limit (`benchmarks/core_limit.py`): plain C on a lattice at rest, without walls, forces, sweeps and
   surfaces, makes 6.5 M particle-iterations/s with lists built in every step, and 13 M with lists kept for 8. The pour
   made 5.1 M: 79 % and 38 % of that.

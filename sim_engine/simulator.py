@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -125,14 +125,13 @@ class TimeLoop:
     Attributes:
         task, motion: of the pour.
         start: time at which the simulation begins, a multiple of `SLICE`; the liquid lies level before [s].
-        scene: its index in the engine.
         times, poured, spilled: recorded curve: [s], fractions.
         frames: time, positions (N, 3) [m], states (N,).
         dribbling: what runs down the outside of the pourer; None if that is not simulated.
         states: of the particles at the times of the curve, (N,) each, if `dribbling` is set.
         slices: time reached, in `SLICE`.
         over: whether the outcome is final.
-        cpu_s: CPU time of the process for this pour [s]; pours that run side by side share it evenly.
+        cpu_s: CPU time of the process for this pour [s].
 
     Raises:
         ValueError: it would start within a slice.
@@ -141,7 +140,6 @@ class TimeLoop:
     task: PourTask
     motion: Motion
     start: float
-    scene: int
     times: list[float] = field(default_factory=lambda: [0.0])
     poured: list[float] = field(default_factory=lambda: [0.0])
     spilled: list[float] = field(default_factory=lambda: [0.0])
@@ -174,9 +172,9 @@ class TimeLoop:
             counts: particles in each state, shape (5,).
         """
         n = self.task.parameters.particles
-        now = fluid.time(self.scene)
+        now = fluid.time()
         if self.task.frame_rate > 0.0 and self.clock >= self._next_frame:
-            self.frames.append((now, *fluid.particles(self.scene)))
+            self.frames.append((now, *fluid.particles()))
             while self._next_frame <= self.clock:
                 self._next_frame += 1.0 / self.task.frame_rate
         if now > self.times[-1]:
@@ -184,8 +182,8 @@ class TimeLoop:
             self.poured.append(1.0 - float(counts[ParticleState.IN_POURER]) / n)
             self.spilled.append(float(counts[ParticleState.SPILLED]) / n)
             if self.dribbling is not None:
-                self.states.append(fluid.particles(self.scene)[1])
-        if fluid.fault(self.scene) is not None or self.clock >= self.motion.duration + LONGEST_TAIL:
+                self.states.append(fluid.particles()[1])
+        if fluid.fault() is not None or self.clock >= self.motion.duration + LONGEST_TAIL:
             self.over = True
             return
         # The pour has ended when nothing is in flight and nothing more can leave.
@@ -205,8 +203,8 @@ def follow(fluid: FluidEngine, course: TimeLoop, cancelled: Callable[[], bool] |
     """
     begun, until = time.process_time(), course.start
     while True:
-        fluid.advance(until, course.scene)
-        course.look(fluid, fluid.census(course.scene))
+        fluid.advance(until)
+        course.look(fluid, fluid.census())
         now = time.process_time()
         course.cpu_s += now - begun
         begun = now
@@ -226,8 +224,8 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
         course: of a pour that has ended.
         loading: CPU time of its setup [s].
     """
-    n, scene = course.task.parameters.particles, course.scene
-    counts, spilled_then, dribbled = fluid.census(scene), course.spilled, 0
+    n = course.task.parameters.particles
+    counts, spilled_then, dribbled = fluid.census(), course.spilled, 0
     if course.dribbling is not None:
         states = np.array(course.states)
         found = course.dribbling.select(states)
@@ -244,7 +242,7 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
             ParticleState.ESCAPED,
         )
     )
-    invalid = fluid.fault(scene)
+    invalid = fluid.fault()
     if invalid is None and escaped > ESCAPED_LIMIT:
         invalid = (
             f"{100 * escaped:.2g} % of the particles crossed vessel walls "
@@ -258,9 +256,9 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
         escaped=escaped,
         particles=n,
         spacing=spacing(course.task.scene.liquid.volume, n),
-        density_error=fluid.mean_compression(scene),
-        simulated_time=fluid.time(scene),
-        steps=fluid.steps(scene),
+        density_error=fluid.mean_compression(),
+        simulated_time=fluid.time(),
+        steps=fluid.steps(),
         cpu_s=course.cpu_s + loading,
         seed=course.task.seed,
         curve_times=tuple(course.times),
@@ -394,7 +392,7 @@ def check_motion(
 
 
 class PourSimulator:
-    """Simulates pours, one by one or many in one call. One per process: the engine's arrays are shared.
+    """Simulates pours, one after another. One per process: the engine's arrays are shared.
 
     Before its first pour, an engine that was never checked on this machine is checked (`engine_package.check_engine`).
 
@@ -457,74 +455,31 @@ class PourSimulator:
             SimulationCancelled: `cancelled` returned True.
             WrongOutcomeError: the engine gives wrong outcomes on this machine.
         """
-        (run,) = self.simulate_many([task], cancelled=cancelled)
-        return run
-
-    def simulate_many(
-        self, tasks: Sequence[PourTask], *, cancelled: Callable[[], bool] | None = None
-    ) -> list[SimulatedPour]:
-        """Run many pours, of any actions, θ, vessels and seeds, in one set of kernels.
-
-        The pours run one after another. Every outcome equals that of the pour alone.
-
-        Args:
-            tasks: what to simulate.
-            cancelled: polled every `SLICE` of simulated time.
-
-        Returns:
-            The simulated pours, in the same order.
-
-        Raises:
-            InvalidSceneError: one of the pours is impossible; nothing was simulated.
-            SimulationCancelled: `cancelled` returned True.
-            WrongOutcomeError: the engine gives wrong outcomes on this machine.
-        """
         from sim_engine.fluid.engine import engine
 
-        motions = [self.prepare(task) for task in tasks]
+        motion = self.prepare(task)
         fluid = engine()
         if not self._checked:
-            check_engine(lambda task: self._batch(fluid, [task], [self.prepare(task)], None)[0].outcome)
+            check_engine(lambda task: self._pour(fluid, task, self.prepare(task), None).outcome)
             self._checked = True
-        runs: list[SimulatedPour] = []
-        while len(runs) < len(tasks):
-            first = len(runs)
-            end = first + fluid.room_for([task.parameters.particles for task in tasks[first:]])
-            runs += self._batch(fluid, tasks[first:end], motions[first:end], cancelled)
-        return runs
+        return self._pour(fluid, task, motion, cancelled)
 
-    def _batch(
-        self,
-        fluid: FluidEngine,
-        tasks: Sequence[PourTask],
-        motions: Sequence[Motion],
-        cancelled: Callable[[], bool] | None,
-    ) -> list[SimulatedPour]:
-        """Pours that fit into one load."""
+    def _pour(
+        self, fluid: FluidEngine, task: PourTask, motion: Motion, cancelled: Callable[[], bool] | None
+    ) -> SimulatedPour:
         begun = time.process_time()
-        starts = [
-            calm_until(motion, self.vessel(task.scene.pourer), task.scene.liquid.volume)
-            for task, motion in zip(tasks, motions, strict=True)
-        ]
-        fluid.load([self._setup(*one) for one in zip(tasks, motions, starts, strict=True)])
-        loading = (time.process_time() - begun) / len(tasks)
-        courses = [
-            TimeLoop(task, motion, start, scene, dribbling=self._dribbling(task, motion))
-            for scene, (task, motion, start) in enumerate(zip(tasks, motions, starts, strict=True))
-        ]
-        for course in courses:  # one after the other: a scene's arrays stay in the core's cache
-            follow(fluid, course, cancelled)
-        for course, task, motion in zip(courses, tasks, motions, strict=True):
-            if task.frame_rate > 0.0:
-                course.frames[:0] = self._level_frames(task, motion, course.start)
-                if course.dribbling is not None:
-                    found = course.dribbling.select(np.array(course.states))
-                    times = np.array(course.times)
-                    course.frames = rivulet_frames(course.dribbling, found, motion, times, course.frames)
-        return [
-            SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
-            for course, motion in zip(courses, motions, strict=True)
-        ]
+        start = calm_until(motion, self.vessel(task.scene.pourer), task.scene.liquid.volume)
+        fluid.load([self._setup(task, motion, start)])
+        loading = time.process_time() - begun
+        course = TimeLoop(task, motion, start, dribbling=self._dribbling(task, motion))
+        follow(fluid, course, cancelled)
+        if task.frame_rate > 0.0:
+            course.frames[:0] = self._level_frames(task, motion, course.start)
+            if course.dribbling is not None:
+                found = course.dribbling.select(np.array(course.states))
+                times = np.array(course.times)
+                course.frames = rivulet_frames(course.dribbling, found, motion, times, course.frames)
+        return SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
 
     def _dribbling(self, task: PourTask, motion: Motion) -> DribblingCourse | None:
         """What runs down the outside of the pourer; None if nothing does."""

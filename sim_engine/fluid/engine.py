@@ -49,26 +49,14 @@ class FluidEngine:
         self._begins = [0]
         self._facts = np.zeros((0, len(FACTS)))
 
-    def room_for(self, counts: Sequence[int]) -> int:
-        """Number of these scenes, given by their numbers of particles, that fit into one load, counted from the first.
-
-        Raises:
-            ValueError: not even the first one fits.
-        """
-        sums = np.cumsum(counts)
-        fits = int(np.searchsorted(sums, self.pool, side="right"))
-        if fits == 0:
-            raise ValueError(f"{counts[0]} particles; at most {self.pool}")
-        return min(fits, self.most_scenes)
-
     def load(self, setups: Sequence[SceneSetup]) -> None:
         """Set up scenes, which replace the loaded ones.
 
-        Args:
-            setups: as many as fit, see `room_for`.
+        Raises:
+            ValueError: they have more particles than there is room for.
         """
-        if self.room_for([len(s.positions) for s in setups]) < len(setups):
-            raise ValueError(f"{len(setups)} scenes do not fit into one load")
+        if (particles := sum(len(s.positions) for s in setups)) > self.pool:
+            raise ValueError(f"{particles} particles; at most {self.pool}")
         values, planes = _Pool[np.float32](), _Pool[np.float32]()
         insides = _Pool[np.uint8]()
         begin, row = 0, 0

@@ -63,9 +63,9 @@ def test_a_simulation_begins_between_two_slices() -> None:
     task = PourTask(SCENE, action(20.0), SimulationParameters(), seed=0)
     start = calm_until(motion, POURER, VOLUME)
     assert start > 0.0
-    assert TimeLoop(task, motion, start, 0).clock == pytest.approx(start)
+    assert TimeLoop(task, motion, start).clock == pytest.approx(start)
     with pytest.raises(ValueError, match="multiple of"):
-        TimeLoop(task, motion, start + 0.5 * SLICE, 0)
+        TimeLoop(task, motion, start + 0.5 * SLICE)
 
 
 @settings(max_examples=examples(25), deadline=None)
@@ -125,7 +125,7 @@ def test_leaving_the_beginning_out_changes_the_pour_by_less_than_seeds_do(monkey
     times = np.arange(1.8, 3.6, 0.1)
 
     def left() -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-        runs = [run.outcome for run in simulator.simulate_many(tasks)]
+        runs = [simulator.simulate(task).outcome for task in tasks]
         return np.array([1.0 - np.interp(times, o.curve_times, o.curve_poured) for o in runs])
 
     late = left()

@@ -1,4 +1,4 @@
-"""Many pours in one call, and where they run."""
+"""The simulator of pours: one after another in one process."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from actors.runtime.child_process import child_environment
 from sim_engine.action import DEG, Action
-from sim_engine.errors import InvalidSceneError, SimulationCancelled
+from sim_engine.errors import SimulationCancelled
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
@@ -37,53 +37,22 @@ def simulator() -> PourSimulator:
     return PourSimulator()
 
 
-def test_a_batch_pours_what_each_pour_does_alone_bit_for_bit(simulator: PourSimulator) -> None:
+def test_a_pour_is_bit_for_bit_the_same_whatever_was_poured_before(simulator: PourSimulator) -> None:
     tasks = [
         task(1),
         task(2, speed=60.0, xsph_rate=8.0),
         task(3, particles=450, cohesion=0.06),
         task(4, scene=OTHER, friction=0.2),
-        task(1),
     ]
-    together = [run.outcome for run in simulator.simulate_many(tasks)]
-    for asked, outcome in zip(tasks, together, strict=True):
-        alone = simulator.simulate(asked).outcome
-        same = {"cpu_s": 0.0}
-        assert dataclasses.replace(outcome, **same) == dataclasses.replace(alone, **same)
-    assert dataclasses.replace(together[0], cpu_s=0.0) == dataclasses.replace(together[4], cpu_s=0.0)
-    assert len({outcome.received for outcome in together}) > 1
+    first, again = (
+        [dataclasses.replace(simulator.simulate(one).outcome, cpu_s=0.0) for one in order]
+        for order in (tasks, tasks[::-1])
+    )
+    assert first == again[::-1]
+    assert len({outcome.received for outcome in first}) > 1
 
 
-def test_more_pours_than_fit_into_memory_at_once_are_split(
-    simulator: PourSimulator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from sim_engine.fluid.engine import FluidEngine
-
-    loads: list[int] = []
-    load = FluidEngine.load
-
-    def counted(self: FluidEngine, setups: list[object]) -> None:
-        loads.append(len(setups))
-        load(self, setups)  # type: ignore[arg-type]
-
-    simulator.simulate(task(1))
-    monkeypatch.setattr(FluidEngine, "load", counted)
-    from sim_engine.fluid.engine import engine
-
-    monkeypatch.setattr(engine(), "pool", 700)
-    outcomes = [run.outcome for run in simulator.simulate_many([task(seed) for seed in (1, 2, 3)])]
-    assert loads == [2, 1]
-    assert [outcome.seed for outcome in outcomes] == [1, 2, 3]
-
-
-def test_a_bad_pour_refuses_the_whole_batch_before_anything_is_simulated(simulator: PourSimulator) -> None:
-    bad = task(2)
-    bad = dataclasses.replace(bad, action=dataclasses.replace(bad.action, x_offset=0.0, height=0.001))
-    with pytest.raises(InvalidSceneError):
-        simulator.simulate_many([task(1), bad])
-
-
-def test_a_batch_can_be_given_up(simulator: PourSimulator) -> None:
+def test_a_pour_can_be_given_up(simulator: PourSimulator) -> None:
     asked = 0
 
     def enough() -> bool:
@@ -92,7 +61,7 @@ def test_a_batch_can_be_given_up(simulator: PourSimulator) -> None:
         return asked > 3
 
     with pytest.raises(SimulationCancelled):
-        simulator.simulate_many([task(1), task(2)], cancelled=enough)
+        simulator.simulate(task(1), cancelled=enough)
     assert simulator.simulate(task(1)).outcome.invalid is None
 
 
