@@ -444,19 +444,22 @@ def draw_posterior(posterior: PosteriorFound, space: Space, theta: Mapping[str, 
 
 
 def _histogram(panel: Axes, axis: Axis, posterior: PosteriorFound, theta: Mapping[str, float]) -> None:
+    factor = style.display_factor(axis.name)
     steps = np.geomspace if axis.scale == "log" else np.linspace
-    values = [draw[axis.name] for draw in posterior.thetas]
-    panel.hist(values, bins=steps(axis.lower, axis.upper, BINS + 1).tolist(), color=style.GREY)
+    bins = steps(axis.lower / factor, axis.upper / factor, BINS + 1).tolist()
+    panel.hist([draw[axis.name] / factor for draw in posterior.thetas], bins=bins, color=style.GREY)
+    low, high = (bound / factor for bound in posterior.region[axis.name])
     name = f"{100 * posterior.level:.0f} % of the draws"
-    panel.axvspan(*posterior.region[axis.name], color=style.MEASURED, alpha=0.18, linewidth=0.0, label=name)
-    panel.axvline(theta[axis.name], color=style.BEST, linewidth=1.8, label="θ*")
+    panel.axvspan(low, high, color=style.MEASURED, alpha=0.18, linewidth=0.0, label=name)
+    panel.axvline(theta[axis.name] / factor, color=style.BEST, linewidth=1.8, label="θ*")
 
 
 def _cloud(
     panel: Axes, across: Axis, up: Axis, draws: Sequence[Mapping[str, float]], theta: Mapping[str, float]
 ) -> None:
-    places = [[draw[axis.name] for draw in draws] for axis in (across, up)]
+    def shown(values: Mapping[str, float]) -> tuple[float, float]:
+        return values[across.name] / style.display_factor(across.name), values[up.name] / style.display_factor(up.name)
+
+    places = zip(*map(shown, draws), strict=True)
     panel.plot(*places, ".", color=style.MEASURED, markersize=4, alpha=0.45, label="a draw")
-    panel.plot(
-        theta[across.name], theta[up.name], "*", color=style.BEST, markersize=13, markeredgecolor="white", zorder=4
-    )
+    panel.plot(*shown(theta), "*", color=style.BEST, markersize=13, markeredgecolor="white", zorder=4)

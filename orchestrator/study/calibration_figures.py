@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -324,6 +324,11 @@ def _curve(name: str, result: Calibrated, expected: Sequence[tuple[int, float]])
     return [] if result.found is None else [(result.simulations, result.found.predicted_discrepancy)]
 
 
+def _displayed(places: Iterable[tuple[float, float]], factors: Sequence[float]) -> list[list[float]]:
+    """The two coordinates of places in SI, in display units."""
+    return [[place[k] / factors[k] for place in places] for k in (0, 1)]
+
+
 def _over_theta(study: StudyPlan, known: Mapping[str, Found]) -> Drawn:
     figure, grid = style.new_figure(1, len(known), size=(1.0 + 3.4 * len(known), 3.9), squeeze=False)
     rows: list[list[object]] = []
@@ -335,6 +340,7 @@ def _over_theta(study: StudyPlan, known: Mapping[str, Found]) -> Drawn:
         found = [result.found for result in one.results if result.found is not None]
         maps = [theta.map for theta in found if theta.map is not None]
         names = list(maps[0].over) if maps else [*found[0].searched, *found[0].searched][:2]
+        factors = [style.display_factor(axis) for axis in names]
         settings = {"cmap": "viridis", "vmin": 0.0, "vmax": top}
         if strategy_of(name) in ("C1", "C2"):
             tried: dict[tuple[float, float], list[float]] = {}
@@ -345,14 +351,14 @@ def _over_theta(study: StudyPlan, known: Mapping[str, Found]) -> Drawn:
                         tried.setdefault(place, []).append(100 * trial.discrepancy)
             places = list(tried)
             values = [mean(tried[place]) for place in places]
-            xs, ys = [p[0] for p in places], [p[1] for p in places]
-            shown = axes.scatter(xs, ys, c=values, marker="s", s=46, clip_on=False, **settings)
+            shown = axes.scatter(*_displayed(places, factors), c=values, marker="s", s=46, clip_on=False, **settings)
             rows += [[name, "trial", names[0], x, names[1], y, v] for (x, y), v in zip(places, values, strict=True)]
         elif maps:
             alike = [m for m in maps if list(m.over) == names]
             surface = 100 * np.mean([np.maximum(m.mean, 0.0) for m in alike], axis=0)
             xs, ys = list(alike[0].axes[names[0]]), list(alike[0].axes[names[1]])
-            shown = axes.pcolormesh(xs, ys, surface, shading="gouraud", **settings)
+            grid_lines = [[v / factor for v in vs] for vs, factor in zip((xs, ys), factors, strict=True)]
+            shown = axes.pcolormesh(*grid_lines, surface, shading="gouraud", **settings)
             rows += [
                 [name, "surrogate", names[0], x, names[1], y, float(surface[j, i])]
                 for j, y in enumerate(ys)
@@ -360,7 +366,7 @@ def _over_theta(study: StudyPlan, known: Mapping[str, Found]) -> Drawn:
             ]
         stars = [(getattr(theta.theta, names[0]), getattr(theta.theta, names[1])) for theta in found]
         axes.plot(
-            [x for x, _ in stars], [y for _, y in stars], "X", color=style.BEST, markeredgecolor="white", markersize=9,
+            *_displayed(stars, factors), "X", color=style.BEST, markeredgecolor="white", markersize=9,
             label="θ* of a repetition", clip_on=False, zorder=4,
         )  # fmt: skip
         rows += [[name, "theta*", names[0], x, names[1], y, ""] for x, y in stars]

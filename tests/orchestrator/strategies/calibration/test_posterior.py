@@ -24,6 +24,7 @@ from orchestrator.strategies.calibration.posterior_summary import (
     RemainingDiscrepancy,
     central,
     left_open,
+    posterior_found,
     region,
 )
 from orchestrator.strategies.campaign_plan import MeasuredPour
@@ -228,6 +229,19 @@ def test_theta_file_says_what_calibration_left_over_of_its_training_pours(determ
 def test_the_posterior_is_drawn(determined: Any, tmp_path: Path) -> None:
     figure = draw_posterior(determined.found.posterior, PARAMETERS, determined.found.theta.model_dump())
     assert is_picture(save(figure, tmp_path / "posterior.png"))
+
+
+def test_lengths_of_the_posterior_are_drawn_in_the_units_of_its_axes() -> None:
+    space = Space((PARAMETERS.axes[0], Axis("receiver_x", -0.025, 0.025)))
+    points = tuple((0.5, 0.8 + 0.002 * k) for k in range(20))
+    found = posterior_found(Posterior(points, (0.01,) * 20, 20.0), space)
+    figure = draw_posterior(found, space, space.decode((0.5, 0.82)))
+    across = figure.axes[3]
+    assert across.get_xlabel() == "receiver x [mm]"
+    (star,) = [line for line in across.lines if line.get_label() == "θ*"]
+    assert star.get_xdata()[0] == pytest.approx(16.0)  # type: ignore[index]
+    cloud = next(line for line in figure.axes[2].lines if line.get_label() == "a draw")
+    assert min(cloud.get_ydata()) == pytest.approx(15.0)  # type: ignore[arg-type]
 
 
 def test_a_prediction_takes_turns_with_thetas_of_the_posterior(tmp_path: Path) -> None:
