@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import signal
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -50,6 +51,14 @@ WITH_PROCESSES = tuple(
     Path(__file__).parent / name for name in ("actors", "plugins", "orchestrator/commands", "orchestrator/daemon")
 )
 """Folders where many tests start processes or threads: a stalled machine may fail one, which is tried once more."""
+
+
+@pytest.fixture(autouse=True)
+def not_quiet() -> None:
+    """A command with `--quiet` in this process makes later ones quiet that a test calls without their options."""
+    if (console := sys.modules.get("orchestrator.cli.console")) is not None:
+        console.set_quiet(False)
+
 
 PART = "DECANT_TESTS_PART"
 """Variable '2/4': of the files with tests that were chosen, each fourth one, from the second on."""

@@ -1,6 +1,6 @@
 """Console output of the commands: messages on stderr, results on stdout, refusals with exit codes, and progress.
 
-- `print_message` and `print_note` print on stderr; `--quiet` suppresses the latter.
+- `print_message`, `print_warning` and `print_note` print on stderr; `--quiet` suppresses the last one.
 - `print_json` prints a result as one line.
 - `RefusalError` ends a command with a message and an exit code.
 - `WaitingIndicator` and `waiting_for` report slow work: nothing for some seconds, then a line that is kept current.
@@ -71,6 +71,11 @@ def set_quiet(quiet: bool) -> bool:
 def is_quiet() -> bool:
     """Whether `--quiet` was given."""
     return _quiet
+
+
+def print_warning(text: object) -> None:
+    """Print a warning, also with `--quiet`."""
+    print_message(f"warning: {text}")
 
 
 def print_note(text: str) -> None:

@@ -18,6 +18,7 @@ from orchestrator.cli.console import (
     print_json,
     print_message,
     print_note,
+    print_warning,
 )
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ def dose_plan(
         doses = _planned_doses(amounts, tolerance, scene.receiver.name)
         series = DispensePlan((scene,), doses, 0.0, as_left, plan.laboratory.name)
     small = dataclasses.replace(plan, name=f"{plan.name}-dose", calibration=None, deployment=None, dispense=series)
-    problems = check_campaign(small, as_written=not amounts, warn=lambda problem: print_note(f"warning: {problem}"))
+    problems = check_campaign(small, as_written=not amounts, warn=print_warning)
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     return small

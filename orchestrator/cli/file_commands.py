@@ -23,7 +23,7 @@ from orchestrator.cli.console import (
     WaitingIndicator,
     print_json,
     print_message,
-    print_note,
+    print_warning,
 )
 
 
@@ -72,7 +72,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
 
             built = build_vessel(load_vessel(path))
             for text in built.warnings:
-                print_note(f"warning: {path}: {text}")
+                print_warning(f"{path}: {text}")
             return f"vessel, holds {1e6 * built.capacity:.4g} mL to the brim", []
         case "laboratory":
             return f"laboratory, {load_laboratory(path).mode}", []
@@ -81,7 +81,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
 
             recording = load_recording(path)
             for warning in recording.warnings:
-                print_note(f"warning: {warning}")
+                print_warning(warning)
             return f"recorded pour, {len(recording.readings)} readings, {1e3 * recording.gain:.4g} g", []
         case "study":
             from orchestrator.study.study_file import load_study
@@ -98,9 +98,9 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
 
             plan = load_campaign(path)
             warned: list[str] = []
-            problems = check_campaign(plan, warn=lambda problem: warned.append(f"warning: {problem}"), doing=doing)
+            problems = check_campaign(plan, warn=lambda problem: warned.append(str(problem)), doing=doing)
             for text in dict.fromkeys(warned):
-                print_note(text)
+                print_warning(text)
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
 
 

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import EnableMotion, InProcess, Json, OtherLaboratory
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message, waiting_for
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    Refused,
+    print_json,
+    print_message,
+    print_warning,
+    waiting_for,
+)
 
 if TYPE_CHECKING:
     from orchestrator.recordings.first_day import DayStep
@@ -115,7 +124,7 @@ def _day_of(folder: Path) -> list[PourRecording]:
         found = load_recordings([folder])
     for one in found:
         for warning in one.warnings:
-            print_message(f"warning: {warning}")
+            print_warning(warning)
     return found
 
 

@@ -28,6 +28,7 @@ from orchestrator.cli.console import (
     is_quiet,
     print_message,
     print_note,
+    print_warning,
     stdout_for_results,
 )
 
@@ -67,7 +68,7 @@ def check_campaign_can_run(request: RunRequest) -> None:
     with WaitingIndicator() as doing:
         report = RunService().check(request, doing=doing)
     for text in report.warnings:
-        print_note(f"warning: {text}")
+        print_warning(text)
     with Refused(RunTaskError):
         report.require()
 

@@ -23,7 +23,16 @@ from orchestrator.cli.command_options import (
     OtherLaboratory,
     SceneName,
 )
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message, print_note
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    FAILED,
+    RefusalError,
+    Refused,
+    print_json,
+    print_message,
+    print_note,
+    print_warning,
+)
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Executed, PathReport, PlannedPour
@@ -142,7 +151,7 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     with Refused(ValueError, at="--set: "):
         action = assigned_action(assignments, fixed=scene.fixed, space=space)
     wanted = wanted_in(plan, scene, scene_name)
-    problems = check_vessels(scene, plan.source, wanted, warn=lambda problem: print_note(f"warning: {problem}"))
+    problems = check_vessels(scene, plan.source, wanted, warn=print_warning)
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     if not plan.laboratory.pours:

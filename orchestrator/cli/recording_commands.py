@@ -18,6 +18,7 @@ from orchestrator.cli.console import (
     print_json,
     print_message,
     print_note,
+    print_warning,
     waiting_for,
 )
 from orchestrator.cli.shell_completion import RUNS, local_runs
@@ -192,7 +193,7 @@ def _loaded(paths: Sequence[Path]) -> list[PourRecording]:
         found = load_recordings(paths)
     for one in found:
         for warning in one.warnings:
-            print_message(f"warning: {warning}")
+            print_warning(warning)
     return found
 
 

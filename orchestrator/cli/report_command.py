@@ -8,7 +8,14 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    RefusalError,
+    Refused,
+    print_json,
+    print_note,
+    print_warning,
+)
 from orchestrator.cli.shell_completion import RUNS, files_of, local_runs
 
 
@@ -83,7 +90,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
     with Refused(JournalFormatError, code=BAD_INPUT):
         check = check_journal(folder / JOURNAL_NAME)
     for problem in check.problems:
-        print_message(f"warning: {problem}")
+        print_warning(problem)
     try:
         try:
             plan = load_campaign(folder / RESOLVED)
@@ -92,7 +99,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
             reason = f"Its campaign or its results can't be read: {error}"
             if missing := missing_plugins(read_versions(folder)):
                 reason = f"Not installed here: {'; '.join(missing)}. Install what is missing for the whole report."
-            print_message(f"warning: the report is reduced to what the journal has. {reason}")
+            print_warning(f"the report is reduced to what the journal has. {reason}")
             return write_reduced_report(output or folder / REPORT_NAME, folder, reason), []
         print_note("drawing the figures …")
         if publish_if_missing(plan, result):

@@ -31,6 +31,7 @@ from orchestrator.cli.console import (
     Refused,
     print_json,
     print_note,
+    print_warning,
     stdout_for_results,
     waiting_for,
 )
@@ -141,7 +142,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     check_output(options.rrd, "--rrd", ".rrd")
     check_output(options.png, "--png", ".png")
     wanted = wanted_in(plan, scene, options.scene)
-    problems = check_vessels(scene, plan.source, wanted, warn=lambda problem: print_note(f"warning: {problem}"))
+    problems = check_vessels(scene, plan.source, wanted, warn=print_warning)
     if problems:
         raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
     frame_rate = 20.0 if options.rrd or options.png else 0.0

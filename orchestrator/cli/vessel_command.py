@@ -16,7 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import BAD_INPUT, RefusalError, print_json, print_message, print_note, waiting_for
+from orchestrator.cli.console import (
+    BAD_INPUT,
+    RefusalError,
+    print_json,
+    print_note,
+    print_warning,
+    waiting_for,
+)
 
 if TYPE_CHECKING:
     from sim_engine.vessel.shapes import LengthUnit
@@ -133,7 +140,7 @@ def vessel(
     for note in found.notes:
         print_note(f"note: {note}")
     for doubt in found.doubts:
-        print_message(f"warning: {doubt}")
+        print_warning(doubt)
     print_note(f"{out} holds {1e6 * found.capacity:.0f} ± {1e6 * found.deviation:.1f} mL; its picture: {found.picture}")
     if as_json:
         print_json(

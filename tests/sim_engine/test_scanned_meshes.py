@@ -16,7 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from typer.testing import CliRunner
 
+from orchestrator.cli.app import app
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.file_commands import validate
 from orchestrator.cli.vessel_command import vessel
@@ -230,6 +232,12 @@ def vessel_file(folder: Path, kind: str) -> Path:
     with_liquid(kind).export(folder / "cup.stl")
     (folder / "cup.yaml").write_text("name: cup\nmesh: cup.stl\nunit: mm\n")
     return folder / "cup.yaml"
+
+
+def test_a_quiet_command_prints_warnings(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["validate", "--quiet", str(vessel_file(tmp_path, "body"))])
+    assert result.exit_code == 0
+    assert "fills a part of the cavity and counts as solid" in result.stderr
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,10 @@ def test_quiet_leaves_notes_out_and_nothing_else(campaign: Path) -> None:
     write(campaign, "far.yaml", small_campaign.CAMPAIGN.replace("[60 mm, 100 mm]", "[200 mm, 300 mm]"))
     loud, quiet = invoke("validate far.yaml"), invoke("validate --quiet far.yaml")
     assert loud.stderr.startswith("warning: far.yaml:27:64: ")
-    assert (quiet.stderr, quiet.stdout) == ("", loud.stdout)
+    assert (quiet.stderr, quiet.stdout) == (loud.stderr, loud.stdout)
+    bowl = "--height '50 mm' --diameters '1 mm: 100 mm, 50 mm: 160 mm' --wall '0.4 mm'"
+    assert "too thin" in invoke(f"vessel bowl.yaml {bowl}").stderr
+    assert invoke(f"vessel --quiet bowl-2.yaml {bowl}").stderr == ""
     write(campaign, "bad.yaml", small_campaign.CAMPAIGN.replace("pours: 2", "pour: 2"))
     assert "did you mean 'pours'?" in invoke("validate -q bad.yaml").stderr
     assert invoke("validate far.yaml").stderr == loud.stderr, "the next command is as loud as before"
