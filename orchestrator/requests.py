@@ -13,7 +13,7 @@ from statistics import NormalDist
 from typing import Literal
 
 from actors.interfaces import DoseTarget
-from actors.optimizer.questions import Suggestion, SuggestionQuery
+from actors.optimizer.questions import WRITTEN_IF_SET, Suggestion, SuggestionQuery
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
@@ -24,9 +24,6 @@ _NORMAL = NormalDist()
 
 ADDED = "added"
 """Purpose of a pour that somebody made and weighed without being asked."""
-
-WRITTEN_IF_SET = {"written": "if set"}
-"""Metadata of a field that journal and events leave out while it is None."""
 
 NOT_WRITTEN = {"written": False}
 """Metadata of a field that the journal leaves out."""

@@ -8,12 +8,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Literal
 
 from sim_engine.search_space import Space
 
 Numbers = tuple[float, ...]
+
+WRITTEN_IF_SET = {"written": "if set"}
+"""Metadata of a field that journal and events leave out while it is None."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +161,22 @@ class Linear:
 
 
 @dataclass(frozen=True)
+class RememberedGroup:
+    """Prior of some axes from earlier campaigns: independent normals, truncated to the unit cube, or else uniform.
+
+    Attributes:
+        axes: indices of the axes.
+        centres, deviations: of the normals, one for each axis.
+        weight: prior probability of the normals; the axes are uniform with the rest.
+    """
+
+    axes: tuple[int, ...]
+    centres: Numbers
+    deviations: Numbers
+    weight: float
+
+
+@dataclass(frozen=True)
 class PosteriorQuestion:
     """Weighed pours, for the posterior of θ.
 
@@ -168,6 +187,7 @@ class PosteriorQuestion:
         count: number of requested draws.
         prior: centre and standard deviation of a normal along every axis of the unit cube, truncated at its faces; with
             a deviation of 0 the axis is uniform. Empty: all axes are uniform.
+        memory: priors from earlier campaigns, each a factor on `prior`; None without any.
     """
 
     contexts: tuple[Point, ...]
@@ -175,6 +195,7 @@ class PosteriorQuestion:
     noise: float
     count: int = 200
     prior: tuple[tuple[float, float], ...] = ()
+    memory: tuple[RememberedGroup, ...] | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)
@@ -199,11 +220,13 @@ class Posterior:
         points: in the unit cube.
         discrepancies: standard deviation of the remaining discrepancy of each draw.
         effective: effective number of independent draws of the chain.
+        held: probability of each group of the question's memory; None without any.
     """
 
     points: tuple[Point, ...]
     discrepancies: tuple[float, ...]
     effective: float
+    held: Numbers | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)

@@ -130,9 +130,11 @@ def posterior_of(
     """Return draws of θ given weighed pours."""
     contexts = array(question.contexts, query.context_dimension)
     if not len(contexts):
-        drawn = drawn_beforehand(question.count, query.space.dimension, array(question.prior, 2), rng)
+        prior, memory = array(question.prior, 2), question.memory or ()
+        drawn = drawn_beforehand(question.count, query.space.dimension, prior, rng, memory)
         lack = (DISCREPANCY_PRIOR[0],) * question.count
-        return Posterior(tuples(region.snap(drawn)), lack, float(question.count))
+        held = None if question.memory is None else tuple(group.weight for group in memory)
+        return Posterior(tuples(region.snap(drawn)), lack, float(question.count), held)
     sampled = sample_posterior(
         model.process,
         contexts,
@@ -142,8 +144,10 @@ def posterior_of(
         snap=region.snap,
         rng=rng,
         prior=array(question.prior, 2),
+        memory=question.memory or (),
     )
-    return Posterior(tuples(sampled.points), tuple(map(float, sampled.discrepancies)), sampled.effective)
+    held = None if question.memory is None else sampled.held
+    return Posterior(tuples(sampled.points), tuple(map(float, sampled.discrepancies)), sampled.effective, held)
 
 
 def design_of(
@@ -500,6 +504,12 @@ def _check_posterior(query: CalibrationQuery) -> None:
         raise ValueError("posterior: offsets and noise must be finite, the noise not negative")
     if not 1 <= question.count <= 2000:
         raise ValueError(f"posterior: count = {question.count} is outside 1 … 2000")
+    for group in question.memory or ():
+        sizes = {len(group.axes), len(group.centres), len(group.deviations)}
+        if len(sizes) > 1 or not all(0 <= axis < query.space.dimension for axis in group.axes):
+            raise ValueError(f"posterior: the memory of the axes {group.axes} does not fit the space")
+        if not (all(deviation > 0.0 for deviation in group.deviations) and 0.0 < group.weight < 1.0):
+            raise ValueError("posterior: a memory needs deviations above 0 and a weight between 0 and 1")
 
 
 def _check_constraints(query: SuggestionQuery) -> None:

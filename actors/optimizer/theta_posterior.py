@@ -7,7 +7,7 @@ the uncertainty of predictions most.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from scipy.stats import qmc
 
 from actors.optimizer.covariance import matern
 from actors.optimizer.gaussian_process import GaussianProcess
+from actors.optimizer.questions import RememberedGroup
 
 Array = NDArray[np.float64]
 
@@ -43,11 +44,13 @@ class Sampled:
         points: (count, dimension), in the unit cube.
         discrepancies: (count,) sampled standard deviations of the remaining discrepancy, in the cost's unit.
         effective: effective number of independent draws of the chain.
+        held: posterior probability of each remembered group.
     """
 
     points: Array
     discrepancies: Array
     effective: float
+    held: tuple[float, ...] = ()
 
 
 def sample_posterior(
@@ -60,6 +63,7 @@ def sample_posterior(
     snap: Callable[[Array], Array],
     rng: np.random.Generator,
     prior: Array | None = None,
+    memory: Sequence[RememberedGroup] = (),
 ) -> Sampled:
     """Draw θ from p(θ | pours) ∝ p(θ) N(e(θ); 0, S(θ) + n² I + σ_δ² M), θ in the cube.
 
@@ -79,9 +83,12 @@ def sample_posterior(
         rng: random number generator.
         prior: p(θ), (dimension, 2) centres and deviations of normals in the cube; uniform along axes with a deviation
             of 0, and along all axes without any row.
+        memory: factors on p(θ), each a mixture of normals and a uniform part that is heavier than their tails. Pours
+            that contradict the normals thus take their weight.
 
     Source: Kennedy & O'Hagan, Bayesian calibration of computer models, 2001; Goodman & Weare, Ensemble samplers with
-    affine invariance, 2010.
+    affine invariance, 2010; robust mixture of a prior from earlier trials: Schmidli et al., Robust
+    meta-analytic-predictive priors in clinical trials with historical control information, Biometrics 2014.
     Limitations: the surrogate's hyperparameters and M's lengthscale are taken as known.
     """
     n, dimension = len(contexts), process.points.shape[1] - contexts.shape[1]
@@ -99,11 +106,15 @@ def sample_posterior(
             values[inside] = likelihood(x[inside, :dimension], np.exp(logs))
             values[inside] -= 0.5 * ((logs - math.log(median)) / width) ** 2
             values[inside] -= 0.5 * (((x[inside, :dimension] - centres) * precision) ** 2).sum(axis=1)
+            for group in memory:
+                values[inside] += np.log(group.weight * _remembered(group, x[inside]) + 1.0 - group.weight)
         return values
 
     assert n > 0
     starts = qmc.Sobol(dimension + 1, rng=rng).random(STARTS)
     starts[:, dimension] = math.log(median) + width * (2.0 * starts[:, dimension] - 1.0)
+    for group in memory:  # every second start: a narrow memory would hold few points of an even design
+        _to_memory(starts, group, np.arange(STARTS) % 2 == 1)
     at_starts = density(starts)
     weights = np.exp(at_starts - at_starts.max())
     # As many different starts as walkers / 2 span all directions: an ensemble never leaves the subspace in which it
@@ -117,16 +128,45 @@ def sample_posterior(
     kept = chain[BURN_IN:]
     flat = kept.reshape(-1, dimension + 1)
     chosen = flat[np.linspace(0, len(flat) - 1, count).round().astype(int)]
-    return Sampled(snap(chosen[:, :dimension]), np.exp(chosen[:, dimension]), _effective(kept))
+    held = []
+    for group in memory:
+        share = group.weight * _remembered(group, flat)
+        held.append(float(np.mean(share / (share + 1.0 - group.weight))))
+    return Sampled(snap(chosen[:, :dimension]), np.exp(chosen[:, dimension]), _effective(kept), tuple(held))
 
 
-def drawn_beforehand(count: int, dimension: int, prior: Array, rng: np.random.Generator) -> Array:
-    """Draws (count, dimension) of θ from its prior: uniform in the cube, normal along the axes of `prior`."""
+def _remembered(group: RememberedGroup, points: Array) -> Array:
+    """Density (m,) of a group's truncated normals at points (m, at least the dimension)."""
+    centres, deviations = np.array(group.centres), np.array(group.deviations)
+    z = (points[:, list(group.axes)] - centres) / deviations
+    inside = ndtr((1.0 - centres) / deviations) - ndtr(-centres / deviations)
+    norms = np.log(deviations * np.maximum(inside, 1e-9)) + 0.5 * math.log(2.0 * math.pi)
+    return np.asarray(np.exp(-0.5 * (z**2).sum(axis=1) - norms.sum()))
+
+
+def _to_memory(points: Array, group: RememberedGroup, rows: NDArray[np.bool_]) -> None:
+    """Move uniform points to the same quantiles of a group's normals, in place."""
+    for axis, centre, deviation in zip(group.axes, group.centres, group.deviations, strict=True):
+        points[rows, axis] = _quantiles(points[rows, axis], centre, deviation)
+
+
+def _quantiles(u: Array, centre: float, deviation: float) -> Array:
+    """Quantiles of a normal that is truncated to the unit interval."""
+    low, high = ndtr((np.array([0.0, 1.0]) - centre) / deviation)
+    return np.asarray(np.clip(centre + deviation * ndtri(low + u * (high - low)), 0.0, 1.0))
+
+
+def drawn_beforehand(
+    count: int, dimension: int, prior: Array, rng: np.random.Generator, memory: Sequence[RememberedGroup] = ()
+) -> Array:
+    """Draws (count, dimension) of θ from its prior: uniform in the cube, normal along the axes of `prior`, and from the
+    mixtures of a memory."""
     points = qmc.Sobol(dimension, rng=rng).random(2 ** math.ceil(math.log2(max(count, 2))))[:count]
     for i, (centre, deviation) in enumerate(prior):
         if deviation > 0.0:
-            low, high = ndtr((np.array([0.0, 1.0]) - centre) / deviation)
-            points[:, i] = np.clip(centre + deviation * ndtri(low + points[:, i] * (high - low)), 0.0, 1.0)
+            points[:, i] = _quantiles(points[:, i], centre, deviation)
+    for group in memory:
+        _to_memory(points, group, rng.random(len(points)) < group.weight)
     return np.asarray(points)
 
 

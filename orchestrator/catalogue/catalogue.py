@@ -1,4 +1,4 @@
-"""The catalogue of this machine's runs: one SQLite file with the tables `run`, `pour`, `tag` and `note`.
+"""The catalogue of this machine's runs: one SQLite file with the tables `run`, `pour`, `posterior`, `tag` and `note`.
 
 - `CatalogueClient` is the interface for the command line, the HTTP API and the library. `Catalogue` implements it on
   this machine, and the daemon's client implements it for another one.
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, annotate
 from orchestrator.catalogue.export import write_tables
@@ -29,9 +29,12 @@ from orchestrator.journal.run_record import Row, read_header
 from orchestrator.run_errors import RunError
 from orchestrator.states import RESTING
 
+if TYPE_CHECKING:
+    from orchestrator.config.campaign_prior import KnownPosterior, PosteriorSource
+
 INDEX_NAME = "catalogue.sqlite"
 
-FORMAT = 3
+FORMAT = 4
 """Version of the index's content; an index of another version is rebuilt."""
 
 
@@ -73,6 +76,24 @@ class CatalogueClient(Protocol):
 
         Returns 'files' and the numbers of 'runs' and 'pours'. Raises MissingExtraError, OSError.
         """
+
+
+def posterior_source() -> PosteriorSource:
+    """The posteriors of this machine, for a campaign that is being loaded."""
+    from orchestrator.config.campaign_prior import PosteriorSource
+    from orchestrator.runs.run_folder import simulator_version
+
+    def every() -> list[KnownPosterior]:
+        with Catalogue() as catalogue:
+            catalogue.refresh()
+            return catalogue.posteriors()
+
+    def of_run(name: str) -> KnownPosterior:
+        with Catalogue() as catalogue:
+            catalogue.refresh()
+            return catalogue.posterior(name)
+
+    return PosteriorSource(simulator_version(), every, of_run)
 
 
 @dataclass
@@ -203,6 +224,36 @@ class Catalogue:
         files = write_tables(tables, folder, formats)
         return {"files": [str(path) for path in files], **{f"{name}s": len(rows) for name, rows in tables.items()}}
 
+    def posteriors(self) -> list[KnownPosterior]:
+        """The posteriors of all calibrations, the oldest first, and then the imported ones of other runs.
+
+        Raises:
+            RunError, OSError: an imported one can't be read.
+        """
+        from orchestrator.catalogue.known_posteriors import imported  # slow import
+        from orchestrator.config.campaign_prior import KnownPosterior
+
+        query = "select content from posterior join run using (path) order by begun, path"
+        found = [KnownPosterior.model_validate_json(row[0]) for row in self._connection.execute(query)]
+        own = {one.posterior for one in found}
+        return [*found, *(one for one in imported(self.state) if one.posterior not in own)]
+
+    def posterior(self, name: str) -> KnownPosterior:
+        """The posterior of a run, or an imported one.
+
+        Raises:
+            RunError: there is no such run, or it has none; the text gives the reason.
+        """
+        from orchestrator.catalogue.known_posteriors import imported, posterior_of
+
+        try:
+            return posterior_of(Path(self._find(name)["path"]))
+        except NoSuchRunError:
+            for known in imported(self.state):
+                if known.posterior == name:
+                    return known
+            raise
+
     def _find(self, name: str) -> Row:
         path = str(Path(name).absolute())
         runs = self._rows("run", "path = ?", [path])
@@ -246,6 +297,7 @@ class Catalogue:
             self._connection.execute(query, [path, run.get("run"), run.get("begun")])
             self._insert("run", [[*_stored("run", run), stamp]])
             self._insert("pour", [_stored("pour", pour) for pour in read.pours])
+            self._insert("posterior", [[path, read.posterior]] if read.posterior else [])
             self._insert("tag", [[path, tag] for tag in annotations.tags])
             self._insert("note", [[path, note.time, note.by, note.text] for note in annotations.notes])
 
@@ -269,13 +321,14 @@ def _layout() -> Iterator[str]:
     own = {name: [c for c in columns if c.name not in _ANNOTATIONS] for name, columns in TABLES.items()}
     declared = {name: ", ".join(f"{c.name} {_TYPES[c.type]}" for c in columns) for name, columns in own.items()}
     yield "drop view if exists runs"
-    for table in ("note", "tag", "pour", "run"):
+    for table in ("note", "tag", "posterior", "pour", "run"):
         yield f"drop table if exists {table}"
     yield f"create table run ({declared['run'].replace('path text', 'path text primary key')}, stamp text) strict"
     yield f"create table pour ({declared['pour'].replace('path text', _BELONGS)}) strict"
+    yield f"create table posterior ({_BELONGS}, content text) strict"
     yield f"create table tag ({_BELONGS}, tag text) strict"
     yield f"create table note ({_BELONGS}, time real, by text, text text) strict"
-    for table in ("pour", "tag", "note"):
+    for table in ("pour", "posterior", "tag", "note"):
         yield f"create index {table}_by_path on {table} (path)"
     columns = [f"state_now(state, path) as {c.name}" if c.name == "state" else c.name for c in own["run"]]
     for name, text in (("tags", "tag"), ("notes", "text")):

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from orchestrator.catalogue.annotations import Annotations, AnnotationsError, Note, read_annotations
 from orchestrator.journal.codec import CodecError, from_json
 from orchestrator.journal.events import StageClosed
-from orchestrator.journal.run_record import Row, RunPour, read_record
+from orchestrator.journal.run_record import Row, RunPour, RunState, read_record
 from orchestrator.run_errors import RunError
 from orchestrator.runs.prior_data import scenes_in
 from orchestrator.strategies.stage_result import displayed_action
@@ -167,10 +167,12 @@ UNREADABLE = "unreadable"
 
 @dataclass(frozen=True)
 class RunRead:
-    """The catalogue's content of a run: rows by the names of the columns, and its tags and notes."""
+    """The catalogue's content of a run: rows by the names of the columns, its posterior (JSON; '' without one), and its
+    tags and notes."""
 
     run: Row
     pours: list[Row] = field(default_factory=list)
+    posterior: str = ""
     annotations: Annotations = field(default_factory=Annotations)
 
 
@@ -179,7 +181,7 @@ def read_run(directory: Path) -> RunRead:
     annotations = Annotations()
     try:
         annotations = read_annotations(directory)
-        return RunRead(*_rows(directory), annotations)
+        return RunRead(*_rows(directory), annotations=annotations)
     except (RunError, CodecError, AnnotationsError, OSError) as error:
         return unreadable(directory, str(error), annotations)
     except Exception as error:  # damaged content can cause any error, and must not hide other runs
@@ -196,8 +198,8 @@ def unreadable(directory: Path, problem: str, annotations: Annotations) -> RunRe
     return RunRead(row, annotations=annotations)
 
 
-def _rows(directory: Path) -> tuple[Row, list[Row]]:
-    """The row of a run and those of its pours."""
+def _rows(directory: Path) -> tuple[Row, list[Row], str]:
+    """The row of a run, those of its pours, and its posterior."""
     record = read_record(directory)
     plan = record.header.fingerprint
     laboratory = plan.get("laboratory") or {}
@@ -226,7 +228,18 @@ def _rows(directory: Path) -> tuple[Row, list[Row]]:
         "spilled_g": sum(row.get("spilled_g") or 0.0 for row in pours),
     }
     receivers = {name: scene["receiver"]["name"] for name, scene in scenes.items()}
-    return run | _result_columns(record.closed.values(), receivers), pours
+    return run | _result_columns(record.closed.values(), receivers), pours, _posterior(directory, record)
+
+
+def _posterior(directory: Path, record: RunState) -> str:
+    if not any(from_json(event.encoded).get("kind") == "calibration" for event in record.closed.values()):
+        return ""
+    from orchestrator.catalogue.known_posteriors import NoPosteriorError, posterior_of  # slow import
+
+    try:
+        return posterior_of(directory, record).model_dump_json()
+    except NoPosteriorError:
+        return ""
 
 
 def _pour(pour: RunPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> Row:

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, create_model
 
 from actors.laboratory_settings import LaboratorySettings
+from orchestrator.config.campaign_prior import AnyPrior
 from orchestrator.config.search_ranges import Actions, Motion, Parameters
 from orchestrator.config.vessel_file import VesselFile
 from orchestrator.strategies.campaign_plan import (
@@ -382,6 +383,10 @@ class CampaignFile(Settings):
 
     dispense: DispenseSettings | None = None
     """A series of wanted amounts."""
+
+    prior: AnyPrior | None = None
+    """Prior of the parameters from earlier campaigns: 'catalogue' for all that fit, or a list of runs and files of
+    posteriors. A run's record has the resolved one."""
 
     on_unknown: Literal["ask", "repeat"] = "ask"
     """Treatment on resume of a pour that had started and has no outcome; 'repeat' on a virtual bench only."""

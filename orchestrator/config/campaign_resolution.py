@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Linear
+from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.config.campaign_file import (
     CalibrationSection,
     CampaignFile,
@@ -26,6 +27,7 @@ from orchestrator.config.campaign_file import (
     StageSettings,
     owners_of_priors,
 )
+from orchestrator.config.campaign_prior import PriorNeeds, PriorSettings, resolve_prior
 from orchestrator.config.run_snapshot import as_file
 from orchestrator.config.scene_builder import SceneBuilder
 from orchestrator.config.search_ranges import ParametersBase
@@ -34,6 +36,7 @@ from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.section_validation import PlacedProblems
 from orchestrator.config.yaml.yaml_source import Place, Report
+from orchestrator.strategies.calibration.campaign_memory import CampaignMemory
 from orchestrator.strategies.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
@@ -355,6 +358,14 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     dispense = None
     if file.dispense is not None:
         dispense = resolve_dispense(file.dispense, builder, root.at("dispense"), laboratory)
+    memory = None
+    in_force = default if parameters is None else default | parameters.in_force()
+    if file.prior is not None and laboratory is not None and not report.problems:
+        memory = _memory(file, parameters, calibration, deployment, laboratory, root.at("prior"), references)
+    if memory is not None and calibration is not None:
+        calibration = replace(calibration, memory=memory)
+    elif memory is not None and deployment is not None:
+        deployment, in_force = replace(deployment, memory=memory), in_force | memory.means
     broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
     if not broken and (file.calibration is None or file.calibration.actions is not None):
         builder.refuse_prior(file.actions, root, "decides nothing: no calibration takes its actions from here")
@@ -367,7 +378,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         return None
     directory = file.outputs.folder if file.outputs.directory is None else root.directory / file.outputs.directory
     outputs = file.outputs.model_copy(update={"directory": str(resolved(directory))})
-    in_force = default if parameters is None else default | parameters.in_force()
+    record = {"outputs": outputs} | ({} if memory is None else {"prior": PriorSettings.of(memory)})
     return CampaignPlan(
         name=file.name,
         seed=file.seed,
@@ -379,10 +390,49 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
         outputs=outputs,
         parallel_simulations=file.parallel_simulations,
         on_unknown=file.on_unknown,
-        resolved=as_file(file.model_copy(update={"outputs": outputs}), root, references),
+        resolved=as_file(file.model_copy(update=record), root, references),
         laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
         dispense=dispense,
     )
+
+
+def _memory(
+    file: CampaignFile,
+    parameters: ParametersBase | None,
+    calibration: CalibrationPlan | None,
+    deployment: DeploymentPlan | None,
+    laboratory: LaboratorySettings,
+    place: Place,
+    references: References,
+) -> CampaignMemory | None:
+    """The prior of a campaign from earlier ones; None after a problem."""
+    report, infos = references.report, SimulationParameters.info()
+    if calibration is not None and not calibration.settings.makes_posterior:
+        report.add(place, f"belongs to C4; {calibration.strategy} takes all values for alike", key=True)
+        return None
+    if calibration is not None:
+        needs = PriorNeeds(
+            scene=calibration.scene,
+            laboratory=laboratory,
+            wanted={axis.name: (axis.lower, axis.upper) for axis in calibration.parameters.axes},
+            fixed=calibration.fixed_parameters,
+            measured=frozenset(prior.name for prior in calibration.parameter_prior),
+        )
+    elif deployment is not None and deployment.settings.simulates:
+        fixed = {} if parameters is None else parameters.fixed()
+        needs = PriorNeeds(
+            scene=deployment.scenes[0],
+            laboratory=laboratory,
+            wanted={name: (info.lower, info.upper) for name, info in infos.items() if name not in fixed},
+            fixed=SimulationParameters().model_dump() | fixed,
+            why="the campaign fixes",
+        )
+    else:
+        what = "doses have none" if deployment is None else f"{deployment.strategy} simulates nothing"
+        report.add(place, f"tells about parameters of the simulator, and {what}; remove it", key=True)
+        return None
+
+    return resolve_prior(file.prior, needs, place, references, posterior_source)
 
 
 def _is_virtual(laboratory: LaboratorySettings) -> bool:

@@ -22,6 +22,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from actors.optimizer.questions import WRITTEN_IF_SET
 from orchestrator.journal.events import (
     CampaignOpened,
     Event,
@@ -31,7 +32,7 @@ from orchestrator.journal.events import (
     SpeculationProgressed,
     StrategyProgressed,
 )
-from orchestrator.requests import WRITTEN_IF_SET, Suggest, Suggested
+from orchestrator.requests import Suggest, Suggested
 
 PASSING = (PourProgressed, StrategyProgressed, SpeculationProgressed)
 """Progress events. Each replaces the one before it, so they are not stored on disk."""

@@ -24,7 +24,8 @@ from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get
 
 from pydantic import BaseModel, ValidationError
 
-from orchestrator.requests import WRITTEN_IF_SET, Outcome, Request
+from actors.optimizer.questions import WRITTEN_IF_SET
+from orchestrator.requests import Outcome, Request
 from orchestrator.run_errors import RunError
 from orchestrator.strategies.stage_result import StageResult
 

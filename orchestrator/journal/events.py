@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from actors.interfaces import PourProgress
+from actors.optimizer.questions import WRITTEN_IF_SET
 from orchestrator.journal.codec import (
     CodecError,
     Results,
@@ -29,7 +30,7 @@ from orchestrator.journal.codec import (
     to_json,
     written_fields,
 )
-from orchestrator.requests import NOT_WRITTEN, WRITTEN_IF_SET, Decision, Outcome, Pour, Request
+from orchestrator.requests import NOT_WRITTEN, Decision, Outcome, Pour, Request
 from orchestrator.run_clock import run_time
 from orchestrator.states import State
 from orchestrator.strategies.stage_result import StageResult

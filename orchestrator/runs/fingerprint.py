@@ -16,8 +16,8 @@ from pydantic import BaseModel
 from actors.balance.scale_model import ScaleSettings
 from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.laboratory_settings import HiddenLiquidBase
+from actors.optimizer.questions import WRITTEN_IF_SET
 from orchestrator.journal.codec import to_json
-from orchestrator.requests import WRITTEN_IF_SET
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import Scene

@@ -6,6 +6,8 @@ journal itself is in `orchestrator.journal`.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import importlib.metadata
 import json
 import platform
@@ -16,7 +18,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from orchestrator.catalogue.run_registry import register
+from orchestrator.catalogue.run_registry import make_state_directory, register, state_directory
 from orchestrator.installed_plugins import packages as plugin_packages
 from orchestrator.journal.codec import digest
 from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
@@ -27,9 +29,14 @@ from orchestrator.states import State
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.engine_package import engine_version
 from sim_engine.settings.plugin_registry import DISTRIBUTION
+from sim_engine.solver_fingerprint import ROOT, folder_digest, solver_fingerprint
 
 RESOLVED, VERSIONS = "resolved.json", "versions.json"
 """Files with the resolved plan of a run and with the versions of the program that began it."""
+
+
+SIMULATOR, SIMULATOR_FILE = "simulator", "simulator.json"
+"""Key of the solver's version in `versions.json`, and the file of the state directory that keeps it."""
 
 
 class RunNotFoundError(JournalError):
@@ -67,7 +74,10 @@ def create_run(plan: CampaignPlan) -> Path:
 def write_provenance(directory: Path, plan: CampaignPlan) -> None:
     """Write what is needed to reproduce the run: resolved.json (the plan) and versions.json."""
     _write_json(directory / RESOLVED, plan.resolved)
-    _write_json(directory / VERSIONS, {"campaign": str(plan.source), "seed": plan.seed, **versions()})
+    about = {"campaign": str(plan.source), "seed": plan.seed, **versions()}
+    if plan.calibration is not None and plan.calibration.settings.makes_posterior:
+        about[SIMULATOR] = simulator_version()
+    _write_json(directory / VERSIONS, about)
 
 
 def versions() -> dict[str, Any]:
@@ -93,6 +103,23 @@ def versions() -> dict[str, Any]:
         "packages": packages,
         "plugins": {name: sorted(set(added)) for name, (_, added) in plugins.items()},
     }
+
+
+@functools.cache
+def simulator_version() -> str:
+    """Version of the solver's code (`solver_fingerprint`). The state directory keeps it: parsing takes about a second."""
+    files, path = folder_digest(ROOT / "sim_engine"), None
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        path = state_directory() / SIMULATOR_FILE
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        if kept["files"] == files:
+            return str(kept["version"])
+    version = solver_fingerprint()
+    with contextlib.suppress(OSError):
+        if path is not None:
+            make_state_directory(path.parent)
+            _write_json(path, {"files": files, "version": version})
+    return version
 
 
 def missing_plugins(versions: Mapping[str, Any]) -> list[str]:

@@ -348,7 +348,7 @@ def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParam
 
 
 def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:
-    """The deployment with the known bench offsets, from earlier pours into a receiver or from the calibration.
+    """The deployment with the known bench offsets, from earlier pours into a receiver, the calibration or a memory.
 
     A calibration contributes if it searched nuisance parameters; parameters that it did not search keep their
     tolerances.
@@ -360,12 +360,19 @@ def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationPar
     ]
     if previous:
         return replace(deployment, bench=previous[-1].displacements())
+    nuisances = set(SimulationParameters.nuisances())
     found = calibrated_theta(results) if CALIBRATION in results else None
-    known = set(SimulationParameters.nuisances()).intersection(() if found is None else found.searched)
-    if found is None or found.posterior is None or not known:
+    if found is None and deployment.memory is not None:
+        known = nuisances.intersection(deployment.memory.means)
+        posterior = deployment.memory.thetas(best, POSTERIOR_DRAWS) if known else []
+    else:
+        known = nuisances.intersection(() if found is None else found.searched)
+        if found is None or found.posterior is None or not known:
+            return deployment
+        rows = found.posterior.thetas
+        posterior = [SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in rows]
+    if not posterior:
         return deployment
-    rows = found.posterior.thetas
-    posterior = [SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in rows]
     benches = drawn_benches(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
     return replace(deployment, bench=tuple(displacement(best, bench, deployment.actions) for bench in benches))
 

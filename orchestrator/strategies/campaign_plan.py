@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from actors.laboratory_settings import LaboratorySettings
-from actors.optimizer.questions import BenchOffset, Linear, Point
-from orchestrator.requests import WRITTEN_IF_SET
+from actors.optimizer.questions import WRITTEN_IF_SET, BenchOffset, Linear, Point
+from orchestrator.strategies.calibration.campaign_memory import CampaignMemory
 from orchestrator.strategies.deployment.objectives import Objectives
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
@@ -360,6 +360,7 @@ class CalibrationPlan(StagePlan):
         design: how the pours are chosen.
         design_simulations: simulations spent on choosing the pours of an active design.
         known: existing simulations that are added when the calibration begins.
+        memory: prior of searched parameters from earlier campaigns.
     """
 
     settings: CalibrationSettings
@@ -380,6 +381,7 @@ class CalibrationPlan(StagePlan):
     design: Design = "stratified"
     design_simulations: int = 0
     known: tuple[KnownSimulation, ...] = ()
+    memory: CampaignMemory | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property
     def scenes(self) -> tuple[Scene, ...]:
@@ -393,8 +395,12 @@ class CalibrationPlan(StagePlan):
 
     @property
     def uncalibrated(self) -> SimulationParameters:
-        """θ that is used without a calibration: the fixed values, and those that were measured before."""
+        """θ that is used without a calibration: the fixed values, and those that were measured or learned before."""
         measured = {prior.name: prior.mean for prior in self.parameter_prior}
+        means = {} if self.memory is None else self.memory.means
+        for axis in self.parameters.axes:
+            if axis.name in means:
+                measured[axis.name] = min(max(means[axis.name], axis.lower), axis.upper)
         return SimulationParameters.from_values(self.fixed_parameters | measured)
 
     @property
@@ -423,6 +429,7 @@ class DeploymentPlan(StagePlan):
         bench: equally likely offsets of the bench from the simulator; empty if nothing is known about it.
         left_over: residual shift of a calibration (`sim_engine.prediction_band`), given in the same case as `thetas`;
             None if unknown.
+        memory: what earlier campaigns tell, if no calibration of the same campaign uses it.
     """
 
     settings: DeploymentSettings
@@ -436,6 +443,7 @@ class DeploymentPlan(StagePlan):
     thetas: tuple[SimulationParameters, ...] = ()
     bench: tuple[BenchOffset, ...] = ()
     left_over: float | None = None
+    memory: CampaignMemory | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property
     def pours(self) -> int:

@@ -20,6 +20,7 @@ from actors.optimizer.questions import (
 )
 from orchestrator.requests import Decision, Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.strategies.calibration.action_prior import Contexts, actions_of_prior
+from orchestrator.strategies.calibration.campaign_memory import unit_memory
 from orchestrator.strategies.calibration.posterior_summary import unit_prior
 from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured, SimulatedPoint, Stratum
 from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan, NormalPrior
@@ -152,6 +153,7 @@ class ActivePours(DesignedPours):
             WEIGHED,
             DRAWS,
             unit_prior(self._plan),
+            unit_memory(self._plan.memory, self._plan.parameters),
         )
         query = CalibrationQuery(
             self._plan.parameters,

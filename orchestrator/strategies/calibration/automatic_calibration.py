@@ -5,26 +5,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from actors.optimizer.questions import (
     CalibrationQuery,
     Data,
     Point,
-    Posterior,
     PosteriorQuestion,
+    RememberedGroup,
     SpaceFillingQuery,
     Suggestion,
 )
 from orchestrator.requests import Decision, Outcome, Request, Simulate
 from orchestrator.strategies.calibration.action_prior import Contexts
 from orchestrator.strategies.calibration.calibration_base import THETA_MAP_RESOLUTION, Calibrated
+from orchestrator.strategies.calibration.campaign_memory import log_memory, remembered_point
 from orchestrator.strategies.calibration.pointwise_calibration import DiscrepancyOverPours, discrepancies
 from orchestrator.strategies.calibration.posterior_summary import (
-    PosteriorFound,
     left_open,
     posterior_change,
-    posterior_found,
     unit_prior,
 )
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
@@ -70,7 +70,8 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
 
     θ* is the θ with the lowest mean |r_i − c_s(a_i, θ)| of all that were simulated on every training pour. It never
     describes them worse than the uncalibrated θ, if that lies in the searched box: the evaluation repeats the same
-    simulations.
+    simulations. With a memory, half of the space-filling θ lie where it expects them, and θ* has the highest posterior
+    density. The uncalibrated θ is then the expected one, which has the highest prior density, so that the same holds.
 
     Source: candidates from the posterior on a surrogate: Wang & Li, Adaptive Gaussian process approximation for
     Bayesian inference with expensive likelihood functions, 2018.
@@ -90,7 +91,6 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         values = {axis.name: float(getattr(self._plain, axis.name)) for axis in plan.parameters.axes}
         if all(axis.lower <= values[axis.name] <= axis.upper for axis in plan.parameters.axes):
             self._plain_at = tuple(map(float, plan.parameters.encode(values)))
-        self._posterior: Posterior | None = None
         self._before, self._starts = 0, 0
         self._ended: str | None = None
 
@@ -112,15 +112,17 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         pours, share = len(self._usable), self._budget // 2
         step = -(-len(suggestion.points) * pours // max(share, 1))
         for k, point in enumerate(suggestion.points):
-            self._try(point, only=range(k % step, pours, step))
+            # where the memory expects θ, the surrogate has to be exact
+            moves = self._memory is not None and k % 2 == 1
+            start = remembered_point(point, self._memory or ()) if moves else point
+            self._try(start, only=range(k % step, pours, step))
         self._starts = len(self._trials)
         text = f"{len(self._trials)} θ, the uncalibrated one among them, on {pours} pours"
         self.decisions.append(Decision(text if plain else f"{len(self._trials)} θ on {pours} pours"))
 
     def _ask_posterior(self) -> None:
-        pours = tuple(self._places.values())
-        question = PosteriorQuestion(pours, (0.0,) * len(pours), WEIGHED, prior=unit_prior(self._plan))
-        left = (self._budget - self._trials.answered) // len(pours)
+        question = self._weighed_pours(self._memory)
+        left = (self._budget - self._trials.answered) // len(self._usable)
         query = self._query(count=1 if left else 0, posterior=question)
 
         def drawn(suggestion: Suggestion) -> None:
@@ -142,6 +144,10 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
 
         self._questions.put(query, "posterior", drawn)
 
+    def _weighed_pours(self, memory: tuple[RememberedGroup, ...] | None) -> PosteriorQuestion:
+        pours = tuple(self._places.values())
+        return PosteriorQuestion(pours, (0.0,) * len(pours), WEIGHED, prior=unit_prior(self._plan), memory=memory)
+
     def _end(self, reason: str) -> None:
         assert self._posterior is not None
         self._ended = reason
@@ -149,8 +155,14 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         self.decisions += [Decision(text) for text in left_open(self._posterior, self._plan.parameters.names)]
         self._settle_at_lowest()
         assert self._best is not None
-        query = self._query(count=0, map_at=self._best, map_resolution=THETA_MAP_RESOLUTION)
-        self._questions.put(query, "map", self._mapped)
+        alone = None if self._memory is None else self._weighed_pours(None)
+        query = self._query(count=0, posterior=alone, map_at=self._best, map_resolution=THETA_MAP_RESOLUTION)
+
+        def mapped(suggestion: Suggestion) -> None:
+            self._mapped(suggestion)
+            self._remember(suggestion.posterior)
+
+        self._questions.put(query, "map", mapped)
 
     def _query(
         self,
@@ -185,10 +197,20 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         super().tell(request, outcome)
         if not isinstance(request, Simulate):
             return
-        known = [score for trial in self._compared() if (score := self._score(trial)) is not None]
+        known = [self._merit(trial, score) for trial in self._compared() if (score := self._score(trial)) is not None]
         for trial in self._trials.all[self._starts :] if known else ():
-            if not trial.closed and sum(discrepancies(trial)) > min(known) * len(self._usable):
+            least = sum(discrepancies(trial)) / len(self._usable)
+            if not trial.closed and self._merit(trial, least) > min(known):
                 self._trials.abandon(trial)
+
+    def _merit(self, trial: Trial, score: float) -> float:
+        """The mean |r_i − c_s(a_i, θ)|; with a memory, minus the logarithm of the posterior density.
+
+        The likelihood is that of independent errors of an unknown common scale.
+        """
+        if self._memory is None:
+            return score
+        return len(self._usable) * math.log(WEIGHED + score) - log_memory(trial.point, self._memory)
 
     def _discrepancy(self, request: Simulate, simulated: float) -> float:
         """r_i − c_s(a_i, θ), with its sign."""
@@ -202,9 +224,6 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     def parameters_at(self, point: Point) -> SimulationParameters:
         """θ_s at a point of the unit cube; exactly the uncalibrated θ at its point."""
         return self._plain if point and point == self._plain_at else super().parameters_at(point)
-
-    def _posterior_found(self) -> PosteriorFound | None:
-        return None if self._posterior is None else posterior_found(self._posterior, self._plan.parameters)
 
     def progress(self) -> Progress:
         """As in the base class; no further simulations after the end."""

@@ -13,10 +13,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar, Generic, Literal, Self, TypeVar, cast
 
-from actors.optimizer.questions import Point, Suggestion
+from pydantic import Field
+
+from actors.optimizer.questions import Point, Posterior, Suggestion
 from orchestrator.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.run_errors import LearningError
-from orchestrator.strategies.calibration.posterior_summary import PosteriorFound
+from orchestrator.strategies.calibration.campaign_memory import MemoryFound, memory_found, unit_memory, verdicts
+from orchestrator.strategies.calibration.posterior_summary import PosteriorFound, posterior_found
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
 from orchestrator.strategies.stage_result import DisplayedMap, ResultPart, StageResult, displayed_map
 from orchestrator.strategies.strategy import Progress, is_sound
@@ -123,6 +126,9 @@ class Calibrated(StageResult):
     pour_seeds: tuple[int, ...] = ()
     """Seeds of the simulations of the usable training pours, if the evaluation repeats these simulations."""
 
+    memory: MemoryFound | None = Field(default=None, exclude_if=lambda found: found is None)
+    """Prior from earlier campaigns, and its agreement with the pours; without `prior` in the campaign it is absent."""
+
 
 class Calibration(ABC, Generic[S]):
     """Base of C1 to C4. Subclasses choose the next trial (`_next`) and convert a simulation to a cost (`_discrepancy`).
@@ -154,7 +160,10 @@ class Calibration(ABC, Generic[S]):
         self._best: Point | None = None
         self._expected: tuple[float, float] = (0.0, 0.0)
         self._final: Suggestion | None = None
-        self.decisions: list[Decision] = []
+        self._posterior: Posterior | None = None
+        self._alone: Posterior | None = None
+        self._memory = unit_memory(plan.memory, plan.parameters)
+        self.decisions: list[Decision] = [] if plan.memory is None else [Decision(plan.memory.text)]
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -261,9 +270,15 @@ class Calibration(ABC, Generic[S]):
     def _row(self, number: int, trial: Trial) -> TriedOnPours | TriedOnce:
         """Convert a trial to its row in the result."""
 
+    def _remember(self, alone: Posterior | None) -> None:
+        """Record the posterior from the pours alone, and decide whether the memory agrees with the pours."""
+        self._alone = alone
+        if self._memory is not None and self._plan.memory is not None and self._posterior is not None:
+            self.decisions += verdicts(self._plan.memory, self._posterior)
+
     def _posterior_found(self) -> PosteriorFound | None:
         """Posterior of the θ that fit the pours, if the strategy has one."""
-        return None
+        return None if self._posterior is None else posterior_found(self._posterior, self._plan.parameters)
 
     def result(self) -> Calibrated:
         """θ* with its expected discrepancy, all trials, and the map of the discrepancy over the two most influential
@@ -276,6 +291,7 @@ class Calibration(ABC, Generic[S]):
             training_pours=len(self._usable),
             trials=tuple(self._row(i, trial) for i, trial in enumerate(self._trials.all) if trial.closed),
             found=self._found() if self.finished else None,
+            memory=memory_found(self._plan.memory, self._posterior, self._alone, self._plan.parameters),
         )
 
     def _found(self) -> CalibratedTheta:

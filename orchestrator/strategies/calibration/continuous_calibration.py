@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Literal, Self
 
 from actors.optimizer.questions import (
@@ -14,7 +15,6 @@ from actors.optimizer.questions import (
     Data,
     MinimumQuery,
     Point,
-    Posterior,
     PosteriorQuestion,
     RegressionQuery,
     SpaceFillingQuery,
@@ -33,10 +33,8 @@ from orchestrator.strategies.calibration.calibration_base import (
     described,
 )
 from orchestrator.strategies.calibration.posterior_summary import (
-    PosteriorFound,
     central,
     left_open,
-    posterior_found,
     unit_prior,
 )
 from orchestrator.strategies.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
@@ -150,8 +148,8 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         self._actions: tuple[Point, ...] = ()
         self._measured_at: tuple[float, ...] = ()
         self._expected_at: dict[Simulate, float] = {}
-        self._posterior: Posterior | None = None
         self._before = Data()
+        self._weighed: PosteriorQuestion | None = None
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -247,8 +245,8 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
                 for spillage, expected in zip(weighed, regression.predictions, strict=True)
             )
             noise = (regression.hyperparameters or {}).get("noise", 0.0)
-            weighed_pours = PosteriorQuestion(places, offsets, noise, prior=unit_prior(self._plan))
-            query = self._query(everything=True, count=0, posterior=weighed_pours)
+            self._weighed = PosteriorQuestion(places, offsets, noise, prior=unit_prior(self._plan), memory=self._memory)
+            query = self._query(everything=True, count=0, posterior=self._weighed)
             self._questions.put(query, "posterior", drawn)
 
         data = Data(places, weighed)
@@ -259,10 +257,17 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
 
         def settle(suggestion: Suggestion) -> None:
             self._final = suggestion
+            self._remember(suggestion.posterior)
             self._settle(point, suggestion.predictions[0], suggestion.prediction_deviations[0])
 
+        alone = None if self._memory is None or self._weighed is None else replace(self._weighed, memory=None)
         query = self._query(
-            everything=True, count=0, predict_at=(point,), map_at=point, map_resolution=THETA_MAP_RESOLUTION
+            everything=True,
+            count=0,
+            predict_at=(point,),
+            map_at=point,
+            map_resolution=THETA_MAP_RESOLUTION,
+            posterior=alone,
         )
         self._questions.put(query, "conclude", settle)
 
@@ -303,9 +308,6 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
         return difference if self._knows_actions else abs(difference)
 
     # -- results ---------------------------------------------------------------------------------------------------
-
-    def _posterior_found(self) -> PosteriorFound | None:
-        return None if self._posterior is None else posterior_found(self._posterior, self._plan.parameters)
 
     @property
     def _budget(self) -> int:

@@ -113,10 +113,14 @@ class DiscrepancyOverPours(Calibration[S]):
         scored = [(score, trial) for trial in self._compared() if (score := self._score(trial)) is not None]
         if not scored:
             raise self._no_discrepancies()
-        mean, best = min(scored, key=lambda pair: pair[0])
+        mean, best = min(scored, key=lambda pair: self._merit(pair[1], pair[0]))
         known = discrepancies(best)
         variance = sum((cost - mean) ** 2 for cost in known) / max(len(known) - 1, 1)
         self._settle(best.point, mean, math.sqrt(variance / len(known)))
+
+    def _merit(self, trial: Trial, score: float) -> float:
+        """The quantity that θ* minimises over the trials."""
+        return score
 
     def _compared(self) -> Sequence[Trial]:
         """The trials that θ* is chosen from."""

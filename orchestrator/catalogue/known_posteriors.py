@@ -1,0 +1,170 @@
+"""The posteriors of earlier calibrations: of one run, of the catalogue, and from files.
+
+- `posterior_of` reads what a finished calibration tells (`orchestrator.config.campaign_prior.KnownPosterior`).
+- `posterior_text` writes the file of one; `import_posterior` enters what another machine has exported.
+
+A posterior enters later campaigns by what its own pours tell: without the prior that the calibration itself had, and
+without the bounds of its searched range. Otherwise the oldest campaign would be counted in every later one.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from orchestrator.catalogue.run_registry import make_state_directory, state_directory
+from orchestrator.config.campaign_prior import KnownPosterior, arm_of, shape_digest
+from orchestrator.config.run_snapshot import written
+from orchestrator.journal.codec import from_json
+from orchestrator.journal.run_record import RunState, read_record
+from orchestrator.run_errors import RunError
+from orchestrator.runs.run_folder import SIMULATOR, read_versions
+from orchestrator.strategies.calibration.campaign_memory import estimates, group_of
+from sim_engine.liquids import Liquid, ParameterInfo, SimulationParameters
+from sim_engine.search_space import Axis
+
+FOLDER = "posteriors"
+"""Folder of imported posteriors in the state directory."""
+
+TELLS = 0.8
+"""Largest ratio of a posterior's variance to that of its prior at which the pours tell something."""
+
+
+class NoPosteriorError(RunError):
+    """A run has no posterior that later campaigns can use; the text gives the reason."""
+
+
+def posterior_of(directory: Path, record: RunState | None = None) -> KnownPosterior:
+    """The posterior of a run's calibration.
+
+    Args:
+        directory: folder of the run.
+        record: its journal, if it was read already.
+
+    Raises:
+        NoPosteriorError: there is none.
+        RunError: the journal can't be read.
+    """
+    record = read_record(directory) if record is None else record
+    plan, name = record.header.fingerprint, directory.name
+    results = [from_json(event.encoded) for event in record.closed.values()]
+    encoded = next((result for result in results if result.get("kind") == "calibration"), {})
+    found, calibration = encoded.get("found") or {}, plan.get("calibration")
+    if calibration is None:
+        raise NoPosteriorError(f"{name}: has no calibration, and therefore no posterior")
+    if not found:
+        raise NoPosteriorError(f"{name}: its calibration is not finished; resume it first")
+    rows = (found.get("posterior") or {}).get("thetas")
+    if not rows:
+        raise NoPosteriorError(f"{name}: its calibration has no posterior of the parameters; C4 has one")
+    memory = encoded.get("memory") or {}
+    alone = {key: (one["mean"], one["deviation"]) for key, one in (memory.get("alone") or {}).items()}
+    told = alone or {key: (one.mean, one.deviation) for key, one in estimates(rows).items()}
+    priors = {one["name"]: one for one in calibration.get("parameter_prior", ())}
+    parameters = {}
+    for axis in (Axis(**row) for row in calibration["parameters"]["axes"]):
+        own = _without_range(*told[axis.name], axis, priors.get(axis.name))
+        if own is not None and group_of(axis.name) is not None:
+            parameters[axis.name] = {"mean": own[0], "deviation": own[1]}
+    if not parameters:
+        raise NoPosteriorError(f"{name}: its pours leave all parameters open")
+    scene, liquid = calibration["scene"], Liquid.model_validate(calibration["scene"]["liquid"])
+    laboratory = plan.get("laboratory") or {}
+    scenes = [scene, *calibration.get("further", ())]
+    return KnownPosterior.model_validate(
+        {
+            "posterior": name,
+            "simulator": str(read_versions(directory).get(SIMULATOR, "")),
+            "laboratory": str(laboratory.get("name", "")),
+            "mode": laboratory.get("mode", "virtual"),
+            "arm": arm_of(laboratory),
+            "liquid": {
+                "name": liquid.name,
+                "density": liquid.density,
+                "surface_tension": liquid.surface_tension,
+                "viscosity": liquid.dynamic_viscosity,
+            },
+            "pourer": scene["pourer"]["name"],
+            "shape": shape_digest(scene),
+            "receivers": list(dict.fromkeys(one["receiver"]["name"] for one in scenes)),
+            "pours": int(encoded.get("training_pours", 0)),
+            "fixed": {key: float(value) for key, value in calibration["fixed_parameters"].items()},
+            "parameters": parameters,
+        }
+    )
+
+
+def _without_range(
+    mean: float, deviation: float, axis: Axis, prior: Mapping[str, Any] | None
+) -> tuple[float, float] | None:
+    """A posterior's moments divided by those of its prior: what the pours alone tell; None if they tell nothing.
+
+    Both are taken for normal distributions. The prior is uniform over the searched range, or a measured value.
+    """
+    centre, spread = 0.5 * (axis.lower + axis.upper), (axis.upper - axis.lower) / math.sqrt(12.0)
+    if axis.scale == "log":  # nearly uniform in the logarithm: the range as seen from the mean
+        spread = mean * math.log(axis.upper / axis.lower) / math.sqrt(12.0)
+        centre = math.sqrt(axis.lower * axis.upper)
+    if prior is not None:
+        centre, spread = float(prior["mean"]), float(prior["deviation"])
+    deviation = max(deviation, 1e-6 * spread)
+    if deviation**2 > TELLS * spread**2:
+        return None
+    precision = 1.0 / deviation**2 - 1.0 / spread**2
+    return (mean / deviation**2 - centre / spread**2) / precision, 1.0 / math.sqrt(precision)
+
+
+def imported(state: Path | None = None) -> Iterable[KnownPosterior]:
+    """The imported posteriors, by name.
+
+    Raises:
+        OSError: one can't be read.
+    """
+    folder = (state or state_directory()) / FOLDER
+    for path in sorted(folder.glob("*.json")):
+        try:
+            yield KnownPosterior.model_validate_json(path.read_bytes())
+        except ValueError as error:
+            raise NoPosteriorError(f"{path}: is damaged ({error}); delete it, and import the posterior again") from None
+
+
+def import_posterior(known: KnownPosterior, state: Path | None = None) -> None:
+    """Enter a posterior, which replaces one of the same run.
+
+    Raises:
+        OSError: it can't be written.
+    """
+    folder = (state or state_directory()) / FOLDER
+    make_state_directory(folder.parent)
+    folder.mkdir(exist_ok=True)
+    name = "".join(c if c.isalnum() or c in "-_." else "_" for c in known.posterior)
+    path = folder / f"{name}.json"
+    part = path.with_suffix(".part")
+    part.write_text(known.model_dump_json(), encoding="utf-8")
+    part.replace(path)
+
+
+def posterior_text(known: KnownPosterior) -> str:
+    """A posterior as a YAML file, with units as they are displayed."""
+    from ruamel.yaml import YAML
+
+    table = written(known)
+    infos = SimulationParameters.info()
+    table["parameters"] = {
+        name: {"mean": _shown(mean, infos[name]), "deviation": _shown(deviation, infos[name])}
+        for name, (mean, deviation) in known.estimates.items()
+    }
+    text = io.StringIO()
+    yaml = YAML()
+    yaml.default_flow_style = None
+    yaml.width = 110
+    yaml.dump(table, text)
+    return text.getvalue()
+
+
+def _shown(value: float, info: ParameterInfo) -> Any:
+    number = float(f"{value / info.factor:.6g}")
+    return number if info.shown == "1" else f"{number!r} {info.shown}"
