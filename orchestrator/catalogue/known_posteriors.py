@@ -51,7 +51,7 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
     record = read_record(directory) if record is None else record
     plan, name = record.header.fingerprint, directory.name
     results = [from_json(event.encoded) for event in record.closed.values()]
-    encoded = next((result for result in results if result.get("kind") == "calibration"), {})
+    encoded: dict[str, Any] = next((result for result in results if result.get("kind") == "calibration"), {})
     found, calibration = encoded.get("found") or {}, plan.get("calibration")
     if calibration is None:
         raise NoPosteriorError(f"{name}: has no calibration, and therefore no posterior")

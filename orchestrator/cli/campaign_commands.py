@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -78,7 +79,8 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         from orchestrator.run_service import RunResources, RunTaskError, task_request
 
         with Refused(RunTaskError):
-            request = task_request(read_campaign(campaign, laboratory, seed), task)
+            resumed = functools.partial(run_directory, resume=True, run_id=run_id) if resume else None
+            request = task_request(read_campaign(campaign, laboratory, seed, resumed), task)
         plan = request.campaign
         check_campaign_can_run(request)
         if answer is not None and not resume:

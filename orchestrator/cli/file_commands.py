@@ -23,6 +23,7 @@ from orchestrator.cli.console import (
     WaitingIndicator,
     print_json,
     print_message,
+    print_note,
     print_warning,
 )
 
@@ -97,6 +98,8 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             from orchestrator.config.campaign_checks import check_campaign
 
             plan = load_campaign(path)
+            for line in () if plan.memory is None else plan.memory.lines:
+                print_note(line)
             warned: list[str] = []
             problems = check_campaign(plan, warn=lambda problem: warned.append(str(problem)), doing=doing)
             for text in dict.fromkeys(warned):

@@ -44,17 +44,33 @@ if TYPE_CHECKING:
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
-def read_campaign(path: Path, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+def read_campaign(
+    path: Path,
+    laboratory: Path | None = None,
+    seed: int | None = None,
+    resumed: Callable[[CampaignPlan], Path] | None = None,
+) -> CampaignPlan:
     """A campaign's plan, on another laboratory or with another seed if one is given.
+
+    Args:
+        path: of its file.
+        laboratory: of another laboratory.
+        seed: another one.
+        resumed: finds the run that is resumed; its prior from earlier campaigns is kept.
 
     Raises:
         RefusalError: with all problems of its files, exit code 2.
     """
     from orchestrator.config.file_loading import load_campaign
     from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.runs.run_folder import RESOLVED
 
     with Refused(ConfigError):
-        return load_campaign(path, laboratory, seed)
+        plan = load_campaign(path, laboratory, seed)
+        if resumed is None or plan.memory is None:
+            return plan
+        memory = load_campaign(resumed(plan) / RESOLVED).memory
+        return load_campaign(path, laboratory, seed, memory=memory)
 
 
 def check_campaign_can_run(request: RunRequest) -> None:
@@ -65,6 +81,9 @@ def check_campaign_can_run(request: RunRequest) -> None:
     """
     from orchestrator.run_service import RunService, RunTaskError
 
+    memory = request.campaign.memory
+    for line in () if memory is None else memory.lines:
+        print_note(line)
     with WaitingIndicator() as doing:
         report = RunService().check(request, doing=doing)
     for text in report.warnings:

@@ -20,7 +20,7 @@ import typer
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, print_note
+from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message, print_note
 from orchestrator.cli.shell_completion import catalogued, catalogued_runs
 
 if TYPE_CHECKING:
@@ -241,6 +241,49 @@ def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json 
         _print_pours(found["list_of_pours"], of_one_run=True)
 
 
+@_command("decant runs known", "decant runs known beaker")
+def known(
+    cup: Annotated[str | None, typer.Argument(help="Name of a vessel: the pourer or a receiver.")] = None,
+    state: State = None,
+    as_json: Json = False,
+) -> None:
+    """Show what calibrations have found, by run: mean ± standard deviation from the pours of the run alone."""
+    from orchestrator.results.console_view import print_table
+    from orchestrator.strategies.calibration.campaign_memory import RememberedParameter
+
+    with _catalogue() as catalogue, _refusing():
+        found = [one for one in catalogue.posteriors() if cup in (None, one.pourer, *one.receivers)]
+    if as_json:
+        print_json({"posteriors": [one.model_dump(exclude_none=True) for one in found]})
+        return
+    if not found:
+        print_note(f"no posterior{'' if cup is None else f' about {cup}'}; a finished calibration with C4 has one")
+        return
+    rows = [
+        {
+            "run": one.posterior,
+            "laboratory": f"{one.laboratory}, arm {one.arm}",
+            "mode": _mode(one.mode),
+            "liquid": one.liquid.name,
+            "from": one.pourer,
+            "into": ", ".join(one.receivers),
+            "pours": str(one.pours),
+            "known": "; ".join(str(RememberedParameter(name, *told, ())) for name, told in one.estimates.items()),
+        }
+        for one in found
+    ]
+    print_table(rows, right=["pours"])
+
+
+@_command("decant runs posterior quickstart-20300301-1 > beaker.yaml")
+def posterior(run: Which, state: State = None) -> None:
+    """Print the posterior of a run as a YAML file with units, for `decant runs add` elsewhere, or for `prior`."""
+    from orchestrator.catalogue.known_posteriors import posterior_text
+
+    with _catalogue() as catalogue, _refusing():
+        print(posterior_text(catalogue.posterior(run)), end="")
+
+
 @_command("decant runs check quickstart-20300301-1", "decant runs check runs/quickstart-20300301-1")
 def check(run: Which, state: State = None, as_json: Json = False) -> None:
     """Check a run's records: SQLite's own check, the hash chain over all entries, and the ledger of pours.
@@ -366,15 +409,27 @@ def export(
     print("\n".join(found["files"]))
 
 
-@_command("decant runs add runs/", "decant runs add /media/usb/runs/quickstart-20300301-1")
+@_command(
+    "decant runs add runs/",
+    "decant runs add /media/usb/runs/quickstart-20300301-1",
+    "decant runs add beaker.yaml   # a posterior from another machine",
+)
 def add(
-    folders: Annotated[list[Path], typer.Argument(help="Folders of runs, or folders that contain runs.")],
+    folders: Annotated[
+        list[Path], typer.Argument(help="Folders of runs, folders that contain runs, or files of posteriors.")
+    ],
     state: State = None,
 ) -> None:
-    """Register runs that the catalogue lacks: from another machine, or moved."""
+    """Register runs that the catalogue lacks: from another machine, or moved. Files add their posteriors only."""
     from orchestrator.catalogue.run_registry import enter, runs_below
 
     found: list[Path] = []
+    posteriors = [path for path in folders if path.suffix.lower() in (".yaml", ".yml", ".json")]
+    if posteriors:
+        _import_posteriors(posteriors)
+        folders = [path for path in folders if path not in posteriors]
+        if not folders:
+            return
     for folder in folders:
         if not folder.is_dir():
             raise RefusalError(f"{folder}: is not a folder", BAD_INPUT)
@@ -387,6 +442,19 @@ def add(
     with _catalogue():
         pass
     print(f"{len(found)} run{'s' * (len(found) > 1)} entered, or known already")
+
+
+def _import_posteriors(paths: Sequence[Path]) -> None:
+    from orchestrator.catalogue.known_posteriors import import_posterior
+    from orchestrator.config.file_loading import load_posterior_file
+    from orchestrator.config.yaml.yaml_errors import ConfigError
+
+    with Refused(ConfigError):
+        read = [load_posterior_file(path) for path in paths]
+    with _refusing():
+        for one in read:
+            import_posterior(one)
+    print(f"{len(read)} posterior{'s' * (len(read) > 1)} entered: {', '.join(one.posterior for one in read)}")
 
 
 @_command("decant runs rebuild")

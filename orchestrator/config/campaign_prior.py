@@ -65,7 +65,8 @@ def _estimates(name: str, base: type[EstimateSettings]) -> Any:
         unit = "" if info.shown == "1" else f" {info.shown}"
         width = Quantity(info.unit, f"{(info.upper - info.lower) / 50 / info.factor:.2g}{unit}", 0.0, positive=True)
         types: dict[str, Any] = {
-            "mean": (Annotated[float, info.quantity], ...),
+            # without bounds: the pours alone may point beyond the parameter's range
+            "mean": (Annotated[float, Quantity(info.unit, info.example)], ...),
             "deviation": (Annotated[float, width], ...),
         }
         part = create_model(f"{name}{parameter.title().replace('_', '')}", __base__=base, __doc__=base.__doc__, **types)
@@ -346,6 +347,7 @@ def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: Poster
             continue
         spread = usual_spread(infos[name], same_vessel=bool(same_vessel))
         mean, deviation = predicted([known.estimates[name] for known in told], spread)
+        mean = min(max(mean, infos[name].lower), infos[name].upper)
         one = RememberedParameter(name, mean, deviation, tuple(known.posterior for known in told))
         if not lower - 3.0 * deviation <= mean <= upper + 3.0 * deviation:
             left_out.append(f"{one} is outside the searched range; widen the range")

@@ -12,6 +12,7 @@ from pydantic import create_model
 
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.campaign_file import CampaignFile
+from orchestrator.config.campaign_prior import KnownPosterior, PriorSettings
 from orchestrator.config.campaign_resolution import resolve_campaign
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import resolved
@@ -19,6 +20,7 @@ from orchestrator.config.yaml.references import References
 from orchestrator.config.yaml.section_validation import validate
 from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
+from orchestrator.strategies.calibration.campaign_memory import CampaignMemory
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import Liquid, LiquidSettings, SimulationParameters
 from sim_engine.settings.model import Settings
@@ -26,22 +28,34 @@ from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import VesselSpec
 
 
-def load_campaign(path: Path | str, laboratory: Path | str | None = None, seed: int | None = None) -> CampaignPlan:
+def load_campaign(
+    path: Path | str,
+    laboratory: Path | str | None = None,
+    seed: int | None = None,
+    *,
+    memory: CampaignMemory | None = None,
+) -> CampaignPlan:
     """The plan of a campaign file, with everything that it refers to.
 
     Args:
         path: the file.
         laboratory: a laboratory's file that replaces the campaign's laboratory.
         seed: replaces the campaign's seed.
+        memory: of the run that is resumed; it replaces the campaign's `prior`, which could find other runs by now.
 
     Raises:
         ConfigError: the file or a file that it refers to is invalid; contains all problems.
     """
     other = None if laboratory is None else Path(laboratory)
-    return campaign_from(Document.read(resolved(Path(path))), other, seed)
+    return campaign_from(Document.read(resolved(Path(path))), other, seed, memory)
 
 
-def campaign_from(document: Document, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
+def campaign_from(
+    document: Document,
+    laboratory: Path | None = None,
+    seed: int | None = None,
+    memory: CampaignMemory | None = None,
+) -> CampaignPlan:
     """The plan of a campaign document; relative paths in it start from the folder of its path.
 
     Raises:
@@ -58,6 +72,8 @@ def campaign_from(document: Document, laboratory: Path | None = None, seed: int 
         section = section.model_copy(update={"laboratory": str(resolved(laboratory))})
     if section is not None and seed is not None:
         section = section.model_copy(update={"seed": seed})
+    if section is not None and memory is not None:
+        section = section.model_copy(update={"prior": PriorSettings.of(memory)})
     plan = None if section is None else resolve_campaign(section, place, report)
     report.raise_if_any()
     assert plan is not None, "a campaign without problems has a plan"
@@ -79,6 +95,15 @@ def load_vessel(path: Path | str) -> VesselSpec:
     report.raise_if_any()
     assert vessel is not None, "a vessel without problems has a spec"
     return vessel
+
+
+def load_posterior_file(path: Path) -> KnownPosterior:
+    """The posterior of a file that `decant runs posterior` has written. Raises ConfigError."""
+    report = Report()
+    found = References(report).file(resolved(path), KnownPosterior)
+    report.raise_if_any()
+    assert found is not None, "a file without problems has a posterior"
+    return found[0]
 
 
 def vessel_from(document: Document) -> VesselSpec:

@@ -47,7 +47,7 @@ def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
         "laboratory": _laboratory(base["laboratory"], plan),
         "simulator": {"parameters": _parameters(plan)},
     }
-    if all(stage is None or stage.memory is None for stage in (plan.calibration, plan.deployment)):
+    if plan.memory is None:
         record.pop("prior", None)  # it belongs to a stage that is left out
     if plan.calibration is not None:
         record["calibration"] = _calibration(base["calibration"], plan.calibration)

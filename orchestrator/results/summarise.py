@@ -130,7 +130,10 @@ def summarise(
         predicted_deviation=deviation,
         posterior=posterior,
         parameters=() if found is None else _parameters(plan.calibration, found),
-        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain, liquid, ended)),
+        theta_sentences=(
+            *wording.memory_sentences(plan.memory, None if calibration is None else calibration.memory),
+            *wording.theta_sentences(expected, deviation, posterior, space, gain, liquid, ended),
+        ),
         discrepancy=discrepancy,
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,

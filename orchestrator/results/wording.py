@@ -24,6 +24,7 @@ from orchestrator.results.run_summary import NOT_SEARCHED, Advice, PoolUse, Pour
 from orchestrator.results.stage_views import SPLITS
 from orchestrator.states import State
 from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
+from orchestrator.strategies.calibration.campaign_memory import CampaignMemory, MemoryFound
 from orchestrator.strategies.calibration.posterior_summary import PosteriorSummary
 from orchestrator.strategies.campaign_plan import CampaignPlan
 from orchestrator.strategies.deployment.deployment_result import ParetoAction, RiskFound
@@ -304,6 +305,13 @@ def about_theta(
     elif discrepancy:
         said.append("The simulator was not scored on pours that calibration did not see.")
     return said
+
+
+def memory_sentences(memory: CampaignMemory | None, found: MemoryFound | None) -> list[str]:
+    """The runs that the prior comes from, and whether the pours agree with it; nothing without a prior."""
+    if memory is None:
+        return []
+    return [_sentence(part) for part in (memory.lines if found is None else [found.text, *memory.lines[1:]])]
 
 
 def theta_sentences(

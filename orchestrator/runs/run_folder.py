@@ -107,7 +107,7 @@ def versions() -> dict[str, Any]:
 
 @functools.cache
 def simulator_version() -> str:
-    """Version of the solver's code (`solver_fingerprint`). The state directory keeps it: parsing takes about a second."""
+    """Version of the solver's code (`solver_fingerprint`), kept in the state directory: it takes about a second."""
     files, path = folder_digest(ROOT / "sim_engine"), None
     with contextlib.suppress(OSError, ValueError, KeyError):
         path = state_directory() / SIMULATOR_FILE

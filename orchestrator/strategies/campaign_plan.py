@@ -572,6 +572,12 @@ class CampaignPlan:
     laboratory_source: Annotated[Path | None, NOT_IN_FINGERPRINT] = field(default=None, compare=False)
     dispense: DispensePlan | None = field(default=None, metadata=WRITTEN_IF_SET)
 
+    @property
+    def memory(self) -> CampaignMemory | None:
+        """The prior from earlier campaigns, of the stage that uses it."""
+        stages = (stage for stage in (self.calibration, self.deployment) if stage is not None)
+        return next((stage.memory for stage in stages if stage.memory is not None), None)
+
 
 @dataclass(frozen=True)
 class Draw:

@@ -369,6 +369,8 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
     except ConfigError as error:
         report.problems.extend(error.problems)
         return None
+    if base.memory is not None:
+        report.add(root.at("campaign"), "has a 'prior', and the cells of a study begin without one; remove it there")
     if laboratory is not None:
         found = references.section(file.laboratory, root.at("laboratory"), LaboratorySettings)
         record = {} if found is None else as_file(*found, references)

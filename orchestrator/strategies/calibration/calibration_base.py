@@ -163,7 +163,7 @@ class Calibration(ABC, Generic[S]):
         self._posterior: Posterior | None = None
         self._alone: Posterior | None = None
         self._memory = unit_memory(plan.memory, plan.parameters)
-        self.decisions: list[Decision] = [] if plan.memory is None else [Decision(plan.memory.text)]
+        self.decisions = [Decision(line) for line in (() if plan.memory is None else plan.memory.lines)]
 
     # -- asking ----------------------------------------------------------------------------------------------------
 

@@ -145,6 +145,11 @@ class CampaignMemory:
         parts = [f"{', '.join(map(str, one))} ({group})" for group, one in self.groups.items()]
         return f"prior from the run{'s' * (len(self.runs) > 1)} {', '.join(self.runs)}: {'; '.join(parts)}"
 
+    @property
+    def lines(self) -> list[str]:
+        """The text, and one line for each reason why something is not used."""
+        return [self.text, *(f"not used: {reason}" for reason in self.left_out)]
+
     def thetas(self, base: SimulationParameters, count: int) -> list[SimulationParameters]:
         """Equally likely θ (count) by the memory, evenly spread; other values as in `base`."""
         from scipy.stats import qmc

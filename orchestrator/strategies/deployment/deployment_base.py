@@ -135,6 +135,8 @@ class Deployment(ABC, Generic[S]):
         self._asked: tuple[Ask, Callable[[str], None]] | None = None
         self._finished = False
         self.decisions: list[Decision] = self._ledger.decisions
+        if plan.memory is not None:
+            self.decisions += [Decision(line) for line in plan.memory.lines]
 
     # -- requests and outcomes --------------------------------------------------------------------------------------
 

@@ -1,0 +1,244 @@
+"""A prior from earlier campaigns: how it is combined, how a calibration uses it, and when it loses its weight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from orchestrator.catalogue.catalogue import Catalogue
+from orchestrator.catalogue.known_posteriors import import_posterior, posterior_text
+from orchestrator.catalogue.run_registry import VARIABLE
+from orchestrator.cli.app import app
+from orchestrator.config.campaign_prior import KnownPosterior, arm_of, shape_digest
+from orchestrator.config.file_loading import load_campaign, load_posterior_file
+from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.runs.run_folder import simulator_version
+from orchestrator.shipped import shipped
+from orchestrator.strategies.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
+from orchestrator.strategies.campaign_plan import MeasuredPour
+from orchestrator.strategy_harness import SCENE, StrategyHarness
+from sim_engine.action import DEG
+from sim_engine.liquids import SimulationParameters
+from sim_engine.search_space import Axis, Space
+from tests.support.plans import calibration_plan
+
+SEARCHED = Space((Axis("receiver_x", -0.02, 0.02),))
+ACTIONS = Space((Axis("x_offset", 0.09, 0.13),))
+
+
+@pytest.fixture
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A state directory of its own."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "state"))
+    return tmp_path / "state"
+
+
+# -- the combination ---------------------------------------------------------------------------------------------------
+
+
+def test_one_earlier_campaign_is_widened_by_the_usual_difference() -> None:
+    mean, deviation = predicted([(0.014, 0.001)], 0.0025)
+    assert mean == pytest.approx(0.014)
+    # the earlier campaign differs from the common mean, and so does the next one
+    assert deviation == pytest.approx(float(np.hypot(0.001, 0.0025 * 2**0.5)), rel=0.01)
+
+
+def test_campaigns_that_agree_narrow_the_prior_and_those_that_differ_widen_it() -> None:
+    alike = [(0.0140, 0.001), (0.0141, 0.001), (0.0139, 0.001), (0.0140, 0.001), (0.0140, 0.001)]
+    differing = [
+        (mean + shift, 0.001) for (mean, _), shift in zip(alike, (-0.006, 0.006, -0.005, 0.005, 0), strict=True)
+    ]
+    assert predicted(alike, 0.0025)[1] < predicted(alike[:1], 0.0025)[1] < predicted(differing, 0.0025)[1]
+
+
+def test_the_eight_schools_of_the_textbook_have_its_common_mean() -> None:
+    # The eight schools: Gelman et al., Bayesian Data Analysis, table 5.2 (estimates and standard errors); the book's
+    # posterior mean of the common effect is 8, and a new school is far less certain than the mean of all.
+    schools = [
+        (28.0, 15.0),
+        (8.0, 10.0),
+        (-3.0, 16.0),
+        (7.0, 11.0),
+        (-1.0, 9.0),
+        (1.0, 11.0),
+        (18.0, 10.0),
+        (12.0, 18.0),
+    ]
+    mean, deviation = predicted(schools, 10.0)
+    assert mean == pytest.approx(8.0, abs=0.5)
+    assert 6.0 < deviation < 14.0
+
+
+# -- the calibration ---------------------------------------------------------------------------------------------------
+
+
+def spilled(action: Any, theta: SimulationParameters, rng: np.random.Generator) -> float:
+    """A smooth rise with the distance between arm and receiver."""
+    distance = action.x_offset + theta.receiver_x - 0.11
+    return float(0.5 + 0.4 * np.tanh(distance / 0.02) + 0.003 * rng.standard_normal())
+
+
+def calibrated(remembered: float | None, pours: int = 3, **changes: Any) -> Any:
+    """A calibration on a bench whose receiver stands 8 mm farther away, with a memory of another place."""
+    rng, truth = np.random.default_rng(1), SimulationParameters(receiver_x=0.008)
+    made = [action_at(0.10 + 0.01 * i) for i in range(pours)]
+    measured = [MeasuredPour(action, spilled(action, truth, rng), 0.98, "train") for action in made]
+    memory = None
+    if remembered is not None:
+        memory = CampaignMemory((RememberedParameter("receiver_x", remembered, 0.001, ("earlier-1",)),))
+    plan = calibration_plan(
+        actions=ACTIONS, parameters=SEARCHED, fixed_parameters={}, simulations="auto", memory=memory, **changes
+    )
+    strategy = plan.settings.build(plan, measured, 1)
+    harness = StrategyHarness(spilled)
+    harness.run(strategy)
+    return strategy
+
+
+def action_at(x_offset: float) -> Any:
+    return SCENE.action({"angular_velocity": 60 * DEG, "x_offset": x_offset})
+
+
+def test_a_memory_that_is_right_keeps_its_weight_and_names_its_run() -> None:
+    strategy = calibrated(0.0075)
+    found = strategy.result().memory
+    (group,) = found.groups
+    assert (group.group, group.runs, group.contradicted) == ("placement", ("earlier-1",), False)
+    assert group.probability > 0.8
+    assert "earlier-1" in strategy.decisions[0].text
+    assert abs(strategy.theta.receiver_x - 0.008) < 0.002
+    assert abs(found.alone["receiver_x"].mean - 0.008) < 0.004  # later campaigns get what these pours alone tell
+
+
+def test_a_memory_that_the_pours_contradict_loses_its_weight_and_the_run_says_so() -> None:
+    strategy = calibrated(-0.012)
+    (group,) = strategy.result().memory.groups
+    assert group.contradicted
+    assert any(
+        "contradict the memory of the placement (earlier-1" in one.text and one.urgent for one in strategy.decisions
+    )
+    assert abs(strategy.theta.receiver_x - 0.008) < 0.003
+
+
+def test_without_a_memory_the_result_is_as_it_was() -> None:
+    assert "memory" not in calibrated(None).result().model_dump(mode="json")
+
+
+# -- the campaign file -------------------------------------------------------------------------------------------------
+
+
+def known(name: str, **changes: Any) -> KnownPosterior:
+    """A posterior that fits the shipped quickstart."""
+    header = fingerprint(load_campaign(shipped("campaigns/quickstart.yaml")))
+    scene = header["calibration"]["scene"]
+    content: dict[str, Any] = {
+        **{"posterior": name, "simulator": simulator_version(), "laboratory": "virtual", "mode": "virtual"},
+        **{"arm": arm_of(header["laboratory"]), "pourer": "beaker", "shape": shape_digest(scene), "pours": 12},
+        "receivers": ["tumbler"],
+        "liquid": {"name": "water", "density": 998.0, "surface_tension": 0.0728, "viscosity": 1e-3},
+        "fixed": {"particles": 600.0},
+        "parameters": {
+            "friction": {"mean": 0.2, "deviation": 0.1},
+            "receiver_x": {"mean": 0.0139, "deviation": 0.001},
+        },
+    }
+    return KnownPosterior.model_validate(content | changes)
+
+
+def with_prior(tmp_path: Path, prior: str) -> Path:
+    path = tmp_path / "second.yaml"
+    shipped_text = Path(shipped("campaigns/quickstart.yaml")).read_text(encoding="utf-8")
+    configs = Path(shipped("campaigns/quickstart.yaml")).parent.parent
+    path.write_text(shipped_text.replace("../", f"{configs}/").replace("seed: 7", f"seed: 7\nprior: {prior}"), "utf-8")
+    return path
+
+
+def test_the_catalogue_is_a_prior_and_a_run_keeps_it_when_the_catalogue_grows(state: Path, tmp_path: Path) -> None:
+    import_posterior(known("first-1"))
+    path = with_prior(tmp_path, "catalogue")
+    plan = load_campaign(path)
+    assert plan.memory is not None
+    assert plan.memory.runs == ("first-1",)
+    import_posterior(known("first-2"))
+    assert load_campaign(path).memory.runs == ("first-1", "first-2")  # type: ignore[union-attr]
+    from decant.running import build_campaign
+
+    again = build_campaign(plan.resolved, tmp_path)  # as the run's record has it
+    assert fingerprint(again) == fingerprint(plan)
+    assert fingerprint(load_campaign(path, memory=plan.memory)) == fingerprint(plan)  # as `--resume` does
+
+
+def test_an_empty_catalogue_is_stated_and_the_prior_is_uniform(state: Path, tmp_path: Path) -> None:
+    memory = load_campaign(with_prior(tmp_path, "catalogue")).memory
+    assert memory is not None
+    assert not memory.parameters
+    assert "uniform" in memory.text
+    assert "no posterior yet" in " ".join(memory.lines)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"simulator": "0123456789abcdef"}, "another simulator (version 0123456789abcdef"),
+        ({"arm": "ur3e"}, "another arm (ur3e, here ur10)"),
+        ({"mode": "hardware"}, "it is of a hardware laboratory"),
+        ({"fixed": {"particles": 2000.0}}, "particles 2000, here it is 600"),
+        (
+            {"parameters": {"cohesion": {"mean": 0.02, "deviation": 0.001}}},
+            "it is about cohesion, which is not searched",
+        ),
+    ],
+)
+def test_a_named_posterior_that_does_not_fit_is_refused_and_in_the_catalogue_left_out(
+    state: Path, tmp_path: Path, changes: dict[str, Any], reason: str
+) -> None:
+    import_posterior(known("first-1", **changes))
+    with pytest.raises(ConfigError, match=r"second\.yaml:5:") as error:
+        load_campaign(with_prior(tmp_path, "[first-1]"))
+    assert reason in str(error.value)
+    memory = load_campaign(with_prior(tmp_path, "catalogue")).memory
+    assert memory is not None
+    assert not memory.parameters
+    assert reason in memory.left_out[0]
+
+
+def test_an_unknown_run_is_refused(state: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="nosuch: no such run in the catalogue"):
+        load_campaign(with_prior(tmp_path, "[nosuch]"))
+
+
+def test_another_liquid_keeps_walls_and_placement(state: Path, tmp_path: Path) -> None:
+    oil = {"name": "oil", "density": 920.0, "surface_tension": 0.033, "viscosity": 0.06}
+    import_posterior(known("first-1", liquid=oil, laboratory="other"))
+    memory = load_campaign(with_prior(tmp_path, "catalogue")).memory
+    assert memory is not None
+    assert list(memory.means) == ["friction"]  # the placement is that of another laboratory
+    assert "its placement is not transferred" in " ".join(memory.left_out)
+
+
+def test_a_posterior_is_exported_and_imported_with_its_units(state: Path, tmp_path: Path) -> None:
+    path = tmp_path / "first.yaml"
+    path.write_text(posterior_text(known("first-1")), encoding="utf-8")
+    assert "{mean: 13.9 mm, deviation: 1.0 mm}" in path.read_text(encoding="utf-8")
+    estimates = load_posterior_file(path).estimates
+    assert estimates["receiver_x"] == pytest.approx((0.0139, 0.001))
+    outcome = CliRunner().invoke(app, ["runs", "add", str(path)])
+    assert outcome.exit_code == 0, outcome.output
+    shown = CliRunner().invoke(app, ["runs", "known", "tumbler"])
+    assert "first-1" in shown.output
+    with Catalogue(state) as catalogue:
+        assert [one.posterior for one in catalogue.posteriors()] == ["first-1"]
+    assert load_campaign(with_prior(tmp_path, f"[{path}]")).memory.runs == ("first-1",)  # type: ignore[union-attr]
+
+
+def test_c1_takes_no_prior(state: Path, tmp_path: Path) -> None:
+    path = with_prior(tmp_path, "catalogue")
+    text = path.read_text(encoding="utf-8").replace("strategy: C4", "strategy: C1")
+    path.write_text(text.replace("simulations: auto", "simulations: 200"), encoding="utf-8")
+    with pytest.raises(ConfigError, match="prior: belongs to C4"):
+        load_campaign(path)
