@@ -138,6 +138,11 @@ class Setup:
     watch: SpillWatch | None = None
     held: HeldVessel | None = None
 
+    @property
+    def lost(self) -> bool:
+        """Whether a gripper may have lost the pourer in this pour: then the liquid is unknown, too."""
+        return self.held is not None and bool(self.held.lost)
+
 
 class Consent:
     """Asks the operator, and moves the arm only as far as the operator has agreed.
@@ -244,7 +249,7 @@ class Consent:
         if isinstance(error, BenchLostError):
             raise error  # cannot be recovered from here
         problem = str(error)
-        begun = begun or isinstance(error, VesselLostError)
+        begun = begun or self._setup.lost
         while await self._agreed(stopped_question(error, problem, begun=begun)):
             try:
                 done = await self._setup.arm.recover()

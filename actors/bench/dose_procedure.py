@@ -34,7 +34,6 @@ from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
 from actors.dosing.dosing_settings import DosingSettings
-from actors.grippers.gripper_interface import VesselLostError
 from actors.interfaces import (
     DoseTarget,
     InvalidActionError,
@@ -185,7 +184,7 @@ class DoseProcedure:
             await self._consent.leave_safe()
             raise
         except LaboratoryError as error:
-            self._begun = self._begun or isinstance(error, VesselLostError)
+            self._begun = self._begun or self._setup.lost
             text = f"{error}. Nothing was poured"
             if self._begun:
                 text = f"{error}. It was not the dose that was asked for: {await self._remaining()}"

@@ -141,7 +141,7 @@ class HeldVessel:
         await self._device.revive()
         await self._call("connect")
         state = await self.state()
-        self.holds = self.holds or (not self.lost and state.detected is True)
+        self.holds, self.lost = self.holds or (not self.lost and state.detected is True), ""
 
     def stood(self, mass: float) -> None:
         """The full pourer stood on the balance, with this weight [kg]."""

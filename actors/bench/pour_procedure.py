@@ -33,7 +33,6 @@ from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
 from actors.bench.ground_truth import PourAsk
 from actors.bench.pour_feasibility import vessel
-from actors.grippers.gripper_interface import VesselLostError
 from actors.interfaces import (
     DoseProgress,
     InvalidActionError,
@@ -227,7 +226,7 @@ class PourProcedure:
             await self._consent.leave_safe()
             raise
         except LaboratoryError as error:
-            self._begun = self._begun or isinstance(error, VesselLostError)
+            self._begun = self._begun or self._setup.lost
             if self._begun and not isinstance(error, BalanceError):
                 await self._weigh_remaining()
             await self._consent.leave_safe()

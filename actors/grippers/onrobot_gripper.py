@@ -14,11 +14,10 @@ import http.client
 import threading
 import xmlrpc.client
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from actors.arm.arm_settings import ArmSettings
 from actors.grippers.gripper_interface import (
-    GripperEmulator,
     GripperError,
     GripperSettings,
     GripperState,
@@ -69,8 +68,6 @@ MODELS = {
 class OnRobotSettings(GripperSettings):
     """An OnRobot gripper with its URCap or a Compute Box."""
 
-    emulated: ClassVar[bool] = True
-
     kind: Literal["onrobot"] = "onrobot"
     """An OnRobot gripper."""
 
@@ -99,12 +96,6 @@ class OnRobotSettings(GripperSettings):
     def driver(self) -> tuple[type[Any], tuple[Any, ...]]:
         """See `GripperSettings.driver`."""
         return OnRobotGripper, (self,)
-
-    def start_emulator(self) -> GripperEmulator:
-        """See `GripperSettings.start_emulator`."""
-        from actors.emulators.gripper_emulators import OnRobotEmulator
-
-        return OnRobotEmulator(self)
 
     def check_laboratory(self, problems: Problems, *, mode: str, arm: ArmSettings | None) -> None:
         """See `GripperSettings.check_laboratory`."""

@@ -18,14 +18,13 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, Strict
 
 from actors.arm.arm_settings import ArmSettings
 from actors.grippers.gripper_interface import (
     REST,
-    GripperEmulator,
     GripperError,
     GripperSettings,
     GripperState,
@@ -101,8 +100,6 @@ for the others."""
 class RobotiqSettings(GripperSettings):
     """A Robotiq gripper with its URCap."""
 
-    emulated: ClassVar[bool] = True
-
     kind: Literal["robotiq"] = "robotiq"
     """A Robotiq gripper; the default kind."""
 
@@ -162,12 +159,6 @@ class RobotiqSettings(GripperSettings):
     def driver(self) -> tuple[type[Any], tuple[Any, ...]]:
         """See `GripperSettings.driver`."""
         return RobotiqGripper, (self,)
-
-    def start_emulator(self) -> GripperEmulator:
-        """See `GripperSettings.start_emulator`."""
-        from actors.emulators.gripper_emulators import RobotiqEmulator
-
-        return RobotiqEmulator(self)
 
     def check_values(self, problems: Problems) -> None:
         """See `Settings.check_values`."""
