@@ -300,6 +300,7 @@ def test_a_grip_and_a_lag_that_are_changed_are_found() -> None:
     assert found["lag"].value - plain["lag"].value == pytest.approx(0.3, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_end_of_a_fitted_recording_is_judged_apart_from_its_beginning() -> None:
     one = samples()[1]
     found = fit_recordings([one], ("grip", "lag"), until=5.0)
@@ -382,6 +383,7 @@ outputs: {directory: runs, figures: false, recording: false, pour_recordings: tr
 """
 
 
+@pytest.mark.slow
 def test_a_run_records_its_doses_and_they_can_be_exported_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -97,6 +97,7 @@ def test_what_is_simulated_and_drawn_is_the_repaired_vessel(
     assert np.abs(built.grid.sample(points)).max() < 0.5 * built.grid.spacing
 
 
+@pytest.mark.slow
 def test_a_body_in_the_cavity_is_kept_with_a_warning_unless_it_is_dropped(tmp_path: Path) -> None:
     found = mended(unpacked("liquid_body.stl", tmp_path), unit="mm", wall=None)
     assert capacity(found) == pytest.approx(129.0, rel=0.02)

@@ -94,6 +94,7 @@ def calibrated(tmp_path: Path) -> Callable[[float], Path]:
     return write
 
 
+@pytest.mark.slow
 def test_pours_are_checked_with_the_stored_calibration_of_the_robot(calibrated: Callable[[float], Path]) -> None:
     campaign = ROOT / "configs" / "campaigns" / "first-pour.yaml"
     rig = calibrated(0.0)

@@ -116,6 +116,7 @@ def test_where_nothing_can_be_made_it_ends(name: str) -> None:
     assert len(played.simulations) <= 2 * (MAX_REFUSED + 5)
 
 
+@pytest.mark.slow
 def test_real_vessels_that_touch_are_learnt_in_a_few_refusals() -> None:
     scene = replace(SCENE, fixed={"height": 0.0})
     vessels = build_vessel(scene.pourer), build_vessel(scene.receiver)

@@ -148,6 +148,7 @@ def test_a_slot_that_falls_free_beside_a_pour_has_its_next_simulation_at_once() 
     assert served > 0.9 * with_room
 
 
+@pytest.mark.slow
 def test_the_next_pour_is_asked_for_with_one_quick_question() -> None:
     """No fit from scratch, no picture, no thousand points, and nothing else first."""
     _, log = played(free(costs=CostSettings(worth=0.0), pours=4, prior_simulations=36), narrow_cup, beside=25)
