@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pytest
+
 from actors.runtime.child_process import run
 from tests.support.waiting import PATIENCE
 
