@@ -11,6 +11,10 @@ import pytest
 
 from actors.grippers.gripper_interface import GRIPPERS
 from actors.interfaces import UnknownPourError
+from tests.actors.bench.test_wired_dose import ACTION as DOSE_ACTION
+from tests.actors.bench.test_wired_dose import SCENE as DOSE_SCENE
+from tests.actors.bench.test_wired_dose import check_amount, dosed, dosing_spec
+from tests.actors.bench.test_wired_dose import target as dose_target
 from tests.support.wired_bench import OpenStage, Stage, reach, wired_spec
 
 GRIPPER = GRIPPERS.get("robotiq")(model="2F-85")
@@ -124,3 +128,27 @@ def test_a_pourer_that_still_stands_on_the_balance_is_not_in_the_gripper(open_st
     _, stage = played(open_stage, play)
     assert stage.heard.count("grasp") == 2
     assert "does the pourer still stand on it?" in stage.said("warning")
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_doses_are_poured_from_a_held_pourer_and_a_lost_one_ends_them(open_stage: OpenStage) -> None:
+    async def play() -> Stage:
+        async with open_stage(dosing_spec().with_values(gripper=GRIPPER.with_values(model="2F-140"))) as stage:
+            check_amount(stage, await dosed(stage, 25), 25)
+            again = dose_target(10, fill=False)
+            await stage.bench.pour(DOSE_SCENE, DOSE_ACTION, seed=5, dose=again)  # the pourer stays in the gripper
+            seen: list[Any] = []
+            stage.answers["recover"] = ["no"]
+            pouring = asyncio.ensure_future(dosed(stage, 100, progress=seen.append))
+            await reach(seen, "dose")
+            await stage.site.gripper_fault("lost")
+            with pytest.raises(UnknownPourError, match="the gripper may have lost the pourer"):
+                await pouring
+            return stage
+
+    stage = asyncio.run(play())
+    assert stage.heard == [
+        *("dose_source", "open_gripper", "grasp", "dose_receiver", "start", "dose_cleared", "dose_receiver", "start"),
+        *("let_go", "dose_source", "open_gripper", "grasp", "dose_receiver", "start", "recover"),
+    ]
