@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 import decant
 from actors.interfaces import LaboratoryError
 from actors.laboratory_settings import RaySettings
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.events import CampaignOpened, Event
-from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.journal_check import JournalDamagedError
-from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, RunTaskError, task_request
+from orchestrator.records.events import CampaignOpened, Event
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.journal_check import JournalDamagedError
+from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService, RunTaskError, task_request
 from tests.golden.world import FormulaLaboratory
 from tests.support.scripted_strategy import Script, one_stage, pour, states
 from tests.support.small_campaign import CAMPAIGN, write_campaign

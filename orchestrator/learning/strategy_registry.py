@@ -1,0 +1,48 @@
+"""Plug-in registries of strategies and objectives, built-in and third-party; both use the same entry points."""
+
+from __future__ import annotations
+
+import typing
+
+from orchestrator.learning.campaign_plan import CalibrationSettings, DeploymentSettings, StrategySettings
+from orchestrator.learning.deployment.objectives import Objective
+from sim_engine.settings.plugin_registry import PluginRegistry
+
+
+def _strategy(loaded: object, name: str) -> type[StrategySettings]:
+    if not (isinstance(loaded, type) and issubclass(loaded, CalibrationSettings | DeploymentSettings)):
+        raise TypeError("should be a class derived from CalibrationSettings or DeploymentSettings")
+    _check_tag(loaded.model_fields[loaded.tag].annotation, loaded.tag, name)
+    return loaded
+
+
+def _objective(loaded: object, name: str) -> type[Objective]:
+    if not (isinstance(loaded, type) and issubclass(loaded, Objective)):
+        raise TypeError("should be a class derived from Objective")
+    _check_tag(loaded.model_fields[loaded.tag].annotation, loaded.tag, name)
+    return loaded
+
+
+def _check_tag(annotation: object, tag: str, name: str) -> None:
+    if typing.get_args(annotation) != (name,) or typing.get_origin(annotation) is not typing.Literal:
+        raise TypeError(
+            f"its field '{tag}' should be Literal['{name}'] = '{name}', the name that it is registered under"
+        )
+
+
+STRATEGIES: PluginRegistry[type[StrategySettings]] = PluginRegistry("decant.strategies", "strategy", _strategy)
+"""Settings classes of all installed strategies, calibrations and deployments."""
+
+
+OBJECTIVES: PluginRegistry[type[Objective]] = PluginRegistry("decant.objectives", "objective", _objective)
+"""All installed objectives."""
+
+
+def calibrations() -> dict[str, type[CalibrationSettings]]:
+    """Settings classes of the calibrations, by name."""
+    return {name: found for name, found in STRATEGIES.all.items() if issubclass(found, CalibrationSettings)}
+
+
+def deployments() -> dict[str, type[DeploymentSettings]]:
+    """Settings classes of the deployments, by name."""
+    return {name: found for name, found in STRATEGIES.all.items() if issubclass(found, DeploymentSettings)}
