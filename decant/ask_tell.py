@@ -44,6 +44,7 @@ from orchestrator.learning.requests import Pour, Prediction
 from orchestrator.learning.stage_result import displayed_action
 from orchestrator.records.events import Subscriber as Watch
 from orchestrator.records.run_record import read_record
+from orchestrator.reports.publishing import publish_run
 from orchestrator.reports.stage_views import receiver_names
 from orchestrator.runs.added_pours import weighed_by_hand
 from orchestrator.runs.resume import LOST
@@ -290,7 +291,7 @@ class AskTell:
             if self._closing:
                 handle.pause()
             result = await handle.wait()
-        self._run = Run(self._campaign, result, await asyncio.to_thread(handle.publish))
+        self._run = Run(self._campaign, result, await asyncio.to_thread(publish_run, handle))
 
     def _pause(self) -> None:
         if self._handle is not None:

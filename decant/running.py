@@ -31,7 +31,7 @@ from orchestrator.live_view.live_server import recorder_of
 from orchestrator.records.events import Subscriber as Watch
 from orchestrator.records.run_clock import run_time
 from orchestrator.reports.progress_state import ProgressState
-from orchestrator.reports.publishing import not_simulated
+from orchestrator.reports.publishing import not_simulated, publish_run
 from orchestrator.reports.stage_views import evaluation_of
 from orchestrator.runs.bench_check import BenchReport, check_bench
 from orchestrator.runs.motion_approval import read_record
@@ -175,7 +175,7 @@ class RunningCampaign:
             result = await self._handle.wait()
         finally:
             self._handle.close()
-        return Run(self._campaign, result, await asyncio.to_thread(self._handle.publish))
+        return Run(self._campaign, result, await asyncio.to_thread(publish_run, self._handle))
 
     def __await__(self) -> Generator[Any, None, Run]:
         return self._task.__await__()
@@ -360,7 +360,7 @@ def _run(request: RunRequest, resources: RunResources) -> Run:
     """Run what was checked, record it, and publish it."""
     with closing(RunService().start(request, resources)) as handle:
         result = run_coroutine(handle.wait())
-    return Run(request.campaign, result, handle.publish())
+    return Run(request.campaign, result, publish_run(handle))
 
 
 def _rows(table: Any) -> list[dict[str, Any]]:

@@ -23,9 +23,8 @@ def modules() -> dict[str, Path]:
 PROCESSES = ("python_module", "ConnectedProcess")
 """Functions that start the module which their first argument names, in a process of its own."""
 
-NAMED_ONLY = ("orchestrator.records.codec", "sim_engine.solver_fingerprint")
-"""Modules whose texts are no imports of theirs: the codec names the modules that declare results, which import the
-journal's types; the fingerprint reads the sources that it names."""
+NAMED_ONLY = ("sim_engine.solver_fingerprint",)
+"""Modules whose texts are no imports of theirs: the fingerprint reads the sources that it names."""
 
 
 def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:

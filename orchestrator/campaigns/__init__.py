@@ -1,1 +1,1 @@
-"""Files of campaigns, laboratories and vessels: their sections, their validation, and the plans made from them."""
+"""Files of campaigns, laboratories and vessels: sections, validation, the plans made from them, and prior data."""

@@ -1,8 +1,8 @@
 """File sections of a campaign: keys, types, defaults and their descriptions.
 
 `CampaignFile` is the whole file. Sections of calibration and deployment combine the common keys with the settings of
-each installed strategy. The classes only describe the file; `orchestrator.campaigns.campaign_resolution` converts them to
-a plan.
+each installed strategy. The classes only describe the file; `orchestrator.campaigns.campaign_resolution` converts them
+to a plan.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ def run_in_front_of_people(
     from orchestrator.live_view.live_server import can_record, recorder_of
     from orchestrator.reports.console_progress import ProgressDisplay
     from orchestrator.reports.console_view import print_summary
-    from orchestrator.reports.publishing import not_simulated
+    from orchestrator.reports.publishing import not_simulated, publish_run
     from orchestrator.runs.run_service import RunService
 
     plan, directory = request.campaign, request.folder
@@ -213,7 +213,7 @@ def run_in_front_of_people(
                 print_note(f"report of what stands  {page}")
     try:
         _close(handle, live)
-        published = handle.publish()
+        published = publish_run(handle)
         print_summary(published.summary)
     except KeyboardInterrupt:
         raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None

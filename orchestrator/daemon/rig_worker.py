@@ -36,7 +36,7 @@ from orchestrator.records.run_clock import run_time
 from orchestrator.records.run_record import CampaignResult
 from orchestrator.records.states import State
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
-from orchestrator.reports.publishing import not_simulated
+from orchestrator.reports.publishing import not_simulated, publish_run, publish_so_far
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
@@ -121,7 +121,7 @@ class Running:
             result = await handle.wait()
         finally:
             await asyncio.to_thread(handle.close)
-        await asyncio.to_thread(handle.publish)
+        await asyncio.to_thread(publish_run, handle)
         return result
 
     async def _renew_order(self) -> None:
@@ -222,7 +222,7 @@ class Running:
         """After a stop: publish the results so far, as those of a finished run."""
 
         def work() -> None:
-            RunService().publish_so_far(run_request(self._shared.settings, self.item, self._rig))
+            publish_so_far(run_request(self._shared.settings, self.item, self._rig))
 
         if self.item.run is not None:
             await asyncio.to_thread(work)

@@ -33,7 +33,7 @@ from orchestrator.records.journal_file import whole_copy
 from orchestrator.runs.run_service import RunRequest, RunResources, RunService, RunTaskError, read_theta, task_request
 
 CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
-"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.runs.run_service.read_theta`)."""
+"""Names of the campaign's file, and of that with the θ for planning (`orchestrator.runs.run_service.read_theta`)."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}(/[A-Za-z0-9][A-Za-z0-9._-]{0,79}){0,3}")
 _FILES = 100

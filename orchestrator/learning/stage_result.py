@@ -3,7 +3,7 @@
 - `StageResult` is the base class. Each kind is defined in the module of its strategy.
 - `displayed_action` and `displayed_map` convert actions and surrogates for display; the units are part of the keys.
 
-Reading and writing of results is in `orchestrator.records.codec`.
+Reading and writing of results is in `orchestrator.records.codec`, the list of all kinds in `strategy_registry`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Plug-in registries of strategies and objectives, built-in and third-party; both use the same entry points."""
+"""Plug-in registries of strategies and objectives, built-in and third-party, and the kinds of their results."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import typing
 
 from orchestrator.learning.campaign_plan import CalibrationSettings, DeploymentSettings, StrategySettings
 from orchestrator.learning.deployment.objectives import Objective
+from orchestrator.learning.stage_result import StageResult
 from sim_engine.settings.plugin_registry import PluginRegistry
 
 
@@ -46,3 +47,20 @@ def calibrations() -> dict[str, type[CalibrationSettings]]:
 def deployments() -> dict[str, type[DeploymentSettings]]:
     """Settings classes of the deployments, by name."""
     return {name: found for name, found in STRATEGIES.all.items() if issubclass(found, DeploymentSettings)}
+
+
+def result_kinds() -> tuple[type[StageResult], ...]:
+    """All kinds of results: Decant's own, and those of installed packages with strategies. Loads all strategies."""
+    from orchestrator.learning import dispense, single_action, study_strategies
+    from orchestrator.learning.calibration import calibration_base, calibration_scores, pour_design
+    from orchestrator.learning.deployment import deployment_result
+
+    own = (
+        *(pour_design, calibration_base, calibration_scores, deployment_result),
+        *(single_action, dispense, study_strategies),
+    )
+    packages = {settings.__module__.partition(".")[0] for settings in STRATEGIES.all.values()}
+    kinds = StageResult.KINDS.values()
+    ours = [found for module in own for found in kinds if found.__module__ == module.__name__]
+    theirs = {found for found in kinds if found.__module__.partition(".")[0] in packages}
+    return (*ours, *sorted(theirs - set(ours), key=lambda found: found.__name__))

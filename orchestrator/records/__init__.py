@@ -1,1 +1,1 @@
-"""The write-ahead record of a run, its checks and its readers."""
+"""Records of a run: its events, their write-ahead journal and its check, and the state that they add up to."""

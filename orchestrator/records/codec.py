@@ -3,8 +3,6 @@
 `to_json` and `from_json` follow the type annotations of the values, so a new field needs no code here. Floats are
 preserved bit for bit (shortest round-trip notation). Numbers that are not finite are written as {"$float": "nan"},
 because JSON cannot represent them.
-
-A result is a value with a `kind`, declared next to the strategy that produces it; `kinds` collects all of them.
 """
 
 from __future__ import annotations
@@ -17,9 +15,7 @@ import math
 import types
 from collections.abc import Hashable, Mapping
 from enum import StrEnum
-from importlib import import_module
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ValidationError
@@ -311,28 +307,6 @@ L = TypeVar("L", bound=StageResult)
 Results = Mapping[str, StageResult]
 """Results of the stages by name, in order."""
 
-DECLARED_IN = (
-    "orchestrator.learning.calibration.pour_design",
-    "orchestrator.learning.calibration.calibration_base",
-    "orchestrator.learning.calibration.calibration_scores",
-    "orchestrator.learning.deployment.deployment_result",
-    "orchestrator.learning.single_action",
-    "orchestrator.learning.dispense",
-    "orchestrator.learning.study_strategies",
-)
-"""Modules that declare Decant's own kinds of results; named as text, so that results do not import strategies."""
-
-
-def kinds() -> tuple[type[StageResult], ...]:
-    """All kinds: Decant's own, and those of installed packages with strategies."""
-    strategies = resolve_name("orchestrator.learning.strategy_registry:STRATEGIES").all.values()  # this loads them
-    packages = {settings.__module__.partition(".")[0] for settings in strategies}
-    for module in DECLARED_IN:
-        import_module(module)
-    ours = [found for module in DECLARED_IN for found in StageResult.KINDS.values() if found.__module__ == module]
-    theirs = {found for found in StageResult.KINDS.values() if found.__module__.partition(".")[0] in packages}
-    return (*ours, *sorted(theirs - set(ours), key=lambda found: found.__name__))
-
 
 def encode_result(result: StageResult) -> dict[str, Any]:
     """JSON-ready mapping of a result; numbers that are not finite are encoded as in the journal."""
@@ -347,7 +321,9 @@ def decode_result(data: Mapping[str, Any]) -> StageResult:
     """
     kind = data.get("kind")
     if kind not in StageResult.KINDS:
-        kinds()  # the kind may belong to a package that is not loaded yet
+        from orchestrator.learning.strategy_registry import result_kinds
+
+        result_kinds()  # the kind may belong to a package that is not loaded yet
     known = StageResult.KINDS.get(str(kind))
     if known is None:
         raise RunError(

@@ -66,7 +66,8 @@ class Event:
     """Base of all events.
 
     Attributes:
-        time: when it happened, by `orchestrator.records.run_clock` [s since 1970]; of a replayed event, when the original did.
+        time: when it happened, by `orchestrator.records.run_clock` [s since 1970]; a replayed event has that of the
+            original.
         stage: name of the stage that it belongs to; empty outside stages.
         replayed: it belongs to an interrupted process of the run, and does not happen now.
     """

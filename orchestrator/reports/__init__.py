@@ -1,1 +1,1 @@
-"""Results of a run: summary, tables, figures and HTML report."""
+"""Results for people: progress, summary, tables, figures, HTML report, and recorded pours with their fits."""

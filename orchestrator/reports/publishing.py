@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from orchestrator.catalogue.run_reading import read_run
 from orchestrator.learning.calibration.calibration_base import CalibratedTheta
@@ -20,7 +20,7 @@ from orchestrator.learning.calibration.calibration_scores import (
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import check_journal
-from orchestrator.records.run_record import CampaignResult, read_record
+from orchestrator.records.run_record import CampaignResult, read_record, read_result
 from orchestrator.records.states import State
 from orchestrator.reports import validity_warnings as regimes
 from orchestrator.reports.html_report import REPORT_NAME, run_page
@@ -30,6 +30,9 @@ from orchestrator.reports.run_summary import SUMMARY_NAME, RunSummary, Totals, w
 from orchestrator.reports.stage_views import evaluation_of, theta_of
 from orchestrator.reports.summarise import pool_use, summarise, summarise_record
 from orchestrator.runs.run_folder import read_versions
+
+if TYPE_CHECKING:
+    from orchestrator.runs.run_service import RunHandle, RunRequest
 
 W = TypeVar("W")
 
@@ -94,6 +97,36 @@ def publish(
         _log.warning("the report was not written: %s: %s", type(error).__name__, error)
         report = None
     return Published(summary, figures, summary.recording, theta, report)
+
+
+def publish_run(handle: RunHandle) -> Published:
+    """Close the recording of a finished run, and publish the run. Blocks for seconds.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    assert handle.result is not None, "publish_run() follows wait()"
+    handle.close()
+    recorded = () if handle.recorder is None else (handle.recorder.path, handle.recorder.dropped)
+    return publish(handle.campaign, handle.result, *recorded)
+
+
+def publish_so_far(request: RunRequest) -> Published | None:
+    """Publish a run that has stopped, from its journal.
+
+    Args:
+        request: with the folder of the run.
+
+    Returns:
+        None if the run has no journal.
+
+    Raises:
+        RunError: the journal can't be read.
+        OSError: a file can't be written.
+    """
+    if request.folder is None or not (request.folder / JOURNAL_NAME).is_file():
+        return None
+    return publish(request.campaign, read_result(request.folder))
 
 
 def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:

@@ -22,7 +22,7 @@ from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.learning.deployment.safe_window import WindowFound
 from orchestrator.learning.single_action import Confirmed
 from orchestrator.learning.stage_result import ResultPart, StageResult
-from orchestrator.records.codec import kinds
+from orchestrator.learning.strategy_registry import result_kinds
 from orchestrator.records.run_record import PourState
 from sim_engine.liquids import SimulationParameters
 from sim_engine.model_validity import NotCovered
@@ -373,7 +373,7 @@ class RunSummary(Totals):
 
 def summary_schema() -> dict[str, Any]:
     """JSON schema of `summary.json`, with all kinds of results of the installed packages."""
-    tagged: Any = Annotated[reduce(or_, cast("Any", kinds())), Field(discriminator="kind")]
+    tagged: Any = Annotated[reduce(or_, cast("Any", result_kinds())), Field(discriminator="kind")]
     documented = create_model("RunSummary", __base__=RunSummary, __doc__=RunSummary.__doc__, results=dict[str, tagged])
     schema = documented.model_json_schema(mode="serialization", schema_generator=DescribedSchema)
     return {**schema, "title": "Result"}

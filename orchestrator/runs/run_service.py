@@ -4,7 +4,7 @@
     report = RunService().check(request)          # problems and warnings; nothing is written or started
     with closing(RunService().start(request, RunResources(in_process=True))) as handle:
         result = await handle.wait()
-    published = handle.publish()
+    published = publish_run(handle)               # orchestrator.reports.publishing
 
 `task_request` selects the stages of a task, `RunRequest` is what shall run, `RunResources` are the handles of this
 process, and `RunHandle` controls one run. Signals, queues and caches belong to the callers.
@@ -16,7 +16,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings, RaySettings
@@ -27,7 +27,7 @@ from orchestrator.records.events import Event, Subscriber
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import check_journal, has_begun
 from orchestrator.records.journal_file import Header
-from orchestrator.records.run_record import CampaignResult, RunState, read_result
+from orchestrator.records.run_record import CampaignResult, RunState
 from orchestrator.records.states import State
 from orchestrator.runs.resume import AskOperator
 from orchestrator.runs.run_folder import create_run
@@ -43,8 +43,6 @@ from orchestrator.runs.stages import (
 if TYPE_CHECKING:
     from actors.interfaces import SimulatorPool
     from orchestrator.campaigns.yaml.yaml_errors import Problem
-    from orchestrator.live_view.rerun_subscriber import RerunMonitor
-    from orchestrator.reports.publishing import Published
     from sim_engine.liquids import SimulationParameters
     from sim_engine.vessel.shapes import VesselSpec
 
@@ -97,6 +95,27 @@ class RunRequest:
         return any(stage.pours for stage in self.stages)
 
 
+class Recorder(Protocol):
+    """A subscriber that writes a recording of the run.
+
+    Attributes:
+        path: of the recording.
+        dropped: number of events that it lacks.
+    """
+
+    @property
+    def path(self) -> Path: ...  # noqa: D102
+
+    @property
+    def dropped(self) -> int: ...  # noqa: D102
+
+    def __call__(self, event: Event, /) -> None:
+        """Take an event; never waits."""
+
+    def close(self) -> object:
+        """Finish the file. May block, and may be called twice."""
+
+
 @dataclass(frozen=True)
 class RunResources:
     """Handles of this process that a run uses. Shared ones stay open.
@@ -124,7 +143,7 @@ class RunResources:
     ask_operator: AskOperator | None = None
     approved_checksum: str = ""
     subscribers: Sequence[Subscriber] = ()
-    recorder: Callable[[CampaignPlan, Path], RerunMonitor | None] | None = None
+    recorder: Callable[[CampaignPlan, Path], Recorder | None] | None = None
     laboratory: Callable[[LaboratorySettings, bool], Laboratory] | None = None
 
     def settings(self, campaign: CampaignPlan) -> LaboratorySettings:
@@ -160,7 +179,7 @@ class CheckReport:
 
 
 class RunService:
-    """Checks, starts and publishes runs. It has no state: every call stands alone."""
+    """Checks and starts runs. It has no state: every call stands alone."""
 
     def check(self, request: RunRequest, *, doing: Callable[[str], None] = lambda text: None) -> CheckReport:
         """Check everything that needs no laboratory: draws of θ, vessels, loads, motions. Writes and starts nothing.
@@ -240,25 +259,6 @@ class RunService:
         recorder = None if resources.recorder is None else resources.recorder(request.campaign, request.folder)
         return RunHandle(request, resources, laboratory, request.folder, recorder)
 
-    def publish_so_far(self, request: RunRequest) -> Published | None:
-        """Publish the results of a run that has stopped, from its journal.
-
-        Args:
-            request: with the folder of the run.
-
-        Returns:
-            None if the run has no journal.
-
-        Raises:
-            RunError: the journal can't be read.
-            OSError: a file can't be written.
-        """
-        from orchestrator.reports.publishing import publish
-
-        if request.folder is None or not (request.folder / JOURNAL_NAME).is_file():
-            return None
-        return publish(request.campaign, read_result(request.folder))
-
 
 class RunHandle:
     """One run of this process, which `wait` runs once. Call `close` afterwards, however it ends.
@@ -267,6 +267,9 @@ class RunHandle:
 
     Attributes:
         folder: of the run.
+        campaign: its plan.
+        recorder: of its recording; None without one.
+        result: after `wait`.
         state: what the run's events say so far.
     """
 
@@ -276,10 +279,10 @@ class RunHandle:
         resources: RunResources,
         laboratory: Laboratory,
         folder: Path,
-        recorder: RerunMonitor | None,
+        recorder: Recorder | None,
     ) -> None:
-        self._request, self._laboratory, self._recorder = request, laboratory, recorder
-        self.folder, self.state = folder, RunState(Header(request.campaign.name, {}))
+        self._request, self._laboratory, self.recorder = request, laboratory, recorder
+        self.campaign, self.folder, self.state = request.campaign, folder, RunState(Header(request.campaign.name, {}))
         self._ask_operator = resources.ask_operator
         self._subscribers: list[Subscriber] = [*resources.subscribers, self._note]
         if recorder is not None:
@@ -288,7 +291,7 @@ class RunHandle:
             self._subscribers.append(VesselAccount.open().follow(series))
         self._pausing = self._aborting = self._abandoning = False
         self._winding_down = asyncio.Event()
-        self._result: CampaignResult | None = None
+        self.result: CampaignResult | None = None
         self._task: asyncio.Task[CampaignResult] | None = None
 
     @property
@@ -322,26 +325,13 @@ class RunHandle:
         self._task = asyncio.ensure_future(work)
         if self._pausing:
             self._task.cancel()
-        self._result = await self._task
-        return self._result
+        self.result = await self._task
+        return self.result
 
     def close(self) -> None:
         """Close the recording. May block, and may be called twice."""
-        if self._recorder is not None:
-            self._recorder.close()
-
-    def publish(self) -> Published:
-        """Close the recording; write figures, summary, θ* and report of the finished run. Blocks for seconds.
-
-        Raises:
-            OSError: a file can't be written.
-        """
-        from orchestrator.reports.publishing import publish
-
-        assert self._result is not None, "publish() follows wait()"
-        self.close()
-        recorded = () if self._recorder is None else (self._recorder.path, self._recorder.dropped)
-        return publish(self._request.campaign, self._result, *recorded)
+        if self.recorder is not None:
+            self.recorder.close()
 
     # ---- ending it sooner
 

@@ -20,6 +20,7 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.app import app
+from orchestrator.reports.publishing import publish_run
 from orchestrator.reports.recording_export import export_recordings
 from orchestrator.reports.recording_file import PourRecording, load_recording, load_recordings
 from orchestrator.reports.recording_fit import Fit, fit_recordings, judge_recording, read_values
@@ -392,7 +393,7 @@ def test_a_run_records_its_doses_and_they_can_be_exported_again(
     async def scenario() -> None:
         with contextlib.closing(RunService().start(task_request(plan, "run"), resources)) as handle:
             await handle.wait()
-            handle.publish()
+            publish_run(handle)
 
     asyncio.run(scenario())
     run = next((tmp_path / "runs").iterdir())

@@ -82,14 +82,14 @@ def test_publishing_names_the_recording_and_can_be_done_again(tmp_path: Path, re
 
 
 def test_kinds_of_installed_strategies_are_in_the_schema_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrator.records import codec as module
+    from orchestrator.learning import strategy_registry as module
     from orchestrator.reports.run_summary import summary_schema
     from tests.support.scripted_strategy import Scripted
 
-    assert Scripted not in module.kinds()
+    assert Scripted not in module.result_kinds()
     settings = type("Settings", (), {"__module__": Scripted.__module__})
     monkeypatch.setattr(
         "orchestrator.learning.strategy_registry.STRATEGIES", SimpleNamespace(all={"scripted": settings})
     )
-    assert Scripted in module.kinds()
+    assert Scripted in module.result_kinds()
     assert "Scripted" in summary_schema()["$defs"]
