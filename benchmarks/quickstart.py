@@ -57,6 +57,7 @@ from machine import ROOT, run_self, say, write_table
 from players import by_turn, coverage, interval
 
 from actors.bench.ground_truth import draw_pose_error
+from actors.interfaces import InvalidActionError
 from actors.simulators.job_runner import Simulator, pour_simulator
 from actors.simulators.local_worker import ThreadWorker
 from actors.simulators.pool import WorkerPool
@@ -288,8 +289,11 @@ async def spilled(
     seed: int,
     error: PoseError | None = None,
 ) -> float:
-    """Return the simulated spillage; 1 if it is undefined, which no pour of this campaign is."""
-    outcome = (await pool.simulate(PourTask(scene, action, theta, seed, pose_error=error))).outcome
+    """Return the simulated spillage; 1 if it is undefined, or if the cups touch with this θ."""
+    try:
+        outcome = (await pool.simulate(PourTask(scene, action, theta, seed, pose_error=error))).outcome
+    except InvalidActionError:
+        return 1.0
     found = normalised_spillage(outcome.fractions)
     return 1.0 if found is None else found
 

@@ -30,6 +30,9 @@ from actors.balance.balance_settings import SerialBalanceSettings
 from actors.balance.display_behaviour import DisplayBehaviour
 from actors.balance.scale_model import ScaleSettings
 from actors.dosing.dosing_settings import DosingSettings
+from actors.grippers.digital_gripper import DigitalSettings
+from actors.grippers.onrobot_gripper import OnRobotSettings
+from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import OperatorSettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
 from orchestrator.campaigns import campaign_file as campaign
@@ -62,7 +65,7 @@ from sim_engine.scene import PoseErrorSettings
 from sim_engine.settings.model import Choice, Settings, meanings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
-from sim_engine.vessel.shapes import ProfileShape
+from sim_engine.vessel.shapes import ProfileShape, VesselGrip
 
 FOLDER = Path(__file__).parent
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -90,6 +93,7 @@ SECTIONS: dict[str, type[Settings]] = {
     "liquid": LiquidSettings,
     "vessel": vessel.VesselFile,
     "profile": ProfileShape,
+    "grip": VesselGrip,
     "recording": recording.RecordingFile,
     "placement": recording.RecordedPlacement,
     "recorded-balance": recording.RecordedBalance,
@@ -99,6 +103,9 @@ SECTIONS: dict[str, type[Settings]] = {
     "arm": UrArmSettings,
     "limits": ArmLimits,
     "cell": RobotCell,
+    "gripper-robotiq": RobotiqSettings,
+    "gripper-onrobot": OnRobotSettings,
+    "gripper-digital": DigitalSettings,
     "pump": SimulatedPumpSettings,
     "source": SourceSettings,
     "spill-sensor": SimulatedSpillSensorSettings,
@@ -141,6 +148,9 @@ OF_SECTIONS = {
     "ScaleSettings": "[virtual balance](#virtual-balance)",
     "DisplayBehaviour": "[display behaviour](#display-behaviour)",
     "PumpSettings": "[pump](#pump)",
+    "GripperSettings": "[gripper](grippers.md)",
+    "EmulatedOnRobotSettings": "[gripper](grippers.md)",
+    "EmulatedRobotiqSettings": "[gripper](grippers.md)",
     "SpillSensorSettings": "[spill sensor](#spill-sensor)",
     "OperatorSettings": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",

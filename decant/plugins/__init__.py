@@ -1,4 +1,4 @@
-"""Names for authors of plug-ins: strategies, objectives, balances, arms, pumps, spill sensors and sources of vessels.
+"""Names for authors of plug-ins: strategies, objectives, sources of vessels, and all kinds of devices.
 
 How to write one: docs/extend/plug-ins.md.
 
@@ -53,6 +53,13 @@ if TYPE_CHECKING:
     from actors.balance.scale_model import Load
     from actors.balance.serial_balance import SerialBalance
     from actors.bench.pour_feasibility import plan_pour
+    from actors.grippers.gripper_interface import (
+        Gripper,
+        GripperEmulator,
+        GripperError,
+        GripperSettings,
+        GripperState,
+    )
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
     from actors.liquid_devices import (
         Pump,
@@ -179,6 +186,11 @@ __all__ = [
     "ExecutedMotion",
     "Failed",
     "Fractions",
+    "Gripper",
+    "GripperEmulator",
+    "GripperError",
+    "GripperSettings",
+    "GripperState",
     "History",
     "InvalidActionError",
     "LaboratoryError",
@@ -367,6 +379,14 @@ _SOURCES = {
     "actors.arm.arm_settings": ("ArmDiagnostics", "ArmEmulator", "ArmKind", "ArmSettings", "History"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
     "actors.bench.pour_feasibility": ("plan_pour",),
+    # Grippers
+    "actors.grippers.gripper_interface": (
+        "Gripper",
+        "GripperEmulator",
+        "GripperError",
+        "GripperSettings",
+        "GripperState",
+    ),
     # Pumps and spill sensors
     "actors.liquid_devices": (
         "Pump",

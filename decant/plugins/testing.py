@@ -2,6 +2,7 @@
 
     from decant.plugins.testing import ArmBench, ArmContract            # needs pytest
     from decant.plugins.testing import BalanceBench, BalanceContract    # needs pytest
+    from decant.plugins.testing import GripperContract, GripperRig    # needs pytest
     from decant.plugins.testing import PumpContract, PumpRig, SpillRig, SpillSensorContract    # needs pytest
     from decant.plugins.testing import StrategyHarness, check_strategy
 
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from actors.contract_tests.arm_contract import ArmBench, ArmContract
     from actors.contract_tests.balance_contract import BalanceBench, BalanceContract
+    from actors.contract_tests.gripper_contract import GripperContract, GripperRig
     from actors.contract_tests.liquid_device_contracts import PumpContract, PumpRig, SpillRig, SpillSensorContract
     from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
     from orchestrator.runs.strategy_harness import (
@@ -43,6 +45,8 @@ __all__ = [
     "ArmContract",
     "BalanceBench",
     "BalanceContract",
+    "GripperContract",
+    "GripperRig",
     "PumpContract",
     "PumpRig",
     "SpillModel",
@@ -61,6 +65,8 @@ _CONTRACTS = {
     "ArmContract": "actors.contract_tests.arm_contract",
     "BalanceBench": "actors.contract_tests.balance_contract",
     "BalanceContract": "actors.contract_tests.balance_contract",
+    "GripperContract": "actors.contract_tests.gripper_contract",
+    "GripperRig": "actors.contract_tests.gripper_contract",
     "PumpContract": "actors.contract_tests.liquid_device_contracts",
     "PumpRig": "actors.contract_tests.liquid_device_contracts",
     "SpillRig": "actors.contract_tests.liquid_device_contracts",

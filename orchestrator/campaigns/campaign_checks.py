@@ -19,9 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from actors.arm.arm_settings import ArmSettings, arm_kind
+from actors.bench.held_vessel import grip_limits
 from actors.bench.pour_feasibility import vessel as built
 from actors.dosing.simulated_dose import check_straight
-from actors.interfaces import InvalidActionError, UnreachablePlaceError
+from actors.grippers.gripper_interface import GripperSettings
+from actors.interfaces import InvalidActionError, LaboratoryError, UnreachablePlaceError
 from orchestrator.campaigns.yaml.file_access import why_not_writable
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Loc
@@ -224,6 +226,7 @@ def _ignore(findings: object) -> None:
 class _Checker:
     source: Path
     arm: ArmSettings | None = None
+    gripper: GripperSettings | None = None
     document: Document | None = None
     warn: Callable[[Problem], None] = _ignore
     doing: Callable[[str], None] = _ignore
@@ -270,7 +273,7 @@ class _Checker:
         receiver = self.vessel(scene.receiver, places["receiver"])
         if pourer is None or receiver is None:
             return None
-        ok = True
+        ok = self._grippable(pourer, places["pourer"])
         load = f"the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g)"
         less = wanted is not None and wanted < scene.liquid.volume
         for vessel, name in ((pourer, "pourer"), (receiver, "receiver")):
@@ -329,6 +332,17 @@ class _Checker:
             f"A larger x_offset or height would clear them"
         )
         self.add(role.places(("actions",)), text)
+
+    def _grippable(self, pourer: Vessel, places: tuple[Loc, ...]) -> bool:
+        """Whether the laboratory's gripper can hold the pourer; if not, a problem is added."""
+        if self.gripper is None or self.arm is None:
+            return True
+        try:
+            grip_limits(pourer, self.gripper, self.arm)
+        except LaboratoryError as error:
+            self.add(places, str(error))
+            return False
+        return True
 
     def _payload(self, scene: Scene) -> None:
         """The configured payload of the arm can't be less than the mass of the liquid."""
@@ -472,7 +486,7 @@ def check_campaign(
         document = Document.read(plan.source) if as_written else None
     except ConfigError:
         document = None  # a plan without a file
-    checker = _Checker(plan.source, plan.laboratory.arm, document, warn, doing)
+    checker = _Checker(plan.source, plan.laboratory.arm, plan.laboratory.gripper, document, warn, doing)
     at: Loc
     if (problem := why_not_writable(plan.outputs.folder)) is not None:
         checker.add((("outputs", "directory"),), problem)

@@ -28,11 +28,12 @@ def doors() -> tuple[PluginRegistry[Any], ...]:
     """All plug-in registries. Plug-ins are loaded on first use."""
     from actors.arm.arm_settings import ARMS
     from actors.balance.dialect_registry import BALANCES
+    from actors.grippers.gripper_interface import GRIPPERS
     from actors.liquid_devices import PUMPS, SPILL_SENSORS
     from orchestrator.learning.strategy_registry import OBJECTIVES, STRATEGIES
     from sim_engine.vessel.shapes import VESSELS
 
-    return STRATEGIES, OBJECTIVES, BALANCES, ARMS, PUMPS, SPILL_SENSORS, VESSELS
+    return STRATEGIES, OBJECTIVES, BALANCES, ARMS, GRIPPERS, PUMPS, SPILL_SENSORS, VESSELS
 
 
 def installed() -> list[Plugin]:

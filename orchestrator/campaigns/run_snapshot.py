@@ -101,12 +101,13 @@ def _deployment(base: Mapping[str, Any], plan: DeploymentPlan) -> dict[str, Any]
 def vessel_record(vessel: VesselSpec) -> dict[str, Any]:
     """A vessel in the format of its file."""
     shape = vessel.shape
+    grip = {} if vessel.grip is None else {"grip": written(vessel.grip)}
     match shape:
         case MeshShape():
             unit = {} if shape.unit is None else {"unit": shape.unit}
-            return {"name": vessel.name, "mesh": str(shape.path), "up": shape.up, **unit}
+            return {"name": vessel.name, "mesh": str(shape.path), "up": shape.up, **unit, **grip}
         case _:
-            return {"name": vessel.name, shape.kind: written(shape)}
+            return {"name": vessel.name, shape.kind: written(shape), **grip}
 
 
 def _common(base: Mapping[str, Any], section: type[Settings]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from orchestrator.campaigns.yaml.file_access import missing_file, resolved
 from orchestrator.campaigns.yaml.yaml_source import Place, Report
 from sim_engine.settings.model import Example, FilePath, Name, Problems, Settings
 from sim_engine.vessel.mesh_shape import MeshShape
-from sim_engine.vessel.shapes import VESSELS, LengthUnit, ProfileShape, Shape, VesselSpec
+from sim_engine.vessel.shapes import VESSELS, LengthUnit, ProfileShape, Shape, VesselGrip, VesselSpec
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
 
@@ -33,6 +33,9 @@ class VesselBase(Settings):
 
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """Axis of the mesh that points out of the opening; z unless given."""
+
+    grip: VesselGrip | None = None
+    """How wide the vessel is where a gripper holds it; from its shape unless given."""
 
     def check_values(self, problems: Problems) -> None:
         """Check that the shape is given once."""
@@ -81,4 +84,4 @@ def resolve_vessel(section: VesselBase, place: Place, report: Report) -> VesselS
         shape = MeshShape(path=path, unit=section.unit, up=section.up or "z")
     if shape is None or report.is_broken_within(place):
         return None
-    return VesselSpec(name=section.name, shape=shape)
+    return VesselSpec(name=section.name, shape=shape, grip=section.grip)

@@ -94,6 +94,8 @@ def check_bench(
             accept = f"decant robot check {path} --accept-safety"
             checks += found.checks(record, accept=accept, virtual=spec.mode != "hardware")
             checks += balance_diagnostics(ready.balance, tare=tare)
+            gripper = None if ready.gripper is None else ready.gripper.beside(ready.arm)
+            checks += device_checks(None, None, None, gripper)
     else:
         checks += balance_diagnostics(spec.balance, tare=tare)
     if spec.mode == "hardware" and spec.source is not None and spec.source.balance is not None:

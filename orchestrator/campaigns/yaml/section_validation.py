@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import copy
+import difflib
 import typing
 from collections.abc import Iterator
 from typing import Any, TypeVar
@@ -94,7 +95,12 @@ def _guess_variant(variants: set[type[Settings]], data: dict[str, Any], place: P
         said = why_unusable(next(iter(variants)).plugins, word) if isinstance(word, str) else ""
         report.add(place.at(key), said or _one_of(word, expected))
     by_word = {section.tag_word(): section for section in variants}
-    data[key] = max(words, key=lambda word: len(data.keys() & by_word[word].written_keys()))
+
+    def fits(name: str) -> tuple[int, float]:
+        alike = difflib.SequenceMatcher(None, str(word), name).ratio()
+        return len(data.keys() & by_word[name].written_keys()), alike
+
+    data[key] = max(words, key=fits)
 
 
 def _variant(sections: set[type[Settings]], data: Any) -> set[type[Settings]]:
