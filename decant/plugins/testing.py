@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from actors.contract_tests.gripper_contract import GripperContract, GripperRig
     from actors.contract_tests.liquid_device_contracts import PumpContract, PumpRig, SpillRig, SpillSensorContract
     from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
-    from orchestrator.strategy_harness import (
+    from orchestrator.runs.strategy_harness import (
         ACTIONS,
         CALIBRATION_ACTIONS,
         PARAMETERS,
@@ -73,7 +73,7 @@ _CONTRACTS = {
     "SpillSensorContract": "actors.contract_tests.liquid_device_contracts",
 }
 
-_SOURCE_OF = dict.fromkeys(__all__, "orchestrator.strategy_harness") | {
+_SOURCE_OF = dict.fromkeys(__all__, "orchestrator.runs.strategy_harness") | {
     **_CONTRACTS,
     "VirtualSerialBalance": "actors.emulators.serial_balance.balance_process",
 }

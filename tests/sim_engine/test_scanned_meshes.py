@@ -18,13 +18,13 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
+from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.app import app
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.file_commands import validate
 from orchestrator.cli.vessel_command import vessel
 from orchestrator.cli.vessel_tables import read_points
-from orchestrator.config.file_loading import load_vessel
-from orchestrator.results.pour_figures import section
+from orchestrator.reports.pour_figures import section
 from sim_engine.vessel.exact_cavity import exact_cavity
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import VesselError, VesselSpec

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from actors.arm.ur_settings import UrArmSettings
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign, load_laboratory
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from tests.support.cli_inputs import RECORDED, ROOT, invoke, process
 
 

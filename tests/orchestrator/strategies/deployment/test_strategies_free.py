@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.journal.journal import Kind
-from orchestrator.journal.run_record import POOL_RESTS, Occupancy, read_record
-from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
-from orchestrator.strategies.deployment.costing import Costs, CostSettings
-from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
-from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings, subsampled
-from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
+from orchestrator.learning.deployment.costing import Costs, CostSettings
+from orchestrator.learning.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
+from orchestrator.learning.deployment.model_monitoring import DiscrepancyPolicySettings, subsampled
+from orchestrator.learning.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.records.journal import Kind
+from orchestrator.records.run_record import POOL_RESTS, Occupancy, read_record
+from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness
 from tests.orchestrator.test_stages import campaign, laboratory
 from tests.support.killed_runs import die_at, finished_times
 from tests.support.plans import deployment_plan
