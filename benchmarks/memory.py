@@ -79,10 +79,10 @@ def _cup(name: str, radius: float) -> dict[str, Any]:
 def calibrated(seed: int, number: int, arm: str, into: Path) -> dict[str, Any]:
     """Run one campaign; return the errors of θ* on 12 further pours, and what it says about its memory."""
     from decant.running import build_campaign
-    from orchestrator.journal.codec import result_of
-    from orchestrator.run_service import RunRequest, RunResources, RunService
+    from orchestrator.learning.calibration.calibration_base import Calibrated
+    from orchestrator.records.codec import result_of
+    from orchestrator.runs.run_service import RunRequest, RunResources, RunService
     from orchestrator.runs.stages import CALIBRATION, calibration_stages
-    from orchestrator.strategies.calibration.calibration_base import Calibrated
 
     state = into / f"state-{seed}" / ("memory" if arm in ("memory", "moved", "other liquid") or number == 0 else arm)
     os.environ["DECANT_STATE"] = str(state)

@@ -22,15 +22,15 @@ from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, annotate
 from orchestrator.catalogue.export import write_tables
 from orchestrator.catalogue.queries import condition_sql, differing_settings, outcomes
 from orchestrator.catalogue.run_reading import TABLES, UNREADABLE, Column, RunRead, read_run, unreadable
-from orchestrator.catalogue.run_registry import known, make_state_directory, state_directory
-from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.journal_check import has_begun
-from orchestrator.journal.run_record import Row, read_header
-from orchestrator.run_errors import RunError
-from orchestrator.states import RESTING
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.journal_check import has_begun
+from orchestrator.records.run_record import Row, read_header
+from orchestrator.records.run_registry import known, make_state_directory, state_directory
+from orchestrator.records.states import RESTING
 
 if TYPE_CHECKING:
-    from orchestrator.config.campaign_prior import KnownPosterior, PosteriorSource
+    from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource
 
 INDEX_NAME = "catalogue.sqlite"
 
@@ -80,7 +80,7 @@ class CatalogueClient(Protocol):
 
 def posterior_source() -> PosteriorSource:
     """The posteriors of this machine, for a campaign that is being loaded."""
-    from orchestrator.config.campaign_prior import PosteriorSource
+    from orchestrator.campaigns.campaign_prior import PosteriorSource
     from orchestrator.runs.run_folder import simulator_version
 
     def every() -> list[KnownPosterior]:
@@ -230,8 +230,8 @@ class Catalogue:
         Raises:
             RunError, OSError: an imported one can't be read.
         """
+        from orchestrator.campaigns.campaign_prior import KnownPosterior
         from orchestrator.catalogue.known_posteriors import imported  # slow import
-        from orchestrator.config.campaign_prior import KnownPosterior
 
         query = "select content from posterior join run using (path) order by begun, path"
         found = [KnownPosterior.model_validate_json(row[0]) for row in self._connection.execute(query)]

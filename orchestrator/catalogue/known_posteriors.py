@@ -1,6 +1,6 @@
 """The posteriors of earlier calibrations: of one run, of the catalogue, and from files.
 
-- `posterior_of` reads what a finished calibration tells (`orchestrator.config.campaign_prior.KnownPosterior`).
+- `posterior_of` reads what a finished calibration tells (`orchestrator.campaigns.campaign_prior.KnownPosterior`).
 - `posterior_text` writes the file of one; `import_posterior` enters what another machine has exported.
 
 A posterior enters later campaigns by what its own pours tell: without the prior that the calibration itself had, and
@@ -15,14 +15,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from orchestrator.catalogue.run_registry import make_state_directory, state_directory
-from orchestrator.config.campaign_prior import KnownPosterior, arm_of, shape_digest
-from orchestrator.config.run_snapshot import written
-from orchestrator.journal.codec import from_json
-from orchestrator.journal.run_record import RunState, read_record
-from orchestrator.run_errors import RunError
+from orchestrator.campaigns.campaign_prior import KnownPosterior, arm_of, shape_digest
+from orchestrator.campaigns.run_snapshot import written
+from orchestrator.learning.calibration.campaign_memory import estimates, group_of
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.codec import from_json
+from orchestrator.records.run_record import RunState, read_record
+from orchestrator.records.run_registry import make_state_directory, state_directory
 from orchestrator.runs.run_folder import SIMULATOR, read_versions
-from orchestrator.strategies.calibration.campaign_memory import estimates, group_of
 from sim_engine.liquids import Liquid, ParameterInfo, SimulationParameters
 from sim_engine.search_space import Axis
 

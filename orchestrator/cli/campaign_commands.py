@@ -30,9 +30,9 @@ from orchestrator.cli.command_options import (
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_note
 
 if TYPE_CHECKING:
-    from orchestrator.journal.run_record import CampaignResult
-    from orchestrator.results.publishing import Published
-    from orchestrator.strategies.campaign_plan import CampaignPlan
+    from orchestrator.learning.campaign_plan import CampaignPlan
+    from orchestrator.records.run_record import CampaignResult
+    from orchestrator.reports.publishing import Published
 
 
 _TOLD = {
@@ -75,8 +75,8 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         )
         from orchestrator.cli.motion_control import enable_campaign_motion
         from orchestrator.cli.view_command import live_view
-        from orchestrator.results.run_summary import summary_json
-        from orchestrator.run_service import RunResources, RunTaskError, task_request
+        from orchestrator.reports.run_summary import summary_json
+        from orchestrator.runs.run_service import RunResources, RunTaskError, task_request
 
         with Refused(RunTaskError):
             resumed = functools.partial(run_directory, resume=True, run_id=run_id) if resume else None
@@ -134,11 +134,11 @@ The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m
 def calibration_json(result: CampaignResult, published: Published) -> dict[str, Any]:
     """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
     `CalibrationEvaluation`."""
-    from orchestrator.journal.codec import result_of
-    from orchestrator.results.stage_views import rival_scores
+    from orchestrator.learning.calibration.calibration_base import Calibrated
+    from orchestrator.learning.calibration.calibration_scores import CALIBRATED, Scores
+    from orchestrator.records.codec import result_of
+    from orchestrator.reports.stage_views import rival_scores
     from orchestrator.runs.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
-    from orchestrator.strategies.calibration.calibration_base import Calibrated
-    from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, Scores
 
     results = result.results
     theta, calibration = calibrated_theta(results).theta, result_of(results, CALIBRATION, Calibrated)
@@ -194,11 +194,11 @@ def plan(
         run_in_front_of_people,
     )
     from orchestrator.cli.simulate_command import prediction_inputs
-    from orchestrator.journal.codec import result_of
-    from orchestrator.run_service import RunRequest, RunResources
+    from orchestrator.learning.deployment.deployment_result import Deployed
+    from orchestrator.learning.single_action import PredictedPour
+    from orchestrator.records.codec import result_of
+    from orchestrator.runs.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
-    from orchestrator.strategies.deployment.deployment_result import Deployed
-    from orchestrator.strategies.single_action import PredictedPour
 
     chosen = planning_plan(read_campaign(campaign, laboratory, seed), parameters, receiver, iterations)
     assert chosen.deployment is not None
@@ -267,9 +267,9 @@ def planning_plan(
     Raises:
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
-    from orchestrator.config.file_loading import load_vessel
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.run_service import RunTaskError, planned, read_theta
+    from orchestrator.campaigns.file_loading import load_vessel
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.runs.run_service import RunTaskError, planned, read_theta
 
     with Refused(ConfigError, RunTaskError):
         given = None if parameters is None else read_theta(parameters, plan)
@@ -282,7 +282,7 @@ def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Pa
     Raises:
         RefusalError: there is none, or it can't be made (exit code 2).
     """
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
     from orchestrator.runs.run_folder import create_run, find_run
 
     if run_id is not None and not resume:

@@ -24,8 +24,8 @@ from orchestrator.cli.console import (
 if TYPE_CHECKING:
     from actors.dosing.dose_series import DoseForecast
     from actors.interfaces import DoseSource
-    from orchestrator.strategies.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
-    from orchestrator.strategies.dispense import Dose, KnownSource
+    from orchestrator.learning.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
+    from orchestrator.learning.dispense import Dose, KnownSource
     from sim_engine.scene import Scene
 
 
@@ -84,7 +84,7 @@ def dose(
 
 
 def _planned_doses(amounts: Sequence[str], tolerance: str, receiver: str) -> tuple[PlannedDose, ...]:
-    from orchestrator.strategies.campaign_plan import PlannedDose
+    from orchestrator.learning.campaign_plan import PlannedDose
     from sim_engine.settings.quantity import QuantityError, parse_quantity
 
     with Refused(QuantityError, at="--tolerance: "):
@@ -119,9 +119,9 @@ def dose_plan(
     Raises:
         RefusalError: the campaign can't be read, it has no bench, or a dose is impossible (exit code 2).
     """
+    from orchestrator.campaigns.campaign_checks import check_campaign
     from orchestrator.cli.foreground_run import read_campaign
-    from orchestrator.config.campaign_checks import check_campaign
-    from orchestrator.strategies.campaign_plan import DispensePlan
+    from orchestrator.learning.campaign_plan import DispensePlan
 
     plan = read_campaign(path, laboratory)
     if not plan.laboratory.pours:
@@ -163,7 +163,7 @@ def _scenes(plan: CampaignPlan) -> list[Scene]:
 
 
 def _known(plan: DispensePlan) -> dict[str, KnownSource]:
-    from orchestrator.catalogue.vessel_account import VesselAccount
+    from orchestrator.materials.vessel_account import VesselAccount
 
     if not plan.as_left:
         return {}
@@ -177,8 +177,8 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
     """Predict one dose after the other; each leaves the source with its expected content."""
     from actors.interfaces import DoseTarget
     from actors.laboratory import predicted_dose
-    from orchestrator.strategies.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, Dispense, KnownSource
-    from orchestrator.strategies.trials import SeedStream
+    from orchestrator.learning.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, Dispense, KnownSource
+    from orchestrator.learning.trials import SeedStream
 
     assert plan.dispense is not None
     series, known = plan.dispense, _known(plan.dispense)
@@ -283,8 +283,8 @@ def pour_doses(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: st
         run_in_front_of_people,
     )
     from orchestrator.cli.motion_control import confirm
-    from orchestrator.journal.codec import result_of
-    from orchestrator.run_service import RunRequest, RunResources
+    from orchestrator.learning.dispense import Dispensed
+    from orchestrator.records.codec import result_of
     from orchestrator.runs.motion_approval import (
         SafetyRecordError,
         campaign_pours,
@@ -292,8 +292,8 @@ def pour_doses(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: st
         envelope_lines,
         required_checksum,
     )
+    from orchestrator.runs.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import DOSES, dispense_stages
-    from orchestrator.strategies.dispense import Dispensed
 
     assert plan.dispense is not None
     if plan.laboratory.arm is None:  # the recording shows the motions of an arm, and there is none

@@ -28,8 +28,8 @@ from orchestrator.runs.motion_approval import SafetyRecordError, required_checks
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, ArmFacts, Executed, PlannedPour
     from actors.laboratory_settings import LaboratorySettings
+    from orchestrator.learning.campaign_plan import CampaignPlan
     from orchestrator.runs.stages import StageDefinition
-    from orchestrator.strategies.campaign_plan import CampaignPlan
 
 T = TypeVar("T")
 

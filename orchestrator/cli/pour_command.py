@@ -36,8 +36,8 @@ from orchestrator.cli.console import (
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Executed, PathReport, PlannedPour
-    from orchestrator.strategies.campaign_plan import CampaignPlan
-    from orchestrator.strategies.single_action import WeighedPour
+    from orchestrator.learning.campaign_plan import CampaignPlan
+    from orchestrator.learning.single_action import WeighedPour
     from sim_engine.action import Action
     from sim_engine.scene import Scene
 
@@ -143,9 +143,9 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     """
     from actors.arm.arm_settings import arm_kind
     from actors.interfaces import InvalidActionError
+    from orchestrator.campaigns.action_assignments import assigned_action
+    from orchestrator.campaigns.campaign_checks import check_vessels
     from orchestrator.cli.simulate_command import scene_to_simulate, wanted_in
-    from orchestrator.config.action_assignments import assigned_action
-    from orchestrator.config.campaign_checks import check_vessels
 
     scene, space = scene_to_simulate(plan, scene_name)
     with Refused(ValueError, at="--set: "):
@@ -173,8 +173,8 @@ def report_json(report: PathReport) -> dict[str, Any]:
 def _draw(chosen: Chosen, png: Path) -> None:
     from actors.arm.planned_pour import PourPath
     from actors.arm.ur_settings import UrArmSettings
-    from orchestrator.results import figure_style
-    from orchestrator.results.pour_figures import draw_path
+    from orchestrator.reports import figure_style
+    from orchestrator.reports.pour_figures import draw_path
     from sim_engine.vessel.vessel import build_vessel
 
     arm = chosen.plan.laboratory.arm
@@ -264,11 +264,11 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool)
         run_in_front_of_people,
     )
     from orchestrator.cli.motion_control import confirm
-    from orchestrator.journal.codec import result_of
-    from orchestrator.run_service import RunRequest, RunResources
+    from orchestrator.learning.single_action import OnePour, OnePoured
+    from orchestrator.records.codec import result_of
     from orchestrator.runs.motion_approval import SafetyRecordError, report_lines, required_checksum
+    from orchestrator.runs.run_service import RunRequest, RunResources
     from orchestrator.runs.stages import StageDefinition
-    from orchestrator.strategies.single_action import OnePour, OnePoured
 
     plan = dataclasses.replace(
         plan_of_scene(chosen.plan, chosen.scene),

@@ -23,7 +23,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from actors.optimizer.questions import WRITTEN_IF_SET
-from orchestrator.journal.events import (
+from orchestrator.learning.requests import Suggest, Suggested
+from orchestrator.records.events import (
     CampaignOpened,
     Event,
     PourProgressed,
@@ -32,7 +33,6 @@ from orchestrator.journal.events import (
     SpeculationProgressed,
     StrategyProgressed,
 )
-from orchestrator.requests import Suggest, Suggested
 
 PASSING = (PourProgressed, StrategyProgressed, SpeculationProgressed)
 """Progress events. Each replaces the one before it, so they are not stored on disk."""
@@ -109,7 +109,7 @@ class SentEvent:
     Attributes:
         id: larger than that of any earlier event.
         campaign: campaign of the event; '' if it concerns the daemon.
-        type: name of its class in `orchestrator.journal.events`, or the name of one of the daemon's own events.
+        type: name of its class in `orchestrator.records.events`, or the name of one of the daemon's own events.
         data: JSON on one line.
     """
 

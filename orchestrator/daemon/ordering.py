@@ -32,7 +32,7 @@ from orchestrator.daemon.pour_orders import (
 from orchestrator.daemon.station_schemas import BatchIn, PourIn
 from orchestrator.daemon.submissions import Submission, prepare, run_request
 from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
 
 WAIT = 0.1
 """Interval at which a waiting call reads the state of its pour [s]."""

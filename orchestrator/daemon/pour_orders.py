@@ -27,21 +27,21 @@ from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
 from actors.laboratory import predicted_dose
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.catalogue.vessel_account import Transfer
-from orchestrator.config.action_assignments import AssignmentError, assigned_action, set_action
-from orchestrator.config.campaign_checks import check_vessels, touch
+from orchestrator.campaigns.action_assignments import AssignmentError, assigned_action, set_action
+from orchestrator.campaigns.campaign_checks import check_vessels, touch
+from orchestrator.campaigns.shipped import shipped
 from orchestrator.daemon.daemon_store import QueueItem, Store
 from orchestrator.daemon.materials import Materials, mass_of
-from orchestrator.journal.run_record import RunPour, read_record
-from orchestrator.requests import Failed, Simulated, Slots
-from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunRequest
+from orchestrator.learning.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.dispense import DOSE, Dispense, KnownSource, spilled_mass
+from orchestrator.learning.requests import Failed, Simulated, Slots
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.single_action import OnePour, RepeatedSimulation
+from orchestrator.materials.vessel_account import Transfer
+from orchestrator.records.run_record import RunPour, read_record
+from orchestrator.runs.run_service import RunRequest
 from orchestrator.runs.stages import StageDefinition
-from orchestrator.shipped import shipped
-from orchestrator.strategies.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.dispense import DOSE, Dispense, KnownSource, spilled_mass
-from orchestrator.strategies.single_action import OnePour, RepeatedSimulation
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import PourMeasurement
@@ -194,7 +194,7 @@ def _range(speed: str) -> list[str]:
 
 
 def _virtual_laboratory() -> dict[str, Any]:
-    from orchestrator.config.yaml.yaml_source import Document
+    from orchestrator.campaigns.yaml.yaml_source import Document
 
     found: dict[str, Any] = Document.read(shipped(VIRTUAL)).data
     return found

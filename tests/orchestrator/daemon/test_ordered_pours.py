@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from tests.support.station import content, order, rigs_in, set_up, until_pour
 from tests.support.toy_daemon import Served, held, run, serving
 

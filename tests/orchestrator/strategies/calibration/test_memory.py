@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from orchestrator.campaigns.campaign_prior import KnownPosterior, arm_of, shape_digest
+from orchestrator.campaigns.file_loading import load_campaign, load_posterior_file
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.shipped import shipped
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.known_posteriors import import_posterior, posterior_text
-from orchestrator.catalogue.run_registry import VARIABLE
 from orchestrator.cli.app import app
-from orchestrator.config.campaign_prior import KnownPosterior, arm_of, shape_digest
-from orchestrator.config.file_loading import load_campaign, load_posterior_file
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.learning.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
+from orchestrator.learning.campaign_plan import MeasuredPour
+from orchestrator.records.run_registry import VARIABLE
 from orchestrator.runs.run_folder import simulator_version
-from orchestrator.shipped import shipped
-from orchestrator.strategies.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
-from orchestrator.strategies.campaign_plan import MeasuredPour
-from orchestrator.strategy_harness import SCENE, StrategyHarness
+from orchestrator.runs.strategy_harness import SCENE, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space

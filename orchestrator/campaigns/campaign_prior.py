@@ -1,0 +1,372 @@
+"""The prior of a campaign from earlier ones: the file of a posterior, the key `prior`, and its resolution.
+
+- `KnownPosterior` is what the pours of one calibration tell about its parameters, and what it is about: vessels,
+  liquid, arm, placement and simulator. The catalogue keeps one for each calibration.
+- `resolve_prior` selects the posteriors that fit a campaign and combines them to its `CampaignMemory`.
+- `PriorSettings` is the resolved form, which a run's record contains.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import Discriminator, Field, Tag, create_model
+
+from actors.laboratory_settings import LaboratorySettings
+from orchestrator.campaigns.fingerprint import deciding, scene_by_content
+from orchestrator.campaigns.yaml.references import YAML_SUFFIXES, References
+from orchestrator.campaigns.yaml.yaml_source import Place
+from orchestrator.learning.calibration.campaign_memory import (
+    LIQUID,
+    PLACEMENT,
+    WALLS,
+    CampaignMemory,
+    RememberedParameter,
+    group_of,
+    predicted,
+    usual_spread,
+)
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.codec import digest
+from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import Scene
+from sim_engine.settings.model import Count, Example, Problems, Settings, Text
+from sim_engine.settings.quantity import Quantity
+
+CATALOGUE = "catalogue"
+
+ALIKE = 0.1
+"""Largest relative difference of a property of two liquids that count as the same."""
+
+
+class EstimateSettings(Settings):
+    """A parameter: mean and standard deviation."""
+
+    mean: Any = None
+    """Mean."""
+
+    deviation: Any = None
+    """Standard deviation."""
+
+
+class RememberedSettings(EstimateSettings):
+    """Prior of a parameter, with the runs that it comes from."""
+
+    runs: Annotated[list[Text], Example("[quickstart-20300301-1]")]
+    """Earlier runs."""
+
+
+def _estimates(name: str, base: type[EstimateSettings]) -> Any:
+    fields: dict[str, Any] = {}
+    for parameter, info in SimulationParameters.info().items():
+        unit = "" if info.shown == "1" else f" {info.shown}"
+        width = Quantity(info.unit, f"{(info.upper - info.lower) / 50 / info.factor:.2g}{unit}", 0.0, positive=True)
+        types: dict[str, Any] = {
+            # without bounds: the pours alone may point beyond the parameter's range
+            "mean": (Annotated[float, Quantity(info.unit, info.example)], ...),
+            "deviation": (Annotated[float, width], ...),
+        }
+        part = create_model(f"{name}{parameter.title().replace('_', '')}", __base__=base, __doc__=base.__doc__, **types)
+        fields[parameter] = (part | None, Field(default=None, description=info.meaning))
+    return create_model(f"{name}Parameters", __base__=Settings, __doc__="Parameters by name.", **fields)
+
+
+AnyEstimates: Any = _estimates("Known", EstimateSettings)
+AnyRemembered: Any = _estimates("Remembered", RememberedSettings)
+
+
+class KnownLiquidSettings(Settings):
+    """A liquid and its properties."""
+
+    name: Annotated[Text, Example("water")]
+    """Its name."""
+
+    density: Annotated[float, Quantity("kg/m^3", "998 kg/m^3", 0.0, positive=True)]
+    """Density."""
+
+    surface_tension: Annotated[float, Quantity("N/m", "72.8 mN/m", 0.0)]
+    """Surface tension against air."""
+
+    viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", 0.0)]
+    """Dynamic viscosity."""
+
+
+class KnownPosterior(Settings):
+    """What the weighed pours of one calibration alone tell about its parameters."""
+
+    posterior: Annotated[Text, Example("quickstart-20300301-1")]
+    """Name of the run."""
+
+    simulator: Annotated[Text, Example("85955227f3491c5b")]
+    """Version of the solver's code; '' if the run does not state it."""
+
+    laboratory: Annotated[Text, Example("virtual")]
+    """Name of the laboratory."""
+
+    mode: Literal["virtual", "hardware", "external"] = "virtual"
+    """Mode of the laboratory."""
+
+    arm: Annotated[Text, Example("ur10")]
+    """Model of the arm; 'none' for a bench without one."""
+
+    liquid: Annotated[KnownLiquidSettings, Example("{name: water, density: 998 kg/m^3, …}")]
+    """The liquid."""
+
+    pourer: Annotated[Text, Example("beaker")]
+    """Vessel that was poured from."""
+
+    shape: Annotated[Text, Example("9f2c01d4a7b3e865")]
+    """Digest of the pourer's shape."""
+
+    receivers: Annotated[list[Text], Example("[tumbler]")]
+    """Vessels that were poured into."""
+
+    pours: Annotated[Count, Example("12")]
+    """Number of weighed pours that it comes from."""
+
+    fixed: Annotated[dict[Text, float], Example("{particles: 600}")]
+    """Values [SI] of the parameters that were not searched."""
+
+    parameters: Annotated[AnyEstimates, Example("{friction: {mean: 0.2, deviation: 0.1}}")]
+    """Parameters that the pours determine better than the searched range does."""
+
+    @property
+    def estimates(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard deviation [SI] by parameter."""
+        given = {name: self.parameters.value(name) for name in self.parameters.written_keys()}
+        return {name: (one.mean, one.deviation) for name, one in given.items() if one is not None}
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that it tells something."""
+        if problems.valid("parameters") and not self.estimates:
+            problems.add("names no parameter", "parameters")
+
+
+def shape_digest(scene: Mapping[str, Any]) -> str:
+    """Digest of the shape of a scene's pourer, in 16 digits.
+
+    Args:
+        scene: as in the fingerprint of a plan.
+    """
+    return digest(scene["pourer"]["shape"])[:16]
+
+
+def arm_of(laboratory: Mapping[str, Any]) -> str:
+    """Model of the arm of a laboratory in a fingerprint; 'none' without one."""
+    arm = laboratory.get("arm") or {}
+    return str(arm.get("model") or arm.get("kind") or "none")
+
+
+class PriorSettings(Settings):
+    """Prior from earlier campaigns, as a run's record has it: nothing is looked up again."""
+
+    parameters: AnyRemembered = Field(default_factory=AnyRemembered)
+    """Normal distribution of each parameter, and the runs that it comes from."""
+
+    left_out: list[Text] = Field(default_factory=list)
+    """Posteriors and parameters that are not used, with reasons."""
+
+    @classmethod
+    def of(cls, memory: CampaignMemory) -> PriorSettings:
+        """The settings of a resolved prior."""
+        rows = {
+            one.name: {"mean": one.mean, "deviation": one.deviation, "runs": list(one.runs)}
+            for one in memory.parameters
+        }
+        return cls.model_validate({"parameters": rows, "left_out": list(memory.left_out)})
+
+    @property
+    def memory(self) -> CampaignMemory:
+        """The resolved prior."""
+        given = {name: self.parameters.value(name) for name in self.parameters.written_keys()}
+        rows = [
+            RememberedParameter(name, one.mean, one.deviation, tuple(one.runs))
+            for name, one in given.items()
+            if one is not None
+        ]
+        return CampaignMemory(tuple(rows), tuple(self.left_out))
+
+
+def _form(value: Any) -> str:
+    return "word" if isinstance(value, str) else "list" if isinstance(value, list | tuple) else "record"
+
+
+AnyPrior = Annotated[
+    Annotated[Literal["catalogue"], Tag("word")]
+    | Annotated[list[Text], Tag("list")]
+    | Annotated[PriorSettings, Tag("record")],
+    Discriminator(_form),
+]
+"""'catalogue', names of runs and files of posteriors, or a resolved prior."""
+
+
+@dataclass(frozen=True)
+class PriorNeeds:
+    """What a campaign needs to know.
+
+    Attributes:
+        scene: of its pours.
+        laboratory: in which they are made.
+        wanted: bounds [SI] of the parameters that a prior may tell, by name.
+        fixed: values of the parameters that are not searched.
+        measured: searched parameters whose prior the file gives itself.
+        why: completes the message about a parameter that is not wanted.
+    """
+
+    scene: Scene
+    laboratory: LaboratorySettings
+    wanted: Mapping[str, tuple[float, float]]
+    fixed: Mapping[str, float]
+    measured: frozenset[str] = frozenset()
+    why: str = "is not searched here"
+
+
+@dataclass(frozen=True)
+class PosteriorSource:
+    """Access to the posteriors of a machine.
+
+    Attributes:
+        simulator: version of the solver here.
+        every: returns all posteriors of the catalogue.
+        of_run: returns that of one run; raises RunError.
+    """
+
+    simulator: str
+    every: Callable[[], Sequence[KnownPosterior]]
+    of_run: Callable[[str], KnownPosterior]
+
+
+def resolve_prior(
+    prior: Any, needs: PriorNeeds, place: Place, references: References, source: Callable[[], PosteriorSource]
+) -> CampaignMemory | None:
+    """The prior of a campaign; None after a problem, which is added to the report.
+
+    Args:
+        prior: value of the key.
+        needs: of the campaign.
+        place: of the key.
+        references: reads files of posteriors.
+        source: opens the catalogue; not called for a resolved prior.
+    """
+    report = references.report
+    if isinstance(prior, PriorSettings):
+        return prior.memory
+    try:
+        opened = source()
+        if prior == CATALOGUE:
+            return _combined(opened.every(), needs, opened)
+    except (RunError, OSError) as error:
+        report.add(place, str(error))
+        return None
+    named: list[KnownPosterior] = []
+    before = len(report.problems)
+    if not prior:
+        report.add(place, "is empty; name runs, or write 'prior: catalogue'")
+    for i, name in enumerate(prior):
+        known = _named(name, place.at(i), references, opened)
+        if known is None:
+            continue
+        reasons = _unfit(known, needs, opened)
+        if reasons:
+            report.add(place.at(i), f"the posterior of {known.posterior} can't be a prior here: {'; '.join(reasons)}")
+        named.append(known)
+    if len(report.problems) > before:
+        return None
+    return _combined(named, needs, opened)
+
+
+def _named(name: str, place: Place, references: References, source: PosteriorSource) -> KnownPosterior | None:
+    if name.lower().endswith(YAML_SUFFIXES):
+        found = references.section(name, place, KnownPosterior)
+        return None if found is None or references.report.is_broken_within(found[1]) else found[0]
+    try:
+        return source.of_run(name)
+    except (RunError, OSError) as error:
+        references.report.add(place, str(error))
+        return None
+
+
+def _unfit(known: KnownPosterior, needs: PriorNeeds, source: PosteriorSource) -> list[str]:
+    """Reasons why a posterior can't be used at all; empty if it can."""
+    reasons = []
+    laboratory = needs.laboratory
+    if known.simulator != source.simulator:
+        theirs = f"version {known.simulator}" if known.simulator else "an unknown version"
+        reasons.append(f"it is of another simulator ({theirs}, here {source.simulator}); calibrate again")
+    if known.mode != laboratory.mode:
+        reasons.append(f"it is of a {known.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
+    if known.arm != (arm := arm_of(deciding(laboratory))):
+        reasons.append(f"it is of another arm ({known.arm}, here {arm})")
+    for name, value in known.fixed.items():
+        here = needs.fixed.get(name)
+        if here is not None and not math.isclose(value, here, rel_tol=1e-9, abs_tol=1e-12):
+            reasons.append(f"its simulations had {name} {value:g}, here it is {here:g}")
+    if not set(known.estimates).intersection(needs.wanted):
+        names = ", ".join(known.estimates)
+        reasons.append(f"it is about {names}, which {needs.why}")
+    return reasons
+
+
+def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: PosteriorSource) -> CampaignMemory:
+    """Combine the posteriors that fit, parameter by parameter."""
+    left_out: list[str] = []
+    usable: list[KnownPosterior] = []
+    for known in found:
+        reasons = _unfit(known, needs, source)
+        if reasons:
+            left_out.append(f"{known.posterior}: {'; '.join(reasons)}")
+        else:
+            usable.append(known)
+    if not found:
+        left_out.append("the catalogue has no posterior yet: a calibration with C4 makes one")
+    shape, infos = shape_digest(scene_by_content(needs.scene)), SimulationParameters.info()
+    for known in usable:
+        if (difference := _liquid_differs(known, needs.scene)) and any(group_of(n) == LIQUID for n in known.estimates):
+            left_out.append(f"{known.posterior}: its {LIQUID} is not transferred, {difference}")
+        if known.laboratory != needs.laboratory.name and any(group_of(n) == PLACEMENT for n in known.estimates):
+            text = f"it is of laboratory '{known.laboratory}', here it is '{needs.laboratory.name}'"
+            left_out.append(f"{known.posterior}: its {PLACEMENT} is not transferred, {text}")
+    remembered = []
+    for name, (lower, upper) in needs.wanted.items():
+        group = group_of(name)
+        told = [known for known in usable if name in known.estimates]
+        if group == LIQUID:
+            told = [known for known in told if not _liquid_differs(known, needs.scene)]
+        elif group == PLACEMENT:
+            told = [known for known in told if known.laboratory == needs.laboratory.name]
+        same_vessel = [known for known in told if known.shape == shape]
+        if group == WALLS and same_vessel:
+            told = same_vessel
+        if group is None or not told:
+            continue
+        if name in needs.measured:
+            left_out.append(f"{name}: the campaign gives what was measured")
+            continue
+        spread = usual_spread(infos[name], same_vessel=bool(same_vessel))
+        mean, deviation = predicted([known.estimates[name] for known in told], spread)
+        mean = min(max(mean, infos[name].lower), infos[name].upper)
+        one = RememberedParameter(name, mean, deviation, tuple(known.posterior for known in told))
+        if not lower - 3.0 * deviation <= mean <= upper + 3.0 * deviation:
+            left_out.append(f"{one} is outside the searched range; widen the range")
+            continue
+        remembered.append(one)
+    return CampaignMemory(tuple(remembered), tuple(left_out))
+
+
+def _liquid_differs(known: KnownPosterior, scene: Scene) -> str:
+    """How the liquid differs from that of a scene, as text; empty if it is the same."""
+    theirs, ours = known.liquid, scene.liquid
+    if theirs.name != ours.name:
+        return f"it is of '{theirs.name}', here it is '{ours.name}'"
+    pairs = {
+        "density": (theirs.density, ours.density),
+        "surface tension": (theirs.surface_tension, ours.surface_tension),
+        "viscosity": (theirs.viscosity, ours.dynamic_viscosity),
+    }
+    for name, (there, here) in pairs.items():
+        if not math.isclose(there, here, rel_tol=ALIKE):
+            return f"its {name} is {there:g}, here it is {here:g} (SI)"
+    return ""
