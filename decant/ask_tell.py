@@ -44,7 +44,8 @@ from orchestrator.journal.events import Subscriber as Watch
 from orchestrator.journal.run_record import read_record
 from orchestrator.requests import Pour, Prediction
 from orchestrator.results.stage_views import receiver_names
-from orchestrator.run_service import RunHandle, RunResources, RunService, RunTaskError, task_request
+from orchestrator.run_service import RunHandle, RunResources, RunService, RunTaskError
+from orchestrator.run_tasks import run_task
 from orchestrator.runs.resume import LOST
 from orchestrator.runs.stages import scenes_of
 from orchestrator.strategies.campaign_plan import CampaignPlan
@@ -122,7 +123,7 @@ class AskTell:
                 f"laboratory {campaign.laboratory.name} is {campaign.laboratory.mode}, and Decant pours there; write "
                 "'laboratory: {name: …, mode: external}' for pours that your program makes"
             )
-        service, request = RunService(), task_request(campaign)
+        service, request = RunService(), run_task(campaign)
         if not request.pours:
             raise RunTaskError(f"campaign '{campaign.name}' asks for no pours; use decant.run")
         resources = checked(

@@ -29,11 +29,12 @@ from orchestrator.daemon.pour_orders import POUR, PourOrder, order_request
 from orchestrator.journal.journal import JOURNAL_NAME
 from orchestrator.journal.journal_file import whole_copy
 from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunRequest, RunResources, RunService, RunTaskError, read_theta, task_request
+from orchestrator.run_service import RunRequest, RunResources, RunService, RunTaskError
+from orchestrator.run_tasks import TASKS, plan_task, read_theta
 from orchestrator.strategies.campaign_plan import CampaignPlan
 
 CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
-"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.run_service.read_theta`)."""
+"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.run_tasks.read_theta`)."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}(/[A-Za-z0-9][A-Za-z0-9._-]{0,79}){0,3}")
 _FILES = 100
@@ -179,7 +180,7 @@ def run_request(
     if item.task == POUR:
         request = order_request(plan, PourOrder.read(folder))
     else:
-        request = task_request(plan, item.task, given=theta)  # type: ignore[arg-type]  # written by us
+        request = plan_task(plan, theta) if item.task == "plan" else TASKS[item.task](plan)  # type: ignore[index]
     if item.run is None:
         return request
     return replace(request, folder=settings.runs / item.run, resume="if begun")

@@ -32,7 +32,8 @@ from orchestrator.journal.events import (
 )
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.requests import Pour, Poured, Slots
-from orchestrator.run_service import RunResources, RunService, task_request
+from orchestrator.run_service import RunResources, RunService
+from orchestrator.run_tasks import run_task
 from orchestrator.strategies.dispense import Dispense, Dispensed
 from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.vessel import build_vessel
@@ -117,7 +118,7 @@ def test_a_dose_on_a_simulated_bench_is_shown_while_it_is_poured(
 
     async def scenario() -> Any:
         resources = RunResources(in_process=True, subscribers=[events.append])
-        with contextlib.closing(RunService().start(task_request(plan, "run"), resources)) as handle:
+        with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
             return await handle.wait()
 
     result = asyncio.run(scenario()).results["doses"]

@@ -24,7 +24,8 @@ from orchestrator.recordings.recording_file import PourRecording, load_recording
 from orchestrator.recordings.recording_fit import Fit, fit_recordings, judge_recording, read_values
 from orchestrator.recordings.recording_replay import ReplayValues, arrivals, replay_recording
 from orchestrator.recordings.time_series import read_series
-from orchestrator.run_service import RunResources, RunService, task_request
+from orchestrator.run_service import RunResources, RunService
+from orchestrator.run_tasks import run_task
 from orchestrator.shipped import shipped
 from sim_engine.hydrostatics import tilting_cup_outflow
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -390,7 +391,7 @@ def test_a_run_records_its_doses_and_they_can_be_exported_again(
     resources = RunResources(in_process=True)
 
     async def scenario() -> None:
-        with contextlib.closing(RunService().start(task_request(plan, "run"), resources)) as handle:
+        with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
             await handle.wait()
             handle.publish()
 

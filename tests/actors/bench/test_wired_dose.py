@@ -32,7 +32,8 @@ from actors.liquid_devices import SimulatedPumpSettings, SourceSettings
 from actors.runtime.child_process import child_environment
 from orchestrator.config.file_loading import load_campaign, load_laboratory
 from orchestrator.requests import Pour, Poured, Slots
-from orchestrator.run_service import RunResources, RunService, task_request
+from orchestrator.run_service import RunResources, RunService
+from orchestrator.run_tasks import run_task
 from orchestrator.shipped import shipped
 from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.strategies.dispense import Dispense, Dispensed
@@ -176,7 +177,7 @@ def test_a_campaign_of_six_beakers_over_the_wires(tmp_path: Path, monkeypatch: p
     service = RunService()
 
     async def scenario() -> Any:
-        handle = service.start(task_request(plan, "run"), RunResources(in_process=True))
+        handle = service.start(run_task(plan), RunResources(in_process=True))
         with contextlib.closing(handle):
             return await handle.wait()
 
