@@ -34,19 +34,6 @@ if TYPE_CHECKING:
     from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
-_TOLD = {
-    "prediction",
-    "prediction_interval",
-    "at_bounds",
-    "predicted_delivered_g",
-    "predicted_delivered_ml",
-    "risk",
-    "window",
-    "not_covered",
-}
-"""Fields of a receiver's summary that `decant plan` prints beside the action."""
-
-
 def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[..., None]:
     """Make the command of a task; both have the same options."""
 
@@ -176,6 +163,7 @@ def plan(
     from orchestrator.cli.foreground_run import check_campaign_can_run, read_campaign, run_task_at_terminal
     from orchestrator.cli.simulate_command import prediction_inputs
     from orchestrator.journal.codec import result_of
+    from orchestrator.results.run_summary import PLANNED
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION
     from orchestrator.strategies.deployment.deployment_result import Deployed
     from orchestrator.strategies.single_action import PredictedPour
@@ -219,7 +207,7 @@ def plan(
                 "predicted_spillage_deviation": None if spillage is None else spillage.deviation,
                 "predicted_deviation": recommended.predicted_deviation,
                 "loss": chosen.deployment.loss_name,
-                **told.model_dump(mode="json", include=_TOLD),
+                **told.model_dump(mode="json", include=set(PLANNED)),
             }
         )
     theta = chosen.parameters.model_dump()

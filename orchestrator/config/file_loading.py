@@ -13,6 +13,7 @@ from pydantic import create_model
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.config.campaign_file import CampaignFile
 from orchestrator.config.campaign_resolution import resolve_campaign
+from orchestrator.config.run_snapshot import as_file
 from orchestrator.config.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.config.yaml.file_access import resolved
 from orchestrator.config.yaml.references import References
@@ -121,6 +122,16 @@ def load_laboratory(path: Path, *, stored: bool = True) -> LaboratorySettings:
     report.raise_if_any()
     assert laboratory is not None, "a laboratory without problems is ready"
     return laboratory
+
+
+def laboratory_record(path: Path) -> dict[str, Any]:
+    """The laboratory of a file as a record, ready for JSON: loading it gives the same. Raises ConfigError."""
+    report = Report()
+    references = References(report)
+    found = references.file(resolved(path), LaboratorySettings)
+    report.raise_if_any()
+    assert found is not None, "a laboratory without problems has settings"
+    return as_file(*found, references)
 
 
 class _LooseQuantity(Quantity):
