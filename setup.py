@@ -26,7 +26,7 @@ SHIPPED = (
 
 
 class BuildWithShippedFiles(build_py):
-    """A checkout has them at its top, an installed package beside `orchestrator/shipped.py`."""
+    """A checkout has them at its top, an installed package beside `orchestrator/campaigns/shipped.py`."""
 
     def run(self) -> None:
         """Build, and copy them; an editable installation uses those of the checkout."""

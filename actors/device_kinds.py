@@ -1,4 +1,4 @@
-"""Decant's own kinds of arms and balances, as `pyproject.toml` registers them: `ArmKind` and `BalanceKind`.
+"""Decant's own kinds of arms, balances and grippers, as `pyproject.toml` registers them.
 
 Each joins settings, which are plain values, with driver, planner, diagnostics, figure and emulator. These are imported
 within the methods: this module is loaded wherever a laboratory's file is read. No other module imports it.
@@ -11,7 +11,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from actors.arm.arm_geometry import RobotCell
 from actors.arm.arm_interface import ArmFigure
@@ -23,6 +23,9 @@ from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_settings import BalanceEmulator, BalanceKind, SerialBalanceSettings
 from actors.balance.serial_port import look_at_port
 from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBalance
+from actors.grippers.gripper_interface import GripperEmulator
+from actors.grippers.onrobot_gripper import OnRobotSettings
+from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import DeviceCheck
 from sim_engine.action import Action
 from sim_engine.scene import Scene
@@ -199,6 +202,30 @@ class SimulatedBalanceKind(BalanceKind[SimulatedBalanceSettings]):
     def driver(self, name: str) -> tuple[type[Any], tuple[Any, ...]]:
         """See `BalanceKind.driver`."""
         return VirtualBalance, (self.spec, name)
+
+
+class EmulatedRobotiqSettings(RobotiqSettings):
+    """A Robotiq gripper with its URCap."""
+
+    emulated: ClassVar[bool] = True
+
+    def start_emulator(self) -> GripperEmulator:
+        """See `GripperSettings.start_emulator`."""
+        from actors.emulators.gripper_emulators import RobotiqEmulator
+
+        return RobotiqEmulator(self)
+
+
+class EmulatedOnRobotSettings(OnRobotSettings):
+    """An OnRobot gripper with its URCap or a Compute Box."""
+
+    emulated: ClassVar[bool] = True
+
+    def start_emulator(self) -> GripperEmulator:
+        """See `GripperSettings.start_emulator`."""
+        from actors.emulators.gripper_emulators import OnRobotEmulator
+
+        return OnRobotEmulator(self)
 
 
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"

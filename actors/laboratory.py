@@ -111,11 +111,11 @@ def reached(spec: LaboratorySettings) -> Iterator[LaboratorySettings]:
         yield spec
         return
     assert spec.arm is not None
-    emulators = BenchEmulators(spec.arm, spec.balance)
+    emulators = BenchEmulators(spec.arm, spec.balance, spec.gripper)
     try:
         where = emulators.found()
         emulators.install()
-        yield spec.with_values(arm=where.arm, balance=where.balance)
+        yield spec.with_values(arm=where.arm, balance=where.balance, gripper=where.gripper)
     finally:
         emulators.close()
 

@@ -20,6 +20,7 @@ from actors.balance.balance_settings import BalanceSettings
 from actors.balance.dialect_registry import kinds
 from actors.balance.scale_model import Drift
 from actors.dosing.dosing_settings import DosingSettings
+from actors.grippers.gripper_interface import GRIPPERS, GripperSettings
 from actors.interfaces import OperatorSettings
 from actors.liquid_devices import (
     PUMPS,
@@ -194,6 +195,9 @@ class LaboratorySettings(Settings):
     pump: Annotated[Annotated[PumpSettings, OneOf(lambda: PUMPS.all)] | None, NOT_IN_FINGERPRINT] = None
     """A pump or tap instead of the arm, for wanted amounts; `kind` is one of the installed kinds."""
 
+    gripper: Annotated[Annotated[GripperSettings, OneOf(lambda: GRIPPERS.all)] | None, NOT_IN_FINGERPRINT] = None
+    """The gripper that holds the pourer; `kind` is one of the installed kinds. The operator works it unless given."""
+
     balance: Annotated[BalanceSettings, OneOf(kinds)] | None = None
     """The balance next to the arm, or under the receiver of the pump."""
 
@@ -288,6 +292,8 @@ class LaboratorySettings(Settings):
         else:
             self._check_with_arm(problems)
             arm_kind(self.arm).check_laboratory(problems, mode=self.mode, cell=self.cell)
+            if self.gripper is not None:
+                self.gripper.check_laboratory(problems.within("gripper"), mode=self.mode, arm=self.arm)
             if self.balance is not None:
                 inner = problems.within("balance")
                 if self.balance.typed:
@@ -307,7 +313,7 @@ class LaboratorySettings(Settings):
             problems.add(text, key=True, of="arm")
 
     def _check_external(self, problems: Problems) -> None:
-        for key in ("arm", "cell", "pump", "balance", "source", "spill_sensor", "operator", "bench"):
+        for key in ("arm", "cell", "gripper", "pump", "balance", "source", "spill_sensor", "operator", "bench"):
             if key in self.model_fields_set and problems.valid(key):
                 text = "an external laboratory has no devices of Decant: your program pours and weighs; remove it"
                 problems.add(text, key, key=True)
@@ -316,6 +322,7 @@ class LaboratorySettings(Settings):
         for key, why in (
             ("arm", "a laboratory pours with an arm or with a pump"),
             ("cell", "belongs to an arm, and a pump pours here"),
+            ("gripper", "belongs to an arm, and a pump pours here"),
             ("bench", "hides the liquid of a virtual arm, and a pump pours here"),
         ):
             if key in self.model_fields_set and problems.valid(key):
@@ -332,9 +339,13 @@ class LaboratorySettings(Settings):
             balance.check_laboratory(inner, mode=self.mode)
 
     def _check_without_arm(self, problems: Problems) -> None:
-        for key in ("cell", "balance", "operator", "source", "spill_sensor"):
+        for key in ("cell", "gripper", "balance", "operator", "source", "spill_sensor"):
             if key in self.model_fields_set:
-                meant = "; a simulated bench has 'bench: {balance: …, operator_time: …}'" if key != "cell" else ""
+                meant = (
+                    "; a simulated bench has 'bench: {balance: …, operator_time: …}'"
+                    if key not in ("cell", "gripper")
+                    else ""
+                )
                 text = f"belongs to an arm, and there is none; add 'arm', or remove it{meant}"
                 problems.add(text, key, of="arm")
 

@@ -22,6 +22,7 @@ import numpy as np
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.dialect_registry import kinds
 from actors.bench.bench_clock import Pace
+from actors.grippers.gripper_interface import Gripper, GripperSettings
 from actors.interfaces import DeviceCheck, LaboratoryError
 from sim_engine.settings.model import SET_BY_PROGRAM, OneOf, Problems, Settings, Text
 from sim_engine.settings.plugin_registry import PluginRegistry, settings_kind
@@ -240,26 +241,34 @@ def check_devices(
 
 
 def device_checks(
-    pump: PumpSettings | None, source: SourceSettings | None, sensor: SpillSensorSettings | None
+    pump: PumpSettings | None,
+    source: SourceSettings | None,
+    sensor: SpillSensorSettings | None,
+    gripper: GripperSettings | None = None,
 ) -> list[DeviceCheck]:
-    """Connect each device of a laboratory in turn, and release it; nothing flows.
+    """Connect each device of a laboratory in turn, and release it; nothing flows, no finger moves.
 
     Args:
-        pump, source, sensor: the sections; None if they are missing.
+        pump, source, sensor, gripper: the sections; None if they are missing.
     """
-    devices: list[tuple[str, PumpSettings | SpillSensorSettings | None]] = [
+    devices: list[tuple[str, PumpSettings | SpillSensorSettings | GripperSettings | None]] = [
         ("pump", pump),
         ("refill", None if source is None else source.refill),
         ("spill sensor", sensor),
+        ("gripper", gripper),
     ]
     return [_device_check(name, device) for name, device in devices if device is not None]
 
 
-def _device_check(name: str, settings: PumpSettings | SpillSensorSettings) -> DeviceCheck:
+def _device_check(name: str, settings: PumpSettings | SpillSensorSettings | GripperSettings) -> DeviceCheck:
     cls, arguments = settings.driver()
-    driver: Pump | SpillSensor = cls(*arguments)
+    driver: Pump | SpillSensor | Gripper = cls(*arguments)
     try:
         found = driver.connect()
+        if isinstance(settings, GripperSettings):
+            problem = cast("Gripper", driver).state().problem
+            if problem:
+                return DeviceCheck(name, "warn", found, "a pour asks for what it needs; see docs/reference/grippers.md")
         if isinstance(settings, SpillSensorSettings):
             wet = [event.place for event in cast("SpillSensor", driver).events() if event.wet]
             if wet:

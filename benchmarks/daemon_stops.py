@@ -29,7 +29,7 @@ from daemon_page import keep
 from daemon_process import await_, end_in_order, serving, started
 from ruamel.yaml import YAML
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client
 from orchestrator.daemon.submissions import Files, pack
 

@@ -382,7 +382,7 @@ def picture(path: Path, seed: int = 3) -> None:
         path: path of the PNG.
         seed: seed of a development series.
     """
-    from orchestrator.results import figure_style as style
+    from orchestrator.reports import figure_style as style
 
     series = Series(next(iter(GROUPS.values())), seed, cup_flows())
     series.refill_for(0.3)

@@ -37,9 +37,9 @@ from machine import ROOT, say, write_table
 from quickstart import KeptPours, calibration_and_test
 
 from decant.running import build_campaign, load_campaign
-from orchestrator.journal.codec import Results
-from orchestrator.results.stage_views import evaluation_of, theta_of
-from orchestrator.run_service import RunRequest, RunResources, RunService
+from orchestrator.records.codec import Results
+from orchestrator.reports.stage_views import evaluation_of, theta_of
+from orchestrator.runs.run_service import RunRequest, RunResources, RunService
 
 CAMPAIGNS = ROOT / "configs" / "campaigns"
 GUESSES = {0.01: 0.03, 0.1: 0.15, 1.0: 0.5}

@@ -33,9 +33,9 @@ from players import SCENE, Floats, interval, unit
 from scipy.stats import qmc
 from threadpoolctl import threadpool_limits
 
-from orchestrator.strategies.campaign_plan import DeploymentPlan
-from orchestrator.strategies.deployment.d1 import D1Settings
-from orchestrator.strategy_harness import StrategyHarness
+from orchestrator.learning.campaign_plan import DeploymentPlan
+from orchestrator.learning.deployment.d1 import D1Settings
+from orchestrator.runs.strategy_harness import StrategyHarness
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss

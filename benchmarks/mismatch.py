@@ -71,12 +71,12 @@ from mismatch_worlds import CHANGED_AFTER, CLIFFS, LEVELS, MILDER, STEEP, Valley
 from players import SCENE, Floats, Numbers, by_turn, coverage, interval, play
 
 from actors.optimizer.model_discrepancy import ModelAveragedProcess
-from orchestrator.requests import Outcome, Prediction, Request
-from orchestrator.strategies.campaign_plan import DeploymentPlan
-from orchestrator.strategies.deployment import deployment_base
-from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
-from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
+from orchestrator.learning.campaign_plan import DeploymentPlan
+from orchestrator.learning.deployment import deployment_base
+from orchestrator.learning.deployment.d2 import D2Settings
+from orchestrator.learning.deployment.d3 import D3Settings
+from orchestrator.learning.deployment.real_pours import PourTrial, scaled_interval
+from orchestrator.learning.requests import Outcome, Prediction, Request
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from orchestrator.results import figure_style as style
+from orchestrator.reports import figure_style as style
 
 COST, PASSES = "performance-cost.png", "performance-passes.png"
 MOMENTS = ("whole pour", "in full flow")

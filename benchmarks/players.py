@@ -11,8 +11,18 @@ import numpy as np
 
 from actors.optimizer.questions import SpaceFillingQuery
 from actors.optimizer.suggest import propose
-from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Slots, Suggest, Suggested
-from orchestrator.strategies.strategy import Strategy
+from orchestrator.learning.requests import (
+    Outcome,
+    Pour,
+    Poured,
+    Request,
+    Simulate,
+    Simulated,
+    Slots,
+    Suggest,
+    Suggested,
+)
+from orchestrator.learning.strategy import Strategy
 from sim_engine.action import DEG
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement, PourOutcome

@@ -57,11 +57,19 @@ from machine import ROOT, run_self, say, write_table
 from players import by_turn, coverage, interval
 
 from actors.bench.ground_truth import draw_pose_error
+from actors.interfaces import InvalidActionError
 from actors.simulators.job_runner import Simulator, pour_simulator
 from actors.simulators.local_worker import ThreadWorker
 from actors.simulators.pool import WorkerPool
-from orchestrator.journal.codec import digest, from_json, result_of, to_json
-from orchestrator.requests import Prediction
+from orchestrator.learning.calibration.action_prior import Contexts
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.calibration.calibration_scores import CalibrationEvaluation, shift_left_over
+from orchestrator.learning.calibration.pour_design import stratified
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
+from orchestrator.learning.deployment import deployment_base
+from orchestrator.learning.deployment.real_pours import PourTrial, scaled_interval
+from orchestrator.learning.requests import Prediction
+from orchestrator.records.codec import digest, from_json, result_of, to_json
 from orchestrator.runs.stages import (
     CALIBRATION,
     EVALUATION,
@@ -71,13 +79,6 @@ from orchestrator.runs.stages import (
     measured_pours,
     posterior_draws,
 )
-from orchestrator.strategies.calibration.action_prior import Contexts
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation, shift_left_over
-from orchestrator.strategies.calibration.pour_design import stratified
-from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
-from orchestrator.strategies.deployment import deployment_base
-from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome, SimulatedPour, normalised_spillage
@@ -136,9 +137,9 @@ class KeptPours(WorkerPool):
 def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: bool = False) -> dict[str, Any]:
     """Run one campaign; return its calibration's error on the test pours, and every pour with its prediction."""
     from decant.running import build_campaign
-    from orchestrator.results.stage_views import deployments_of, evaluation_of, theta_of
-    from orchestrator.run_service import RunRequest, RunResources, RunService
-    from orchestrator.run_tasks import run_task
+    from orchestrator.reports.stage_views import deployments_of, evaluation_of, theta_of
+    from orchestrator.runs.run_service import RunRequest, RunResources, RunService
+    from orchestrator.runs.run_tasks import run_task
 
     pool = kept_pours(seed, into)
     unscaled: list[tuple[float, float]] = []
@@ -205,8 +206,8 @@ FURTHER, DRAWN, CELLS = 12, 6, 10
 def fitted(seed: int, bench: str, laboratory: Path, into: Path) -> list[dict[str, Any]]:
     """Calibrate with each program; return errors on the training, test and further pours, one row per program."""
     from decant.running import build_campaign, load_campaign
-    from orchestrator.results.stage_views import evaluation_of
-    from orchestrator.run_service import RunRequest, RunResources, RunService
+    from orchestrator.reports.stage_views import evaluation_of
+    from orchestrator.runs.run_service import RunRequest, RunResources, RunService
 
     pool, rows = kept_pours(f"fit-{seed}", into), []
     for program, simulations in PROGRAMS.items():
@@ -289,8 +290,11 @@ async def spilled(
     seed: int,
     error: PoseError | None = None,
 ) -> float:
-    """Return the simulated spillage; 1 if it is undefined, which no pour of this campaign is."""
-    outcome = (await pool.simulate(PourTask(scene, action, theta, seed, pose_error=error))).outcome
+    """Return the simulated spillage; 1 if it is undefined, or if the cups touch with this θ."""
+    try:
+        outcome = (await pool.simulate(PourTask(scene, action, theta, seed, pose_error=error))).outcome
+    except InvalidActionError:
+        return 1.0
     found = normalised_spillage(outcome.fractions)
     return 1.0 if found is None else found
 
@@ -364,9 +368,9 @@ def calibration_and_test(plan: CalibrationPlan) -> tuple[StageDefinition, ...]:
 def uncalibrated_plan(seed: int, laboratory: Path, into: Path) -> dict[str, float]:
     """Return the predicted loss of the uncalibrated simulator's plan, and its loss on the bench."""
     from decant.running import build_campaign
-    from orchestrator.results.stage_views import deployments_of
-    from orchestrator.run_service import RunResources, RunService
-    from orchestrator.run_tasks import plan_task
+    from orchestrator.reports.stage_views import deployments_of
+    from orchestrator.runs.run_service import RunResources, RunService
+    from orchestrator.runs.run_tasks import plan_task
 
     pool = kept_pours(f"plan-{seed}", into)
     with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:

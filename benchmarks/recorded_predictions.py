@@ -24,10 +24,13 @@ from typing import Any, cast
 
 from machine import ROOT, TABLES, describe, provenance, run_self, say, write_table
 
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.codec import digest
-from orchestrator.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
-from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.learning.calibration.calibration_scores import ScoredPour
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
+from orchestrator.learning.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
+from orchestrator.learning.strategy import Strategy
+from orchestrator.records.codec import digest
 from orchestrator.runs.stage_scheduler import PendingRequest, free_slots, next_to_tell
 from orchestrator.runs.stages import (
     CALIBRATION,
@@ -38,9 +41,6 @@ from orchestrator.runs.stages import (
     scenes_of,
     stage_seed,
 )
-from orchestrator.strategies.calibration.calibration_scores import ScoredPour
-from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
-from orchestrator.strategies.strategy import Strategy
 from sim_engine.errors import InvalidSceneError
 from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import band

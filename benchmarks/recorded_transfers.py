@@ -30,7 +30,7 @@ from players import Floats, coverage
 
 from actors.optimizer.gaussian_process import GaussianProcess, constant_mean_process
 from actors.optimizer.prediction_intervals import observation_intervals
-from orchestrator.requests import Prediction
+from orchestrator.learning.requests import Prediction
 from sim_engine.prediction_band import LEVEL
 
 DATA = Path(__file__).parents[1] / "tests" / "data" / "real" / "liq_transfer" / "transfers.csv"

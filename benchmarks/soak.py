@@ -48,13 +48,13 @@ from ruamel.yaml import YAML
 from scipy import stats
 
 from actors.runtime.child_process import child_environment
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.submissions import Files, pack
-from orchestrator.journal.events import Kind
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.journal_check import check_journal
-from orchestrator.results import figure_style as style
+from orchestrator.records.events import Kind
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader
+from orchestrator.records.journal_check import check_journal
+from orchestrator.reports import figure_style as style
 
 ROOT = Path(__file__).parents[1]
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.vessel_command import vessel
-from orchestrator.config.file_loading import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene

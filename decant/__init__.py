@@ -30,22 +30,22 @@ if TYPE_CHECKING:
     )
     from decant.simulation import Simulation, simulate
     from decant.station import Station, StationPour
-    from orchestrator.added_pours import add_pour
-    from orchestrator.bench_check import BenchReport
-    from orchestrator.catalogue.vessel_account import VesselAccount, VesselContent
-    from orchestrator.config.action_assignments import AssignmentError
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.journal import events
-    from orchestrator.journal.events import Event
-    from orchestrator.recordings.recording_export import export_recordings
-    from orchestrator.recordings.recording_file import PourRecording, load_recording, load_recordings
-    from orchestrator.recordings.recording_fit import Fit, Judgement, fit_recordings, judge_recording
-    from orchestrator.recordings.recording_replay import PourReplay, ReplayValues, replay_recording
-    from orchestrator.results.publishing import Published
-    from orchestrator.results.recording_figures import replay_figure
-    from orchestrator.run_errors import RunError
-    from orchestrator.run_service import CheckReport
-    from orchestrator.strategies.campaign_plan import CampaignPlan
+    from orchestrator.campaigns.action_assignments import AssignmentError
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.learning.campaign_plan import CampaignPlan
+    from orchestrator.learning.run_errors import RunError
+    from orchestrator.materials.vessel_account import VesselAccount, VesselContent
+    from orchestrator.records import events
+    from orchestrator.records.events import Event
+    from orchestrator.reports.publishing import Published
+    from orchestrator.reports.recording_export import export_recordings
+    from orchestrator.reports.recording_figures import replay_figure
+    from orchestrator.reports.recording_file import PourRecording, load_recording, load_recordings
+    from orchestrator.reports.recording_fit import Fit, Judgement, fit_recordings, judge_recording
+    from orchestrator.reports.recording_replay import PourReplay, ReplayValues, replay_recording
+    from orchestrator.runs.added_pours import add_pour
+    from orchestrator.runs.bench_check import BenchReport
+    from orchestrator.runs.run_service import CheckReport
     from sim_engine.errors import DecantError, InvalidArgumentError
     from sim_engine.liquids import SimulationParameters
     from sim_engine.resources import MissingExtraError
@@ -118,21 +118,21 @@ _HOMES = {
     "decant.simulation": ("Simulation", "simulate"),
     "decant.station": ("Station", "StationPour"),
     "actors.interfaces": ("LaboratoryError",),
-    "orchestrator.bench_check": ("BenchReport",),
-    "orchestrator.catalogue.vessel_account": ("VesselAccount", "VesselContent"),
-    "orchestrator.config.action_assignments": ("AssignmentError",),
-    "orchestrator.config.yaml.yaml_errors": ("ConfigError",),
-    "orchestrator.run_errors": ("RunError",),
-    "orchestrator.run_service": ("CheckReport",),
-    "orchestrator.added_pours": ("add_pour",),
-    "orchestrator.journal.events": ("Event",),
-    "orchestrator.strategies.campaign_plan": ("CampaignPlan",),
-    "orchestrator.recordings.recording_export": ("export_recordings",),
-    "orchestrator.recordings.recording_file": ("PourRecording", "load_recording", "load_recordings"),
-    "orchestrator.recordings.recording_fit": ("Fit", "Judgement", "fit_recordings", "judge_recording"),
-    "orchestrator.recordings.recording_replay": ("PourReplay", "ReplayValues", "replay_recording"),
-    "orchestrator.results.publishing": ("Published",),
-    "orchestrator.results.recording_figures": ("replay_figure",),
+    "orchestrator.runs.bench_check": ("BenchReport",),
+    "orchestrator.materials.vessel_account": ("VesselAccount", "VesselContent"),
+    "orchestrator.campaigns.action_assignments": ("AssignmentError",),
+    "orchestrator.campaigns.yaml.yaml_errors": ("ConfigError",),
+    "orchestrator.learning.run_errors": ("RunError",),
+    "orchestrator.runs.run_service": ("CheckReport",),
+    "orchestrator.runs.added_pours": ("add_pour",),
+    "orchestrator.records.events": ("Event",),
+    "orchestrator.learning.campaign_plan": ("CampaignPlan",),
+    "orchestrator.reports.recording_export": ("export_recordings",),
+    "orchestrator.reports.recording_file": ("PourRecording", "load_recording", "load_recordings"),
+    "orchestrator.reports.recording_fit": ("Fit", "Judgement", "fit_recordings", "judge_recording"),
+    "orchestrator.reports.recording_replay": ("PourReplay", "ReplayValues", "replay_recording"),
+    "orchestrator.reports.publishing": ("Published",),
+    "orchestrator.reports.recording_figures": ("replay_figure",),
     "sim_engine.errors": ("DecantError", "InvalidArgumentError"),
     "sim_engine.resources": ("MissingExtraError",),
     "sim_engine.liquids": ("SimulationParameters",),
@@ -148,7 +148,7 @@ if not TYPE_CHECKING:  # else a type checker would take a misspelt name for Any
     def __getattr__(name: str) -> Any:
         """Import a name when it is asked for (PEP 562)."""
         if name == "events":
-            return import_module("orchestrator.journal.events")
+            return import_module("orchestrator.records.events")
         if name not in _HOME_OF:
             raise AttributeError(f"module 'decant' has no attribute '{name}'; it has {', '.join(__all__)}")
         return getattr(import_module(_HOME_OF[name]), name)

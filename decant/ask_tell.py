@@ -39,17 +39,18 @@ from actors.laboratory import open_laboratory
 from actors.laboratory_settings import LaboratorySettings
 from decant.run_results import Run, html_table
 from decant.running import checked
-from orchestrator.added_pours import weighed_by_hand
-from orchestrator.journal.events import Subscriber as Watch
-from orchestrator.journal.run_record import read_record
-from orchestrator.requests import Pour, Prediction
-from orchestrator.results.stage_views import receiver_names
-from orchestrator.run_service import RunHandle, RunResources, RunService, RunTaskError
-from orchestrator.run_tasks import run_task
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Pour, Prediction
+from orchestrator.learning.stage_result import displayed_action
+from orchestrator.records.events import Subscriber as Watch
+from orchestrator.records.run_record import read_record
+from orchestrator.reports.publishing import publish_run
+from orchestrator.reports.stage_views import receiver_names
+from orchestrator.runs.added_pours import weighed_by_hand
 from orchestrator.runs.resume import LOST
+from orchestrator.runs.run_service import RunHandle, RunResources, RunService, RunTaskError
+from orchestrator.runs.run_tasks import run_task
 from orchestrator.runs.stages import scenes_of
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.stage_result import displayed_action
 from sim_engine.action import Action
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.outcome import PourMeasurement
@@ -291,7 +292,7 @@ class AskTell:
             if self._closing:
                 handle.pause()
             result = await handle.wait()
-        self._run = Run(self._campaign, result, await asyncio.to_thread(handle.publish))
+        self._run = Run(self._campaign, result, await asyncio.to_thread(publish_run, handle))
 
     def _pause(self) -> None:
         if self._handle is not None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Unpack
 from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.queries import Conditions, PourConditions
 from orchestrator.catalogue.run_reading import TABLES
-from orchestrator.journal.run_record import Row
+from orchestrator.records.run_record import Row
 from sim_engine.resources import require
 
 if TYPE_CHECKING:

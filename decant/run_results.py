@@ -12,16 +12,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.codec import Results
-from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.run_record import CampaignResult, Row, answers, read_record, read_result
-from orchestrator.requests import Failed, Simulate, Simulated
-from orchestrator.results.loss_units import loss_of_pour
-from orchestrator.results.publishing import Published, report_on, summary_of
-from orchestrator.results.publishing import publish as write
-from orchestrator.results.run_summary import RunSummary
-from orchestrator.results.stage_views import (
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.learning.calibration.calibration_scores import CalibrationGain
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.deployment.deployment_result import Recommended
+from orchestrator.learning.requests import Failed, Simulate, Simulated
+from orchestrator.learning.stage_result import UNIT_SUFFIXES, displayed_action
+from orchestrator.records.codec import Results
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.run_record import CampaignResult, Row, answers, read_record, read_result
+from orchestrator.reports.loss_units import loss_of_pour
+from orchestrator.reports.publishing import Published, report_on, summary_of
+from orchestrator.reports.publishing import publish as write
+from orchestrator.reports.run_summary import RunSummary
+from orchestrator.reports.stage_views import (
     deployments_of,
     gain_of,
     predictions_of,
@@ -29,11 +34,6 @@ from orchestrator.results.stage_views import (
     recommended_theta_of,
     theta_of,
 )
-from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
-from orchestrator.strategies.calibration.calibration_scores import CalibrationGain
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.stage_result import UNIT_SUFFIXES, displayed_action
 from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import normalised_spillage
@@ -136,7 +136,7 @@ class Run:
 
     def figures(self) -> dict[str, Figure]:
         """All figures that its results allow, by name."""
-        from orchestrator.results.run_figures import figures_of
+        from orchestrator.reports.run_figures import figures_of
 
         return figures_of(self.campaign, self.results)
 

@@ -21,18 +21,23 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from decant.run_results import Run
-from orchestrator.bench_check import BenchReport, check_bench
-from orchestrator.config.file_loading import campaign_from, load_campaign, load_laboratory, load_vessel
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.config.yaml.yaml_source import Document
-from orchestrator.journal.events import Subscriber as Watch
+from orchestrator.campaigns.file_loading import campaign_from, load_campaign, load_laboratory, load_vessel
+from orchestrator.campaigns.shipped import shipped, starting_set
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_source import Document
+from orchestrator.learning.calibration.calibration_scores import shift_left_over
+from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.live_view.live_server import recorder_of
-from orchestrator.progress.progress_state import ProgressState
-from orchestrator.results.publishing import not_simulated
-from orchestrator.results.stage_views import evaluation_of
-from orchestrator.run_clock import run_time
-from orchestrator.run_service import CheckReport, RunHandle, RunRequest, RunResources, RunService
-from orchestrator.run_tasks import (
+from orchestrator.records.events import Subscriber as Watch
+from orchestrator.records.run_clock import run_time
+from orchestrator.reports.progress_state import ProgressState
+from orchestrator.reports.publishing import not_simulated, publish_run
+from orchestrator.reports.stage_views import evaluation_of
+from orchestrator.runs.bench_check import BenchReport, check_bench
+from orchestrator.runs.motion_approval import read_record
+from orchestrator.runs.run_folder import create_run
+from orchestrator.runs.run_service import CheckReport, RunHandle, RunRequest, RunResources, RunService
+from orchestrator.runs.run_tasks import (
     PREDICTION_SEEDS,
     TASKS,
     GivenTheta,
@@ -42,12 +47,7 @@ from orchestrator.run_tasks import (
     read_theta,
     run_task,
 )
-from orchestrator.runs.motion_approval import read_record
-from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.stages import POSTERIOR_DRAWS, posterior_draws
-from orchestrator.shipped import shipped, starting_set
-from orchestrator.strategies.calibration.calibration_scores import shift_left_over
-from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import SimulationParameters
 from sim_engine.vessel.shapes import VesselSpec
@@ -174,7 +174,7 @@ class RunningCampaign:
             result = await self._handle.wait()
         finally:
             self._handle.close()
-        return Run(self._campaign, result, await asyncio.to_thread(self._handle.publish))
+        return Run(self._campaign, result, await asyncio.to_thread(publish_run, self._handle))
 
     def __await__(self) -> Generator[Any, None, Run]:
         return self._task.__await__()
@@ -359,7 +359,7 @@ def _run(request: RunRequest, resources: RunResources) -> Run:
     """Run what was checked, record it, and publish it."""
     with closing(RunService().start(request, resources)) as handle:
         result = run_coroutine(handle.wait())
-    return Run(request.campaign, result, handle.publish())
+    return Run(request.campaign, result, publish_run(handle))
 
 
 def _rows(table: Any) -> list[dict[str, Any]]:

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orchestrator.config.action_assignments import assigned_action
-from orchestrator.config.campaign_checks import check_vessels
-from orchestrator.config.file_loading import load_vessel
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.campaigns.action_assignments import assigned_action
+from orchestrator.campaigns.campaign_checks import check_vessels
+from orchestrator.campaigns.file_loading import load_vessel
+from orchestrator.learning.campaign_plan import CampaignPlan
 from sim_engine.errors import InvalidArgumentError, InvalidSceneError
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import SimulatedPour
@@ -47,7 +47,7 @@ class Simulation:
 
     def figure(self) -> Figure:
         """Four moments of the first seed from the side, and the place of the liquid at every time."""
-        from orchestrator.results.pour_figures import simulation_figure
+        from orchestrator.reports.pour_figures import simulation_figure
 
         return simulation_figure(self.task, self.pours[0])
 

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from orchestrator.results import figure_style as style
-from orchestrator.results.pour_figures import fill_section, place, section
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.pour_figures import fill_section, place, section
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
 from sim_engine.motion import plan_motion

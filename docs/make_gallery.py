@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import decant
-from orchestrator.config.file_loading import load_vessel
-from orchestrator.results import figure_style as style
-from orchestrator.results.pour_figures import fill_section, section, simulation_figure
+from orchestrator.campaigns.file_loading import load_vessel
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.pour_figures import fill_section, section, simulation_figure
 from sim_engine.vessel.vessel import build_vessel
 
 ROOT = Path(__file__).resolve().parent.parent

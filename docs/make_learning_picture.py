@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from orchestrator.results import figure_style as style
+from orchestrator.reports import figure_style as style
 
 DOCS = Path(__file__).resolve().parent
 SHOWN = {

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from actors.runtime.child_process import child_environment
-from orchestrator.journal.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
+from orchestrator.records.journal import JOURNAL_NAME, JournalError, JournalReader, Kind
 
 ROOT = Path(__file__).parents[1]
 

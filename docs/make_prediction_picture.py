@@ -10,7 +10,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from orchestrator.results import figure_style as style
+from orchestrator.reports import figure_style as style
 
 DOCS = Path(__file__).parent
 DATA, PICTURE = DOCS / "data" / "recorded-predictions.json", DOCS / "images" / "recorded-predictions.png"

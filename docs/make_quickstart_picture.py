@@ -15,12 +15,12 @@ from matplotlib.text import Text
 from PIL import Image
 
 import decant
-from orchestrator.config.file_loading import load_campaign, load_parameters
-from orchestrator.journal.run_record import read_result
-from orchestrator.results import figure_style as style
-from orchestrator.results.pour_figures import simulation_figure
-from orchestrator.results.run_figures import figures_of
-from orchestrator.results.stage_views import deployments_of
+from orchestrator.campaigns.file_loading import load_campaign, load_parameters
+from orchestrator.records.run_record import read_result
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.pour_figures import simulation_figure
+from orchestrator.reports.run_figures import figures_of
+from orchestrator.reports.stage_views import deployments_of
 from orchestrator.runs.run_folder import RESOLVED
 
 ROOT = Path(__file__).resolve().parent.parent

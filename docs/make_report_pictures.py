@@ -11,7 +11,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from orchestrator.results.html_report import REPORT_NAME
+from orchestrator.reports.html_report import REPORT_NAME
 from orchestrator.study.study_page import PAGE, REPORT
 
 DOCS = Path(__file__).parent

@@ -30,30 +30,33 @@ from actors.balance.balance_settings import SerialBalanceSettings
 from actors.balance.display_behaviour import DisplayBehaviour
 from actors.balance.scale_model import ScaleSettings
 from actors.dosing.dosing_settings import DosingSettings
+from actors.grippers.digital_gripper import DigitalSettings
+from actors.grippers.onrobot_gripper import OnRobotSettings
+from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import OperatorSettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
+from orchestrator.campaigns import campaign_file as campaign
+from orchestrator.campaigns import vessel_file as vessel
+from orchestrator.campaigns.pour_table import MASS_COLUMNS, SPLITS, column_name
+from orchestrator.campaigns.scene_builder import DEFAULTS, NEEDED
+from orchestrator.campaigns.yaml.section_validation import sections_in
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.cli.physics_command import kept_records
-from orchestrator.config import campaign_file as campaign
-from orchestrator.config import vessel_file as vessel
-from orchestrator.config.pour_table import MASS_COLUMNS, SPLITS, column_name
-from orchestrator.config.scene_builder import DEFAULTS, NEEDED
-from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySettings
-from orchestrator.recordings import recording_file as recording
-from orchestrator.states import State
-from orchestrator.strategies.campaign_plan import OutputSettings
-from orchestrator.strategies.deployment.costing import CostSettings
-from orchestrator.strategies.deployment.disturbances import RiskSettings
-from orchestrator.strategies.deployment.model_monitoring import (
+from orchestrator.learning.campaign_plan import OutputSettings
+from orchestrator.learning.deployment.costing import CostSettings
+from orchestrator.learning.deployment.disturbances import RiskSettings
+from orchestrator.learning.deployment.model_monitoring import (
     DiscrepancyPolicySettings,
     RiskLimitSettings,
     StopSettings,
 )
-from orchestrator.strategies.deployment.objectives import Objective
-from orchestrator.strategies.deployment.safe_window import WindowSettings
-from orchestrator.strategies.strategy_registry import OBJECTIVES, STRATEGIES
+from orchestrator.learning.deployment.objectives import Objective
+from orchestrator.learning.deployment.safe_window import WindowSettings
+from orchestrator.learning.strategy_registry import OBJECTIVES, STRATEGIES
+from orchestrator.records.states import State
+from orchestrator.reports import recording_file as recording
 from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquids import KNOWN, ROOM, LiquidSettings, SimulationParameters
@@ -62,7 +65,7 @@ from sim_engine.scene import PoseErrorSettings
 from sim_engine.settings.model import Choice, Settings, meanings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.validation import sensitivity
-from sim_engine.vessel.shapes import ProfileShape
+from sim_engine.vessel.shapes import ProfileShape, VesselGrip
 
 FOLDER = Path(__file__).parent
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -90,6 +93,7 @@ SECTIONS: dict[str, type[Settings]] = {
     "liquid": LiquidSettings,
     "vessel": vessel.VesselFile,
     "profile": ProfileShape,
+    "grip": VesselGrip,
     "recording": recording.RecordingFile,
     "placement": recording.RecordedPlacement,
     "recorded-balance": recording.RecordedBalance,
@@ -99,6 +103,9 @@ SECTIONS: dict[str, type[Settings]] = {
     "arm": UrArmSettings,
     "limits": ArmLimits,
     "cell": RobotCell,
+    "gripper-robotiq": RobotiqSettings,
+    "gripper-onrobot": OnRobotSettings,
+    "gripper-digital": DigitalSettings,
     "pump": SimulatedPumpSettings,
     "source": SourceSettings,
     "spill-sensor": SimulatedSpillSensorSettings,
@@ -141,6 +148,9 @@ OF_SECTIONS = {
     "ScaleSettings": "[virtual balance](#virtual-balance)",
     "DisplayBehaviour": "[display behaviour](#display-behaviour)",
     "PumpSettings": "[pump](#pump)",
+    "GripperSettings": "[gripper](grippers.md)",
+    "EmulatedOnRobotSettings": "[gripper](grippers.md)",
+    "EmulatedRobotiqSettings": "[gripper](grippers.md)",
     "SpillSensorSettings": "[spill sensor](#spill-sensor)",
     "OperatorSettings": "[operator](#operator)",
     "HiddenLiquid": "[parameters](#simulator), one value each",
@@ -634,7 +644,7 @@ def rest() -> str:
 
 def events() -> str:
     """The events of a run with their fields."""
-    from orchestrator.journal import events as module
+    from orchestrator.records import events as module
 
     parts = []
     for name, kind in vars(module).items():

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 import typer.testing
 
-from orchestrator.catalogue.run_registry import VARIABLE
+from orchestrator.records.run_registry import VARIABLE
 from tests.support.hypothesis_examples import load_profile
 
 load_profile()

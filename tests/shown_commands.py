@@ -92,8 +92,8 @@ def write_scratch(folder: Path) -> str:
 
     Laboratories wait for nothing and need no Ray; liquids are coarse; there are few pours and few simulations.
     """
-    from orchestrator.config.file_loading import load_campaign
-    from orchestrator.results.publishing import publish
+    from orchestrator.campaigns.file_loading import load_campaign
+    from orchestrator.reports.publishing import publish
 
     shutil.copytree(ROOT / "configs", folder / "configs")
     _change(folder / "configs/laboratories/twin.yaml", _small_laboratory)

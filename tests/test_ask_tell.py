@@ -72,6 +72,7 @@ def test_what_was_told_is_what_the_campaign_learns_from(tmp_path: Path) -> None:
     assert (units["angular_velocity_deg_s"], units["spilled_g"], units["seconds"]) == ("deg/s", "g", "s")
 
 
+@pytest.mark.slow
 def test_a_pour_that_nothing_was_told_of_is_never_asked_for_as_a_new_one(tmp_path: Path) -> None:
     left = (
         "import os, tests.test_ask_tell as here, decant, sys\n"
@@ -146,6 +147,7 @@ def test_no_other_program_pours_in_an_external_laboratory(
 ACTION: dict[str, str | float] = {"angular_velocity": "40 deg/s", "x_offset": 100}
 
 
+@pytest.mark.slow
 def test_an_added_pour_is_learned_from_and_is_not_one_of_the_campaigns(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     with decant.AskTell(campaign(), folder) as session:

@@ -16,14 +16,14 @@ import pytest
 from ruamel.yaml import YAML
 
 from actors.runtime.child_process import child_environment
+from orchestrator.campaigns.campaign_file import CampaignFile
+from orchestrator.campaigns.file_loading import load_campaign, load_vessel
+from orchestrator.campaigns.search_ranges import EXAMPLES
+from orchestrator.campaigns.vessel_file import VesselFile
+from orchestrator.campaigns.yaml.section_validation import sections_in
 from orchestrator.cli import foreground_run as common
-from orchestrator.config.campaign_file import CampaignFile
-from orchestrator.config.file_loading import load_campaign, load_vessel
-from orchestrator.config.search_ranges import EXAMPLES
-from orchestrator.config.vessel_file import VesselFile
-from orchestrator.config.yaml.section_validation import sections_in
 from orchestrator.daemon.daemon_settings import DaemonFile
-from orchestrator.journal.journal import Kind
+from orchestrator.records.journal import Kind
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.study.study_file import StudyFile
 from sim_engine import model_validity as regimes

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import decant
-from orchestrator.requests import Simulate
+from orchestrator.learning.requests import Simulate
 from tests.support.hypothesis_examples import THOROUGH
 
 ROOT = Path(__file__).parents[1]
@@ -161,9 +161,9 @@ def test_a_program_of_a_user_passes_a_strict_type_check_and_misspelt_names_do_no
 
 
 def test_every_public_error_is_a_decant_error_and_what_it_was_before() -> None:
-    from orchestrator.journal.codec import CodecError
-    from orchestrator.journal.journal_file import JournalError
-    from orchestrator.run_service import RunTaskError
+    from orchestrator.records.codec import CodecError
+    from orchestrator.records.journal_file import JournalError
+    from orchestrator.runs.run_service import RunTaskError
     from sim_engine.errors import InvalidSceneError
     from sim_engine.settings.plugin_registry import PluginError
     from sim_engine.vessel.shapes import VesselError

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.strategy_harness import SCENE
+from orchestrator.runs.strategy_harness import SCENE
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
 from tests.support.fake_simulator import make_fake

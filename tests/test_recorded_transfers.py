@@ -18,6 +18,7 @@ def transfers(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return recorded_transfers
 
 
+@pytest.mark.slow
 def test_nine_recorded_transfers_in_ten_lie_in_the_intervals_of_a_surrogate(transfers: ModuleType) -> None:
     found = transfers.figures(transfers.campaigns(transfers.ANSWERS), "linear")
     shown, before = found["averaged"], found["plug-in"]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pytest
+
 from actors.runtime.child_process import run
 from tests.support.waiting import PATIENCE
 
@@ -43,6 +45,7 @@ def test_after_it(outcome):
 """
 
 
+@pytest.mark.slow
 def test_a_rerun_renews_the_fixtures_of_its_module(tmp_path: Path) -> None:
     (tmp_path / "conftest.py").write_text(CONFTEST, encoding="utf-8")
     (tmp_path / "test_inner.py").write_text(TESTS, encoding="utf-8")

@@ -7,7 +7,7 @@ from types import ModuleType
 
 import pytest
 
-from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
+from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED
 from orchestrator.study.study_statistics import LEVEL, RANDOM, Final, Found, Gathered, Key
 
 LEVELS, CUPS = ["bench1", "bench2"], ["cone"]

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from actors.runtime.child_process import child_environment
-from orchestrator.shipped import STARTING_SET
+from orchestrator.campaigns.shipped import STARTING_SET
 from sim_engine.resources import EXTRAS
 from tests.plugins import test_plugins as example
 
@@ -37,7 +37,7 @@ importlib.util.find_spec = lambda name, package=None: None if name in {sorted(EX
 HARNESS = """
 from decant.plugins import DeploymentPlan, Loss
 from decant.plugins.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.strategies.deployment.d2 import D2Settings
+from orchestrator.learning.deployment.d2 import D2Settings
 
 def spill(action, theta, rng):
     return abs(action.x_offset - 0.12)
@@ -134,9 +134,9 @@ def test_authors_of_plug_ins_test_them_with_what_the_wheel_carries(wheel: Path, 
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    where = "import decant.plugins.testing as t, orchestrator.strategy_harness as h; print(t.__file__, h.__file__)"
+    where = "import decant.plugins.testing as t, orchestrator.runs.strategy_harness as h; print(t.__file__, h.__file__)"
     assert python("-c", where).split() == [
-        str(tmp_path / "site" / name) for name in ("decant/plugins/testing.py", "orchestrator/strategy_harness.py")
+        str(tmp_path / "site" / name) for name in ("decant/plugins/testing.py", "orchestrator/runs/strategy_harness.py")
     ]
     assert "3 pours" in python("-c", HARNESS)
     reported = python("-m", "pytest", "-q", "-rs", "-p", "no:cacheprovider", "-k", A_FEW, "test_my_arm.py")

@@ -74,7 +74,9 @@ class Plan:
 _POUR = WeighingStep("pour", "The arm pours.", "pour")
 _DRY = "Put the empty, dry pourer on the balance, alone."
 _FULL = "Fill the pourer and put it on the balance."
-_GRIP = "Give the pourer to the gripper. "
+GRIP = "Give the pourer to the gripper. "
+"""The part of an instruction for which a bench with a gripper asks separately, see `actors.bench.held_vessel`."""
+
 _LOADED = {"pourer_full": 1.0, "pourer_empty": -1.0}
 _RETAINED = {"pourer_after": 1.0, "pourer_empty": -1.0}
 
@@ -91,7 +93,7 @@ PLANS: dict[Placement, Plan] = {
             WeighingStep("weigh", "Fill the pourer and put it on the tray.", "before", "pourer_full"),
             _tare(
                 "set_up",
-                _GRIP + "Wipe the tray, and put the receiver on its stand; it must not touch the tray.",
+                GRIP + "Wipe the tray, and put the receiver on its stand; it must not touch the tray.",
                 "before",
             ),
             _POUR,
@@ -106,7 +108,7 @@ PLANS: dict[Placement, Plan] = {
             _tare("cleared", "Take everything off the balance.", "before"),
             WeighingStep("weigh", _DRY, "once", "pourer_empty"),
             WeighingStep("weigh", _FULL, "before", "pourer_full"),
-            _tare("set_up", _GRIP + "Put the empty receiver on the balance; nothing else may touch its pan.", "before"),
+            _tare("set_up", GRIP + "Put the empty receiver on the balance; nothing else may touch its pan.", "before"),
             _POUR,
             WeighingStep(
                 "weigh", "Touch nothing: what is in the receiver is weighed.", "after", "received", hands=False
@@ -127,7 +129,7 @@ PLANS: dict[Placement, Plan] = {
             WeighingStep("weigh", "Put the empty, dry pourer on the tray.", "once", "pourer_empty"),
             WeighingStep("weigh", "Fill the pourer and put it on the tray.", "before", "pourer_full"),
             WeighingStep(
-                "weigh", _GRIP + "Put the empty receiver on the tray, where it will stand.", "before", "receiver_empty"
+                "weigh", GRIP + "Put the empty receiver on the tray, where it will stand.", "before", "receiver_empty"
             ),
             _tare("set_up", "Leave tray and receiver as they are.", "before", hands=False),
             _POUR,
@@ -149,7 +151,7 @@ PLANS: dict[Placement, Plan] = {
         (
             _tare("dry_pourer", "Put a dry pourer on the balance, alone; it counts as nothing.", "before"),
             WeighingStep("weigh", "Put the filled pourer on the balance in its place.", "before", "pourer_full"),
-            _tare("set_up", _GRIP + "Put the wiped tray on the balance, the receiver on its stand.", "before"),
+            _tare("set_up", GRIP + "Put the wiped tray on the balance, the receiver on its stand.", "before"),
             _POUR,
             WeighingStep("weigh", "Touch nothing: what lies on the tray is weighed.", "after", "spilled", hands=False),
             _tare("dry_pourer_after", "Put a dry pourer on the balance, alone; it counts as nothing.", "after"),
@@ -162,7 +164,7 @@ PLANS: dict[Placement, Plan] = {
             WeighingStep("weigh", "Weigh the empty, dry pourer.", "once", "pourer_empty", "operator"),
             WeighingStep("weigh", "Fill the pourer and weigh it.", "before", "pourer_full", "operator"),
             WeighingStep(
-                "weigh", _GRIP + "Wipe the tray, weigh it, and put it under.", "before", "tray_before", "operator"
+                "weigh", GRIP + "Wipe the tray, weigh it, and put it under.", "before", "tray_before", "operator"
             ),
             _POUR,
             WeighingStep("weigh", "Weigh the tray with what was spilled on it.", "after", "tray_after", "operator"),

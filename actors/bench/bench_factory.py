@@ -20,17 +20,19 @@ from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings, balance_kind
 from actors.balance.scale_model import Load
-from actors.balance.weighing_plan import PourMasses
+from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.consent import Setup
 from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.ground_truth import GroundTruth
+from actors.bench.held_vessel import HeldVessel, HoldingArm
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.pump_bench import PumpBench
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
 from actors.dosing.dosing_settings import DosingSettings
+from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import (
     DoseTarget,
     InvalidActionError,
@@ -142,6 +144,8 @@ class PouringBench:
                 await self.balance.release()
         if self._setup.supply is not None:
             await self._setup.supply.close()
+        if self._setup.held is not None:
+            await self._setup.held.close()
         if self._watch is not None:
             await self._watch.close()
 
@@ -201,13 +205,33 @@ class _Opening:
         self.devices.append(self.make(name, cls, *args))
         return self.devices[-1]
 
-    def arm(self, spec: ArmSettings, accepted: str | None = None) -> DeviceArm:
+    def arm(self, spec: ArmSettings, accepted: str | None = None, held: HeldVessel | None = None) -> DeviceArm:
         cls, args = arm_kind(spec).driver(accepted)
-        return DeviceArm(self("arm", cls, *args), spec)
+        device = self("arm", cls, *args)
+        return DeviceArm(device, spec) if held is None else HoldingArm(device, spec, held)
 
     def balance(self, spec: BalanceSettings, name: str, device: str = "balance") -> DeviceBalance:
         cls, args = balance_kind(spec).driver(name)
         return DeviceBalance(self(device, cls, *args), spec.time_scale, longest_call=spec.longest_call)
+
+    def held(
+        self,
+        spec: GripperSettings | None,
+        arm: ArmSettings,
+        balance: DeviceBalance | None,
+        weighing: BalanceSettings,
+        tell: Callable[[Notice], None],
+    ) -> HeldVessel | None:
+        if spec is None:
+            return None
+        cls, args = spec.driver()
+        weight = None
+        if balance is not None and weighing.position is Placement.TRAY and weighing.pourer == "here":
+
+            async def weight() -> float:
+                return (await balance.weigh()).mass
+
+        return HeldVessel(self("gripper", cls, *args), spec, arm, tell, weight)
 
     def pump(self, spec: PumpSettings, name: str) -> PumpDevice:
         cls, args = spec.driver()
@@ -334,20 +358,22 @@ async def _open_devices(
 ) -> OpenBench:
     emulators: DeviceEmulators | None = None
     true_arm: ArmSettings | None = None
+    gripper_spec = None if spec.gripper is None else spec.gripper.beside(arm_spec)
     if spec.mode == "virtual":
-        emulators = DeviceEmulators(opening("emulators", BenchEmulators, arm_spec, balance_spec))
+        emulators = DeviceEmulators(opening("emulators", BenchEmulators, arm_spec, balance_spec, gripper_spec))
         found = await emulators.found()
         arm_spec, true_arm = found.arm, found.true_arm
-        balance_spec = found.balance or balance_spec
-    arm = opening.arm(arm_spec, None if spec.mode == "virtual" else spec.accepted_checksum)
+        balance_spec, gripper_spec = found.balance or balance_spec, found.gripper or gripper_spec
     balance = None if balance_spec.typed else opening.balance(balance_spec, spec.name)
+    held = opening.held(gripper_spec, arm_spec, balance, balance_spec, tell)
+    arm = opening.arm(arm_spec, None if spec.mode == "virtual" else spec.accepted_checksum, held)
     if emulators is not None and balance_spec.receives_load:
         emulators.told = balance
     ground_truth = GroundTruth(arm_spec.time_scale)
     contents: BenchContents | None = None
     if emulators is not None and spec.bench is not None and liquid is not None:
         contents = BenchContents(balance_spec.position)
-        hands = Hands(contents, None if balance is None else emulators.put)
+        hands = Hands(contents, None if balance is None else emulators.put, None if held is None else emulators.hold)
         if isinstance(true_arm, UrArmSettings):
             ground_truth = FollowedBench(spec.bench, true_arm, emulators, hands, liquid)
         else:
@@ -369,5 +395,6 @@ async def _open_devices(
         tell,
         supply,
         watch,
+        held,
     )
     return OpenBench(PouringBench(setup, spec.dosing), opening.devices, emulators, operator)

@@ -235,6 +235,9 @@ the problem."""
 Put = Callable[[float], Awaitable[None]]
 """Replaces the mass on the virtual balance [kg]."""
 
+Hold = Callable[[float | None], Awaitable[None]]
+"""Holds a vessel of this width between the fingers of a virtual gripper [m], or takes it away with None."""
+
 
 class Hands:
     """Moves objects on a virtual bench.
@@ -242,10 +245,11 @@ class Hands:
     Args:
         contents: the bench contents.
         put: changes the mass on the balance; None without a balance.
+        hold: puts the pourer between the fingers of a gripper; None without one.
     """
 
-    def __init__(self, contents: BenchContents, put: Put | None) -> None:
-        self.contents, self._put = contents, put
+    def __init__(self, contents: BenchContents, put: Put | None, hold: Hold | None = None) -> None:
+        self.contents, self._put, self._hold = contents, put, hold
         self._rng = np.random.default_rng(0)
         self._load = 0.0
 
@@ -263,6 +267,8 @@ class Hands:
         self.contents.do(question.about, self._load + float(self._rng.normal(0.0, SCATTER)))
         if self._put is not None and question.wants == "done":
             await self._put(self.contents.carried)
+        if self._hold is not None and question.about in ("grasp", "let_go", "open_gripper", "activate_gripper"):
+            await self._hold(1e-3 * float(question.details["width_mm"]) if question.about == "grasp" else None)
 
 
 class VirtualOperator:
@@ -322,7 +328,7 @@ class PlayedOperator:
             question = replace(question, text=f"{question.text} (The virtual scale shows {shown}.)")
             return await self._person.ask(question)
         answer = await self._person.ask(question)
-        if answer == "done":
+        if answer in ("done", "yes"):
             await self._hands.do(question)
         return answer
 

@@ -20,7 +20,9 @@ from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.ground_truth import GroundTruth
+from actors.bench.held_vessel import HeldVessel
 from actors.bench.liquid_supply import LiquidSupply, SpillWatch
+from actors.grippers.gripper_interface import VesselLostError
 from actors.interfaces import BenchLostError, LaboratoryError, Notice, OperatorQuestion
 from actors.runtime.remote_object import DeviceLostError
 
@@ -134,6 +136,12 @@ class Setup:
     tell: Callable[[Notice], None]
     supply: LiquidSupply | None = None
     watch: SpillWatch | None = None
+    held: HeldVessel | None = None
+
+    @property
+    def lost(self) -> bool:
+        """Whether a gripper may have lost the pourer in this pour: then the liquid is unknown, too."""
+        return self.held is not None and bool(self.held.lost)
 
 
 class Consent:
@@ -148,7 +156,14 @@ class Consent:
         self._setup, self._path = setup, path
 
     async def ask(self, question: OperatorQuestion) -> str:
-        """Ask a question. If it invites hands into the cell, make sure first that nothing can move."""
+        """Ask a question. If it invites hands into the cell, make sure first that nothing can move.
+
+        With a gripper, the pourer is gripped or let go before or after questions that need it.
+        """
+        held = self._setup.held
+        return await (self._ask(question) if held is None else held.around(question, self._ask))
+
+    async def _ask(self, question: OperatorQuestion) -> str:
         if question.hands:
             await self.make_safe()
         return await self._setup.questions.ask(question)
@@ -207,15 +222,23 @@ class Consent:
                 error = again
 
     async def bring_home(self, error: Exception, *, begun: bool) -> None:
-        """Bring the arm home after a stop on the way to the pour, or on the way back from it."""
+        """Bring the arm home after a stop on the way to the pour, or on the way back from it.
+
+        Raises:
+            VesselLostError: as given, once the arm is home: the pour is not what it was planned to be.
+        """
+        first = error
         while True:
             await self._recover(error, begun=begun)
             await self.given(way_home_question(self._setup.spec))
             try:
                 await self._setup.arm.retreat(self._path)
-                return
             except STUCK as again:
                 error = again
+                continue
+            if isinstance(first, VesselLostError):
+                raise first
+            return
 
     async def _recover(self, error: Exception, *, begun: bool) -> None:
         """Make the robot ready again after the operator has fixed the cause; nothing moves yet.
@@ -226,6 +249,7 @@ class Consent:
         if isinstance(error, BenchLostError):
             raise error  # cannot be recovered from here
         problem = str(error)
+        begun = begun or self._setup.lost
         while await self._agreed(stopped_question(error, problem, begun=begun)):
             try:
                 done = await self._setup.arm.recover()

@@ -26,8 +26,9 @@ import numpy as np
 
 from actors.arm.arm_interface import ArmFacts, ArmState, Executed, PlannedPour
 from actors.balance.balance_interface import BalanceError
-from actors.balance.weighing_plan import Placement
+from actors.balance.weighing_plan import GRIP, Placement
 from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
+from actors.bench.pour_feasibility import vessel
 from actors.bench.pour_procedure import PourReport
 from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult
 from actors.dosing.dose_estimator import DoseReading
@@ -183,6 +184,7 @@ class DoseProcedure:
             await self._consent.leave_safe()
             raise
         except LaboratoryError as error:
+            self._begun = self._begun or self._setup.lost
             text = f"{error}. Nothing was poured"
             if self._begun:
                 text = f"{error}. It was not the dose that was asked for: {await self._remaining()}"
@@ -200,6 +202,8 @@ class DoseProcedure:
         self._report.enter("operator")
         self._facts = await setup.arm.ready()
         await self._consent.make_safe()
+        if setup.held is not None:
+            await setup.held.ready(vessel(self._scene.pourer))
         await setup.balance.device.revive()
         await setup.balance.resume()
         await setup.balance.connect()
@@ -232,8 +236,8 @@ class DoseProcedure:
         if source.fill:
             await self._consent.ask(
                 OperatorQuestion(
-                    f"Fill '{source.name}' with {1e3 * source.mass:.0f} g of {self._scene.liquid.name}, weighed, and "
-                    "give it to the gripper. Take everything off the balance.",
+                    f"Fill '{source.name}' with {1e3 * source.mass:.0f} g of {self._scene.liquid.name}, weighed. "
+                    f"{GRIP}Take everything off the balance.",
                     wants="done",
                     about="dose_source",
                 )

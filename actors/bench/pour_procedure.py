@@ -32,6 +32,7 @@ from actors.balance.weighing import Weighings
 from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
 from actors.bench.ground_truth import PourAsk
+from actors.bench.pour_feasibility import vessel
 from actors.interfaces import (
     DoseProgress,
     InvalidActionError,
@@ -225,6 +226,7 @@ class PourProcedure:
             await self._consent.leave_safe()
             raise
         except LaboratoryError as error:
+            self._begun = self._begun or self._setup.lost
             if self._begun and not isinstance(error, BalanceError):
                 await self._weigh_remaining()
             await self._consent.leave_safe()
@@ -241,6 +243,8 @@ class PourProcedure:
         self._report.enter("operator")
         self._facts = await setup.arm.ready()
         await self._consent.make_safe()
+        if setup.held is not None:
+            await setup.held.ready(vessel(self._scene.pourer))
         if setup.balance is not None:
             await setup.balance.device.revive()
             await setup.balance.resume()
@@ -329,6 +333,8 @@ class PourProcedure:
 
     def _note_weight(self, key: str, weighed: PourMasses) -> None:
         """Write a weight to the journal at once, so that no later failure can lose it."""
+        if key == "pourer_full" and self._setup.held is not None:
+            self._setup.held.stood(weighed.mass)
         self._setup.tell(Notice("note", f"weighed, {key}: {grams(weighed.mass)} ± {1e3 * weighed.uncertainty:.2f} g"))
 
     def _pour_error(self, error: Exception) -> LaboratoryError:

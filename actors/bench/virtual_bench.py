@@ -30,6 +30,7 @@ from actors.bench.flowing_liquid import FlowEnd, FlowingLiquid, FlowOrder
 from actors.bench.ground_truth import GroundTruth, PourAsk, draw_pose_error, hidden_pour, spill_of, stream
 from actors.dosing.dose_series import source_of
 from actors.dosing.simulated_dose import true_cup
+from actors.grippers.gripper_interface import GripperEmulator, GripperSettings
 from actors.interfaces import DoseTarget, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
 from actors.runtime.remote_object import Device
@@ -70,28 +71,36 @@ class Found:
         balance: the balance's settings with the address of its emulator; None without one.
         true_arm: the arm's settings with the geometry of the emulator, which a driver has to read from it; None without
             an emulator. With one, `history` is available.
+        gripper: the gripper's settings with the address of its emulator; None without one.
     """
 
     arm: ArmSettings
     balance: BalanceSettings | None
     true_arm: ArmSettings | None
+    gripper: GripperSettings | None = None
 
 
 class BenchEmulators:
-    """The emulators of arm and balance, in child processes that end with this process.
+    """The emulators of arm, balance and gripper, in child processes and threads that end with this process.
 
     Args:
         arm: settings of the arm.
         balance: settings of the balance; None without one.
+        gripper: settings of the gripper; None without one.
     """
 
-    def __init__(self, arm: ArmSettings, balance: BalanceSettings | None) -> None:
+    def __init__(
+        self, arm: ArmSettings, balance: BalanceSettings | None, gripper: GripperSettings | None = None
+    ) -> None:
         self._spec = arm
         self._arm = arm_kind(arm).start_emulator()
         self._weighs = balance
         self._balance: BalanceEmulator | None = None
         self._flow: FlowingLiquid | None = None
+        self._gripper: GripperEmulator | None = None
         try:
+            if gripper is not None:
+                self._gripper = gripper.beside(arm if self._arm is None else self._arm.arm).start_emulator()
             self._balance = None if balance is None or balance.typed else balance_kind(balance).start_emulator()
         except BaseException:
             self.close()
@@ -100,9 +109,10 @@ class BenchEmulators:
     def found(self) -> Found:
         """Return the addresses of the emulators."""
         balance = self._weighs if self._balance is None else self._balance.balance
-        return (
-            Found(self._spec, balance, None) if self._arm is None else Found(self._arm.arm, balance, self._arm.true_arm)
-        )
+        gripper = None if self._gripper is None else self._gripper.gripper
+        if self._arm is None:
+            return Found(self._spec, balance, None, gripper)
+        return Found(self._arm.arm, balance, self._arm.true_arm, gripper)
 
     def install(self) -> None:
         """See `ArmEmulator.install`."""
@@ -118,6 +128,17 @@ class BenchEmulators:
         """Set the mass on the balance from now on [kg]."""
         if self._balance is not None:
             self._balance.put(mass)
+
+    def hold(self, width: float | None) -> None:
+        """See `GripperEmulator.put`."""
+        if self._gripper is not None:
+            self._gripper.put(width)
+
+    def gripper_fault(self, name: str, value: float) -> None:
+        """See `GripperEmulator.fault`."""
+        if self._gripper is None:
+            raise LaboratoryError("there is no virtual gripper here")
+        self._gripper.fault(name, value)
 
     def history(self, since: float) -> History:
         """See `ArmEmulator.history`."""
@@ -167,6 +188,8 @@ class BenchEmulators:
             self._arm.close()
         if self._balance is not None:
             self._balance.close()
+        if self._gripper is not None:
+            self._gripper.close()
 
 
 class DeviceEmulators:
@@ -200,6 +223,14 @@ class DeviceEmulators:
             await self.told.put(Load((0.0,), (mass,)))
         else:
             await self.device.call("put", mass, deadline=DEADLINE)
+
+    async def hold(self, width: float | None) -> None:
+        """Hold a vessel of this width between the gripper's fingers [m], or take it away with None."""
+        await self.device.call("hold", width, deadline=DEADLINE)
+
+    async def gripper_fault(self, name: str, value: float = 1.0) -> None:
+        """Request a fault from the gripper's emulator."""
+        await self.device.call("gripper_fault", name, value, deadline=DEADLINE, urgent=True)
 
     async def history(self, since: float) -> History:
         """Joint motion since a controller time [s]; empty for a time in the future."""

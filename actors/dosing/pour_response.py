@@ -2,7 +2,7 @@
 
 `PourHypotheses` are values of cup, flow and balance; `respond` computes the readings that each of them predicts, with
 the equations of `actors.dosing.dose_estimator`. `displayed` is the balance alone: it turns any mass past the lip into
-readings. A fit of recorded pours uses both (`orchestrator.recordings`).
+readings. A fit of recorded pours uses both (`orchestrator.reports`).
 
 Limitations: those of `actors.dosing.cup_flow`.
 """

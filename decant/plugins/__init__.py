@@ -1,4 +1,4 @@
-"""Names for authors of plug-ins: strategies, objectives, balances, arms, pumps, spill sensors and sources of vessels.
+"""Names for authors of plug-ins: strategies, objectives, sources of vessels, and all kinds of devices.
 
 How to write one: docs/extend/plug-ins.md.
 
@@ -53,6 +53,13 @@ if TYPE_CHECKING:
     from actors.balance.scale_model import Load
     from actors.balance.serial_balance import SerialBalance
     from actors.bench.pour_feasibility import plan_pour
+    from actors.grippers.gripper_interface import (
+        Gripper,
+        GripperEmulator,
+        GripperError,
+        GripperSettings,
+        GripperState,
+    )
     from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
     from actors.liquid_devices import (
         Pump,
@@ -74,7 +81,19 @@ if TYPE_CHECKING:
         Suggestion,
         SuggestionQuery,
     )
-    from orchestrator.requests import (
+    from orchestrator.learning.calibration.calibration_base import THETA_MAP_RESOLUTION, Calibration, DesignSettings
+    from orchestrator.learning.calibration.pointwise_calibration import DiscrepancyOverPours
+    from orchestrator.learning.campaign_plan import (
+        CalibrationPlan,
+        CalibrationSettings,
+        DeploymentPlan,
+        DeploymentSettings,
+        MeasuredPour,
+    )
+    from orchestrator.learning.deployment.deployment_base import MAP_RESOLUTION, Deployment
+    from orchestrator.learning.deployment.deployment_ledger import SearchSettings
+    from orchestrator.learning.deployment.objectives import Objective, Objectives
+    from orchestrator.learning.requests import (
         Answered,
         Ask,
         Decision,
@@ -89,22 +108,10 @@ if TYPE_CHECKING:
         Suggest,
         Suggested,
     )
-    from orchestrator.run_errors import LearningError
-    from orchestrator.strategies.calibration.calibration_base import THETA_MAP_RESOLUTION, Calibration, DesignSettings
-    from orchestrator.strategies.calibration.pointwise_calibration import DiscrepancyOverPours
-    from orchestrator.strategies.campaign_plan import (
-        CalibrationPlan,
-        CalibrationSettings,
-        DeploymentPlan,
-        DeploymentSettings,
-        MeasuredPour,
-    )
-    from orchestrator.strategies.deployment.deployment_base import MAP_RESOLUTION, Deployment
-    from orchestrator.strategies.deployment.deployment_ledger import SearchSettings
-    from orchestrator.strategies.deployment.objectives import Objective, Objectives
-    from orchestrator.strategies.stage_result import ResultPart, StageResult
-    from orchestrator.strategies.strategy import Progress, Strategy
-    from orchestrator.strategies.trials import OptimizerQueries, SeedStream, Trial, Trials
+    from orchestrator.learning.run_errors import LearningError
+    from orchestrator.learning.stage_result import ResultPart, StageResult
+    from orchestrator.learning.strategy import Progress, Strategy
+    from orchestrator.learning.trials import OptimizerQueries, SeedStream, Trial, Trials
     from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
     from sim_engine.liquids import Liquid, SimulationParameters
     from sim_engine.outcome import Fractions, Loss, PourMeasurement, PourOutcome
@@ -179,6 +186,11 @@ __all__ = [
     "ExecutedMotion",
     "Failed",
     "Fractions",
+    "Gripper",
+    "GripperEmulator",
+    "GripperError",
+    "GripperSettings",
+    "GripperState",
     "History",
     "InvalidActionError",
     "LaboratoryError",
@@ -301,7 +313,7 @@ _SOURCES = {
         "Suggestion",
         "SuggestionQuery",
     ),
-    "orchestrator.requests": (
+    "orchestrator.learning.requests": (
         "Answered",
         "Ask",
         "Decision",
@@ -316,23 +328,23 @@ _SOURCES = {
         "Suggest",
         "Suggested",
     ),
-    "orchestrator.run_errors": ("LearningError",),
-    "orchestrator.strategies.calibration.calibration_base": ("THETA_MAP_RESOLUTION", "Calibration", "DesignSettings"),
-    "orchestrator.strategies.calibration.pointwise_calibration": ("DiscrepancyOverPours",),
-    "orchestrator.strategies.campaign_plan": (
+    "orchestrator.learning.run_errors": ("LearningError",),
+    "orchestrator.learning.calibration.calibration_base": ("THETA_MAP_RESOLUTION", "Calibration", "DesignSettings"),
+    "orchestrator.learning.calibration.pointwise_calibration": ("DiscrepancyOverPours",),
+    "orchestrator.learning.campaign_plan": (
         "CalibrationPlan",
         "CalibrationSettings",
         "DeploymentPlan",
         "DeploymentSettings",
         "MeasuredPour",
     ),
-    "orchestrator.strategies.deployment.deployment_base": ("MAP_RESOLUTION", "Deployment"),
-    "orchestrator.strategies.deployment.deployment_ledger": ("SearchSettings",),
-    "orchestrator.strategies.stage_result": ("ResultPart", "StageResult"),
-    "orchestrator.strategies.strategy": ("Progress", "Strategy"),
-    "orchestrator.strategies.trials": ("OptimizerQueries", "SeedStream", "Trial", "Trials"),
+    "orchestrator.learning.deployment.deployment_base": ("MAP_RESOLUTION", "Deployment"),
+    "orchestrator.learning.deployment.deployment_ledger": ("SearchSettings",),
+    "orchestrator.learning.stage_result": ("ResultPart", "StageResult"),
+    "orchestrator.learning.strategy": ("Progress", "Strategy"),
+    "orchestrator.learning.trials": ("OptimizerQueries", "SeedStream", "Trial", "Trials"),
     # Objectives
-    "orchestrator.strategies.deployment.objectives": ("Objective", "Objectives"),
+    "orchestrator.learning.deployment.objectives": ("Objective", "Objectives"),
     # Balances
     "actors.balance.balance_interface": ("BalanceDriver", "ReferenceLostError", "Weight"),
     "actors.balance.balance_settings": ("BalanceSettings", "BalanceEmulator", "BalanceKind", "SerialBalanceSettings"),
@@ -367,6 +379,14 @@ _SOURCES = {
     "actors.arm.arm_settings": ("ArmDiagnostics", "ArmEmulator", "ArmKind", "ArmSettings", "History"),
     "actors.arm.planned_pour": ("ExecutedMotion", "MotionPath"),
     "actors.bench.pour_feasibility": ("plan_pour",),
+    # Grippers
+    "actors.grippers.gripper_interface": (
+        "Gripper",
+        "GripperEmulator",
+        "GripperError",
+        "GripperSettings",
+        "GripperState",
+    ),
     # Pumps and spill sensors
     "actors.liquid_devices": (
         "Pump",

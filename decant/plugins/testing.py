@@ -2,6 +2,7 @@
 
     from decant.plugins.testing import ArmBench, ArmContract            # needs pytest
     from decant.plugins.testing import BalanceBench, BalanceContract    # needs pytest
+    from decant.plugins.testing import GripperContract, GripperRig    # needs pytest
     from decant.plugins.testing import PumpContract, PumpRig, SpillRig, SpillSensorContract    # needs pytest
     from decant.plugins.testing import StrategyHarness, check_strategy
 
@@ -17,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from actors.contract_tests.arm_contract import ArmBench, ArmContract
     from actors.contract_tests.balance_contract import BalanceBench, BalanceContract
+    from actors.contract_tests.gripper_contract import GripperContract, GripperRig
     from actors.contract_tests.liquid_device_contracts import PumpContract, PumpRig, SpillRig, SpillSensorContract
     from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
-    from orchestrator.strategy_harness import (
+    from orchestrator.runs.strategy_harness import (
         ACTIONS,
         CALIBRATION_ACTIONS,
         PARAMETERS,
@@ -43,6 +45,8 @@ __all__ = [
     "ArmContract",
     "BalanceBench",
     "BalanceContract",
+    "GripperContract",
+    "GripperRig",
     "PumpContract",
     "PumpRig",
     "SpillModel",
@@ -61,13 +65,15 @@ _CONTRACTS = {
     "ArmContract": "actors.contract_tests.arm_contract",
     "BalanceBench": "actors.contract_tests.balance_contract",
     "BalanceContract": "actors.contract_tests.balance_contract",
+    "GripperContract": "actors.contract_tests.gripper_contract",
+    "GripperRig": "actors.contract_tests.gripper_contract",
     "PumpContract": "actors.contract_tests.liquid_device_contracts",
     "PumpRig": "actors.contract_tests.liquid_device_contracts",
     "SpillRig": "actors.contract_tests.liquid_device_contracts",
     "SpillSensorContract": "actors.contract_tests.liquid_device_contracts",
 }
 
-_SOURCE_OF = dict.fromkeys(__all__, "orchestrator.strategy_harness") | {
+_SOURCE_OF = dict.fromkeys(__all__, "orchestrator.runs.strategy_harness") | {
     **_CONTRACTS,
     "VirtualSerialBalance": "actors.emulators.serial_balance.balance_process",
 }

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
 
 ANNOTATIONS_NAME = "remarks.json"
 

@@ -22,12 +22,12 @@ from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, annotate
 from orchestrator.catalogue.export import write_tables
 from orchestrator.catalogue.queries import condition_sql, differing_settings, outcomes
 from orchestrator.catalogue.run_reading import TABLES, UNREADABLE, Column, RunRead, read_run, unreadable
-from orchestrator.catalogue.run_registry import known, make_state_directory, state_directory
-from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.journal_check import has_begun
-from orchestrator.journal.run_record import Row, read_header
-from orchestrator.run_errors import RunError
-from orchestrator.states import RESTING
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.journal_check import has_begun
+from orchestrator.records.run_record import Row, read_header
+from orchestrator.records.run_registry import known, make_state_directory, state_directory
+from orchestrator.records.states import RESTING
 
 INDEX_NAME = "catalogue.sqlite"
 

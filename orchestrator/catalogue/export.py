@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.catalogue.run_reading import TABLES, Column
-from orchestrator.journal.run_record import Row
+from orchestrator.records.run_record import Row
 from sim_engine.resources import require
 
 if TYPE_CHECKING:

@@ -15,13 +15,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
+from orchestrator.campaigns.prior_data import scenes_in
 from orchestrator.catalogue.annotations import Annotations, AnnotationsError, Note, read_annotations
-from orchestrator.journal.codec import CodecError, from_json
-from orchestrator.journal.events import StageClosed
-from orchestrator.journal.run_record import Row, RunPour, read_record
-from orchestrator.run_errors import RunError
-from orchestrator.runs.prior_data import scenes_in
-from orchestrator.strategies.stage_result import displayed_action
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.stage_result import displayed_action
+from orchestrator.records.codec import CodecError, from_json
+from orchestrator.records.events import StageClosed
+from orchestrator.records.run_record import Row, RunPour, read_record
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.outcome import Loss
 

@@ -371,9 +371,9 @@ def _port_settings(port: str, given: list[str] | None) -> SerialBalanceSettings:
         RefusalError: a setting is invalid; lists all problems.
     """
     from actors.balance.balance_settings import SerialBalanceSettings
-    from orchestrator.config.yaml.section_validation import PlacedProblems, validate
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.config.yaml.yaml_source import Document, Place, Report
+    from orchestrator.campaigns.yaml.section_validation import PlacedProblems, validate
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 
     lines = [f"port: {json.dumps(port)}"]
     for text in given or ():

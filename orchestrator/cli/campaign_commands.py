@@ -28,10 +28,10 @@ from orchestrator.cli.command_options import (
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_note
 
 if TYPE_CHECKING:
-    from orchestrator.journal.run_record import CampaignResult
-    from orchestrator.results.publishing import Published
-    from orchestrator.run_service import RunRequest
-    from orchestrator.strategies.campaign_plan import CampaignPlan
+    from orchestrator.learning.campaign_plan import CampaignPlan
+    from orchestrator.records.run_record import CampaignResult
+    from orchestrator.reports.publishing import Published
+    from orchestrator.runs.run_service import RunRequest
 
 
 def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[..., None]:
@@ -53,9 +53,9 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         from orchestrator.cli.foreground_run import check_campaign_can_run, read_campaign, run_task_at_terminal
         from orchestrator.cli.motion_control import require_campaign_flag
         from orchestrator.cli.view_command import live_view
-        from orchestrator.results.run_summary import summary_json
-        from orchestrator.run_service import RunTaskError
-        from orchestrator.run_tasks import TASKS
+        from orchestrator.reports.run_summary import summary_json
+        from orchestrator.runs.run_service import RunTaskError
+        from orchestrator.runs.run_tasks import TASKS
 
         with Refused(RunTaskError):
             request = TASKS[task](read_campaign(campaign, laboratory, seed))
@@ -107,11 +107,11 @@ The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m
 def calibration_json(result: CampaignResult, published: Published) -> dict[str, Any]:
     """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
     `CalibrationEvaluation`."""
-    from orchestrator.journal.codec import result_of
-    from orchestrator.results.stage_views import rival_scores
+    from orchestrator.learning.calibration.calibration_base import Calibrated
+    from orchestrator.learning.calibration.calibration_scores import CALIBRATED, Scores
+    from orchestrator.records.codec import result_of
+    from orchestrator.reports.stage_views import rival_scores
     from orchestrator.runs.stages import CALIBRATION, EVALUATION, calibrated_theta, deployed_theta
-    from orchestrator.strategies.calibration.calibration_base import Calibrated
-    from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, Scores
 
     results = result.results
     theta, calibration = calibrated_theta(results).theta, result_of(results, CALIBRATION, Calibrated)
@@ -162,11 +162,11 @@ def plan(
     """
     from orchestrator.cli.foreground_run import check_campaign_can_run, read_campaign, run_task_at_terminal
     from orchestrator.cli.simulate_command import prediction_inputs
-    from orchestrator.journal.codec import result_of
-    from orchestrator.results.run_summary import PLANNED
+    from orchestrator.learning.deployment.deployment_result import Deployed
+    from orchestrator.learning.single_action import PredictedPour
+    from orchestrator.records.codec import result_of
+    from orchestrator.reports.run_summary import PLANNED
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION
-    from orchestrator.strategies.deployment.deployment_result import Deployed
-    from orchestrator.strategies.single_action import PredictedPour
 
     base = read_campaign(campaign, laboratory, seed)
     known = prediction_inputs(base, parameters, thetas, seeds)
@@ -231,10 +231,10 @@ def planning_request(
     Raises:
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
-    from orchestrator.config.file_loading import load_vessel
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.run_service import RunTaskError
-    from orchestrator.run_tasks import plan_task, read_theta
+    from orchestrator.campaigns.file_loading import load_vessel
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.runs.run_service import RunTaskError
+    from orchestrator.runs.run_tasks import plan_task, read_theta
 
     with Refused(ConfigError, RunTaskError):
         given = None if parameters is None else read_theta(parameters, plan)

@@ -23,9 +23,9 @@ from orchestrator.cli.console import (
 if TYPE_CHECKING:
     from actors.dosing.dose_series import DoseForecast
     from actors.interfaces import DoseSource
-    from orchestrator.run_service import RunRequest
-    from orchestrator.strategies.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
-    from orchestrator.strategies.dispense import Dose, KnownSource
+    from orchestrator.learning.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
+    from orchestrator.learning.dispense import Dose, KnownSource
+    from orchestrator.runs.run_service import RunRequest
 
 
 def dose(
@@ -102,7 +102,7 @@ def _dose_request(
         RefusalError: the campaign can't be read, it has no bench, or a dose is impossible (exit code 2).
     """
     from orchestrator.cli.foreground_run import read_campaign
-    from orchestrator.run_tasks import dose_scenes, dose_task
+    from orchestrator.runs.run_tasks import dose_scenes, dose_task
     from sim_engine.settings.quantity import QuantityError, parse_quantity
 
     plan = read_campaign(path, laboratory)
@@ -127,7 +127,7 @@ def _dose_request(
 
 
 def _known(plan: DispensePlan) -> dict[str, KnownSource]:
-    from orchestrator.catalogue.vessel_account import VesselAccount
+    from orchestrator.materials.vessel_account import VesselAccount
 
     if not plan.as_left:
         return {}
@@ -141,8 +141,8 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
     """Predict one dose after the other; each leaves the source with its expected content."""
     from actors.interfaces import DoseTarget
     from actors.laboratory import predicted_dose
-    from orchestrator.strategies.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, Dispense, KnownSource
-    from orchestrator.strategies.trials import SeedStream
+    from orchestrator.learning.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, Dispense, KnownSource
+    from orchestrator.learning.trials import SeedStream
 
     assert plan.dispense is not None
     series, known = plan.dispense, _known(plan.dispense)
@@ -241,9 +241,9 @@ def pour_doses(request: RunRequest, *, in_process: bool, as_json: bool, again: s
         RefusalError: refused (exit code 2), or not every dose was poured (1).
     """
     from orchestrator.cli.foreground_run import run_task_at_terminal
-    from orchestrator.journal.codec import result_of
+    from orchestrator.learning.dispense import Dispensed
+    from orchestrator.records.codec import result_of
     from orchestrator.runs.stages import DOSES
-    from orchestrator.strategies.dispense import Dispensed
 
     assert request.campaign.dispense is not None
     finished, _ = run_task_at_terminal(

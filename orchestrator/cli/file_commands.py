@@ -34,7 +34,7 @@ def validate(
     ],
 ) -> None:
     """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured."""
-    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from sim_engine.vessel.shapes import VesselError
 
     bad = 0
@@ -61,9 +61,9 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
     Raises:
         ConfigError, VesselError: the file can't be used.
     """
-    from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
-    from orchestrator.config.yaml.file_access import resolved
-    from orchestrator.config.yaml.yaml_source import Document, kind_of
+    from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_vessel
+    from orchestrator.campaigns.yaml.file_access import resolved
+    from orchestrator.campaigns.yaml.yaml_source import Document, kind_of
 
     doing(f"reading {path}")
     match kind_of(Document.read(resolved(path)).data):
@@ -77,7 +77,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
         case "laboratory":
             return f"laboratory, {load_laboratory(path).mode}", []
         case "recording":
-            from orchestrator.recordings.recording_file import load_recording
+            from orchestrator.reports.recording_file import load_recording
 
             recording = load_recording(path)
             for warning in recording.warnings:
@@ -94,7 +94,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
 
             return f"daemon, rigs: {', '.join(rig.name for rig in load_settings(path).rigs)}", []
         case _:
-            from orchestrator.config.campaign_checks import check_campaign
+            from orchestrator.campaigns.campaign_checks import check_campaign
 
             plan = load_campaign(path)
             warned: list[str] = []
@@ -106,7 +106,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
 
 def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one that does not exist yet.")]) -> None:
     """Copy example files into a folder: campaigns, laboratories, studies, vessels and recorded pours."""
-    from orchestrator.shipped import starting_set
+    from orchestrator.campaigns.shipped import starting_set
 
     try:
         campaigns = starting_set(directory)
@@ -123,7 +123,7 @@ def plugins(as_json: Json = False) -> None:
 
     Exit code 1 if a plug-in can't be used; the output gives its package and the reason.
     """
-    from orchestrator.installed_plugins import broken, installed
+    from orchestrator.campaigns.installed_plugins import broken, installed
 
     found, unusable = installed(), broken()
     if as_json:
@@ -147,7 +147,7 @@ def schema(
     ] = "campaign",
 ) -> None:
     """Print a JSON schema: of campaign or other files, for editors; of summary.json; of the output of `--json`."""
-    from orchestrator.config.json_schema import SCHEMAS, schema_text
+    from orchestrator.cli.json_schema import SCHEMAS, schema_text
 
     if which not in SCHEMAS:
         raise RefusalError(f"no schema '{which}'; there are {', '.join(SCHEMAS)}", BAD_INPUT)

@@ -24,10 +24,10 @@ from orchestrator.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from orchestrator.recordings.first_day import DayStep
-    from orchestrator.recordings.recording_file import PourRecording
-    from orchestrator.recordings.rig_diagnosis import RigDiagnosis
-    from orchestrator.strategies.campaign_plan import CampaignPlan
+    from orchestrator.learning.campaign_plan import CampaignPlan
+    from orchestrator.reports.first_day import DayStep
+    from orchestrator.reports.recording_file import PourRecording
+    from orchestrator.reports.rig_diagnosis import RigDiagnosis
     from sim_engine.scene import Scene
 
 DOSE_LIMIT = 1e-3
@@ -64,9 +64,9 @@ def first_day(
     With a campaign, its bench makes the steps that the folder lacks, one after the other; run the command again after
     an interruption. Without one, the recordings of the folder are explained. Writes first-day.html and first-day.json.
     """
-    from orchestrator.recordings.first_day import practice_day
-    from orchestrator.recordings.recording_replay import replay_recording
-    from orchestrator.recordings.rig_diagnosis import diagnose
+    from orchestrator.reports.first_day import practice_day
+    from orchestrator.reports.recording_replay import replay_recording
+    from orchestrator.reports.rig_diagnosis import diagnose
     from sim_engine.errors import DecantError
     from sim_engine.liquids import SimulationParameters
     from sim_engine.settings.quantity import QuantityError, parse_quantity
@@ -117,8 +117,8 @@ def _day_of(folder: Path) -> list[PourRecording]:
     Raises:
         RefusalError: there are none, or one is invalid (exit code 2).
     """
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.recordings.recording_file import load_recordings
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.reports.recording_file import load_recordings
 
     if not folder.is_dir() or not any(folder.glob("*.yaml")):
         text = f"{folder}: has no recorded pour; name a --campaign whose bench pours, or --practise"
@@ -140,7 +140,7 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
     from orchestrator.cli.foreground_run import read_campaign
     from orchestrator.cli.motion_control import require_flag
     from orchestrator.cli.simulate_command import scene_to_simulate
-    from orchestrator.recordings.first_day import first_day as steps_of
+    from orchestrator.reports.first_day import first_day as steps_of
     from sim_engine.errors import DecantError
 
     plan = read_campaign(path, laboratory)
@@ -185,8 +185,8 @@ def _pour_step(
     from orchestrator.cli.dose_command import pour_doses
     from orchestrator.cli.foreground_run import check_campaign_can_run
     from orchestrator.cli.pour_command import chosen_pour, pour_weighed
-    from orchestrator.recordings.recording_export import export_recordings
-    from orchestrator.run_tasks import dose_task
+    from orchestrator.reports.recording_export import export_recordings
+    from orchestrator.runs.run_tasks import dose_task
 
     def filled(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
         return tuple(
@@ -247,7 +247,7 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
         found: the explanation.
         replays: documents of the replays.
     """
-    from orchestrator.recordings.rig_diagnosis import ADVICE
+    from orchestrator.reports.rig_diagnosis import ADVICE
 
     inside = sum(one.inside for one in found.doses)
     words = []
@@ -295,11 +295,11 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
     Raises:
         OSError: the picture can't be written.
     """
-    from orchestrator.recordings.rig_diagnosis import STANDS_OUT
-    from orchestrator.results.figure_style import save
-    from orchestrator.results.html_report import Picture, render
-    from orchestrator.results.recording_figures import diagnosis_figure
-    from orchestrator.results.wording import ResultRow, ResultTable
+    from orchestrator.reports.figure_style import save
+    from orchestrator.reports.html_report import Picture, render
+    from orchestrator.reports.recording_figures import diagnosis_figure
+    from orchestrator.reports.rig_diagnosis import STANDS_OUT
+    from orchestrator.reports.wording import ResultRow, ResultTable
 
     pictures = (
         []

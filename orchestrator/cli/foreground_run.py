@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from actors.arm.arm_interface import PathReport
     from actors.interfaces import Operator
     from actors.laboratory_settings import LaboratorySettings
-    from orchestrator.journal.run_record import CampaignResult
+    from orchestrator.learning.campaign_plan import CampaignPlan
     from orchestrator.live_view.live_server import LiveView
     from orchestrator.live_view.rerun_subscriber import RerunMonitor
-    from orchestrator.results.publishing import Published
-    from orchestrator.run_service import RunHandle, RunRequest, RunResources
+    from orchestrator.records.run_record import CampaignResult
+    from orchestrator.reports.publishing import Published
     from orchestrator.runs.resume import AskOperator
-    from orchestrator.strategies.campaign_plan import CampaignPlan
+    from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources
 
 
 def read_campaign(path: Path, laboratory: Path | None = None, seed: int | None = None) -> CampaignPlan:
@@ -51,8 +51,8 @@ def read_campaign(path: Path, laboratory: Path | None = None, seed: int | None =
     Raises:
         RefusalError: with all problems of its files, exit code 2.
     """
-    from orchestrator.config.file_loading import load_campaign
-    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.campaigns.file_loading import load_campaign
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
     with Refused(ConfigError):
         return load_campaign(path, laboratory, seed)
@@ -64,7 +64,7 @@ def check_campaign_can_run(request: RunRequest) -> None:
     Raises:
         RefusalError: with every problem, exit code 2.
     """
-    from orchestrator.run_service import RunService, RunTaskError
+    from orchestrator.runs.run_service import RunService, RunTaskError
 
     with WaitingIndicator() as doing:
         report = RunService().check(request, doing=doing)
@@ -81,7 +81,7 @@ def check_laboratory_answers(request: RunRequest, resources: RunResources) -> No
         RefusalError: something is missing; exit code 2.
     """
     from actors.interfaces import LaboratoryError
-    from orchestrator.run_service import RunService
+    from orchestrator.runs.run_service import RunService
 
     laboratory = resources.settings(request.campaign)
     if laboratory.ray is not None and not laboratory.in_process:
@@ -96,7 +96,7 @@ def check_output(path: Path | None, option: str, suffix: str) -> None:
     Raises:
         RefusalError: it can't be written there, or has the wrong suffix (exit code 2).
     """
-    from orchestrator.config.yaml.file_access import why_unreadable
+    from orchestrator.campaigns.yaml.file_access import why_unreadable
 
     if path is None:
         return
@@ -116,7 +116,7 @@ def check_output(path: Path | None, option: str, suffix: str) -> None:
 
 def _why_not_opened(path: Path) -> str | None:
     """Found out by opening it: permissions don't tell of full disks, names too long, and folders of the system."""
-    from orchestrator.config.yaml.file_access import why_unreadable
+    from orchestrator.campaigns.yaml.file_access import why_unreadable
 
     there = why_unreadable(path) != "no such file"
     try:
@@ -157,7 +157,7 @@ def run_task_at_terminal(
         RefusalError: refused (exit code 2), or as `run_in_front_of_people`.
     """
     from orchestrator.cli.motion_control import consent_to_motion
-    from orchestrator.run_service import RunResources
+    from orchestrator.runs.run_service import RunResources
 
     checksum = consent_to_motion(request, *motion)
     if request.pours:
@@ -182,7 +182,7 @@ def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Pa
     Raises:
         RefusalError: there is none, or it can't be made (exit code 2).
     """
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
     from orchestrator.runs.run_folder import create_run, find_run
 
     if run_id is not None and not resume:
@@ -221,12 +221,12 @@ def run_in_front_of_people(
         RefusalError: it failed, was interrupted, or needs a person.
     """
     from actors.interfaces import LaboratoryError
+    from orchestrator.learning.run_errors import RunError
     from orchestrator.live_view.live_server import can_record, recorder_of
-    from orchestrator.progress.console_progress import ProgressDisplay
-    from orchestrator.results.console_view import print_summary
-    from orchestrator.results.publishing import not_simulated
-    from orchestrator.run_errors import RunError
-    from orchestrator.run_service import RunService
+    from orchestrator.reports.console_progress import ProgressDisplay
+    from orchestrator.reports.console_view import print_summary
+    from orchestrator.reports.publishing import not_simulated, publish_run
+    from orchestrator.runs.run_service import RunService
 
     plan, directory = request.campaign, request.folder
     assert directory is not None
@@ -280,7 +280,7 @@ def run_in_front_of_people(
                 print_note(f"report of what stands  {page}")
     try:
         _close(handle, live)
-        published = handle.publish()
+        published = publish_run(handle)
         print_summary(published.summary)
     except KeyboardInterrupt:
         raise RefusalError(f"interrupted{finished_without_report(directory)}", INTERRUPTED) from None
@@ -297,7 +297,7 @@ def _close(handle: RunHandle | None, live: LiveView | None) -> None:
 
 
 def _way_on(directory: Path, again: str, not_resumed: str) -> str:
-    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.records.journal import JOURNAL_NAME
 
     if not (directory / JOURNAL_NAME).is_file():
         return "\nnothing had begun"
@@ -367,9 +367,9 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
 
 def finished_without_report(directory: Path) -> str:
     """Follows 'interrupted' if all stages of a run are done and its results may not be published; empty otherwise."""
-    from orchestrator.journal.journal_file import JournalError
-    from orchestrator.journal.run_record import read_record
-    from orchestrator.states import State
+    from orchestrator.records.journal_file import JournalError
+    from orchestrator.records.run_record import read_record
+    from orchestrator.records.states import State
 
     with contextlib.suppress(JournalError):
         if read_record(directory).state is State.FINISHED:
@@ -382,8 +382,8 @@ def finished_without_report(directory: Path) -> str:
 
 def given_up_pours(directory: Path) -> list[str]:
     """Pours of a run that had begun and have no outcome: 'pour 3 of stage deployment:narrow'."""
-    from orchestrator.journal.journal_file import JournalError
-    from orchestrator.journal.run_record import read_record
+    from orchestrator.records.journal_file import JournalError
+    from orchestrator.records.run_record import read_record
 
     with contextlib.suppress(JournalError):
         return [f"pour {one.request.number} of stage {one.stage}" for one in read_record(directory).unknown_pours]
@@ -395,10 +395,10 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
 
     Whatever goes wrong with it, a further Ctrl-C too, is no reason to say less about the run itself.
     """
-    from orchestrator.journal.codec import digest
-    from orchestrator.journal.run_record import read_header, read_result
-    from orchestrator.results.publishing import report_on
-    from orchestrator.runs.fingerprint import fingerprint
+    from orchestrator.campaigns.fingerprint import fingerprint
+    from orchestrator.records.codec import digest
+    from orchestrator.records.run_record import read_header, read_result
+    from orchestrator.reports.publishing import report_on
 
     with contextlib.suppress(Exception, KeyboardInterrupt):
         if digest(read_header(directory).fingerprint) != digest(fingerprint(plan)):
@@ -409,7 +409,7 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
 
 def file_trouble(error: OSError, directory: Path) -> str:
     """What went wrong with a file of a run: which one, and how much room there should be where the disk is full."""
-    from orchestrator.journal.journal_file import MB, TO_BEGIN, free_space
+    from orchestrator.records.journal_file import MB, TO_BEGIN, free_space
 
     where = error.filename or directory
     text = f"{where}: {error.strerror}"

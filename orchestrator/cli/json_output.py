@@ -17,9 +17,9 @@ from actors.interfaces import DeviceCheck
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, StatusOut
 from orchestrator.daemon.station_schemas import AccountOut, BatchOut, ContentOut, PourOut
-from orchestrator.results.run_summary import PLANNED, ReceiverSummary, RunSummary
-from orchestrator.strategies.dispense import Dose
-from orchestrator.strategies.single_action import WeighedPour
+from orchestrator.learning.dispense import Dose
+from orchestrator.learning.single_action import WeighedPour
+from orchestrator.reports.run_summary import PLANNED, ReceiverSummary, RunSummary
 from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import SampleStatistics
 from sim_engine.settings.model import DescribedSchema, meanings

@@ -22,8 +22,8 @@ from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_jso
 from orchestrator.cli.queue_commands import State, Url, connected_client
 
 if TYPE_CHECKING:
-    from orchestrator.catalogue.vessel_account import VesselAccount
     from orchestrator.daemon.daemon_client import Client
+    from orchestrator.materials.vessel_account import VesselAccount
 
 VesselName = Annotated[
     str,
@@ -40,8 +40,8 @@ Note = Annotated[str, typer.Option(help="Text of the entry.", show_default=False
 @contextmanager
 def _opened(url: str | None, state: Path | None) -> Iterator[Client | VesselAccount]:
     """The daemon if there is one, else the account of this machine."""
-    from orchestrator.catalogue.run_registry import state_directory
-    from orchestrator.catalogue.vessel_account import VesselAccount
+    from orchestrator.materials.vessel_account import VesselAccount
+    from orchestrator.records.run_registry import state_directory
 
     with Refused(OSError):
         folder = state or state_directory()
@@ -93,7 +93,7 @@ def list_vessels(url: Url = None, state: State = None, as_json: Json = False) ->
 
     Vessels of the daemon have an id; the sources of `dispense` campaigns and of `decant dose` are LABORATORY/VESSEL.
     """
-    from orchestrator.catalogue.vessel_account import VesselAccount
+    from orchestrator.materials.vessel_account import VesselAccount
 
     rows: list[dict[str, Any]]
     with _opened(url, state) as where:
@@ -127,7 +127,7 @@ def history(
     as_json: Json = False,
 ) -> None:
     """Show the last entries of a vessel's account, newest last: fillings, weighings and pours."""
-    from orchestrator.catalogue.vessel_account import VesselAccount
+    from orchestrator.materials.vessel_account import VesselAccount
 
     with _opened(url, state) as where:
         if not isinstance(where, VesselAccount):
@@ -155,7 +155,7 @@ def weigh(
     state: State = None,
 ) -> None:
     """Enter what a vessel holds, as weighed: it replaces the estimate."""
-    from orchestrator.catalogue.vessel_account import VesselAccount
+    from orchestrator.materials.vessel_account import VesselAccount
     from sim_engine.errors import InvalidArgumentError
 
     kilograms, spread = _mass(mass, "MASS"), _mass(deviation, "--deviation")
@@ -183,7 +183,7 @@ def poured(
     state: State = None,
 ) -> None:
     """Enter a pour that you made by hand and weighed: the source holds less, the receiver more."""
-    from orchestrator.catalogue.vessel_account import Transfer, VesselAccount
+    from orchestrator.materials.vessel_account import Transfer, VesselAccount
 
     moved = _mass(mass, "--weighed"), _mass(deviation, "--deviation")
     with _opened(url, state) as where:

@@ -28,7 +28,7 @@ from orchestrator.runs.motion_approval import SafetyRecordError, required_checks
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, ArmFacts, Executed, PathReport, PlannedPour
     from actors.laboratory_settings import LaboratorySettings
-    from orchestrator.run_service import RunRequest
+    from orchestrator.runs.run_service import RunRequest
 
 T = TypeVar("T")
 

@@ -92,7 +92,7 @@ def validate_solver(
     from rich.console import Console
     from rich.progress import Progress
 
-    from orchestrator.results.console_view import PLAIN_WIDTH
+    from orchestrator.reports.console_view import PLAIN_WIDTH
     from sim_engine.simulator import PourSimulator
     from sim_engine.solver_fingerprint import solver_fingerprint
     from sim_engine.validation.cases import CASES, PLAIN, CaseEffort, describe
@@ -206,7 +206,7 @@ def draw(figure: Figure, path: Path) -> Path:
         figure: its curves.
         path: path of the PNG; its folder is made if needed.
     """
-    from orchestrator.results import figure_style
+    from orchestrator.reports import figure_style
 
     panels = len(figure.titles)
     columns = min(panels, PANELS_ABREAST)
@@ -245,7 +245,7 @@ class CaseFigureStyle:
 
 def _curve_styles(figure: Figure) -> dict[str, CaseFigureStyle]:
     """Styles by name. Measured curves differ in colour; references have their subject's colour and another style."""
-    from orchestrator.results import figure_style
+    from orchestrator.reports import figure_style
 
     shades = figure_style.MEASURED, figure_style.PREDICTED, figure_style.GOOD
     colours = (*shades, figure_style.BEST, figure_style.FALLING, figure_style.ESCAPED)
@@ -263,7 +263,7 @@ def _curve_styles(figure: Figure) -> dict[str, CaseFigureStyle]:
 
 
 def _panel(axes: Axes, figure: Figure, number: int, styles: Mapping[str, CaseFigureStyle]) -> None:
-    from orchestrator.results import figure_style
+    from orchestrator.reports import figure_style
 
     for series in (s for s in figure.series if s.panel == number):
         look = styles[series.name]

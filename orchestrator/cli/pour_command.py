@@ -35,8 +35,8 @@ from orchestrator.cli.console import (
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Executed, PathReport, PlannedPour
-    from orchestrator.strategies.campaign_plan import CampaignPlan
-    from orchestrator.strategies.single_action import WeighedPour
+    from orchestrator.learning.campaign_plan import CampaignPlan
+    from orchestrator.learning.single_action import WeighedPour
     from sim_engine.action import Action
     from sim_engine.scene import Scene
 
@@ -142,9 +142,9 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     """
     from actors.arm.arm_settings import arm_kind
     from actors.interfaces import InvalidActionError
+    from orchestrator.campaigns.action_assignments import assigned_action
+    from orchestrator.campaigns.campaign_checks import check_vessels
     from orchestrator.cli.simulate_command import scene_to_simulate, wanted_in
-    from orchestrator.config.action_assignments import assigned_action
-    from orchestrator.config.campaign_checks import check_vessels
 
     scene, space = scene_to_simulate(plan, scene_name)
     with Refused(ValueError, at="--set: "):
@@ -172,8 +172,8 @@ def report_json(report: PathReport) -> dict[str, Any]:
 def _draw(chosen: Chosen, png: Path) -> None:
     from actors.arm.planned_pour import PourPath
     from actors.arm.ur_settings import UrArmSettings
-    from orchestrator.results import figure_style
-    from orchestrator.results.pour_figures import draw_path
+    from orchestrator.reports import figure_style
+    from orchestrator.reports.pour_figures import draw_path
     from sim_engine.vessel.vessel import build_vessel
 
     arm = chosen.plan.laboratory.arm
@@ -257,9 +257,9 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool)
         RefusalError: refused (exit code 2), or nothing was poured (1).
     """
     from orchestrator.cli.foreground_run import run_task_at_terminal
-    from orchestrator.journal.codec import result_of
-    from orchestrator.run_tasks import POUR, pour_task
-    from orchestrator.strategies.single_action import OnePoured
+    from orchestrator.learning.single_action import OnePoured
+    from orchestrator.records.codec import result_of
+    from orchestrator.runs.run_tasks import POUR, pour_task
 
     finished, _ = run_task_at_terminal(
         pour_task(chosen.plan, chosen.scene, chosen.action),

@@ -77,9 +77,9 @@ def start(
     stopped, and asks the operator about a pour that had started. SIGTERM or Ctrl-C stops it at the next safe point, a
     second signal at once.
     """
-    from orchestrator.config.yaml.file_access import resolved
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.run_errors import RunError
+    from orchestrator.campaigns.yaml.file_access import resolved
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.learning.run_errors import RunError
 
     _require_extra()
     from orchestrator.daemon import server_process
@@ -119,7 +119,7 @@ def connected_client(url: str | None, state: Path | None) -> Iterator[Client]:
     """Open a client of the daemon; its refusals end the command."""
     _require_extra()
     from orchestrator.daemon.daemon_client import Client
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
 
     try:
         with Client(url, state) as client:
@@ -400,7 +400,7 @@ def answer(
     state: State = None,
 ) -> None:
     """Answer a question, or list the open questions if none is given."""
-    from orchestrator.states import State
+    from orchestrator.records.states import State
 
     with connected_client(url, state) as client:
         if question is None:

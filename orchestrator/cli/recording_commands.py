@@ -24,9 +24,9 @@ from orchestrator.cli.console import (
 from orchestrator.cli.shell_completion import RUNS, local_runs
 
 if TYPE_CHECKING:
-    from orchestrator.recordings.recording_file import PourRecording
-    from orchestrator.recordings.recording_fit import Fit, Judgement
-    from orchestrator.recordings.recording_replay import PourReplay
+    from orchestrator.reports.recording_file import PourRecording
+    from orchestrator.reports.recording_fit import Fit, Judgement
+    from orchestrator.reports.recording_replay import PourReplay
 
 Recordings = Annotated[
     list[Path],
@@ -54,9 +54,9 @@ def export(
     Files that exist are kept. To write them at the end of every run, set 'outputs: {pour_recordings: true}' in the
     campaign.
     """
-    from orchestrator.journal.journal import JOURNAL_NAME
-    from orchestrator.recordings.recording_export import export_recordings
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
+    from orchestrator.records.journal import JOURNAL_NAME
+    from orchestrator.reports.recording_export import export_recordings
 
     folder = run if run.exists() or len(run.parts) > 1 else RUNS / run
     if not (folder / JOURNAL_NAME).is_file():
@@ -94,12 +94,12 @@ def replay(
     Nothing is fitted but the lag of the balance, which the estimator finds; values of '--fitted' are named. Exit code 2
     if a file is invalid.
     """
-    from orchestrator.config.file_loading import load_parameters
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.recordings.recording_fit import read_values
-    from orchestrator.recordings.recording_replay import ReplayValues, replay_recording
-    from orchestrator.results.figure_style import save
-    from orchestrator.results.recording_figures import replay_figure
+    from orchestrator.campaigns.file_loading import load_parameters
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.reports.figure_style import save
+    from orchestrator.reports.recording_figures import replay_figure
+    from orchestrator.reports.recording_fit import read_values
+    from orchestrator.reports.recording_replay import ReplayValues, replay_recording
     from sim_engine.errors import DecantError
     from sim_engine.liquids import SimulationParameters
     from sim_engine.simulator import PourSimulator
@@ -159,7 +159,7 @@ def fit(
     The model is the tilting cup with the lag of the balance, not the particles; its flow is always fitted. Judged are
     the recordings of '--judge', and with '--until' the later readings of the fitted ones.
     """
-    from orchestrator.recordings.recording_fit import fit_recordings, judge_recording
+    from orchestrator.reports.recording_fit import fit_recordings, judge_recording
     from sim_engine.errors import DecantError
     from sim_engine.settings.quantity import QuantityError, parse_quantity
 
@@ -186,8 +186,8 @@ def fit(
 
 def _loaded(paths: Sequence[Path]) -> list[PourRecording]:
     """Recorded pours; their warnings are printed."""
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.recordings.recording_file import load_recordings
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.reports.recording_file import load_recordings
 
     with Refused(ConfigError):
         found = load_recordings(paths)

@@ -43,7 +43,7 @@ def report(
     which state this.
     """
     from orchestrator.cli.foreground_run import check_output
-    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.records.journal import JOURNAL_NAME
     from orchestrator.study.study_folder import SETTINGS
 
     check_output(output, "--output", ".html")
@@ -62,8 +62,8 @@ def report(
 
 
 def _nothing_there(folder: Path) -> str:
-    from orchestrator.journal.journal import JOURNAL_NAME
-    from orchestrator.journal.journal_check import check_journal, has_begun
+    from orchestrator.records.journal import JOURNAL_NAME
+    from orchestrator.records.journal_check import check_journal, has_begun
 
     if has_begun(folder / JOURNAL_NAME):
         return f"{folder}: {check_journal(folder / JOURNAL_NAME).verdict}"
@@ -76,15 +76,15 @@ def _nothing_there(folder: Path) -> str:
 
 
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
-    from orchestrator.config.file_loading import load_campaign
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.journal.journal import JOURNAL_NAME
-    from orchestrator.journal.journal_check import check_journal
-    from orchestrator.journal.journal_file import JournalFormatError
-    from orchestrator.journal.run_record import read_result
-    from orchestrator.results.html_report import REPORT_NAME
-    from orchestrator.results.publishing import publish_if_missing, report_on, write_reduced_report
-    from orchestrator.run_errors import RunError
+    from orchestrator.campaigns.file_loading import load_campaign
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.learning.run_errors import RunError
+    from orchestrator.records.journal import JOURNAL_NAME
+    from orchestrator.records.journal_check import check_journal
+    from orchestrator.records.journal_file import JournalFormatError
+    from orchestrator.records.run_record import read_result
+    from orchestrator.reports.html_report import REPORT_NAME
+    from orchestrator.reports.publishing import publish_if_missing, report_on, write_reduced_report
     from orchestrator.runs.run_folder import RESOLVED, missing_plugins, read_versions
 
     with Refused(JournalFormatError, code=BAD_INPUT):

@@ -64,8 +64,8 @@ def check(
     """
     from actors.interfaces import LaboratoryError
     from actors.laboratory import check_bench_packages
-    from orchestrator.bench_check import check_bench
-    from orchestrator.commissioning_archive import ArchiveError, write_robot_check
+    from orchestrator.cli.commissioning_archive import ArchiveError, write_robot_check
+    from orchestrator.runs.bench_check import check_bench
     from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
     spec = read_laboratory(laboratory)
@@ -127,7 +127,7 @@ def archive(
     stable weights of the balance, the weighed pours of runs. Exit code 1 if this version of Decant reads one of them
     differently. Nothing is connected.
     """
-    from orchestrator.commissioning_archive import ArchiveError, CommissioningArchive
+    from orchestrator.cli.commissioning_archive import ArchiveError, CommissioningArchive
 
     with Refused(ArchiveError, OSError):
         kept = CommissioningArchive(archive)
@@ -167,8 +167,8 @@ def read_laboratory(path: Path) -> LaboratorySettings:
     Raises:
         RefusalError: the file is invalid; lists all problems, exit code 2.
     """
-    from orchestrator.config.file_loading import load_laboratory
-    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.campaigns.file_loading import load_laboratory
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
     with Refused(ConfigError):
         return load_laboratory(path)

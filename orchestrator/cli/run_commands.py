@@ -25,7 +25,7 @@ from orchestrator.cli.shell_completion import catalogued, catalogued_runs
 
 if TYPE_CHECKING:
     from orchestrator.catalogue.catalogue import Catalogue, CatalogueClient
-    from orchestrator.journal.run_record import Row
+    from orchestrator.records.run_record import Row
 
 NEWEST = 20
 
@@ -51,7 +51,7 @@ Dates are `2030-03-01`, `2030-03` (a whole month), `'2030-03-01 14:30'` or `7d` 
 
 
 def _state(path: Path | None) -> Path | None:
-    from orchestrator.catalogue.run_registry import use_state_directory
+    from orchestrator.records.run_registry import use_state_directory
 
     if path is not None:
         use_state_directory(path)
@@ -155,7 +155,7 @@ def newest(context: typer.Context, state: State = None, daemon: Daemon = False) 
 )
 def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """List runs, newest first; all given conditions must hold."""
-    from orchestrator.results.console_view import print_table
+    from orchestrator.reports.console_view import print_table
 
     with _client(daemon) as client:
         found = client.runs(conditions)
@@ -247,8 +247,8 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
 
     Exit code 0: complete and unchanged. 1: damaged or incomplete. 2: there is no run, or one of another version.
     """
-    from orchestrator.journal.journal import JOURNAL_NAME
-    from orchestrator.journal.journal_check import check_journal, has_begun
+    from orchestrator.records.journal import JOURNAL_NAME
+    from orchestrator.records.journal_check import check_journal, has_begun
 
     folder = Path(run)
     if folder.is_dir():
@@ -287,7 +287,7 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare runs: the settings in which they differ, and their outcomes."""
-    from orchestrator.results.console_view import print_table
+    from orchestrator.reports.console_view import print_table
 
     if len(which) < 2:
         raise RefusalError("comparing takes two runs or more: decant runs compare RUN RUN", BAD_INPUT)
@@ -372,7 +372,7 @@ def add(
     state: State = None,
 ) -> None:
     """Register runs that the catalogue lacks: from another machine, or moved."""
-    from orchestrator.catalogue.run_registry import enter, runs_below
+    from orchestrator.records.run_registry import enter, runs_below
 
     found: list[Path] = []
     for folder in folders:
@@ -411,7 +411,7 @@ _OPEN = "has begun and has no outcome: under way, or UNKNOWN"
 def _print_pours(pours: Sequence[Row], *, of_one_run: bool = False) -> None:
     """Print a table of pours; values that are equal in all pours are printed once, above it."""
     from orchestrator.catalogue.run_reading import ACTION_COLUMNS
-    from orchestrator.results.console_view import print_table
+    from orchestrator.reports.console_view import print_table
 
     used = {name: [pour[name] for pour in pours] for name in ACTION_COLUMNS}
     used = {name: values for name, values in used.items() if any(value is not None for value in values)}
@@ -450,7 +450,7 @@ def _print_pours(pours: Sequence[Row], *, of_one_run: bool = False) -> None:
 
 def _loss(value: float | None, name: str | None, deviation: float | None = None) -> str:
     """Format the loss of a pour or a prediction with its unit: '3.4 %', '3.4 ± 1.2 %'."""
-    from orchestrator.results.loss_units import named_loss_unit
+    from orchestrator.reports.loss_units import named_loss_unit
 
     return "" if value is None else named_loss_unit(str(name)).text(value, deviation)
 
@@ -553,7 +553,7 @@ def _catalogue(*, rebuild: bool = False) -> Iterator[Catalogue]:
 
 @contextlib.contextmanager
 def _refusing() -> Iterator[None]:
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
 
     try:
         yield

@@ -31,7 +31,7 @@ def files_of(kind: str) -> Callable[[str], list[str]]:
     """
 
     def complete(incomplete: str) -> list[str]:
-        from orchestrator.config.yaml.yaml_source import kind_of
+        from orchestrator.campaigns.yaml.yaml_source import kind_of
 
         found = []
         for path in _yaml_files(incomplete):
@@ -48,7 +48,7 @@ def files_of(kind: str) -> Callable[[str], list[str]]:
 
 def _yaml_files(incomplete: str) -> list[Path]:
     """The YAML files whose paths begin with the text, also in folders further down; run folders are left out."""
-    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.records.journal import JOURNAL_NAME
 
     start, beginning = os.path.split(incomplete)
     found: list[Path] = []
@@ -68,7 +68,7 @@ def _yaml_files(incomplete: str) -> list[Path]:
 
 def catalogued_runs(incomplete: str) -> list[str]:
     """Names of the runs in this machine's catalogue, newest first."""
-    from orchestrator.catalogue.run_registry import known, state_directory
+    from orchestrator.records.run_registry import known, state_directory
 
     try:
         folders = [path for path in known(state_directory()) if path.is_dir()]
@@ -79,7 +79,7 @@ def catalogued_runs(incomplete: str) -> list[str]:
 
 def local_runs(incomplete: str) -> list[str]:
     """Names of the runs in the folder runs/."""
-    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.records.journal import JOURNAL_NAME
 
     return sorted(
         path.parent.name for path in RUNS.glob(f"*/{JOURNAL_NAME}") if path.parent.name.startswith(incomplete)
@@ -101,8 +101,8 @@ def catalogued(column: str) -> Callable[[str], list[str]]:
 
 def _values(column: str) -> Iterator[str]:
     from orchestrator.catalogue.catalogue import Catalogue
-    from orchestrator.catalogue.run_registry import known, state_directory
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
+    from orchestrator.records.run_registry import known, state_directory
 
     try:
         if not known(state_directory()):
@@ -119,7 +119,7 @@ def _values(column: str) -> Iterator[str]:
 
 def queued_campaigns(incomplete: str) -> list[str]:
     """Ids of the daemon's newest campaigns; none if no daemon answers."""
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
 
     try:
         from orchestrator.daemon.daemon_client import Client

@@ -37,9 +37,9 @@ from orchestrator.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from orchestrator.config.pour_table import RecordTable
-    from orchestrator.results.prediction_scores import ScoredRow
-    from orchestrator.strategies.campaign_plan import CampaignPlan, RecordedPour, RecordSet
+    from orchestrator.campaigns.pour_table import RecordTable
+    from orchestrator.learning.campaign_plan import CampaignPlan, RecordedPour, RecordSet
+    from orchestrator.reports.prediction_scores import ScoredRow
     from sim_engine.action import Action
     from sim_engine.liquids import SimulationParameters
     from sim_engine.model_validity import ModelValidity
@@ -122,11 +122,11 @@ class SimulateOptions:
 
 def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     """Simulate one pour with several seeds; their mean and spread are the prediction."""
+    from orchestrator.campaigns.action_assignments import assigned_action
+    from orchestrator.campaigns.campaign_checks import check_vessels
+    from orchestrator.campaigns.file_loading import load_vessel
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.cli.foreground_run import check_output, read_campaign
-    from orchestrator.config.action_assignments import assigned_action
-    from orchestrator.config.campaign_checks import check_vessels
-    from orchestrator.config.file_loading import load_vessel
-    from orchestrator.config.yaml.yaml_errors import ConfigError
     from sim_engine.prediction_band import band_of, spreads
     from sim_engine.simulator import InvalidSceneError, PourSimulator
 
@@ -250,7 +250,7 @@ def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, SampleStatistics]
 
 def _regimes(task: PourTask) -> ModelValidity | None:
     """Return the model validity of a pour; effects that the simulator lacks are printed on stderr."""
-    from orchestrator.results.validity_warnings import numbers_line, regimes_of
+    from orchestrator.reports.validity_warnings import numbers_line, regimes_of
 
     try:
         found = regimes_of(task.scene, task.action, task.parameters.particles, task.parameters.lip_adhesion)
@@ -288,8 +288,8 @@ def _show(task: PourTask, pour: SimulatedPour, options: SimulateOptions) -> None
 
         print_note(f"recording: {simulation_rrd(options.rrd, task, pour)} (open it with: rerun {options.rrd})")
     if options.png is not None:
-        from orchestrator.results import figure_style
-        from orchestrator.results.pour_figures import simulation_figure
+        from orchestrator.reports import figure_style
+        from orchestrator.reports.pour_figures import simulation_figure
 
         print_note(f"picture: {figure_style.save(simulation_figure(task, pour), options.png)}")
 
@@ -297,7 +297,7 @@ def _show(task: PourTask, pour: SimulatedPour, options: SimulateOptions) -> None
 def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     """Predict all pours of a table with simulations in this process."""
     from orchestrator.cli.foreground_run import check_output, read_campaign
-    from orchestrator.results.prediction_scores import scores
+    from orchestrator.reports.prediction_scores import scores
     from sim_engine.prediction_band import LEVEL
     from sim_engine.simulator import PourSimulator
 
@@ -320,12 +320,12 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     dimensions = [name for name in table.dimensions if name in table.varying()] or list(table.dimensions)
     found = scores(rows)
     if options.csv is not None:
-        from orchestrator.results.prediction_scores import write_scored
+        from orchestrator.reports.prediction_scores import write_scored
 
         print_note(f"table: {write_scored(options.csv, rows, dimensions)}")
     if options.png is not None:
-        from orchestrator.results import figure_style
-        from orchestrator.results.prediction_scores import draw_scored
+        from orchestrator.reports import figure_style
+        from orchestrator.reports.prediction_scores import draw_scored
 
         title = f"{scene.pourer.name} into {scene.receiver.name}, {len(rows)} weighed pours"
         print_note(f"picture: {figure_style.save(draw_scored(rows, title=title, note=said), options.png)}")
@@ -360,8 +360,8 @@ def _scene(plan: CampaignPlan, options: SimulateOptions, source: Path) -> tuple[
     Returns:
         The scene, and the records that define how such a file is read, if the campaign has any.
     """
-    from orchestrator.config.file_loading import load_vessel
-    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.campaigns.file_loading import load_vessel
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
     calibration = plan.calibration
     sets = {} if calibration is None else {"calibration": calibration.records, "transfer": calibration.transfer}
@@ -384,8 +384,8 @@ def _pours(scene: Scene, records: RecordSet | None, source: Path) -> tuple[Recor
     Raises:
         RefusalError: the table has problems; lists them by line and column (exit code 2).
     """
-    from orchestrator.config.pour_table import read_records
-    from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
+    from orchestrator.campaigns.pour_table import read_records
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
     from sim_engine.vessel.shapes import ProfileShape
 
     radius = None if records is None else records.lip_radius
@@ -419,7 +419,7 @@ def _check(simulator: PourSimulator, table: RecordTable, source: Path, tasks: Se
     Raises:
         RefusalError: lists the lines at which the vessels touch or can't be built (exit code 2).
     """
-    from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
     from sim_engine.simulator import InvalidSceneError
 
     problems, begin, done = [], time.monotonic(), 0
@@ -463,7 +463,7 @@ def _simulated(simulator: PourSimulator, tasks: Sequence[Sequence[PourTask]]) ->
 
 
 def _row(line: int, pour: RecordedPour, outcomes: Sequence[PourOutcome], discrepancy: float | None) -> ScoredRow:
-    from orchestrator.results.prediction_scores import ScoredRow
+    from orchestrator.reports.prediction_scores import ScoredRow
     from sim_engine.outcome import normalised_spillage
     from sim_engine.prediction_band import SampleStatistics, band_of
 
@@ -559,13 +559,13 @@ def prediction_inputs(plan: CampaignPlan, parameters: Path | None, thetas: int |
     Raises:
         RefusalError: the file is invalid, or it lacks the requested posterior (exit code 2).
     """
-    from orchestrator.config.file_loading import (
+    from orchestrator.campaigns.file_loading import (
         load_discrepancy,
         load_parameters,
         load_posterior,
         predicts_with_posterior,
     )
-    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
     if parameters is None:
         if thetas:

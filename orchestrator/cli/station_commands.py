@@ -151,7 +151,7 @@ def serve_sila(
     It is a process of its own over the daemon's HTTP API, with an operator's token. Ending it ends no pour. The
     motion of hardware is enabled with 'decant queue enable' only.
     """
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
     from sim_engine.resources import MissingExtraError, require
 
     with Refused(MissingExtraError):
@@ -174,9 +174,9 @@ def backup(
     file: Annotated[Path, typer.Argument(help="Archive to write (.zip).", show_default=False)], state: State = None
 ) -> None:
     """Back up a daemon's state, also while it runs: queue, orders, materials, campaigns, runs and tokens."""
-    from orchestrator.catalogue.run_registry import state_directory
     from orchestrator.daemon.state_backup import back_up
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
+    from orchestrator.records.run_registry import state_directory
 
     with Refused(RunError), Refused(OSError):
         found = back_up(state or state_directory(), file)
@@ -189,9 +189,9 @@ def restore(
     state: State = None,
 ) -> None:
     """Restore a backup into a new state directory. The queue is paused: check the pours made since the backup."""
-    from orchestrator.catalogue.run_registry import state_directory
     from orchestrator.daemon import state_backup
-    from orchestrator.run_errors import RunError
+    from orchestrator.learning.run_errors import RunError
+    from orchestrator.records.run_registry import state_directory
 
     with Refused(RunError), Refused(OSError):
         found = state_backup.restore(file, state or state_directory())

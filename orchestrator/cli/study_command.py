@@ -132,9 +132,9 @@ def read_study(path: Path) -> StudyPlan:
     """
     from dataclasses import replace
 
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.cli.foreground_run import check_campaign_can_run
-    from orchestrator.config.yaml.yaml_errors import ConfigError
-    from orchestrator.run_service import RunRequest
+    from orchestrator.runs.run_service import RunRequest
     from orchestrator.study.study_file import load_study
 
     with Refused(ConfigError):

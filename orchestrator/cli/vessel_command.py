@@ -432,7 +432,7 @@ def _draw_outline(name: str, outline: FittedOutline, evidence: Sequence[Evidence
     """The section of a turned vessel with its band, and the radii and levels that were measured."""
     import numpy as np
 
-    from orchestrator.results import figure_style
+    from orchestrator.reports import figure_style
     from sim_engine.vessel.profile import outer_profile
     from sim_engine.vessel_acquisition.measurements import FillTable, Radii
 
@@ -515,8 +515,8 @@ def _written_mesh(
     """Write a mesh in millimetres next to the vessel's file, after checking that it holds liquid."""
     import trimesh
 
-    from orchestrator.results import figure_style
-    from orchestrator.results.pour_figures import draw_solid
+    from orchestrator.reports import figure_style
+    from orchestrator.reports.pour_figures import draw_solid
     from sim_engine.vessel.mesh import rim_tilt
     from sim_engine.vessel.mesh_shape import MeshShape
     from sim_engine.vessel.shapes import VesselError, VesselSpec

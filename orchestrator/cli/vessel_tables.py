@@ -10,8 +10,8 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orchestrator.campaigns.table_columns import KnownColumn, columns_of
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_note
-from orchestrator.config.table_columns import KnownColumn, columns_of
 from sim_engine.settings.quantity import QuantityError, parse_quantity
 
 if TYPE_CHECKING:
@@ -153,8 +153,8 @@ def _monotonic(
 
 def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, float, float]]:
     """Read line number, value of a column and mass [g] of each row; see `read_fill_table`."""
-    from orchestrator.config.saved_table import read_saved_table
-    from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
+    from orchestrator.campaigns.saved_table import read_saved_table
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 
     wanted = (COLUMNS[column], COLUMNS["mass_g"])
     problems: list[Problem] = []

@@ -21,8 +21,8 @@ from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_mes
 from orchestrator.cli.shell_completion import local_runs
 
 if TYPE_CHECKING:
+    from orchestrator.learning.campaign_plan import CampaignPlan
     from orchestrator.live_view.live_server import LiveView
-    from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
 def view(
@@ -107,8 +107,8 @@ def _serve(shown: Path, at: str | None) -> None:
 
 def _again(what: Path, number: int, particles: int | None, stage: str | None, path: Path) -> Path:
     from orchestrator.cli.console import waiting_for
+    from orchestrator.learning.run_errors import RunError
     from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, simulation_rrd, task_of
-    from orchestrator.run_errors import RunError
     from sim_engine.simulator import PourSimulator
 
     run = _run_of(what)
@@ -133,7 +133,7 @@ def _again(what: Path, number: int, particles: int | None, stage: str | None, pa
 
 def _beside(what: list[Path], path: Path) -> Path:
     from orchestrator.live_view.blueprints import put_beside
-    from orchestrator.results.figure_style import safe_name
+    from orchestrator.reports.figure_style import safe_name
 
     named: dict[str, Path] = {}
     for each in what:
@@ -162,7 +162,7 @@ def _recording_of(what: Path) -> Path:
 
 
 def _run_of(what: Path) -> Path:
-    from orchestrator.journal.journal import JOURNAL_NAME
+    from orchestrator.records.journal import JOURNAL_NAME
 
     run = what if what.exists() or len(what.parts) > 1 else Path("runs") / what
     if not (run / JOURNAL_NAME).is_file():
@@ -171,8 +171,8 @@ def _run_of(what: Path) -> Path:
 
 
 def _plan_of(run: Path) -> CampaignPlan:
-    from orchestrator.config.file_loading import load_campaign
-    from orchestrator.config.yaml.yaml_errors import ConfigError
+    from orchestrator.campaigns.file_loading import load_campaign
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.runs.run_folder import RESOLVED
 
     with Refused(ConfigError, at="the run's own campaign can't be read:\n"):

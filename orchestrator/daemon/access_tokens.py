@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 
-from orchestrator.catalogue.run_registry import make_state_directory
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.run_registry import make_state_directory
 
 FAILURES, WINDOW = 10, 60.0
 """Number of wrong tokens per address and time window [s]; more wrong tokens are refused for as long."""

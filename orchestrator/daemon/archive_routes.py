@@ -27,7 +27,7 @@ from orchestrator.daemon.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.materials import Materials
 from orchestrator.daemon.run_readout import REPORT
 from orchestrator.daemon.supervisor import Supervisor
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
 from sim_engine.resources import MissingExtraError
 
 T = TypeVar("T")

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, HTTPException, Path, Request, Response
 from fastapi.responses import JSONResponse
 
-from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Stopping
 from orchestrator.daemon.daemon_store import ENDED, QueueItem
 from orchestrator.daemon.query_routes import campaign_out, found_item, status
@@ -38,7 +38,7 @@ from orchestrator.daemon.schemas import (
 from orchestrator.daemon.stop_request import ALL_STOPPED, BODY_TIME, RIG_TIME, StopBody, read_stop
 from orchestrator.daemon.submissions import Submission, SubmissionError, prepare, run_request
 from orchestrator.daemon.supervisor import UNSTORED, ArmStops, RequestRefusedError, Supervisor
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count, required_checksum
 
 _log = logging.getLogger(__name__)

@@ -20,13 +20,13 @@ from urllib.parse import quote
 
 import httpx
 
-from orchestrator.catalogue.run_registry import state_directory
 from orchestrator.daemon import PHYSICAL, PORT
 from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.run_registry import state_directory
 
 if TYPE_CHECKING:  # a command that only asks the daemon reads no run
-    from orchestrator.journal.run_record import Row
+    from orchestrator.records.run_record import Row
 
 V1 = "/api/v1"
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)

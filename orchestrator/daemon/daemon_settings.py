@@ -17,14 +17,14 @@ from typing import Annotated, Any, ClassVar
 from pydantic import Field
 
 from actors.laboratory_settings import LaboratorySettings, RayAddress, RaySettings
-from orchestrator.catalogue.run_registry import state_directory
-from orchestrator.config.file_loading import load_laboratory
-from orchestrator.config.yaml.file_access import missing_file, resolved
-from orchestrator.config.yaml.section_validation import validate
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.campaigns.file_loading import load_laboratory
+from orchestrator.campaigns.yaml.file_access import missing_file, resolved
+from orchestrator.campaigns.yaml.section_validation import validate
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 from orchestrator.daemon import PORT
 from orchestrator.daemon.notifications import NotifySettings, problem_of
+from orchestrator.records.run_registry import state_directory
 from sim_engine.settings.model import Count, FilePath, Name, PositiveCount, Settings, Switch, Text
 from sim_engine.settings.quantity import Quantity
 

@@ -19,9 +19,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from orchestrator.catalogue.run_registry import make_state_directory
-from orchestrator.journal.journal_file import locked_alone
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.journal_file import locked_alone
+from orchestrator.records.run_registry import make_state_directory
 
 FORMAT = 4
 
@@ -130,7 +130,7 @@ class QueueItem:
         mode: mode of that rig: 'virtual', 'hardware' or 'none'.
         priority: higher priorities run first.
         rank: order within one priority, smallest first.
-        state: state of the run (`orchestrator.states`), or 'stopped', 'withdrawn'.
+        state: state of the run (`orchestrator.records.states`), or 'stopped', 'withdrawn'.
         desired_state: desired state.
         reason: reason of the state, for the operator.
         by: user who submitted it.

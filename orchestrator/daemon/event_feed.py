@@ -22,7 +22,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from orchestrator.journal.events import (
+from orchestrator.learning.requests import WRITTEN_IF_SET, Suggest, Suggested
+from orchestrator.records.events import (
     CampaignOpened,
     Event,
     PourProgressed,
@@ -31,7 +32,6 @@ from orchestrator.journal.events import (
     SpeculationProgressed,
     StrategyProgressed,
 )
-from orchestrator.requests import WRITTEN_IF_SET, Suggest, Suggested
 
 PASSING = (PourProgressed, StrategyProgressed, SpeculationProgressed)
 """Progress events. Each replaces the one before it, so they are not stored on disk."""
@@ -108,7 +108,7 @@ class SentEvent:
     Attributes:
         id: larger than that of any earlier event.
         campaign: campaign of the event; '' if it concerns the daemon.
-        type: name of its class in `orchestrator.journal.events`, or the name of one of the daemon's own events.
+        type: name of its class in `orchestrator.records.events`, or the name of one of the daemon's own events.
         data: JSON on one line.
     """
 

@@ -26,7 +26,7 @@ from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.page import page_router
 from orchestrator.daemon.schemas import HealthOut, ProblemOut
 from orchestrator.daemon.supervisor import Supervisor
-from orchestrator.strategies.stage_result import ResultPart
+from orchestrator.learning.stage_result import ResultPart
 from sim_engine.settings.model import meanings
 
 V1 = "/api/v1"

@@ -35,7 +35,7 @@ from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.pour_request import PourIn, described
 from orchestrator.daemon.submissions import Submission, prepare
 from orchestrator.daemon.supervisor import Supervisor
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 PERSON = "madsci"

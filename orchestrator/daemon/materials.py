@@ -1,7 +1,7 @@
 """Materials of a station: liquids, vessels and positions, and what their contents can serve.
 
 `Materials` registers them in the daemon's `Store`; the contents are in the account of this machine's vessels
-(`orchestrator.catalogue.vessel_account`). `Materials.refusal` is the reason why vessels can't serve a pour; it is
+(`orchestrator.materials.vessel_account`). `Materials.refusal` is the reason why vessels can't serve a pour; it is
 checked before anything moves. A vessel `LABORATORY/VESSEL`, the source of a campaign, needs no registration.
 """
 
@@ -16,13 +16,13 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-from orchestrator.catalogue.vessel_account import FILE_NAME, MIXTURE, Transfer, VesselAccount, VesselContent
-from orchestrator.config.file_loading import liquid_from, vessel_from
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.config.yaml.yaml_source import Document
+from orchestrator.campaigns.file_loading import liquid_from, vessel_from
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.daemon.daemon_store import ENDED, Store
-from orchestrator.run_errors import RunError
-from orchestrator.strategies.dispense import ENOUGH
+from orchestrator.learning.dispense import ENOUGH
+from orchestrator.learning.run_errors import RunError
+from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, Transfer, VesselAccount, VesselContent
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 from sim_engine.settings.quantity import QuantityError, parse_quantity

@@ -23,8 +23,8 @@ from orchestrator.daemon.pour_request import PourIn
 from orchestrator.daemon.station_schemas import BatchIn
 from orchestrator.daemon.submissions import Submission, planned_order, prepare
 from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
-from orchestrator.run_errors import RunError
-from orchestrator.run_tasks import POUR
+from orchestrator.learning.run_errors import RunError
+from orchestrator.runs.run_tasks import POUR
 
 WAIT = 0.1
 """Interval at which a waiting call reads the state of its pour [s]."""

@@ -29,33 +29,33 @@ from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
 from actors.laboratory import predicted_dose
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.catalogue.vessel_account import MIXTURE, Transfer
-from orchestrator.config.action_assignments import AssignmentError, assigned_action
-from orchestrator.config.campaign_checks import check_vessels, touch
-from orchestrator.config.file_loading import laboratory_record, load_laboratory, vessel_from
-from orchestrator.config.yaml.yaml_source import Document
+from orchestrator.campaigns.action_assignments import AssignmentError, assigned_action
+from orchestrator.campaigns.campaign_checks import check_vessels, touch
+from orchestrator.campaigns.file_loading import laboratory_record, load_laboratory, vessel_from
+from orchestrator.campaigns.shipped import shipped
+from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.daemon.daemon_settings import Rig
 from orchestrator.daemon.daemon_store import QueueItem, Store
 from orchestrator.daemon.materials import Materials, liquid_of, mass_of
 from orchestrator.daemon.pour_request import PourIn
-from orchestrator.journal.run_record import RunPour, read_record
-from orchestrator.requests import Failed, Simulated, Slots
-from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunRequest
-from orchestrator.run_tasks import POUR
-from orchestrator.runs.stages import StageDefinition
-from orchestrator.shipped import shipped
-from orchestrator.strategies.campaign_plan import (
+from orchestrator.learning.campaign_plan import (
     CampaignPlan,
     DeploymentPlan,
     DispensePlan,
     OutputSettings,
     PlannedDose,
 )
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.dispense import DOSE, Dispense, KnownSource, spilled_mass
-from orchestrator.strategies.single_action import OnePour, RepeatedSimulation
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.d2 import D2Settings
+from orchestrator.learning.dispense import DOSE, Dispense, KnownSource, spilled_mass
+from orchestrator.learning.requests import Failed, Simulated, Slots
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.single_action import OnePour, RepeatedSimulation
+from orchestrator.materials.vessel_account import MIXTURE, Transfer
+from orchestrator.records.run_record import RunPour, read_record
+from orchestrator.runs.run_service import RunRequest
+from orchestrator.runs.run_tasks import POUR
+from orchestrator.runs.stages import StageDefinition
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import plan_motion

@@ -22,7 +22,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 
-from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.access_control import Daemon, Viewer
 from orchestrator.daemon.daemon_store import QueueItem
 from orchestrator.daemon.remote_operator import question_json
@@ -30,10 +30,10 @@ from orchestrator.daemon.run_readout import REPORT, summary_of
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, RigOut, StatusOut
 from orchestrator.daemon.submissions import run_request
 from orchestrator.daemon.supervisor import Supervisor
-from orchestrator.journal.journal_file import free_space
-from orchestrator.results.run_summary import PourSummary
-from orchestrator.run_errors import RunError
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.journal_file import free_space
+from orchestrator.reports.run_summary import PourSummary
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 READERS = 400

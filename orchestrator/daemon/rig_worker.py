@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
-from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import ENDED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
@@ -26,22 +26,22 @@ from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, re
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
 from orchestrator.daemon.submissions import run_request
-from orchestrator.journal.events import CampaignStateChanged, Event
-from orchestrator.journal.journal_file import MB, JournalError, free_space
-from orchestrator.journal.run_record import CampaignResult
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView, recorder_of
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
-from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
-from orchestrator.results.publishing import not_simulated
-from orchestrator.run_clock import run_time
-from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService
-from orchestrator.run_tasks import POUR
+from orchestrator.records.events import CampaignStateChanged, Event
+from orchestrator.records.journal_file import MB, JournalError, free_space
+from orchestrator.records.run_clock import run_time
+from orchestrator.records.run_record import CampaignResult
+from orchestrator.records.states import State
+from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
+from orchestrator.reports.publishing import not_simulated, publish_run, publish_so_far
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.resume import OperatorNeededError
+from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
+from orchestrator.runs.run_tasks import POUR
 from orchestrator.runs.stages import scenes_of
-from orchestrator.states import State
-from orchestrator.strategies.campaign_plan import CampaignPlan
 
 _log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ class Running:
             result = await handle.wait()
         finally:
             await asyncio.to_thread(handle.close)
-        await asyncio.to_thread(handle.publish)
+        await asyncio.to_thread(publish_run, handle)
         return result
 
     async def _renew_order(self) -> None:
@@ -223,7 +223,7 @@ class Running:
         """After a stop: publish the results so far, as those of a finished run."""
 
         def work() -> None:
-            RunService().publish_so_far(run_request(self._shared.settings, self.item, self._rig))
+            publish_so_far(run_request(self._shared.settings, self.item, self._rig))
 
         if self.item.run is not None:
             await asyncio.to_thread(work)

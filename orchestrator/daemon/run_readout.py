@@ -22,13 +22,13 @@ from actors.interfaces import LaboratoryError
 from actors.laboratory import reached
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.daemon.daemon_settings import DaemonSettings
-from orchestrator.journal.codec import CodecError
-from orchestrator.journal.journal_file import JournalError
-from orchestrator.journal.run_record import RunState, read_record
-from orchestrator.results.html_report import REPORT_NAME as REPORT
-from orchestrator.results.run_summary import PourSummary
-from orchestrator.results.summarise import pour_summaries
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.records.codec import CodecError
+from orchestrator.records.journal_file import JournalError
+from orchestrator.records.run_record import RunState, read_record
+from orchestrator.reports.html_report import REPORT_NAME as REPORT
+from orchestrator.reports.run_summary import PourSummary
+from orchestrator.reports.summarise import pour_summaries
 
 __all__ = ["REPORT", "Pours", "summary_of"]
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.results.run_summary import PourSummary
+from orchestrator.reports.run_summary import PourSummary
 
 
 class _In(BaseModel):

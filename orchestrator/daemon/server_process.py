@@ -29,7 +29,6 @@ from pythonjsonlogger.json import JsonFormatter
 from actors.interfaces import LaboratoryError
 from actors.runtime.ray_cluster import check_cluster
 from actors.simulators.job_runner import few_arenas
-from orchestrator.catalogue.run_registry import make_state_directory, use_state_directory
 from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
@@ -37,8 +36,9 @@ from orchestrator.daemon.madsci_node import create_node
 from orchestrator.daemon.notifications import OCCASIONS, Notifier, NotifyError, pass_on
 from orchestrator.daemon.stop_request import StopProtocol
 from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
-from orchestrator.run_errors import RunError
+from orchestrator.records.run_registry import make_state_directory, use_state_directory
 
 LISTENING, RENEWED = "DECANT_LISTENING", "DECANT_RENEWED"
 """Environment variables for the next program: file descriptor of the socket, and times of restarts [s]."""

@@ -32,7 +32,7 @@ from sila import UndefinedExecutionError, ValidationError
 from unitelabs.cdk import Connector, ConnectorBaseConfig, Logger, SiLAServerConfig, run, sila
 
 from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 INTERVAL = 0.5

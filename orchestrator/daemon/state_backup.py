@@ -13,13 +13,13 @@ import time
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from orchestrator.catalogue.run_registry import make_state_directory
-from orchestrator.catalogue.vessel_account import FILE_NAME as ACCOUNT
 from orchestrator.daemon.daemon_store import ENDED, DesiredState, Store, StoreError
 from orchestrator.daemon.supervisor import PAUSED
-from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.journal_check import LEDGER_NAME
-from orchestrator.journal.journal_file import JournalError, whole_copy
+from orchestrator.materials.vessel_account import FILE_NAME as ACCOUNT
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.journal_check import LEDGER_NAME
+from orchestrator.records.journal_file import JournalError, whole_copy
+from orchestrator.records.run_registry import make_state_directory
 
 STORE = "daemon.sqlite"
 CONTENT = "backup.json"

@@ -35,7 +35,7 @@ from orchestrator.daemon.station_schemas import (
 )
 from orchestrator.daemon.submissions import SubmissionError
 from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
 
 LONGEST_WAIT = 600.0
 """Longest time that a request may wait for its pour [s]."""

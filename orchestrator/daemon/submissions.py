@@ -20,21 +20,21 @@ from pathlib import Path
 from typing import Any
 
 from actors.interfaces import LaboratoryError
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.file_access import confined, out_of_bounds, resolved
-from orchestrator.config.yaml.yaml_errors import ConfigError, Problem
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.yaml.file_access import confined, out_of_bounds, resolved
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.daemon.daemon_settings import ANY_RIG, NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import DesiredState, QueueItem
 from orchestrator.daemon.pour_orders import PlannedOrder, PourOrder
-from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.journal_file import whole_copy
-from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunRequest, RunResources, RunService, RunTaskError
-from orchestrator.run_tasks import POUR, TASKS, plan_task, read_theta
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.journal_file import whole_copy
+from orchestrator.runs.run_service import RunRequest, RunResources, RunService, RunTaskError
+from orchestrator.runs.run_tasks import POUR, TASKS, plan_task, read_theta
 
 CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
-"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.run_tasks.read_theta`)."""
+"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.runs.run_tasks.read_theta`)."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}(/[A-Za-z0-9][A-Za-z0-9._-]{0,79}){0,3}")
 _FILES = 100

@@ -20,7 +20,6 @@ from typing import Any
 
 from actors.interfaces import LaboratoryError
 from actors.laboratory import WarmSimulators
-from orchestrator.catalogue.run_registry import make_state_directory
 from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
@@ -30,9 +29,10 @@ from orchestrator.daemon.remote_operator import Asking
 from orchestrator.daemon.rig_worker import RigWorker, Running, SharedServices, settle
 from orchestrator.daemon.run_readout import Pours
 from orchestrator.daemon.stop_request import later_stop, recorded_reason, unknown_rig
+from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
-from orchestrator.run_errors import RunError
-from orchestrator.run_tasks import POUR
+from orchestrator.records.run_registry import make_state_directory
+from orchestrator.runs.run_tasks import POUR
 
 LEAVING = 10.0
 """Time for campaigns to stop after Ray has died [s]; then campaigns that don't pour are given up."""

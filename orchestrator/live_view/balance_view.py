@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.interfaces import DoseProgress, PourProgress
+from orchestrator.learning.requests import Pour
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink, Track, columns_of
-from orchestrator.requests import Pour
-from orchestrator.results import figure_style as style
+from orchestrator.reports import figure_style as style
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.scene import Scene

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from orchestrator.results.figure_style import safe_name
+from orchestrator.reports.figure_style import safe_name
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

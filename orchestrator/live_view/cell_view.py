@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from actors.arm.arm_interface import ArmFigure
 from actors.arm.arm_settings import arm_kind
 from actors.interfaces import PourProgress
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Pour
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import Moment, Playback, PlaybackQueue, RecordingSink, Track
 from orchestrator.live_view.simulation_view import MAXIMUM_RATE
-from orchestrator.requests import Pour
-from orchestrator.results import figure_style as style
-from orchestrator.run_clock import run_time
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.records.run_clock import run_time
+from orchestrator.reports import figure_style as style
 from sim_engine.outcome import ParticleState, PourMeasurement, RecordedFrames
 from sim_engine.scene import Scene
 

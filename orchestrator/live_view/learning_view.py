@@ -22,14 +22,19 @@ from actors.optimizer.questions import (
     SurrogateQuery,
 )
 from actors.optimizer.suggest import slices
-from orchestrator.journal.events import RequestFinished
-from orchestrator.journal.run_record import RunPour
+from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.deployment.deployment_result import Deployed
+from orchestrator.learning.deployment.model_monitoring import Believed
+from orchestrator.learning.requests import Pour, Poured, Suggest, Suggested
+from orchestrator.learning.stage_result import StageResult
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
-from orchestrator.requests import Pour, Poured, Suggest, Suggested
-from orchestrator.results import figure_style as style
-from orchestrator.results.figure_style import safe_name
-from orchestrator.results.loss_units import (
+from orchestrator.records.events import RequestFinished
+from orchestrator.records.run_record import RunPour
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.figure_style import safe_name
+from orchestrator.reports.loss_units import (
     DISCREPANCY,
     LossUnit,
     at_least_nothing,
@@ -38,13 +43,8 @@ from orchestrator.results.loss_units import (
     loss_of_pour,
     unit_of_pour,
 )
-from orchestrator.results.stage_views import receiver_names
-from orchestrator.results.summarise import pour_summary
-from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.model_monitoring import Believed
-from orchestrator.strategies.stage_result import StageResult
+from orchestrator.reports.stage_views import receiver_names
+from orchestrator.reports.summarise import pour_summary
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.prediction_band import LEVEL
 

@@ -22,10 +22,10 @@ from typing import Self
 from urllib.parse import quote
 
 from actors.runtime.child_process import ChildProcess, python_module
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.rerun_subscriber import CAPACITY, RerunMonitor
 from orchestrator.live_view.viewer_server import environment
-from orchestrator.run_errors import RunError
-from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.resources import installed
 
 LOOPBACK = "127.0.0.1"

@@ -11,11 +11,11 @@ import re
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
-from orchestrator.progress.progress_state import CHECKPOINT_WORDS, ProgressState
-from orchestrator.results import figure_style as style
-from orchestrator.results.figure_style import safe_name
-from orchestrator.results.stage_views import receiver_name
-from orchestrator.states import RESTING, State
+from orchestrator.records.states import RESTING, State
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.figure_style import safe_name
+from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
+from orchestrator.reports.stage_views import receiver_name
 
 PLACE = "/machine"
 

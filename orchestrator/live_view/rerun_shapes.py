@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orchestrator.live_view.recording_sink import Columns, Track, columns_of
-from orchestrator.results import figure_style as style
+from orchestrator.reports import figure_style as style
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import ArmFigure

@@ -25,14 +25,14 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Generic, TypeVar
 
 from actors.runtime.child_process import ChildProcess
-from orchestrator.journal.events import Event
+from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.live_view.recording_sink import SENDING
 from orchestrator.live_view.viewer_server import environment
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.records.events import Event
 
 if TYPE_CHECKING:
+    from orchestrator.learning.campaign_plan import CampaignPlan
     from orchestrator.live_view.run_recording import CampaignRecording
-    from orchestrator.strategies.campaign_plan import CampaignPlan
 
 
 _log = logging.getLogger(__name__)

@@ -14,7 +14,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from actors.laboratory_settings import MODE_LABELS
-from orchestrator.journal.events import (
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
+from orchestrator.live_view.balance_view import BalanceStage
+from orchestrator.live_view.blueprints import Moment, campaign_blueprint
+from orchestrator.live_view.cell_view import CellScene
+from orchestrator.live_view.learning_view import MAPPED, LearningStage
+from orchestrator.live_view.machine_view import MachineView, status_page
+from orchestrator.live_view.recording_sink import PlaybackQueue, RecordingSink
+from orchestrator.live_view.simulation_view import SimulatedStage
+from orchestrator.records.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
@@ -28,20 +37,11 @@ from orchestrator.journal.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.live_view.balance_view import BalanceStage
-from orchestrator.live_view.blueprints import Moment, campaign_blueprint
-from orchestrator.live_view.cell_view import CellScene
-from orchestrator.live_view.learning_view import MAPPED, LearningStage
-from orchestrator.live_view.machine_view import MachineView, status_page
-from orchestrator.live_view.recording_sink import PlaybackQueue, RecordingSink
-from orchestrator.live_view.simulation_view import SimulatedStage
-from orchestrator.progress.progress_state import ProgressState
-from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
-from orchestrator.results.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
-from orchestrator.results.stage_views import receiver_names
-from orchestrator.run_clock import run_time
+from orchestrator.records.run_clock import run_time
+from orchestrator.reports.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
+from orchestrator.reports.progress_state import ProgressState
+from orchestrator.reports.stage_views import receiver_names
 from orchestrator.runs.stages import scenes_of
-from orchestrator.strategies.campaign_plan import CampaignPlan
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb

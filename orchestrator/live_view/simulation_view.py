@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.arm_settings import arm_kind
-from orchestrator.journal.run_record import RunPour, read_record
+from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.blueprints import simulation_blueprint
 from orchestrator.live_view.recording_sink import Playback, PlaybackQueue, RecordingSink, Track, columns_of
-from orchestrator.results import figure_style as style
-from orchestrator.run_clock import run_time
+from orchestrator.records.run_clock import run_time
+from orchestrator.records.run_record import RunPour, read_record
+from orchestrator.reports import figure_style as style
 from orchestrator.runs.stages import scenes_of
-from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, SampledMotion, Scene

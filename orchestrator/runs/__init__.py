@@ -1,1 +1,1 @@
-"""One run of a campaign: stages, request execution, resuming and the run folder."""
+"""One run of a campaign: run service, stages, request execution, resuming and the run folder."""

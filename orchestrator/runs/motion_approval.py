@@ -22,10 +22,10 @@ from actors.arm.arm_interface import PathReport
 from actors.arm.arm_settings import ArmSettings, SafetyRecord, arm_kind
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear
-from orchestrator.run_errors import RunError
+from orchestrator.learning.calibration.action_prior import actions_all_over
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.stages import CONFIRMATION, DEPLOYMENT, DOSES, StageDefinition
-from orchestrator.strategies.calibration.action_prior import actions_all_over
-from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import Action
 from sim_engine.errors import shown_path
 from sim_engine.scene import Scene

@@ -30,8 +30,8 @@ from actors.interfaces import (
     SimulatorPool,
     UnknownPourError,
 )
-from orchestrator.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
-from orchestrator.run_errors import RunError
+from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
+from orchestrator.learning.run_errors import RunError
 from sim_engine.outcome import RecordedFrames
 from sim_engine.scene import PourTask, Scene
 

@@ -14,12 +14,12 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
-from orchestrator.journal.codec import Results
-from orchestrator.requests import Ask, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.learning.requests import Ask, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.strategy import Strategy
+from orchestrator.records.codec import Results
 from orchestrator.runs.request_executor import SpeculativeExecution
 from orchestrator.runs.stages import StageDefinition, calibrated_theta, stage_seed
-from orchestrator.strategies.stage_result import StageResult
-from orchestrator.strategies.strategy import Strategy
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 

@@ -13,8 +13,13 @@ import inspect
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from orchestrator.journal.codec import canonical, encode_request, first_difference
-from orchestrator.journal.events import (
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Answered, Ask, Failed, Outcome, Pour, Poured, Request, Slots
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.strategy import Strategy
+from orchestrator.records.codec import canonical, encode_request, first_difference
+from orchestrator.records.events import (
     Asked,
     DecisionMade,
     Event,
@@ -28,12 +33,7 @@ from orchestrator.journal.events import (
     StageOpened,
     Told,
 )
-from orchestrator.journal.journal import Journal, JournalReader
-from orchestrator.requests import Answered, Ask, Failed, Outcome, Pour, Poured, Request, Slots
-from orchestrator.run_errors import RunError
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.stage_result import StageResult
-from orchestrator.strategies.strategy import Strategy
+from orchestrator.records.journal import Journal, JournalReader
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 

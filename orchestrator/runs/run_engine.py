@@ -16,8 +16,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from actors.interfaces import Laboratory, Notice, Telling
-from orchestrator.journal.codec import Results
-from orchestrator.journal.events import (
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.records.codec import Results
+from orchestrator.records.events import (
     CampaignClosed,
     CampaignOpened,
     CampaignStateChanged,
@@ -27,11 +31,10 @@ from orchestrator.journal.events import (
     StageOpened,
     Subscriber,
 )
-from orchestrator.journal.journal import JOURNAL_NAME, Journal
-from orchestrator.journal.journal_file import Header, JournalError, NoSpaceError
-from orchestrator.journal.run_record import CampaignResult, read_result
-from orchestrator.run_errors import RunError
-from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.records.journal import JOURNAL_NAME, Journal
+from orchestrator.records.journal_file import Header, JournalError, NoSpaceError
+from orchestrator.records.run_record import CampaignResult, read_result
+from orchestrator.records.states import RESTING, State, check_transition
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor, RequestExecutorError
 from orchestrator.runs.request_forecast import RequestForecast
 from orchestrator.runs.resume import (
@@ -45,9 +48,6 @@ from orchestrator.runs.resume import (
 from orchestrator.runs.run_folder import write_provenance
 from orchestrator.runs.stage_scheduler import StageScheduler
 from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
-from orchestrator.states import RESTING, State, check_transition
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.stage_result import StageResult
 
 
 async def run_campaign(

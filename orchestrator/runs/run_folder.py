@@ -1,7 +1,7 @@
 """Run folders: their names, the files next to the journal, and the search for an unfinished run.
 
 `create_run` makes the folder, `write_provenance` stores plan and versions, `find_run` returns the run to resume. The
-journal itself is in `orchestrator.journal`.
+journal itself is in `orchestrator.records`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from orchestrator.catalogue.run_registry import register
-from orchestrator.installed_plugins import packages as plugin_packages
-from orchestrator.journal.codec import digest
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.journal_check import LEDGER_NAME, check_journal, has_begun, readable_lines
-from orchestrator.journal.journal_file import TO_BEGIN, JournalError, require_space
-from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.states import State
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.installed_plugins import packages as plugin_packages
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.records.codec import digest
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader
+from orchestrator.records.journal_check import LEDGER_NAME, check_journal, has_begun, readable_lines
+from orchestrator.records.journal_file import TO_BEGIN, JournalError, require_space
+from orchestrator.records.run_registry import register
+from orchestrator.records.states import State
 from sim_engine.engine_package import engine_version
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 

@@ -22,8 +22,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from actors.interfaces import PourProgress
-from orchestrator.journal.codec import decode_outcome, encode_outcome
-from orchestrator.journal.events import (
+from orchestrator.learning.requests import Ask, Order, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.strategy import Strategy
+from orchestrator.records.codec import decode_outcome, encode_outcome
+from orchestrator.records.events import (
     Asked,
     DecisionMade,
     Event,
@@ -36,14 +40,10 @@ from orchestrator.journal.events import (
     StrategyProgressed,
     Told,
 )
-from orchestrator.journal.journal import Journal
-from orchestrator.journal.journal_file import JournalError
-from orchestrator.requests import Ask, Order, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
-from orchestrator.run_errors import RunError
+from orchestrator.records.journal import Journal
+from orchestrator.records.journal_file import JournalError
 from orchestrator.runs.request_executor import RequestExecutor
 from orchestrator.runs.resume import StageHistory, needs_answer, replay, weighed_by_hand
-from orchestrator.strategies.stage_result import StageResult
-from orchestrator.strategies.strategy import Strategy
 from sim_engine.outcome import RecordedFrames
 
 _LOGICAL_ORDER: dict[type[Request], int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}

@@ -16,14 +16,10 @@ import numpy as np
 
 from actors.dosing.dose_estimator import calibrated_knowledge
 from actors.interfaces import DoseKnowledge
-from orchestrator.catalogue.vessel_account import VesselAccount
-from orchestrator.journal.codec import Results, result_of
-from orchestrator.requests import Order
-from orchestrator.run_errors import RunError
-from orchestrator.strategies.calibration.action_prior import Contexts, drawn_benches
-from orchestrator.strategies.calibration.active_design import ActivePours
-from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
-from orchestrator.strategies.calibration.calibration_scores import (
+from orchestrator.learning.calibration.action_prior import Contexts, drawn_benches
+from orchestrator.learning.calibration.active_design import ActivePours
+from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.learning.calibration.calibration_scores import (
     DRAWS,
     UNCALIBRATED,
     CalibrationEvaluation,
@@ -33,8 +29,8 @@ from orchestrator.strategies.calibration.calibration_scores import (
     recommended_theta,
     shift_left_over,
 )
-from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured
-from orchestrator.strategies.campaign_plan import (
+from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured
+from orchestrator.learning.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
@@ -43,12 +39,16 @@ from orchestrator.strategies.campaign_plan import (
     MeasuredPour,
     RecordSet,
 )
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.model_monitoring import displacement
-from orchestrator.strategies.dispense import Dispense, ReadSources, SourcesRead
-from orchestrator.strategies.single_action import Confirmation, RepeatedSimulation
-from orchestrator.strategies.strategy import Strategy
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.deployment_result import Deployed
+from orchestrator.learning.deployment.model_monitoring import displacement
+from orchestrator.learning.dispense import Dispense, ReadSources, SourcesRead
+from orchestrator.learning.requests import Order
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.single_action import Confirmation, RepeatedSimulation
+from orchestrator.learning.strategy import Strategy
+from orchestrator.materials.vessel_account import VesselAccount
+from orchestrator.records.codec import Results, result_of
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from orchestrator.results import figure_style as style
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED
+from orchestrator.reports import figure_style as style
 from orchestrator.study.study_plan import StudyPlan
 from orchestrator.study.study_statistics import RANDOM, SHARE, Estimate, Found, Gathered, estimate, mean, running_least
 

@@ -22,8 +22,8 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.ray_tasks import ClusterTask, ClusterTasks
 from actors.simulators.local_worker import thread_pool
 from actors.simulators.ray_worker import from_portable, portable
-from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunResources
+from orchestrator.learning.run_errors import RunError
+from orchestrator.runs.run_service import RunResources
 from orchestrator.study.study_folder import code_now, run_folder
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
 from orchestrator.study.study_runner import run_cell

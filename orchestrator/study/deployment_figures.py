@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from orchestrator.results import figure_style as style
-from orchestrator.results.loss_units import deployment_unit, largest_loss
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.loss_units import deployment_unit, largest_loss
 from orchestrator.study.calibration_figures import (
     Drawn,
     SeriesStyle,

@@ -13,11 +13,21 @@ from pathlib import Path
 
 import numpy as np
 
-from orchestrator.config.run_snapshot import record_of
-from orchestrator.journal.codec import Results, result_of
-from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.run_record import answers
-from orchestrator.requests import Simulate
+from orchestrator.campaigns.run_snapshot import record_of
+from orchestrator.learning.calibration.action_prior import Contexts, region_of
+from orchestrator.learning.calibration.active_design import ActivePours
+from orchestrator.learning.calibration.calibration_scores import CalibrationEvaluation
+from orchestrator.learning.calibration.pointwise_calibration import C1Settings
+from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured, draw_allowed, stratified
+from orchestrator.learning.campaign_plan import CampaignPlan, OutputSettings, RecordedPour, RecordSet
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.deployment_result import Deployed
+from orchestrator.learning.requests import Simulate
+from orchestrator.learning.strategy import Strategy
+from orchestrator.learning.study_strategies import AnsweredByTable, FinalPour, SimulatedTable
+from orchestrator.records.codec import Results, result_of
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.run_record import answers
 from orchestrator.runs.stages import (
     CALIBRATION,
     EVALUATION,
@@ -31,17 +41,7 @@ from orchestrator.runs.stages import (
     stage_seed,
     with_posterior,
 )
-from orchestrator.strategies.calibration.action_prior import Contexts, region_of
-from orchestrator.strategies.calibration.active_design import ActivePours
-from orchestrator.strategies.calibration.calibration_scores import CalibrationEvaluation
-from orchestrator.strategies.calibration.pointwise_calibration import C1Settings
-from orchestrator.strategies.calibration.pour_design import DesignedPours, DesignPoured, draw_allowed, stratified
-from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings, RecordedPour, RecordSet
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.strategy import Strategy
 from orchestrator.study.study_plan import FINAL, GRID, StudyCell, StudyPlan
-from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 

@@ -16,27 +16,27 @@ from typing import Annotated, Any
 from pydantic import Field, create_model
 
 from actors.laboratory_settings import BenchSettings, HiddenLiquid, LaboratorySettings
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.run_snapshot import as_file
-from orchestrator.config.search_ranges import Parameters, ParametersBase
-from orchestrator.config.yaml.file_access import missing_file, resolved
-from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.section_validation import PlacedProblems, validate
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.config.yaml.yaml_source import Document, Place, Report, wrong_kind
-from orchestrator.strategies.calibration.continuous_calibration import C4Settings
-from orchestrator.strategies.calibration.pointwise_calibration import C1Settings, C2Settings, C3Settings
-from orchestrator.strategies.campaign_plan import (
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.run_snapshot import as_file
+from orchestrator.campaigns.search_ranges import Parameters, ParametersBase
+from orchestrator.campaigns.yaml.file_access import missing_file, resolved
+from orchestrator.campaigns.yaml.references import References
+from orchestrator.campaigns.yaml.section_validation import PlacedProblems, validate
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report, wrong_kind
+from orchestrator.learning.calibration.continuous_calibration import C4Settings
+from orchestrator.learning.calibration.pointwise_calibration import C1Settings, C2Settings, C3Settings
+from orchestrator.learning.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
     Premises,
     StrategySettings,
 )
-from orchestrator.strategies.deployment.d1 import D1Settings
-from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
-from orchestrator.strategies.strategy_registry import calibrations, deployments
+from orchestrator.learning.deployment.d1 import D1Settings
+from orchestrator.learning.deployment.d2 import D2Settings
+from orchestrator.learning.deployment.d3 import D3Settings
+from orchestrator.learning.strategy_registry import calibrations, deployments
 from orchestrator.study.study_plan import ALL, CalibrationArm, DeploymentArm, Level, StudyPlan
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise

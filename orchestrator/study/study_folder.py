@@ -21,10 +21,10 @@ from typing import Any
 from pydantic import SerializeAsAny, field_validator
 
 from actors.runtime.ray_cluster import versions
-from orchestrator.journal.codec import decode_result, digest, first_difference, from_json, to_json
-from orchestrator.journal.journal_file import locked_alone
-from orchestrator.run_errors import RunError
-from orchestrator.strategies.stage_result import ResultPart, StageResult
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.stage_result import ResultPart, StageResult
+from orchestrator.records.codec import decode_result, digest, first_difference, from_json, to_json
+from orchestrator.records.journal_file import locked_alone
 from orchestrator.study.study_plan import StudyCell, StudyPlan, study_fingerprint
 from sim_engine.solver_fingerprint import folder_digest
 
@@ -181,7 +181,7 @@ def code_now() -> dict[str, str]:
     return {
         "decant": here.decant,
         "optimiser": folder_digest(_ROOT / "actors" / "optimizer"),
-        "strategies": folder_digest(_ROOT / "orchestrator" / "strategies"),
+        "strategies": folder_digest(_ROOT / "orchestrator" / "learning"),
         "solver": here.simulator,
     }
 

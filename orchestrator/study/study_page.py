@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestrator.results import html_report as page
-from orchestrator.results.loss_units import deployment_unit
-from orchestrator.results.wording import ResultRow, ResultTable, minutes
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.calibration.calibration_scores import UNCALIBRATED
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED
+from orchestrator.reports import html_report as page
+from orchestrator.reports.loss_units import deployment_unit
+from orchestrator.reports.wording import ResultRow, ResultTable, minutes
 from orchestrator.study.calibration_figures import (
     Drawn,
     d1_iterations,

@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from actors.laboratory_settings import BenchSettings
-from orchestrator.runs.fingerprint import deciding, fingerprint
+from orchestrator.campaigns.fingerprint import deciding, fingerprint
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.runs.stages import stage_seed
-from orchestrator.strategies.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 
 ALL = "all"
 """Value used instead of a level's name: calibrations are compared at all levels."""

@@ -28,9 +28,9 @@ from typing import Protocol
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
 from actors.simulators.local_worker import thread_pool
-from orchestrator.journal.run_record import read_record
-from orchestrator.run_errors import RunError
-from orchestrator.run_service import RunRequest, RunResources, RunService
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.run_record import read_record
+from orchestrator.runs.run_service import RunRequest, RunResources, RunService
 from orchestrator.runs.stages import CALIBRATION
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study

@@ -23,14 +23,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from orchestrator.journal.codec import result_of
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.calibration.calibration_scores import CALIBRATED, UNCALIBRATED, Scores
+from orchestrator.learning.deployment.deployment_result import Deployed
+from orchestrator.learning.study_strategies import FinalPoured
+from orchestrator.records.codec import result_of
 from orchestrator.runs.stages import CALIBRATION, EVALUATION
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.calibration.calibration_scores import CALIBRATED, UNCALIBRATED, Scores
-from orchestrator.strategies.deployment.deployment_result import Deployed
 from orchestrator.study.study_folder import CellResult
 from orchestrator.study.study_plan import FINAL, StudyPlan, cells_of
-from orchestrator.study.study_strategies import FinalPoured
 
 RANDOM = "random θ"
 """Label of the random θ of a study, which count as one strategy."""

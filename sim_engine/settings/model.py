@@ -4,7 +4,7 @@
   `Name` and `FilePath` validate single values; `tagged` and `Choice` make variants.
 - `Settings.check_values` holds the rules between keys. `Problems` collects their errors with positions in the file.
 - A file is validated with the context `FROM_FILE`: units are mandatory. Missing keys become None, so that all errors
-  are found in one pass (`orchestrator.config.yaml.section_validation`).
+  are found in one pass (`orchestrator.campaigns.yaml.section_validation`).
 - `FieldMark`s state how a field enters files and a run's fingerprint: `Annotated[Path, NOT_IN_FINGERPRINT]` on a field
   of a dataclass or a pydantic model. `marks_of` returns them.
 """

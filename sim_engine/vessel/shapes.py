@@ -167,13 +167,24 @@ VESSELS: PluginRegistry[type[Shape]] = PluginRegistry("decant.vessels", "source 
 """All installed sources of vessels."""
 
 
+class VesselGrip(Settings):
+    """How wide a vessel is where a gripper holds it."""
+
+    width: Annotated[float, Quantity("m", "88 mm", lower=1e-3, upper=0.5)] | None = None
+    """Width between the fingertips; computed from the shape unless given. Give it if the vessel has a handle."""
+
+    tolerance: Annotated[float, Quantity("m", "2 mm", lower=1e-4, upper=0.05)] = 2e-3
+    """Largest difference of the fingers from it in a good grasp."""
+
+
 class VesselSpec(BaseModel):
-    """A vessel by its name and the source of its shape."""
+    """A vessel by its name, the source of its shape, and how it is gripped."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     shape: SerializeAsAny[Shape]
+    grip: Annotated[VesselGrip | None, NOT_IN_FINGERPRINT] = None
 
     @property
     def uncertain(self) -> bool:

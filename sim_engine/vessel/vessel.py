@@ -85,6 +85,29 @@ class Vessel:
         z = (1.0 - part) * crest[first, 2] + part * crest[second, 2]
         return np.array([r * np.cos(direction), r * np.sin(direction), z])
 
+    def width_at(self, height: float) -> float:
+        """Width of the solid at a height: twice its largest distance from the axis there [m].
+
+        Args:
+            height: above the underside [m].
+
+        Returns:
+            0 if there is no solid at this height.
+        """
+        corners = self.solid_vertices[self.solid_faces]  # (F, 3, 3)
+        widest = 0.0
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            start, end = corners[:, a], corners[:, b]
+            low, high = start[:, 2] - height, end[:, 2] - height
+            cut = low * high <= 0.0
+            if not cut.any():
+                continue
+            start, end, low, high = start[cut], end[cut], low[cut], high[cut]
+            part = np.where(low == high, 0.0, low / np.where(low == high, 1.0, low - high))[:, None]
+            points = start + part * (end - start)
+            widest = max(widest, float(np.hypot(points[:, 0], points[:, 1]).max()))
+        return 2.0 * widest
+
     def surface_points(self, count: int) -> Floats:
         """Points on the solid's surface for contact checks: a third on its sharp edges, the others even by area.
 

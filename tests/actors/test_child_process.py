@@ -274,7 +274,7 @@ def test_one_module_of_the_product_starts_programs() -> None:
 
 
 AT_THE_START = {
-    "orchestrator/catalogue/run_registry.py",  # `--state`, before anything is started
+    "orchestrator/records/run_registry.py",  # `--state`, before anything is started
     "orchestrator/daemon/server_process.py",  # what the previous program left, before anything is started
     "actors/runtime/child_process.py",  # `own_environment`: read by Ray's library, which has no other way
 }

@@ -78,6 +78,7 @@ def decant(folder: Path, address: str, environment: dict[str, str]) -> subproces
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 def test_an_address_where_nothing_answers_is_refused_at_once(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.2", 0))

@@ -453,6 +453,7 @@ def test_a_dose_passes_on_what_it_has_seen_of_the_display() -> None:
     assert again.display == seen
 
 
+@pytest.mark.slow
 def test_a_forecast_states_what_a_coarse_display_can_support() -> None:
     cup, order = CUP, DoseOrder(0.1, receiver_mass=0.2)
     reachable = {}

@@ -16,7 +16,7 @@ from actors.laboratory import check_laboratory, open_laboratory
 from actors.laboratory_settings import HiddenLiquid, LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.runtime.remote_object import DeviceLostError
-from orchestrator.config.file_loading import load_laboratory
+from orchestrator.campaigns.file_loading import load_laboratory
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
 from sim_engine.search_space import Axis, Space

@@ -15,7 +15,7 @@ from actors.optimizer.questions import (
     SpaceFillingQuery,
 )
 from actors.optimizer.suggest import propose
-from orchestrator.requests import Prediction
+from orchestrator.learning.requests import Prediction
 from sim_engine.search_space import Axis, Space
 from tests.support.hypothesis_examples import examples
 

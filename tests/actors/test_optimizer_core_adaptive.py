@@ -21,7 +21,7 @@ from actors.optimizer.questions import (
 )
 from actors.optimizer.suggest import propose
 from actors.optimizer.surrogate_models import QueryArrays, fit
-from orchestrator.journal.codec import canonical, from_json, to_json
+from orchestrator.records.codec import canonical, from_json, to_json
 from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))

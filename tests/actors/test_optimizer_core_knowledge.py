@@ -14,7 +14,7 @@ from actors.optimizer.gaussian_process import (
 )
 from actors.optimizer.questions import Data, SearchEffort, SimulationQuery, Suggestion
 from actors.optimizer.suggest import propose
-from orchestrator.journal.codec import from_json, to_json
+from orchestrator.records.codec import from_json, to_json
 from sim_engine.search_space import Axis, Space
 
 PLANE = Space((Axis("x", 0.0, 1.0), Axis("y", 0.0, 1.0)))

@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from orchestrator.journal.journal import Entry, Kind
+from orchestrator.records.journal import Entry, Kind
 from tests.support import small_campaign
 from tests.support.command_process import (
     PATIENCE,

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client
 from orchestrator.daemon.submissions import pack
-from orchestrator.journal.journal import JournalReader
+from orchestrator.records.journal import JournalReader
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import finished_results
 from orchestrator.study.study_plan import StudyPlan, cells_of

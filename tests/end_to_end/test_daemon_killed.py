@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 
 from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.journal.codec import decode_outcome
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.requests import Poured
+from orchestrator.learning.requests import Poured
+from orchestrator.records.codec import decode_outcome
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from tests.support.browser import browser
 from tests.support.command_process import ROOT, pour_under_way, started_after_they_were_finished
 from tests.support.small_campaign import CAMPAIGN, write_campaign

@@ -10,7 +10,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from orchestrator.journal.journal import Kind
+from orchestrator.records.journal import Kind
 from tests.end_to_end.test_daemon_killed import SLOW_POURS, Laboratory, opened
 from tests.reliability import strikes
 from tests.support.command_process import pour_under_way, started_after_they_were_finished

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.journal.journal import Entry, Kind
-from orchestrator.states import State
+from orchestrator.records.journal import Entry, Kind
+from orchestrator.records.states import State
 from tests.support.command_process import Workplace
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 

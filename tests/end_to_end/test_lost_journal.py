@@ -17,10 +17,10 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.journal import JOURNAL_NAME, Entry, Kind
-from orchestrator.journal.journal_check import LEDGER_NAME, JournalDamagedError, read_ledger
+from orchestrator.records.journal import JOURNAL_NAME, Entry, Kind
+from orchestrator.records.journal_check import LEDGER_NAME, JournalDamagedError, read_ledger
 from orchestrator.runs.run_folder import find_run
 from tests.support import small_campaign
 from tests.support.command_process import Workplace, ended, started_after_they_were_finished

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.deployment.d3 import D3Settings
 from orchestrator.runs.stages import stages_of
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.d3 import D3Settings
 from sim_engine.scene import PoseError
 
 CAMPAIGNS = Path(__file__).parents[2] / "configs" / "campaigns"

@@ -12,7 +12,7 @@ from typing import Any
 import psutil
 import pytest
 
-from orchestrator.journal.journal import Entry, Kind
+from orchestrator.records.journal import Entry, Kind
 from tests.support.command_process import (
     Workplace,
     ended,

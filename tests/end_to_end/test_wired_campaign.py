@@ -12,7 +12,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from actors.arm.planned_pour import unpack
-from orchestrator.journal.journal import Entry, Kind
+from orchestrator.records.journal import Entry, Kind
 from tests.support import small_campaign
 from tests.support.command_process import Workplace, finished_in, pour_under_way, started_after_they_were_finished
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.catalogue.run_registry import VARIABLE
+from orchestrator.records.run_registry import VARIABLE
 from sim_engine.resources import cache_directory
 from tests.golden.golden import Golden
 

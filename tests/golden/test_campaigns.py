@@ -16,14 +16,14 @@ from typing import Any
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
-from orchestrator.journal.codec import encode_request, to_json
-from orchestrator.requests import Ask, Failed, Pour, Request, Simulate, Slots, Suggest
-from orchestrator.runs.fingerprint import deciding, fingerprint
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_vessel
+from orchestrator.campaigns.fingerprint import deciding, fingerprint
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Ask, Failed, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.strategy import Strategy
+from orchestrator.records.codec import encode_request, to_json
 from orchestrator.runs.stages import prediction_stages, stage_seed, stages_of
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.stage_result import StageResult
-from orchestrator.strategies.strategy import Strategy
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import cells_of, study_fingerprint
 from tests.golden.golden import DATA, ROOT, Changes, Golden, columns, compact, normalised

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator.catalogue.run_registry import VARIABLE
 from orchestrator.cli.app import app
+from orchestrator.records.run_registry import VARIABLE
 from tests.golden.golden import DATA, ROOT, Golden, normalised
 
 INPUTS = DATA / "bad_input"

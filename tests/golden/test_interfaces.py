@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
-from orchestrator.config.json_schema import SCHEMAS, schema_text
+from orchestrator.cli.json_schema import SCHEMAS, schema_text
 from orchestrator.daemon.http_api import openapi_text
 from tests.golden.golden import ROOT, Golden, differing, normalised
 from tests.support.cli_inputs import command_tree

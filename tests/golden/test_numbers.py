@@ -43,7 +43,7 @@ from actors.optimizer.questions import (
     SuggestionQuery,
 )
 from actors.optimizer.suggest import propose
-from orchestrator.journal.codec import to_json
+from orchestrator.records.codec import to_json
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.prediction_band import spreads

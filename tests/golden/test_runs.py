@@ -14,14 +14,14 @@ from typing import Any
 
 from rich.console import Console
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.event_feed import PASSING as PASSED_BY
 from orchestrator.daemon.event_feed import event_json
-from orchestrator.journal.events import Event, PourProgressed, StrategyProgressed
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.progress.console_progress import ProgressDisplay
-from orchestrator.results.console_view import summary_table
-from orchestrator.results.publishing import publish
+from orchestrator.records.events import Event, PourProgressed, StrategyProgressed
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader
+from orchestrator.reports.console_progress import ProgressDisplay
+from orchestrator.reports.console_view import summary_table
+from orchestrator.reports.publishing import publish
 from orchestrator.runs.run_engine import run_campaign
 from tests.golden.golden import ROOT, Golden, compact, line, normalised
 from tests.golden.world import FormulaLaboratory

@@ -23,7 +23,7 @@ from actors.optimizer.questions import (
     SuggestionQuery,
     SurrogateMap,
 )
-from orchestrator.requests import (
+from orchestrator.learning.requests import (
     Answered,
     Ask,
     Failed,

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from orchestrator.journal.events import Event, RequestFinished, StageClosed
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.requests import Failed, Outcome, Pour, Simulate
+from orchestrator.learning.requests import Failed, Outcome, Pour, Simulate
+from orchestrator.records.events import Event, RequestFinished, StageClosed
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor, SpeculativeExecution
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
 from sim_engine.scene import PourTask

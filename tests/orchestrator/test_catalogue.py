@@ -23,10 +23,10 @@ from orchestrator.catalogue import run_registry as registry
 from orchestrator.catalogue.catalogue import INDEX_NAME, Catalogue
 from orchestrator.catalogue.queries import moment
 from orchestrator.catalogue.run_reading import POURS, RUNS, RunRead, read_run
-from orchestrator.catalogue.run_registry import VARIABLE, state_directory
 from orchestrator.cli import console
 from orchestrator.cli.app import app
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.run_registry import VARIABLE, state_directory
 from orchestrator.runs.run_folder import create_run
 from tests.support.killed_runs import die_at, run
 from tests.support.toy_campaign import ToyLaboratory, ToySimulators, toy_plan

@@ -20,8 +20,11 @@ from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from actors.interfaces import DoseProgress, PourProgress
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.events import (
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.learning.dispense import Dispense, Dispensed
+from orchestrator.learning.requests import Pour, Poured, Slots
+from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.records.events import (
     CampaignClosed,
     CampaignOpened,
     Event,
@@ -30,11 +33,8 @@ from orchestrator.journal.events import (
     RequestStarted,
     StageOpened,
 )
-from orchestrator.live_view.rerun_subscriber import RerunMonitor
-from orchestrator.requests import Pour, Poured, Slots
-from orchestrator.run_service import RunResources, RunService
-from orchestrator.run_tasks import run_task
-from orchestrator.strategies.dispense import Dispense, Dispensed
+from orchestrator.runs.run_service import RunResources, RunService
+from orchestrator.runs.run_tasks import run_task
 from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.vessel import build_vessel
 from tests.support.rerun_recordings import Contents, timeline, views

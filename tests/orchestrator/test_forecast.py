@@ -9,7 +9,9 @@ from itertools import pairwise
 import pytest
 
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
-from orchestrator.journal.events import (
+from orchestrator.learning.requests import Failed, Pour, Simulate, Simulated
+from orchestrator.learning.strategy import Progress
+from orchestrator.records.events import (
     Event,
     RequestFinished,
     RequestStarted,
@@ -17,9 +19,7 @@ from orchestrator.journal.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.progress.time_estimate import PRICE, Forecast, WorkEstimate, pour_time, work_of
-from orchestrator.requests import Failed, Pour, Simulate, Simulated
-from orchestrator.strategies.strategy import Progress
+from orchestrator.reports.time_estimate import PRICE, Forecast, WorkEstimate, pour_time, work_of
 from sim_engine.liquids import SimulationParameters
 from tests.support import example_run
 from tests.support.toy_campaign import SCENE, SPACE, toy_plan

@@ -13,11 +13,11 @@ import pytest
 from actors.interfaces import DoseSource, DoseTarget, Notice, ProgressCallback
 from actors.runtime.child_process import child_environment
 from orchestrator.cli.foreground_run import BAD_INPUT, RefusalError, run_directory
-from orchestrator.journal.events import Event, LogLine
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal.journal_file import MB, RESERVE, TO_BEGIN, JournalError, NoSpaceError, Reserve
-from orchestrator.requests import Poured
-from orchestrator.strategies.campaign_plan import OutputSettings
+from orchestrator.learning.campaign_plan import OutputSettings
+from orchestrator.learning.requests import Poured
+from orchestrator.records.events import Event, LogLine
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.journal_file import MB, RESERVE, TO_BEGIN, JournalError, NoSpaceError, Reserve
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from tests.support.scripted_strategy import Script, one_stage, pour, run, states

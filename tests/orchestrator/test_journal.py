@@ -22,8 +22,9 @@ from actors.runtime.child_process import child_environment
 from orchestrator.cli.app import app
 from orchestrator.daemon.daemon_store import FORMAT as STORE_FORMAT
 from orchestrator.daemon.daemon_store import Store, StoreError
-from orchestrator.journal.codec import CodecError
-from orchestrator.journal.events import (
+from orchestrator.learning.requests import Failed, Pour, Poured, Simulate
+from orchestrator.records.codec import CodecError
+from orchestrator.records.events import (
     CampaignStateChanged,
     LogLine,
     Requested,
@@ -31,11 +32,10 @@ from orchestrator.journal.events import (
     RequestStarted,
     Told,
 )
-from orchestrator.journal.journal import JOURNAL_NAME, Journal, JournalReader, Kind
-from orchestrator.journal.journal_check import BEGUN, LEDGER_NAME, JournalDamagedError, check_journal, read_ledger
-from orchestrator.journal.journal_file import FORMAT, Header, JournalError, JournalLockedError
-from orchestrator.requests import Failed, Pour, Poured, Simulate
-from orchestrator.states import State
+from orchestrator.records.journal import JOURNAL_NAME, Journal, JournalReader, Kind
+from orchestrator.records.journal_check import BEGUN, LEDGER_NAME, JournalDamagedError, check_journal, read_ledger
+from orchestrator.records.journal_file import FORMAT, Header, JournalError, JournalLockedError
+from orchestrator.records.states import State
 from orchestrator.study.study_folder import StudyError, opened
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
@@ -138,9 +138,9 @@ def test_pours_are_flushed_to_the_disk_and_simulations_need_not_be(path: Path) -
 def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal.events import LogLine
-        from orchestrator.journal.journal import Journal
-        from orchestrator.journal.journal_file import Header
+        from orchestrator.records.events import LogLine
+        from orchestrator.records.journal import Journal
+        from orchestrator.records.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         for number in range(10**6):
             journal.append(LogLine(text=str(number), kept=True))
@@ -165,8 +165,8 @@ def test_everything_acknowledged_survives_the_death_of_the_writer(path: Path) ->
 def test_a_second_process_is_refused_and_told_who_is_first(path: Path) -> None:
     code = f"""
         from pathlib import Path
-        from orchestrator.journal.journal import Journal
-        from orchestrator.journal.journal_file import Header
+        from orchestrator.records.journal import Journal
+        from orchestrator.records.journal_file import Header
         journal = Journal.create(Path({str(path)!r}), Header("toy", {HEADER.fingerprint!r}))
         print("open", flush=True)
         input()

@@ -28,7 +28,8 @@ from actors.optimizer.questions import (
     Suggestion,
     SurrogateMap,
 )
-from orchestrator.journal.codec import (
+from orchestrator.learning.requests import Failed, Pour, Poured, Prediction, Simulate, Simulated, Suggest, Suggested
+from orchestrator.records.codec import (
     CodecError,
     canonical,
     decode_outcome,
@@ -37,7 +38,6 @@ from orchestrator.journal.codec import (
     encode_request,
     first_difference,
 )
-from orchestrator.requests import Failed, Pour, Poured, Prediction, Simulate, Simulated, Suggest, Suggested
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome

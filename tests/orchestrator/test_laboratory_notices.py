@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from actors.interfaces import BenchLostError, LaboratoryError, Notice
-from orchestrator.journal.events import LogLine
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.events import LogLine
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.request_executor import RequestExecutorError
 from tests.support.scripted_strategy import Script, one_stage, pour, run, simulate, states
 from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToySimulators

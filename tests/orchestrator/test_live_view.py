@@ -14,12 +14,12 @@ import pytest
 
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.view_command import live_view, parsed
-from orchestrator.journal.events import LogLine
 from orchestrator.live_view.blueprints import put_beside
 from orchestrator.live_view.live_server import LiveError, LiveView, answers
 from orchestrator.live_view.recording_sink import SENDING
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.live_view.viewer_server import run_rerun
+from orchestrator.records.events import LogLine
 from tests.support import example_run
 from tests.support.rerun_recordings import Contents, seen, tabs_as_they_came, viewer
 from tests.support.waiting import PATIENCE

@@ -16,14 +16,14 @@ from actors.interfaces import PourProgress
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.optimizer.suggest import propose, slices
 from actors.runtime.child_process import child_environment
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.events import LogLine, PourProgressed, RequestFinished, RequestStarted
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.learning.requests import Pour, Simulate, Simulated, Suggest, Suggested
 from orchestrator.live_view.learning_view import slices_picture, surrogate_picture
 from orchestrator.live_view.rerun_subscriber import QueueThread, RerunMonitor
 from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.live_view.simulation_view import simulation_rrd
-from orchestrator.requests import Pour, Simulate, Simulated, Suggest, Suggested
-from orchestrator.results.loss_units import DISCREPANCY
+from orchestrator.records.events import LogLine, PourProgressed, RequestFinished, RequestStarted
+from orchestrator.reports.loss_units import DISCREPANCY
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.search_space import Axis, Space

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from actors.interfaces import NotPouredError, UnknownPourError
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.requests import Poured
+from orchestrator.learning.requests import Poured
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.request_executor import PourNotMadeError, PourUnknownError
 from orchestrator.runs.resume import OperatorNeededError
 from tests.support.scripted_strategy import Script, one_stage, pour, run, states

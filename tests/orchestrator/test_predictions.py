@@ -14,24 +14,24 @@ import pytest
 
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.progress.progress_state import ProgressState
-from orchestrator.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots
-from orchestrator.results.console_view import summary_table
-from orchestrator.results.loss_units import loss_unit
-from orchestrator.results.summarise import summarise
-from orchestrator.run_service import planned
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.learning.deployment import deployment_base
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.d1 import D1Settings, OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import Hybrid
+from orchestrator.learning.deployment.real_pours import PourTrial, scaled_interval
+from orchestrator.learning.requests import Failed, Outcome, Pour, Prediction, Request, Simulate, Slots
+from orchestrator.learning.single_action import RepeatedSimulation
+from orchestrator.learning.strategy import Progress, Strategy
+from orchestrator.reports.console_view import summary_table
+from orchestrator.reports.loss_units import loss_unit
+from orchestrator.reports.progress_state import ProgressState
+from orchestrator.reports.summarise import summarise
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
+from orchestrator.runs.run_service import planned
 from orchestrator.runs.stages import deployment_stages, prediction_stages
-from orchestrator.strategies.deployment import deployment_base
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.real_pours import PourTrial, scaled_interval
-from orchestrator.strategies.single_action import RepeatedSimulation
-from orchestrator.strategies.strategy import Progress, Strategy
-from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
+from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness
 from sim_engine.outcome import Loss
 from sim_engine.prediction_band import resolution_shift
 from sim_engine.vessel.shapes import VesselSpec

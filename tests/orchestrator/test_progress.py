@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from orchestrator.journal.events import (
+from orchestrator.learning.requests import Failed, Pour, Poured, Simulate
+from orchestrator.learning.strategy import Progress
+from orchestrator.records.events import (
     CampaignClosed,
     CampaignOpened,
     LogLine,
@@ -21,10 +23,8 @@ from orchestrator.journal.events import (
     StageOpened,
     StrategyProgressed,
 )
-from orchestrator.progress.console_progress import ProgressDisplay
-from orchestrator.progress.progress_state import ProgressState
-from orchestrator.requests import Failed, Pour, Poured, Simulate
-from orchestrator.strategies.strategy import Progress
+from orchestrator.reports.console_progress import ProgressDisplay
+from orchestrator.reports.progress_state import ProgressState
 from sim_engine.outcome import PourMeasurement
 from tests.support.example_run import LEARNT, campaign, events
 

@@ -16,17 +16,18 @@ from typer.testing import CliRunner, Result
 
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.pour_response import PourHypotheses, displayed, respond
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.shipped import shipped
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.recordings.recording_export import export_recordings
-from orchestrator.recordings.recording_file import PourRecording, load_recording, load_recordings
-from orchestrator.recordings.recording_fit import Fit, fit_recordings, judge_recording, read_values
-from orchestrator.recordings.recording_replay import ReplayValues, arrivals, replay_recording
-from orchestrator.recordings.time_series import read_series
-from orchestrator.run_service import RunResources, RunService
-from orchestrator.run_tasks import run_task
-from orchestrator.shipped import shipped
+from orchestrator.reports.publishing import publish_run
+from orchestrator.reports.recording_export import export_recordings
+from orchestrator.reports.recording_file import PourRecording, load_recording, load_recordings
+from orchestrator.reports.recording_fit import Fit, fit_recordings, judge_recording, read_values
+from orchestrator.reports.recording_replay import ReplayValues, arrivals, replay_recording
+from orchestrator.reports.time_series import read_series
+from orchestrator.runs.run_service import RunResources, RunService
+from orchestrator.runs.run_tasks import run_task
 from sim_engine.hydrostatics import tilting_cup_outflow
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.vessel.shapes import cylinder
@@ -301,6 +302,7 @@ def test_a_grip_and_a_lag_that_are_changed_are_found() -> None:
     assert found["lag"].value - plain["lag"].value == pytest.approx(0.3, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_end_of_a_fitted_recording_is_judged_apart_from_its_beginning() -> None:
     one = samples()[1]
     found = fit_recordings([one], ("grip", "lag"), until=5.0)
@@ -383,6 +385,7 @@ outputs: {directory: runs, figures: false, recording: false, pour_recordings: tr
 """
 
 
+@pytest.mark.slow
 def test_a_run_records_its_doses_and_they_can_be_exported_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -393,7 +396,7 @@ def test_a_run_records_its_doses_and_they_can_be_exported_again(
     async def scenario() -> None:
         with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
             await handle.wait()
-            handle.publish()
+            publish_run(handle)
 
     asyncio.run(scenario())
     run = next((tmp_path / "runs").iterdir())

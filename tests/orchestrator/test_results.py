@@ -11,12 +11,12 @@ from typing import Any, Literal
 
 import pytest
 
-from orchestrator.journal.codec import decode_result, encode_result, result_of
-from orchestrator.results.publishing import publish
-from orchestrator.run_errors import RunError
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.stage_result import StageResult
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.deployment.deployment_result import Deployed
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.records.codec import decode_result, encode_result, result_of
+from orchestrator.reports.publishing import publish
 from tests.support import example_run
 from tests.support.example_results import changed
 from tests.support.toy_campaign import run_toy
@@ -82,14 +82,14 @@ def test_publishing_names_the_recording_and_can_be_done_again(tmp_path: Path, re
 
 
 def test_kinds_of_installed_strategies_are_in_the_schema_and_others_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrator.journal import codec as module
-    from orchestrator.results.run_summary import summary_schema
+    from orchestrator.learning import strategy_registry as module
+    from orchestrator.reports.run_summary import summary_schema
     from tests.support.scripted_strategy import Scripted
 
-    assert Scripted not in module.kinds()
+    assert Scripted not in module.result_kinds()
     settings = type("Settings", (), {"__module__": Scripted.__module__})
     monkeypatch.setattr(
-        "orchestrator.strategies.strategy_registry.STRATEGIES", SimpleNamespace(all={"scripted": settings})
+        "orchestrator.learning.strategy_registry.STRATEGIES", SimpleNamespace(all={"scripted": settings})
     )
-    assert Scripted in module.kinds()
+    assert Scripted in module.result_kinds()
     assert "Scripted" in summary_schema()["$defs"]

@@ -17,13 +17,13 @@ from typing import Any
 import pytest
 
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.journal.events import Event, RequestFinished, StageClosed
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal.journal_file import JournalError, JournalLockedError
-from orchestrator.journal.run_record import read_record
-from orchestrator.progress.progress_state import ProgressState
-from orchestrator.requests import Pour
-from orchestrator.run_clock import run_time
+from orchestrator.learning.requests import Pour
+from orchestrator.records.events import Event, RequestFinished, StageClosed
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.journal_file import JournalError, JournalLockedError
+from orchestrator.records.run_clock import run_time
+from orchestrator.records.run_record import read_record
+from orchestrator.reports.progress_state import ProgressState
 from orchestrator.runs.resume import ReplayError
 from orchestrator.runs.stages import StageDefinition
 from tests.support import toy_campaign

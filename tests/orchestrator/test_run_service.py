@@ -15,13 +15,14 @@ from typer.testing import CliRunner
 import decant
 from actors.interfaces import LaboratoryError
 from actors.laboratory_settings import RaySettings
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.events import CampaignOpened, Event
-from orchestrator.journal.journal import JOURNAL_NAME
-from orchestrator.journal.journal_check import JournalDamagedError
-from orchestrator.run_service import RunHandle, RunRequest, RunResources, RunService, RunTaskError
-from orchestrator.run_tasks import calibrate_task, plan_task, run_task
+from orchestrator.records.events import CampaignOpened, Event
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.journal_check import JournalDamagedError
+from orchestrator.reports.publishing import publish_run, publish_so_far
+from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService, RunTaskError
+from orchestrator.runs.run_tasks import calibrate_task, plan_task, run_task
 from tests.golden.world import FormulaLaboratory
 from tests.support.scripted_strategy import Script, one_stage, pour, states
 from tests.support.small_campaign import CAMPAIGN, write_campaign
@@ -253,7 +254,7 @@ def test_recorder_and_subscribers_get_every_event_and_the_run_is_published(tmp_p
     assert made.closed == 1
     assert made.events == heard
     assert any(isinstance(event, CampaignOpened) for event in heard)
-    published = handle.publish()
+    published = publish_run(handle)
     assert (published.recording, published.summary.dropped_events) == (made.path, 3)
     assert published.summary.pours == result.pours == 5
     assert published.theta is not None
@@ -261,9 +262,9 @@ def test_recorder_and_subscribers_get_every_event_and_the_run_is_published(tmp_p
 
 def test_a_stopped_run_is_published_as_far_as_it_came(tmp_path: Path) -> None:
     request = run_task(campaign(tmp_path))
-    assert RunService().publish_so_far(request) is None
+    assert publish_so_far(request) is None
     request = RunService().with_folder(request)
-    assert RunService().publish_so_far(request) is None, "it has not begun"
+    assert publish_so_far(request) is None, "it has not begun"
 
     async def work() -> None:
         seen = asyncio.Event()
@@ -276,7 +277,7 @@ def test_a_stopped_run_is_published_as_far_as_it_came(tmp_path: Path) -> None:
             await running
 
     play(work())
-    published = RunService().publish_so_far(request)
+    published = publish_so_far(request)
     assert published is not None
     assert published.report is not None
     assert "paused" in published.report.read_text(encoding="utf-8")

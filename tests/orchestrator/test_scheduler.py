@@ -14,8 +14,8 @@ import pytest
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
 from actors.optimizer import optimizer_actor as optimizer
 from actors.runtime.remote_object import DeviceLostError
-from orchestrator.journal.events import Event, LogLine, PourProgressed, RequestFinished
-from orchestrator.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Slots
+from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Slots
+from orchestrator.records.events import Event, LogLine, PourProgressed, RequestFinished
 from orchestrator.runs.request_executor import Deadlines, PourUnknownError, RequestExecutorError
 from orchestrator.runs.stage_scheduler import StrategyError
 from sim_engine.scene import PourTask

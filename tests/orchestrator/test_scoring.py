@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.results.figure_style import save
-from orchestrator.results.prediction_scores import ScoredRow, draw_scored, rank_correlation, score, scores, write_scored
+from orchestrator.reports.figure_style import save
+from orchestrator.reports.prediction_scores import ScoredRow, draw_scored, rank_correlation, score, scores, write_scored
 from sim_engine.action import DEG, Action
 from sim_engine.prediction_band import SampleStatistics, band
 from tests.support.example_results import is_picture

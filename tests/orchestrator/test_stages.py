@@ -14,27 +14,27 @@ import pytest
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from decant.run_results import open_run
-from orchestrator.config.file_loading import predicts_with_posterior
-from orchestrator.journal.codec import canonical
-from orchestrator.journal.events import Event, RequestFinished
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.progress.time_estimate import work_of
-from orchestrator.requests import Pour, Simulate
-from orchestrator.results.console_view import summary_table
-from orchestrator.results.publishing import publish
-from orchestrator.results.summarise import summarise
-from orchestrator.run_errors import RunError
-from orchestrator.runs.motion_approval import pour_count
-from orchestrator.runs.stages import deployed_theta, scenes_of, stages_of
-from orchestrator.strategies.campaign_plan import (
+from orchestrator.campaigns.file_loading import predicts_with_posterior
+from orchestrator.learning.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
     DeploymentSettings,
     RecordedPour,
     RecordSet,
 )
-from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
+from orchestrator.learning.deployment.d2 import D2Settings
+from orchestrator.learning.deployment.d3 import D3Settings
+from orchestrator.learning.requests import Pour, Simulate
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.codec import canonical
+from orchestrator.records.events import Event, RequestFinished
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.reports.console_view import summary_table
+from orchestrator.reports.publishing import publish
+from orchestrator.reports.summarise import summarise
+from orchestrator.reports.time_estimate import work_of
+from orchestrator.runs.motion_approval import pour_count
+from orchestrator.runs.stages import deployed_theta, scenes_of, stages_of
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.run_errors import RunError
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.states import RESTING, TRANSITIONS, State, TransitionError, check_transition
 from orchestrator.runs.stages import stage_seed
-from orchestrator.states import RESTING, TRANSITIONS, State, TransitionError, check_transition
 from tests.support.scripted_strategy import run, states
 from tests.support.toy_campaign import ToyLaboratory, toy_stages
 

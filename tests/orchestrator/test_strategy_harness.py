@@ -8,11 +8,11 @@ from typing import Any, Literal
 
 import pytest
 
-from orchestrator.requests import Ask, Outcome, Pour, Request, Simulate, Slots
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.stage_result import StageResult
-from orchestrator.strategies.strategy import Progress
-from orchestrator.strategy_harness import (
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.requests import Ask, Outcome, Pour, Request, Simulate, Slots
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.strategy import Progress
+from orchestrator.runs.strategy_harness import (
     ACTIONS,
     SCENE,
     THETA,

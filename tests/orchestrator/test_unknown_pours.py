@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.journal.codec import decode_outcome, encode_outcome
-from orchestrator.journal.events import Event, RequestFinished
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.requests import Failed, Poured
-from orchestrator.run_errors import RunError
+from orchestrator.learning.requests import Failed, Poured
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.codec import decode_outcome, encode_outcome
+from orchestrator.records.events import Event, RequestFinished
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.resume import LOST, REPEAT, WEIGHED, OperatorNeededError, parse_answer
 from tests.support import toy_campaign
 from tests.support.killed_runs import SMALL, killed_when_last, run

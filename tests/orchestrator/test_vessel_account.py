@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from actors.interfaces import ProgressCallback
-from orchestrator.catalogue.vessel_account import FILE_NAME, MIXTURE, Transfer, VesselAccount
-from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
+from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
+from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, Transfer, VesselAccount
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement

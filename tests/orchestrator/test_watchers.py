@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from orchestrator.journal.codec import CodecError
-from orchestrator.journal.events import (
+from orchestrator.learning.requests import Pour, Simulate
+from orchestrator.records.codec import CodecError
+from orchestrator.records.events import (
     CampaignClosed,
     DecisionMade,
     Event,
@@ -20,10 +21,9 @@ from orchestrator.journal.events import (
     StageClosed,
     event_of,
 )
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.journal.journal_file import Header
-from orchestrator.journal.run_record import RunState, read_record
-from orchestrator.requests import Pour, Simulate
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader
+from orchestrator.records.journal_file import Header
+from orchestrator.records.run_record import RunState, read_record
 from orchestrator.runs.stage_scheduler import is_recorded
 from sim_engine.outcome import RecordedFrames
 from sim_engine.scene import PourTask

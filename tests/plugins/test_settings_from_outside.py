@@ -14,7 +14,7 @@ import pytest
 
 from decant.plugins import DeploymentPlan, Loss, Objectives
 from decant.plugins.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.strategies.deployment.objectives import Spillage
+from orchestrator.learning.deployment.objectives import Spillage
 from tests.plugins.decant_example.objective import Gentle
 from tests.plugins.decant_example.strategy import Hypercube, HypercubeSettings
 from tests.support.toy_spillage import narrow_cup
@@ -63,10 +63,10 @@ import json, sys
 from pathlib import Path
 sys.path.insert(0, "docs")
 import make_tables
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.json_schema import campaign_schema
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.cli.json_schema import campaign_schema
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.runs.stages import stages_of
 
 folder = Path(sys.argv[1])
@@ -190,7 +190,7 @@ from orchestrator.study.study_page import write_report
 from tests.support.study_files import read, written
 from tests.support.toy_study import run_toy_study
 from orchestrator.study.study_file import load_study
-from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
 folder = Path(sys.argv[1])
 data = read("quick")

@@ -6,8 +6,8 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
-from orchestrator.states import State
+from orchestrator.records.journal import JOURNAL_NAME, Entry, JournalReader, Kind
+from orchestrator.records.states import State
 from tests.support.command_process import timeless
 
 

@@ -8,10 +8,10 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
-from orchestrator.journal.events import Subscriber
+from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.records.events import Subscriber
 from tests.reliability import clock, strikes
 from tests.reliability.case import AHEAD, BACK, CUT, FULL, KILLED, STOPPED, Case, every, first_of_kind
 from tests.reliability.program import ProgramRig

@@ -24,12 +24,12 @@ from typing import Any, NoReturn
 
 import psutil
 
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.events import Event, PourProgressed, Subscriber
-from orchestrator.journal.journal import Journal, Kind
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.records.events import Event, PourProgressed, Subscriber
+from orchestrator.records.journal import Journal, Kind
+from orchestrator.records.states import State
 from orchestrator.runs.run_engine import run_campaign
-from orchestrator.states import State
-from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.reliability import strikes
 from tests.reliability.afterwards import entries, first_difference, kinds, record, state, unknown_pours, weights
 from tests.reliability.case import (

@@ -17,7 +17,7 @@ from typing import Any
 
 from actors.bench.bench_factory import PouringBench
 from actors.laboratory import WarmSimulators
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.daemon_settings import load_settings
 from orchestrator.daemon.server_process import serve

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_client import Client
 from orchestrator.daemon.submissions import Files, pack

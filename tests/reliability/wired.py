@@ -16,7 +16,7 @@ from actors.bench import bench_operators
 from actors.bench.bench_operators import VirtualOperator
 from actors.interfaces import OperatorQuestion, OperatorSettings
 from actors.laboratory import InProcessLaboratory
-from orchestrator.journal.journal import Kind
+from orchestrator.records.journal import Kind
 from tests.end_to_end.test_wired_campaign import write_wired
 from tests.reliability import strikes
 from tests.reliability.case import CUT, KILLED, STOPPED, Case, Point, every, first_of_kind

@@ -129,6 +129,7 @@ def test_dribbling_is_spilled_next_to_the_receiver(simulator: PourSimulator) -> 
     assert list(wet.curve_spilled) == sorted(wet.curve_spilled)
 
 
+@pytest.mark.slow
 def test_dribbling_does_not_depend_on_the_number_of_particles(simulator: PourSimulator) -> None:
     coarse, fine = (simulated(simulator, 1.0, n) for n in (500, 2000))
     assert coarse.dribbled / coarse.fractions.poured == pytest.approx(fine.dribbled / fine.fractions.poured, abs=0.003)

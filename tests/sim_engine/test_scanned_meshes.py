@@ -18,13 +18,13 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
+from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.app import app
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.file_commands import validate
 from orchestrator.cli.vessel_command import vessel
 from orchestrator.cli.vessel_tables import read_points
-from orchestrator.config.file_loading import load_vessel
-from orchestrator.results.pour_figures import section
+from orchestrator.reports.pour_figures import section
 from sim_engine.vessel.exact_cavity import exact_cavity
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import VesselError, VesselSpec
@@ -97,6 +97,7 @@ def test_what_is_simulated_and_drawn_is_the_repaired_vessel(
     assert np.abs(built.grid.sample(points)).max() < 0.5 * built.grid.spacing
 
 
+@pytest.mark.slow
 def test_a_body_in_the_cavity_is_kept_with_a_warning_unless_it_is_dropped(tmp_path: Path) -> None:
     found = mended(unpacked("liquid_body.stl", tmp_path), unit="mm", wall=None)
     assert capacity(found) == pytest.approx(129.0, rel=0.02)

@@ -198,3 +198,14 @@ def test_bottle_has_shoulder_and_neck() -> None:
     assert bottle.outer_radius == pytest.approx(0.032, abs=1e-5)
     neck = np.array([[0.013, 0.0, 0.145], [0.02, 0.0, 0.145], [0.0, 0.0, 0.145]])
     assert np.sign(bottle.grid.sample(neck)).tolist() == [-1.0, 1.0, 1.0]
+
+
+def test_the_width_for_a_gripper_is_that_of_the_outside_at_its_height() -> None:
+    cup = build_vessel(cylinder("cup", inner_radius=0.04, inner_height=0.1, wall=0.004, floor=0.004))
+    assert cup.width_at(0.06) == pytest.approx(0.088, abs=1e-4)
+    flared = ProfileShape(unit="mm", inner=((0, 0), (40, 0), (47, 80)), wall=0.004, floor=0.004)
+    cone = build_vessel(VesselSpec(name="cone", shape=flared))
+    # 40 mm and 7/80 of the height above the inner floor, and the wall across its slope of 5°
+    expected = 2.0 * (0.040 + 7.0 / 80.0 * 0.046 + 0.004 / np.cos(np.arctan(7.0 / 80.0)))
+    assert cone.width_at(0.05) == pytest.approx(expected, abs=1e-4)
+    assert cone.width_at(0.2) == 0.0

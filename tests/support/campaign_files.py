@@ -8,12 +8,12 @@ from textwrap import dedent
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.run_snapshot import as_file
-from orchestrator.config.yaml.references import References
-from orchestrator.config.yaml.section_validation import validate
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.run_snapshot import as_file
+from orchestrator.campaigns.yaml.references import References
+from orchestrator.campaigns.yaml.section_validation import validate
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 from sim_engine.settings.model import Settings
 
 CAMPAIGN = """\

@@ -17,8 +17,8 @@ from typing import Any
 
 import psutil
 
-from orchestrator.journal.journal import JOURNAL_NAME, Entry, JournalReader, Kind
-from orchestrator.journal.journal_file import JournalError
+from orchestrator.records.journal import JOURNAL_NAME, Entry, JournalReader, Kind
+from orchestrator.records.journal_file import JournalError
 from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[2]

@@ -12,11 +12,11 @@ from matplotlib.collections import PathCollection
 from matplotlib.text import Text
 from rich.console import Console
 
-from orchestrator.strategies.calibration.calibration_scores import Evaluation, ScoredPour, random_parameters
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.campaign_plan import MeasuredPour
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.stage_result import StageResult
+from orchestrator.learning.calibration.calibration_scores import Evaluation, ScoredPour, random_parameters
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.campaign_plan import MeasuredPour
+from orchestrator.learning.deployment.d3 import Hybrid
+from orchestrator.learning.stage_result import StageResult
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from tests.support import example_run

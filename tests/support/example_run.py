@@ -14,20 +14,8 @@ from actors.interfaces import PourProgress
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery, SurrogateMap
 from actors.optimizer.suggest import propose
-from orchestrator.journal.events import (
-    CampaignClosed,
-    CampaignOpened,
-    DecisionMade,
-    Event,
-    LogLine,
-    PourProgressed,
-    RequestFinished,
-    RequestStarted,
-    StageClosed,
-    StageOpened,
-    StrategyProgressed,
-)
-from orchestrator.requests import (
+from orchestrator.learning.campaign_plan import CampaignPlan, OutputSettings
+from orchestrator.learning.requests import (
     Decision,
     Failed,
     Outcome,
@@ -41,9 +29,21 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
-from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
-from orchestrator.strategies.single_action import PredictedPour
-from orchestrator.strategies.strategy import Progress, Strategy
+from orchestrator.learning.single_action import PredictedPour
+from orchestrator.learning.strategy import Progress, Strategy
+from orchestrator.records.events import (
+    CampaignClosed,
+    CampaignOpened,
+    DecisionMade,
+    Event,
+    LogLine,
+    PourProgressed,
+    RequestFinished,
+    RequestStarted,
+    StageClosed,
+    StageOpened,
+    StrategyProgressed,
+)
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import Loss, PourMeasurement, PourOutcome, RecordedFrames, SimulatedPour

@@ -6,7 +6,7 @@ import socket
 from pathlib import Path
 
 from actors.emulators.ur_controller.controller_process import VirtualController
-from orchestrator.config.file_loading import load_laboratory
+from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon.daemon_settings import Rig
 from tests.support.waiting import wait_for
 

@@ -9,7 +9,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from orchestrator.journal.journal import JOURNAL_NAME, Journal, JournalReader, Kind
+from orchestrator.records.journal import JOURNAL_NAME, Journal, JournalReader, Kind
 from tests.support.toy_campaign import ToyLaboratory, run_toy, toy_plan, toy_stages
 
 SMALL = toy_stages(simulations=3, pours=2, beside=2)

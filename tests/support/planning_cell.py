@@ -15,7 +15,7 @@ from actors.arm.planning.kinematics import flange_poses, inverse, posture
 from actors.arm.planning.trajectory import follow
 from actors.arm.ur.robot_models import MODELS
 from actors.arm.ur_settings import UrArmSettings
-from orchestrator.config.file_loading import load_vessel
+from orchestrator.campaigns.file_loading import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
 from sim_engine.motion import PourMotion, plan_motion

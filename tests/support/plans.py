@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from orchestrator.strategies.calibration.calibration_base import Calibrated, CalibratedTheta
-from orchestrator.strategies.calibration.posterior_summary import PosteriorFound, RemainingDiscrepancy
-from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan
-from orchestrator.strategies.deployment.disturbances import PoseNoise, RiskSettings
-from orchestrator.strategies.deployment.safe_window import WindowSettings
-from orchestrator.strategies.strategy_registry import STRATEGIES
-from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE
+from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
+from orchestrator.learning.calibration.posterior_summary import PosteriorFound, RemainingDiscrepancy
+from orchestrator.learning.campaign_plan import CalibrationPlan, DeploymentPlan
+from orchestrator.learning.deployment.disturbances import PoseNoise, RiskSettings
+from orchestrator.learning.deployment.safe_window import WindowSettings
+from orchestrator.learning.strategy_registry import STRATEGIES
+from orchestrator.runs.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss

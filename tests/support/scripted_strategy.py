@@ -6,12 +6,12 @@ import asyncio
 from pathlib import Path
 from typing import Any, Literal
 
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.requests import Outcome, Pour, Request, Simulate, Slots
+from orchestrator.learning.requests import Outcome, Pour, Request, Simulate, Slots
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.strategy import Progress
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.states import State, check_transition
 from orchestrator.runs.stages import StageDefinition
-from orchestrator.states import State, check_transition
-from orchestrator.strategies.stage_result import StageResult
-from orchestrator.strategies.strategy import Progress
 from tests.support.toy_campaign import SCENE, SPACE, THETA, ToyLaboratory, run_toy
 
 

@@ -6,7 +6,7 @@ import asyncio
 from pathlib import Path
 from typing import Any
 
-from orchestrator.config.file_loading import load_laboratory
+from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon.daemon_settings import Rig
 from tests.support.toy_daemon import Served
 from tests.support.waiting import PATIENCE

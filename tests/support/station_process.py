@@ -20,7 +20,6 @@ from typing import Any
 import uvicorn
 
 from actors.runtime.child_process import child_environment
-from orchestrator.catalogue.vessel_account import VesselAccount
 from orchestrator.daemon import ordering, rig_worker
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
@@ -28,6 +27,7 @@ from orchestrator.daemon.madsci_node import create_node
 from orchestrator.daemon.materials import Materials
 from orchestrator.daemon.pour_orders import OrderBook
 from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.materials.vessel_account import VesselAccount
 from tests.support.station import BEAKER, VIAL, rigs_in
 from tests.support.toy_daemon import HeldBench, HeldLaboratory
 

@@ -19,10 +19,8 @@ import numpy as np
 from actors.interfaces import PourProgress, ProgressCallback
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.questions import Data, MinimumQuery, Suggestion, SuggestionQuery
-from orchestrator.journal.codec import Results, result_of
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.journal.run_record import CampaignResult
-from orchestrator.requests import (
+from orchestrator.learning.campaign_plan import CampaignPlan, OutputSettings
+from orchestrator.learning.requests import (
     Decision,
     Failed,
     Outcome,
@@ -35,11 +33,13 @@ from orchestrator.requests import (
     Suggest,
     Suggested,
 )
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.strategy import Progress
+from orchestrator.records.codec import Results, result_of
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.run_record import CampaignResult
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import StageDefinition
-from orchestrator.strategies.campaign_plan import CampaignPlan, OutputSettings
-from orchestrator.strategies.stage_result import StageResult
-from orchestrator.strategies.strategy import Progress
 from sim_engine.action import DEG
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import Loss, PourMeasurement, PourOutcome, SimulatedPour

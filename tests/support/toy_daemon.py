@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from actors.interfaces import OperatorQuestion, PourProgress, ProgressCallback
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.access_tokens import Role, Tokens, token_of
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.daemon_store import AT_REST

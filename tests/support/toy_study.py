@@ -16,7 +16,7 @@ import numpy as np
 
 from actors.laboratory_settings import LaboratorySettings
 from actors.optimizer.suggest import propose
-from orchestrator.run_service import RunResources
+from orchestrator.runs.run_service import RunResources
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import opened
 from orchestrator.study.study_plan import StudyPlan

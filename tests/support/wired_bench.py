@@ -21,7 +21,7 @@ from actors.bench.virtual_bench import DeviceEmulators, FollowedBench, VirtualBe
 from actors.interfaces import Notice, OperatorQuestion, OperatorSettings
 from actors.laboratory import InProcessLaboratory
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.config.file_loading import load_laboratory
+from orchestrator.campaigns.file_loading import load_laboratory
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourOutcome, SimulatedPour

@@ -17,7 +17,7 @@ from actors.arm.planning.pour_planner import plan_path
 from actors.arm.planning.trajectory import STEEPEST, TOOL_ACCELERATION
 from actors.arm.ur_settings import UrArmSettings
 from actors.interfaces import InvalidActionError
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from sim_engine.action import DEG
 from sim_engine.collision import clearance, first_contact, rotations
 from sim_engine.motion import plan_motion

@@ -34,14 +34,14 @@ from actors.laboratory import InProcessLaboratory, RayLaboratory
 from actors.laboratory_settings import LaboratorySettings
 from actors.liquid_devices import SimulatedPump, SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
 from actors.runtime.remote_object import LocalDevice
-from orchestrator.bench_check import check_bench
-from orchestrator.catalogue.vessel_account import VesselAccount
+from orchestrator.campaigns.file_loading import load_laboratory
+from orchestrator.campaigns.shipped import shipped
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_laboratory
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.journal.run_record import read_result
-from orchestrator.shipped import shipped
-from orchestrator.strategies.dispense import Dispensed
+from orchestrator.learning.dispense import Dispensed
+from orchestrator.materials.vessel_account import VesselAccount
+from orchestrator.records.run_record import read_result
+from orchestrator.runs.bench_check import check_bench
 from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder

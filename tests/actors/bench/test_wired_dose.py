@@ -30,13 +30,13 @@ from actors.interfaces import DoseSource, DoseTarget, PourProgress, UnknownPourE
 from actors.laboratory_settings import LaboratorySettings
 from actors.liquid_devices import SimulatedPumpSettings, SourceSettings
 from actors.runtime.child_process import child_environment
-from orchestrator.config.file_loading import load_campaign, load_laboratory
-from orchestrator.requests import Pour, Poured, Slots
-from orchestrator.run_service import RunResources, RunService
-from orchestrator.run_tasks import run_task
-from orchestrator.shipped import shipped
-from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
-from orchestrator.strategies.dispense import Dispense, Dispensed
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
+from orchestrator.campaigns.shipped import shipped
+from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
+from orchestrator.learning.dispense import Dispense, Dispensed
+from orchestrator.learning.requests import Pour, Poured, Slots
+from orchestrator.runs.run_service import RunResources, RunService
+from orchestrator.runs.run_tasks import run_task
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from actors.emulators.ur_controller.controller_process import VirtualController
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
 from orchestrator.runs.motion_approval import (
     Envelope,
     SafetyRecord,

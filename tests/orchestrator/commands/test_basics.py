@@ -13,13 +13,13 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.yaml.yaml_errors import Problem
 from orchestrator.cli import console as speaking
 from orchestrator.cli.app import app
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import Problem
-from orchestrator.journal.events import LogLine
-from orchestrator.progress.console_progress import ProgressDisplay
+from orchestrator.records.events import LogLine
+from orchestrator.reports.console_progress import ProgressDisplay
 from tests.support import small_campaign
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, VESSEL, report, write, write_good
 

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from orchestrator.cli.app import app
-from orchestrator.commissioning_archive import CommissioningArchive
+from orchestrator.cli.commissioning_archive import CommissioningArchive
 
 ROOT = Path(__file__).parents[3]
 ARCHIVES = sorted((ROOT / "tests" / "data" / "commissioning").glob("*.zip"))

@@ -28,8 +28,8 @@ from actors.arm.ur.ur_driver import require_accepted
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.emulators.ur_controller.safety_system import SafetyConfiguration
+from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_laboratory
 from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum, read_record, record_path
 from tests.support import hardware_laboratory
 from tests.support.loopback import free_address

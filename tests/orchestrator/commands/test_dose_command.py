@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from orchestrator.campaigns.prior_data import read_former_run
+from orchestrator.campaigns.shipped import shipped
 from orchestrator.cli.app import app
-from orchestrator.journal.run_record import read_result
-from orchestrator.runs.prior_data import read_former_run
-from orchestrator.shipped import shipped
-from orchestrator.strategies.dispense import Dispensed
+from orchestrator.learning.dispense import Dispensed
+from orchestrator.records.run_record import read_result
 from tests.support import small_campaign
 from tests.support.output_schema import validated
 

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
 from orchestrator.cli.command_options import Answer
+from orchestrator.learning.deployment.model_monitoring import OPTIONS
 from orchestrator.runs.resume import LOST, REPEAT
-from orchestrator.strategies.deployment.model_monitoring import OPTIONS
 from tests.support.cli_inputs import ROOT, command_tree, invoke, write_inputs
 
 HELP = {
@@ -94,7 +94,7 @@ def test_a_full_disk_ends_a_run_with_its_name_and_advises_no_resuming_of_what_ha
 
 
 def test_a_campaign_runs_on_another_laboratory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrator.config.file_loading import load_campaign
+    from orchestrator.campaigns.file_loading import load_campaign
 
     twin = ROOT / "configs" / "laboratories" / "twin.yaml"
     plan = load_campaign(ROOT / "configs" / "campaigns" / "quickstart.yaml", twin)

@@ -13,8 +13,8 @@ from actors.arm.arm_interface import ArmPose
 from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError
+from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.cli.motion_control import JogError, Jogging, JogStep, parse_step, steps_home
-from orchestrator.config.file_loading import load_laboratory
 from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from tests.support import hardware_laboratory
 from tests.support.cli_inputs import invoke

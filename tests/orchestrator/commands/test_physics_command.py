@@ -15,8 +15,8 @@ from typer.testing import CliRunner
 
 from orchestrator.cli import physics_command
 from orchestrator.cli.app import app
-from orchestrator.results import figure_style as style
-from orchestrator.results.figure_style import INK
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.figure_style import INK
 from sim_engine import solver_fingerprint as sources
 from sim_engine.validation import cases as suite
 from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, reported, within

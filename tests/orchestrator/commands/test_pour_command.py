@@ -18,13 +18,13 @@ from typer.testing import CliRunner, Result
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import UnknownPourError
 from orchestrator.cli.app import app
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader
-from orchestrator.requests import Pour
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Pour
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader
+from orchestrator.records.states import State
 from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
 from orchestrator.runs.stages import scenes_of
-from orchestrator.states import State
-from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import Action
 from tests.support import hardware_laboratory, small_campaign
 from tests.support.loopback import free_address

@@ -18,8 +18,8 @@ from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.consent import stopped_question
 from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, OperatorSettings
 from orchestrator.cli.terminal_operator import TerminalOperator
-from orchestrator.journal.events import LogLine
-from orchestrator.progress.console_progress import ProgressDisplay
+from orchestrator.records.events import LogLine
+from orchestrator.reports.console_progress import ProgressDisplay
 from tests.support import example_run
 from tests.support.waiting import PATIENCE, wait_async
 

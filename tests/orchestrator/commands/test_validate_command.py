@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from actors.arm.ur_settings import UrArmSettings
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign, load_laboratory
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from tests.support.cli_inputs import RECORDED, ROOT, invoke, process
 
 
@@ -94,6 +94,7 @@ def calibrated(tmp_path: Path) -> Callable[[float], Path]:
     return write
 
 
+@pytest.mark.slow
 def test_pours_are_checked_with_the_stored_calibration_of_the_robot(calibrated: Callable[[float], Path]) -> None:
     campaign = ROOT / "configs" / "campaigns" / "first-pour.yaml"
     rig = calibrated(0.0)

@@ -11,10 +11,10 @@ import pytest
 import trimesh
 from PIL import ExifTags, Image
 
+from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.vessel_command import vessel
 from orchestrator.cli.vessel_tables import read_fill_table, read_photograph
-from orchestrator.config.file_loading import load_vessel
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
 from tests.support.measured_vessel import FOCAL, Bench

@@ -15,15 +15,15 @@ import pytest
 from actors.arm.arm_settings import arm_kind
 from actors.arm.ur_settings import UrArmSettings
 from actors.laboratory_settings import LaboratorySettings
+from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.view_command import _recording_of, view
-from orchestrator.config.file_loading import load_laboratory
-from orchestrator.journal.events import Requested, RequestFinished
-from orchestrator.journal.journal import JOURNAL_NAME, Header, Journal
+from orchestrator.learning.requests import Pour, Poured
 from orchestrator.live_view.blueprints import put_beside
 from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, task_of
-from orchestrator.requests import Pour, Poured
+from orchestrator.records.events import Requested, RequestFinished
+from orchestrator.records.journal import JOURNAL_NAME, Header, Journal
 from sim_engine.outcome import PourMeasurement
 from tests.support import example_run
 from tests.support.rerun_recordings import Contents, seen, viewer

@@ -11,9 +11,9 @@ import pytest
 from actors.arm.arm_geometry import Plane, Pose, RobotCell
 from actors.arm.arm_settings import arm_kind
 from actors.arm.ur_settings import UrArmSettings
-from orchestrator.config.yaml.section_validation import PlacedProblems, validate
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.campaigns.yaml.section_validation import PlacedProblems, validate
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 from sim_engine.settings.model import Settings, meanings
 from tests.support.campaign_files import written_out
 

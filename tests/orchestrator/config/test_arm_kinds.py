@@ -9,8 +9,8 @@ import pytest
 from actors.arm.arm_settings import ARMS
 from actors.arm.simulated_arm import SimulatedArmSettings
 from actors.arm.ur_settings import UrArmSettings
-from orchestrator.config.file_loading import load_laboratory
-from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.file_loading import load_laboratory
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
 SHIPPED = Path("configs/laboratories/virtual.yaml").read_text(encoding="utf-8")
 UNTIL, FROM = SHIPPED.index("arm:"), SHIPPED.index("balance:")

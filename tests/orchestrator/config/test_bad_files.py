@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.action_assignments import AssignmentError, set_action
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign, load_laboratory, load_parameters, load_vessel
-from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.action_assignments import AssignmentError, set_action
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_parameters, load_vessel
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, LABORATORY, VESSEL, write
 
 BAD_VESSELS = {

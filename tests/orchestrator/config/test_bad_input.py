@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from tests.support.campaign_files import CAMPAIGN, CSV, DEPLOYED, RECORDED, report, write
 
 

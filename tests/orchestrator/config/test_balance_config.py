@@ -11,10 +11,10 @@ from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
 from actors.balance.display_behaviour import DisplayBehaviour
 from actors.balance.scale_model import ScaleSettings
 from actors.balance.weighing_plan import Placement
-from orchestrator.config.yaml.section_validation import PlacedProblems, validate
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.config.yaml.yaml_source import Document, Place, Report
-from orchestrator.runs.fingerprint import deciding
+from orchestrator.campaigns.fingerprint import deciding
+from orchestrator.campaigns.yaml.section_validation import PlacedProblems, validate
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 from tests.support.campaign_files import written_out
 
 

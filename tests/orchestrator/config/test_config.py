@@ -12,19 +12,19 @@ from pathlib import Path
 import pytest
 
 from actors.laboratory_settings import RaySettings
-from orchestrator.catalogue.run_registry import state_directory
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_vessel
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.command_options import call
-from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
-from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import load_settings
-from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.learning.calibration.continuous_calibration import C4Settings
+from orchestrator.learning.campaign_plan import DeploymentSettings
+from orchestrator.learning.deployment.costing import CostSettings
+from orchestrator.learning.deployment.d1 import D1Settings
+from orchestrator.learning.deployment.d2 import D2Settings
+from orchestrator.learning.deployment.d3 import D3Settings
+from orchestrator.records.run_registry import state_directory
 from orchestrator.runs.run_folder import create_run
-from orchestrator.strategies.calibration.continuous_calibration import C4Settings
-from orchestrator.strategies.campaign_plan import DeploymentSettings
-from orchestrator.strategies.deployment.costing import CostSettings
-from orchestrator.strategies.deployment.d1 import D1Settings
-from orchestrator.strategies.deployment.d2 import D2Settings
-from orchestrator.strategies.deployment.d3 import D3Settings
 from orchestrator.study.study_file import load_study
 from sim_engine.action import DEG
 

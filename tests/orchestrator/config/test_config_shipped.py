@@ -17,15 +17,15 @@ from actors.arm.ur_settings import UrArmSettings
 from actors.emulators.ur_controller.robot import MODELS as CONTROLLED
 from actors.emulators.ur_controller.robot import calibrated
 from actors.runtime.child_process import child_environment
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign, load_laboratory, load_vessel
-from orchestrator.config.json_schema import (
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_vessel
+from orchestrator.campaigns.yaml.yaml_source import Document
+from orchestrator.cli.json_schema import (
     campaign_schema,
     laboratory_schema,
     study_schema,
     vessel_schema,
 )
-from orchestrator.config.yaml.yaml_source import Document
 from sim_engine.action import DEG, Action
 from sim_engine.vessel.mesh_shape import MeshShape
 from tests.support.waiting import PATIENCE
@@ -159,7 +159,7 @@ def test_paths_resolve_against_the_file_that_names_them(tmp_path: Path, monkeypa
 @pytest.mark.slow
 def test_loading_a_campaign_starts_nothing_heavy() -> None:
     code = (
-        "import sys; from pathlib import Path; from orchestrator.config.file_loading import load_campaign;"
+        "import sys; from pathlib import Path; from orchestrator.campaigns.file_loading import load_campaign;"
         f"load_campaign(Path({str(CONFIGS / 'campaigns' / 'recorded.yaml')!r}));"
         "heavy = ('ray', 'taichi', 'rerun', 'sklearn', 'scipy.stats', 'matplotlib', 'trimesh');"
         "print([m for m in heavy if m in sys.modules])"

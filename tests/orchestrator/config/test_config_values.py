@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.action_assignments import assigned_action, set_action
-from orchestrator.config.file_loading import load_campaign, load_parameters
+from orchestrator.campaigns.action_assignments import assigned_action, set_action
+from orchestrator.campaigns.file_loading import load_campaign, load_parameters
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
 from sim_engine.settings.quantity import QuantityError, format_quantity, parse_quantity

@@ -12,17 +12,17 @@ import yaml
 
 from actors.optimizer.questions import Data, Linear, RegressionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.config.action_assignments import parse_constraint
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.requests import Pour, Simulate
-from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.campaigns.action_assignments import parse_constraint
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.learning.deployment.costing import CostSettings
+from orchestrator.learning.deployment.d1 import OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import FreeHybrid, Hybrid
+from orchestrator.learning.requests import Pour, Simulate
 from orchestrator.runs.stages import calibration_stages
-from orchestrator.strategies.deployment.costing import CostSettings
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
-from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
+from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign, load_vessel
-from orchestrator.config.yaml.file_access import SIZE_LIMIT
-from orchestrator.config.yaml.yaml_errors import PROBLEMS_SHOWN, ConfigError, Problem
-from orchestrator.config.yaml.yaml_source import Document
+from orchestrator.campaigns.file_loading import load_campaign, load_vessel
+from orchestrator.campaigns.yaml.file_access import SIZE_LIMIT
+from orchestrator.campaigns.yaml.yaml_errors import PROBLEMS_SHOWN, ConfigError, Problem
+from orchestrator.campaigns.yaml.yaml_source import Document
 from tests.support.campaign_files import CAMPAIGN, CSV, RECORDED, report, write
 from tests.support.counted_calls import counted_calls
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, report, write
 
 FLOW = "motion: {max_angle: 110 deg, x_offset: 84 mm, height: 90 mm}"

@@ -17,13 +17,13 @@ import yaml
 from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
+from orchestrator.campaigns.campaign_file import CALIBRATIONS, DEPLOYMENTS, CalibrationSection, DeploymentSection
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.campaign_commands import planning_request
-from orchestrator.config.campaign_file import CALIBRATIONS, DEPLOYMENTS, CalibrationSection, DeploymentSection
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.deployment_result import Deployed
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import cells_of

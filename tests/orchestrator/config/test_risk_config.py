@@ -11,13 +11,13 @@ import jsonschema
 import pytest
 import yaml
 
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli import campaign_commands as campaigns
 from orchestrator.cli.console import RefusalError
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.json_schema import campaign_schema
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.strategies.deployment.d1 import D1Settings
+from orchestrator.cli.json_schema import campaign_schema
+from orchestrator.learning.deployment.d1 import D1Settings
 from sim_engine.action import DEG
 from sim_engine.scene import PoseError
 from tests.support import plans

@@ -25,10 +25,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.pour_table import RecordTable, read_records
-from orchestrator.config.yaml.yaml_errors import ConfigError
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.pour_table import RecordTable, read_records
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from sim_engine import resources
 from tests.support.campaign_files import CSV, RECORDED, report, write
 from tests.support.hypothesis_examples import examples

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import Problem
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.yaml.yaml_errors import Problem
 from tests.support.campaign_files import CAMPAIGN, RECORDED, write
 
 CONFIGS = Path(__file__).parents[3] / "configs"

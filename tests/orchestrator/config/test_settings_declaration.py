@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import pytest
 
-from orchestrator.config.yaml.section_validation import validate
-from orchestrator.config.yaml.yaml_source import Document, Place, Report
+from orchestrator.campaigns.yaml.section_validation import validate
+from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 from sim_engine.settings.model import SET_BY_PROGRAM, Example, Name, Problems, SchemaGenerator, Settings
 from sim_engine.settings.quantity import Quantity
 

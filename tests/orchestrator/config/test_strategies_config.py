@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.campaign_plan import CampaignPlan
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 

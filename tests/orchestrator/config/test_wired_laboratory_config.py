@@ -10,11 +10,11 @@ import pytest
 
 from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.config.campaign_checks import check_campaign
-from orchestrator.config.file_loading import load_campaign, load_laboratory
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.campaigns.campaign_checks import check_campaign
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.campaign_plan import CampaignPlan
 from tests.support.campaign_files import written_out
 from tests.support.counted_calls import counted_calls
 

@@ -17,10 +17,10 @@ from typing import Any
 import pytest
 
 from orchestrator.catalogue.catalogue import Catalogue
-from orchestrator.catalogue.run_registry import enter
 from orchestrator.daemon.access_control import DRAIN
 from orchestrator.daemon.access_tokens import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
 from orchestrator.daemon.submissions import SubmissionBundleError, unpack
+from orchestrator.records.run_registry import enter
 from tests.support.browser import on_port
 from tests.support.toy_daemon import Served, held, run, serving
 

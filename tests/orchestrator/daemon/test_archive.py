@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from orchestrator.catalogue.run_registry import VARIABLE, use_state_directory
 from orchestrator.cli.app import app
 from orchestrator.daemon.access_tokens import Role
+from orchestrator.records.run_registry import VARIABLE, use_state_directory
 from tests.orchestrator.test_catalogue import made
 from tests.support.daemon_thread import Real
 from tests.support.toy_daemon import Served, run, serving

@@ -12,7 +12,7 @@ import pytest
 
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import DeviceCheck
-from orchestrator.config.file_loading import load_laboratory
+from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon import rig_worker
 from orchestrator.daemon.daemon_settings import Rig
 from tests.support.hardware_laboratory import hardware_rig

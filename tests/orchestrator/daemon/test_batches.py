@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.submissions import pack
 from tests.support.station import order, rigs_in, set_up, until_pour

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from actors.runtime.child_process import child_environment
-from orchestrator.config.file_loading import load_laboratory
+from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon import PHYSICAL
 from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.daemon_client import Client, DaemonError

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.run_folder import RESOLVED
 from tests.support.station import content, order, rigs_in, set_up, until_pour
 from tests.support.toy_daemon import Served, held, run, serving

@@ -19,10 +19,10 @@ import pytest
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import OperatorQuestion
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.catalogue.run_registry import VARIABLE
-from orchestrator.config.file_loading import load_laboratory
+from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_settings import Rig
+from orchestrator.records.run_registry import VARIABLE
 from tests.support.browser import OnPort, browser, on_port
 from tests.support.hardware_laboratory import hardware_rig
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators

@@ -15,7 +15,7 @@ from urllib.parse import urlparse
 import httpx
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.access_tokens import Role, token_of
 from orchestrator.daemon.daemon_client import Client, DaemonError
 from orchestrator.daemon.submissions import pack

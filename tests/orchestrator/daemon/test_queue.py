@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.cli.app import app
 from orchestrator.cli.queue_commands import submit
-from orchestrator.config.file_loading import load_campaign, load_laboratory
 from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import QueueItem
 from orchestrator.daemon.run_readout import Pours
 from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
-from orchestrator.run_service import RunHandle, RunRequest
-from orchestrator.strategies.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.runs.run_service import RunHandle, RunRequest
 from tests.support.small_campaign import NARROW, write_campaign
 from tests.support.toy_daemon import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
 
@@ -173,7 +173,7 @@ def test_a_campaign_for_no_rig_there_is_is_refused_with_those_there_are(tmp_path
 
     async def work() -> None:
         async with serving(tmp_path, HeldLaboratory) as served:
-            from orchestrator.config.file_loading import load_campaign
+            from orchestrator.campaigns.file_loading import load_campaign
             from orchestrator.daemon.submissions import pack
 
             text, files = pack(load_campaign(served.campaign))

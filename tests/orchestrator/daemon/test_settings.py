@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.app import app
-from orchestrator.config.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.daemon_settings import DaemonSettings, load_settings
 
 LABORATORY = "{name: numbers, bench: {liquid: {particles: 400}}}\n"

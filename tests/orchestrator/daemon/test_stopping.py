@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from orchestrator.daemon.access_tokens import Role
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from tests.support.toy_daemon import HeldLaboratory, held, run, serving
 
 
@@ -142,7 +142,7 @@ def test_an_emergency_stop_is_latched_until_somebody_clears_it(tmp_path: Path) -
 
 
 def test_one_emergency_stop_is_for_all_rigs(tmp_path: Path) -> None:
-    from orchestrator.config.file_loading import load_laboratory
+    from orchestrator.campaigns.file_loading import load_laboratory
     from orchestrator.daemon.daemon_settings import Rig
 
     laboratory = tmp_path / "numbers.yaml"

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from orchestrator.config.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.submissions import Files, Submission, SubmissionError, pack, prepare
 from tests.support.hypothesis_examples import examples

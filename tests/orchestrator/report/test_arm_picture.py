@@ -11,7 +11,7 @@ from matplotlib.text import Text
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
-from orchestrator.results import figure_style as style
+from orchestrator.reports import figure_style as style
 from tests.support.example_results import strays
 
 QUICKSTART = Path(__file__).parents[3] / "configs" / "campaigns" / "quickstart.yaml"

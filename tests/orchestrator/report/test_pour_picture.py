@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orchestrator.results import figure_style as style
-from orchestrator.results.pour_figures import _moments, place, section, simulation_figure
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.pour_figures import _moments, place, section, simulation_figure
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import SimulatedPour
 from sim_engine.vessel.vessel import build_vessel

@@ -10,18 +10,18 @@ from typing import Any, NoReturn
 import pytest
 from typer.testing import CliRunner
 
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.results.console_view import summary_table
-from orchestrator.results.summarise import summarise
-from orchestrator.results.validity_warnings import (
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.reports.console_view import summary_table
+from orchestrator.reports.summarise import summarise
+from orchestrator.reports.validity_warnings import (
     best_action_warnings,
     campaign_warnings,
     lines,
     numbers_line,
     regimes_of,
 )
-from orchestrator.strategies.campaign_plan import CampaignPlan
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
 from sim_engine.model_validity import NotCovered
@@ -155,8 +155,8 @@ def test_a_campaign_begins_with_what_is_not_simulated_in_it_each_kind_once(verb:
 def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from orchestrator.cli.console import RefusalError
     from orchestrator.cli.foreground_run import run_in_front_of_people
-    from orchestrator.run_service import RunResources
-    from orchestrator.run_tasks import run_task
+    from orchestrator.runs.run_service import RunResources
+    from orchestrator.runs.run_tasks import run_task
 
     request = replace(run_task(load_campaign(folder / "small.yaml")), folder=folder)
     resumed = replace(request, resume="yes")
@@ -171,7 +171,7 @@ def test_calibrate_is_silent_about_a_deployment_that_it_does_not_make(folder: Pa
 
 
 def test_a_vessel_that_can_t_be_judged_stops_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from orchestrator.results import validity_warnings as regimes
+    from orchestrator.reports import validity_warnings as regimes
 
     def broken(*args: object) -> NoReturn:
         raise ValueError("the pourer has no lip")

@@ -12,12 +12,12 @@ import pytest
 from matplotlib.collections import PathCollection
 from matplotlib.text import Text
 
-from orchestrator.results import figure_style as style
-from orchestrator.results import run_figures as figures_module
-from orchestrator.results.console_view import summary_table
-from orchestrator.results.figure_style import display_value, display_values, log_ticks
-from orchestrator.results.loss_units import loss_unit
-from orchestrator.results.run_figures import (
+from orchestrator.reports import figure_style as style
+from orchestrator.reports import run_figures as figures_module
+from orchestrator.reports.console_view import summary_table
+from orchestrator.reports.figure_style import display_value, display_values, log_ticks
+from orchestrator.reports.loss_units import loss_unit
+from orchestrator.reports.run_figures import (
     DiscrepancyGroup,
     PourSeries,
     calibration_picture,
@@ -28,9 +28,9 @@ from orchestrator.results.run_figures import (
     draw_spillage,
     pour_series,
 )
-from orchestrator.results.stage_views import evaluation_of
-from orchestrator.results.summarise import summarise
-from orchestrator.results.surrogate_figures import SurrogatePicture, draw_posterior, draw_surrogate, draw_trials
+from orchestrator.reports.stage_views import evaluation_of
+from orchestrator.reports.summarise import summarise
+from orchestrator.reports.surrogate_figures import SurrogatePicture, draw_posterior, draw_surrogate, draw_trials
 from sim_engine.action import DEG, Action
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space

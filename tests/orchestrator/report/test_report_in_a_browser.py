@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.results.publishing import publish
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.reports.publishing import publish
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
 from tests.orchestrator.report.test_run_report import laboratory

@@ -16,22 +16,22 @@ from typer.testing import CliRunner
 
 from actors.interfaces import LaboratoryError
 from actors.optimizer.optimizer_actor import Proposer
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
 from orchestrator.cli.foreground_run import report_of_what_stands
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.journal.journal_check import JournalCheck
-from orchestrator.journal.run_record import CampaignResult, RecordedDecision, read_record
-from orchestrator.requests import Failed
-from orchestrator.results import figure_style as style
-from orchestrator.results.console_view import summary_table
-from orchestrator.results.html_report import run_page
-from orchestrator.results.publishing import Published, publish
-from orchestrator.results.run_summary import summary_json
-from orchestrator.results.summarise import summarise
-from orchestrator.run_errors import RunError
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.requests import Failed
+from orchestrator.learning.run_errors import RunError
+from orchestrator.records.journal_check import JournalCheck
+from orchestrator.records.run_record import CampaignResult, RecordedDecision, read_record
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.console_view import summary_table
+from orchestrator.reports.html_report import run_page
+from orchestrator.reports.publishing import Published, publish
+from orchestrator.reports.run_summary import summary_json
+from orchestrator.reports.summarise import summarise
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
-from orchestrator.strategies.campaign_plan import CampaignPlan
 from tests.support.example_results import shown
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 from tests.support.toy_campaign import ToyBench, ToyLaboratory

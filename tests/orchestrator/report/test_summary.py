@@ -9,15 +9,15 @@ from typing import Any
 import jsonschema
 import pytest
 
-from orchestrator.journal.codec import decode_result
-from orchestrator.results.console_view import print_summary, summary_table
-from orchestrator.results.figure_style import display_value, display_values
-from orchestrator.results.run_summary import NotSimulated, PoolUse, RunSummary, Totals, summary_schema, write_summary
-from orchestrator.results.summarise import summarise
-from orchestrator.results.wording import pool_line
-from orchestrator.strategies.deployment.model_monitoring import Belief, Believed
-from orchestrator.strategies.deployment.real_pours import PredictionCheck
-from orchestrator.strategies.single_action import PredictedPour
+from orchestrator.learning.deployment.model_monitoring import Belief, Believed
+from orchestrator.learning.deployment.real_pours import PredictionCheck
+from orchestrator.learning.single_action import PredictedPour
+from orchestrator.records.codec import decode_result
+from orchestrator.reports.console_view import print_summary, summary_table
+from orchestrator.reports.figure_style import display_value, display_values
+from orchestrator.reports.run_summary import NotSimulated, PoolUse, RunSummary, Totals, summary_schema, write_summary
+from orchestrator.reports.summarise import summarise
+from orchestrator.reports.wording import pool_line
 from sim_engine.prediction_band import SampleStatistics
 from tests.support import example_run
 from tests.support.example_results import changed, shown

@@ -9,14 +9,14 @@ import pytest
 
 from actors.dosing.dose_estimator import ONSET
 from actors.interfaces import DoseSource
-from orchestrator.catalogue.vessel_account import VesselAccount
-from orchestrator.journal.codec import decode_request, decode_result, encode_request, encode_result
-from orchestrator.journal.events import CampaignOpened, RequestFinished, RequestStarted
-from orchestrator.requests import Failed, Pour, Poured, Slots
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
+from orchestrator.learning.dispense import Dispense, KnownSource, SourcesRead
+from orchestrator.learning.requests import Failed, Pour, Poured, Slots
+from orchestrator.materials.vessel_account import VesselAccount
+from orchestrator.records.codec import decode_request, decode_result, encode_request, encode_result
+from orchestrator.records.events import CampaignOpened, RequestFinished, RequestStarted
 from orchestrator.runs.stages import CALIBRATION, DOSES, SOURCES, dispense_stages
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.campaign_plan import DispensePlan, PlannedDose
-from orchestrator.strategies.dispense import Dispense, KnownSource, SourcesRead
 from sim_engine.action import Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import PourMeasurement

@@ -10,17 +10,17 @@ import pytest
 import yaml
 
 from actors.optimizer.questions import MinimumQuery, SuggestionQuery
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.campaign_commands import run
 from orchestrator.cli.console import RefusalError
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.requests import Suggest
-from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.learning.campaign_plan import CampaignPlan, DeploymentPlan
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import D3Settings, Hybrid
+from orchestrator.learning.requests import Suggest
 from orchestrator.runs.stages import calibration_stages
-from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import D3Settings, Hybrid
-from orchestrator.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, StrategyHarness
+from orchestrator.runs.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE, THETA, StrategyHarness
 from orchestrator.study.calibration_figures import colour, draw_calibrations
 from orchestrator.study.deployment_figures import draw_deployments
 from orchestrator.study.study_file import load_study

@@ -17,24 +17,24 @@ from hypothesis import strategies as st
 
 from actors.optimizer.questions import Data, Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.journal.codec import encode_result
-from orchestrator.journal.events import Event, RequestFinished
-from orchestrator.requests import Outcome, Pour, Poured, Request, Suggest
-from orchestrator.run_errors import LearningError
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.pointwise_calibration import (
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.calibration.pointwise_calibration import (
     BayesianCalibration,
     StratifiedSampling,
     UniformGrid,
 )
-from orchestrator.strategies.calibration.pour_design import DesignedPours
-from orchestrator.strategies.campaign_plan import CampaignPlan
-from orchestrator.strategies.deployment.costing import CostSettings
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
-from orchestrator.strategies.deployment.objectives import Objectives, Retained, Spillage
-from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, THETA, StrategyHarness, failures, replay
+from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.deployment.costing import CostSettings
+from orchestrator.learning.deployment.d1 import OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import FreeHybrid, Hybrid
+from orchestrator.learning.deployment.objectives import Objectives, Retained, Spillage
+from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Suggest
+from orchestrator.learning.run_errors import LearningError
+from orchestrator.records.codec import encode_result
+from orchestrator.records.events import Event, RequestFinished
+from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, SCENE, THETA, StrategyHarness, failures, replay
 from sim_engine.outcome import Loss, PourMeasurement
 from sim_engine.scene import PoseError
 from sim_engine.search_space import Axis, Space

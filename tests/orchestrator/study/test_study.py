@@ -17,11 +17,12 @@ import pytest
 from typer.testing import CliRunner
 
 from actors.simulators.local_worker import thread_pool
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.requests import Failed, Poured, Slots
-from orchestrator.run_service import RunResources
-from orchestrator.strategies.deployment.costing import Costing
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.requests import Failed, Poured, Slots
+from orchestrator.learning.study_strategies import FinalPour
+from orchestrator.runs.run_service import RunResources
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import (
     RESULT,
@@ -36,7 +37,6 @@ from orchestrator.study.study_folder import (
 )
 from orchestrator.study.study_plan import StudyPlan, cells_of, study_fingerprint
 from orchestrator.study.study_runner import run_cell
-from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from sim_engine.solver_fingerprint import folder_digest

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.journal.codec import result_of
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.calibration.calibration_scores import Scores
+from orchestrator.learning.calibration.pour_design import DesignPoured
+from orchestrator.records.codec import result_of
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, POURS
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.calibration.calibration_scores import Scores
-from orchestrator.strategies.calibration.pour_design import DesignPoured
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import finished_results
 from orchestrator.study.study_page import write_report

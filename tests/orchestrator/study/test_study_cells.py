@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from orchestrator.config.campaign_checks import touch
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
+from orchestrator.campaigns.campaign_checks import touch
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.deployment.d1 import D1Settings, OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_plan import cells_of

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.orchestrator.learning.calibration.test_nuisances import SEARCHED, TRUTH, spilled, written
 
 from actors.optimizer.questions import CalibrationQuery, Data, DesignQuestion, PosteriorQuestion
 from actors.optimizer.suggest import propose
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.requests import Failed, Pour, Simulate, Slots
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.calibration.active_design import ActivePours, joint_contexts
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.requests import Failed, Pour, Simulate, Slots
 from orchestrator.runs.stages import POURS, known_simulations, measured_pours, stages_of
-from orchestrator.strategies.calibration.active_design import ActivePours, joint_contexts
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategy_harness import ACTIONS, SCENE, StrategyHarness, replay
+from orchestrator.runs.strategy_harness import ACTIONS, SCENE, StrategyHarness, replay
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator.strategies.calibration.test_nuisances import SEARCHED, TRUTH, spilled, written
 from tests.support.plans import calibration_plan, deployment_plan
 
 NARROW = replace(SCENE, name="deployment-narrow", fixed={"height": 0.07})

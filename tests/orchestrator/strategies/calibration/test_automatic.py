@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Posterior
-from orchestrator.requests import Failed, Outcome, Request, Simulate
+from orchestrator.learning.calibration import automatic_calibration
+from orchestrator.learning.calibration.action_prior import Contexts
+from orchestrator.learning.calibration.automatic_calibration import simulation_limit
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.calibration.calibration_scores import NOT_JUSTIFIED, CalibrationEvaluation, ScoredPour
+from orchestrator.learning.calibration.posterior_summary import posterior_change
+from orchestrator.learning.campaign_plan import MeasuredPour
+from orchestrator.learning.requests import Failed, Outcome, Request, Simulate
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, deployed_theta, with_posterior
-from orchestrator.strategies.calibration import automatic_calibration
-from orchestrator.strategies.calibration.action_prior import Contexts
-from orchestrator.strategies.calibration.automatic_calibration import simulation_limit
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.calibration.calibration_scores import NOT_JUSTIFIED, CalibrationEvaluation, ScoredPour
-from orchestrator.strategies.calibration.posterior_summary import posterior_change
-from orchestrator.strategies.campaign_plan import MeasuredPour
-from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness, replay
+from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness, replay
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from tests.support.plans import calibration_plan, deployment_plan

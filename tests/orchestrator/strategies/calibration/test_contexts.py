@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.orchestrator.learning.calibration.test_nuisances import written
 
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.requests import Simulate
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.calibration.action_prior import Contexts
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.requests import Simulate
 from orchestrator.runs.stages import POURS, measured_pours, scenes_of
-from orchestrator.strategies.calibration.action_prior import Contexts
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.pour_design import DesignedPours
-from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
+from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
-from tests.orchestrator.strategies.calibration.test_nuisances import written
 from tests.support.plans import calibration_plan
 
 WIDE = replace(SCENE, name="calibration-wide", receiver=cylinder("wide", inner_radius=0.05, inner_height=0.1))

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.config.file_loading import load_campaign, load_parameters, load_posterior
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.results.publishing import theta_file
-from orchestrator.strategies.calibration.action_prior import drawn_benches
-from orchestrator.strategies.calibration.calibration_base import described
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.campaign_plan import MeasuredPour, NormalPrior
-from orchestrator.strategy_harness import SCENE, StrategyHarness
+from orchestrator.campaigns.file_loading import load_campaign, load_parameters, load_posterior
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.calibration.action_prior import drawn_benches
+from orchestrator.learning.calibration.calibration_base import described
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.campaign_plan import MeasuredPour, NormalPrior
+from orchestrator.reports.publishing import theta_file
+from orchestrator.runs.strategy_harness import SCENE, StrategyHarness
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space

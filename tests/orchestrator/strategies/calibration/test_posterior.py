@@ -10,15 +10,11 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Posterior
-from orchestrator.config.file_loading import load_discrepancy, load_parameters, load_posterior
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.results.figure_style import save
-from orchestrator.results.publishing import theta_file
-from orchestrator.results.surrogate_figures import draw_posterior
-from orchestrator.results.wording import posterior_lines, theta_sentences
-from orchestrator.strategies.calibration.calibration_scores import ScoredPair, Scores
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.posterior_summary import (
+from orchestrator.campaigns.file_loading import load_discrepancy, load_parameters, load_posterior
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.calibration.calibration_scores import ScoredPair, Scores
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.calibration.posterior_summary import (
     PosteriorFound,
     PosteriorSummary,
     RemainingDiscrepancy,
@@ -27,10 +23,14 @@ from orchestrator.strategies.calibration.posterior_summary import (
     posterior_found,
     region,
 )
-from orchestrator.strategies.campaign_plan import MeasuredPour
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.single_action import RepeatedSimulation
-from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness
+from orchestrator.learning.campaign_plan import MeasuredPour
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.single_action import RepeatedSimulation
+from orchestrator.reports.figure_style import save
+from orchestrator.reports.publishing import theta_file
+from orchestrator.reports.surrogate_figures import draw_posterior
+from orchestrator.reports.wording import posterior_lines, theta_sentences
+from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import Loss

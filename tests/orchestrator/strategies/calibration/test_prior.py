@@ -11,12 +11,12 @@ import yaml
 from scipy.stats import kstest, truncnorm
 
 from actors.optimizer.questions import Linear
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.runs.fingerprint import fingerprint
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.learning.calibration.action_prior import actions_of_prior
+from orchestrator.learning.campaign_plan import CalibrationPlan, NormalPrior
 from orchestrator.runs.stages import calibration_stages
-from orchestrator.strategies.calibration.action_prior import actions_of_prior
-from orchestrator.strategies.campaign_plan import CalibrationPlan, NormalPrior
-from orchestrator.strategy_harness import CALIBRATION_ACTIONS, StrategyHarness
+from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.search_space import Axis, Space
 from tests.support.campaign_files import CAMPAIGN, DEPLOYED, report, write

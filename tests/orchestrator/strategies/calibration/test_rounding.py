@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from orchestrator.learning.calibration.calibration_base import Calibrated
+from orchestrator.learning.calibration.calibration_scores import CalibrationGain, Scores
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.campaign_plan import DeploymentPlan, MeasuredPour
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.single_action import PredictedPour, RepeatedSimulation
 from orchestrator.runs.stages import CALIBRATION, EVALUATION, posterior_draws, with_posterior
-from orchestrator.strategies.calibration.calibration_base import Calibrated
-from orchestrator.strategies.calibration.calibration_scores import CalibrationGain, Scores
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.campaign_plan import DeploymentPlan, MeasuredPour
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.single_action import PredictedPour, RepeatedSimulation
-from orchestrator.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
+from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, SCENE, StrategyHarness
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss

@@ -4,11 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orchestrator.requests import Failed, Simulate, Simulated, Suggest, Suggested
-from orchestrator.run_errors import LearningError
-from orchestrator.runs.stages import POURS, measured_pours
-from orchestrator.strategies.calibration.action_prior import Contexts
-from orchestrator.strategies.calibration.calibration_scores import (
+from orchestrator.learning.calibration.action_prior import Contexts
+from orchestrator.learning.calibration.calibration_scores import (
     JUSTIFIED,
     NOT_JUSTIFIED,
     CalibrationEvaluation,
@@ -20,10 +17,20 @@ from orchestrator.strategies.calibration.calibration_scores import (
     random_parameters,
     regression_discrepancy,
 )
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.pour_design import DesignedPours, choose_holdout, stratified
-from orchestrator.strategies.campaign_plan import MeasuredPour
-from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of, replay
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.calibration.pour_design import DesignedPours, choose_holdout, stratified
+from orchestrator.learning.campaign_plan import MeasuredPour
+from orchestrator.learning.requests import Failed, Simulate, Simulated, Suggest, Suggested
+from orchestrator.learning.run_errors import LearningError
+from orchestrator.runs.stages import POURS, measured_pours
+from orchestrator.runs.strategy_harness import (
+    CALIBRATION_ACTIONS,
+    PARAMETERS,
+    SCENE,
+    StrategyHarness,
+    outcome_of,
+    replay,
+)
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from tests.support.plans import calibration_plan, unit

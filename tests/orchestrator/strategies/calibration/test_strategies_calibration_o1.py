@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from orchestrator.requests import Failed, Simulate, Simulated, Suggest
-from orchestrator.run_errors import LearningError
-from orchestrator.strategies.calibration.calibration_scores import Evaluation, ScoredPour
-from orchestrator.strategies.calibration.pointwise_calibration import (
+from orchestrator.learning.calibration.calibration_scores import Evaluation, ScoredPour
+from orchestrator.learning.calibration.pointwise_calibration import (
     BayesianCalibration,
     StratifiedSampling,
     UniformGrid,
 )
-from orchestrator.strategies.calibration.pour_design import DesignedPours
-from orchestrator.strategies.strategy import Progress
-from orchestrator.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of
+from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.requests import Failed, Simulate, Simulated, Suggest
+from orchestrator.learning.run_errors import LearningError
+from orchestrator.learning.strategy import Progress
+from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness, outcome_of
 from tests.support.plans import calibration_plan
 from tests.support.toy_spillage import TRUE_THETA, calibration_spill, weighed
 

@@ -10,13 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.journal.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.requests import Answered, Ask, Suggest
-from orchestrator.runs.resume import OperatorNeededError
-from orchestrator.runs.stages import DEPLOYMENT, with_bench
-from orchestrator.strategies.deployment.d3 import FreeHybrid, Hybrid
-from orchestrator.strategies.deployment.deployment_result import Deployed
-from orchestrator.strategies.deployment.model_monitoring import (
+from orchestrator.learning.deployment.d3 import FreeHybrid, Hybrid
+from orchestrator.learning.deployment.deployment_result import Deployed
+from orchestrator.learning.deployment.model_monitoring import (
     Believed,
     DiscrepancyPolicySettings,
     RiskLimitSettings,
@@ -24,8 +20,12 @@ from orchestrator.strategies.deployment.model_monitoring import (
     displacement,
     offset_priors,
 )
-from orchestrator.strategies.stage_result import StageResult
-from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
+from orchestrator.learning.requests import Answered, Ask, Suggest
+from orchestrator.learning.stage_result import StageResult
+from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.runs.resume import OperatorNeededError
+from orchestrator.runs.stages import DEPLOYMENT, with_bench
+from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.search_space import Axis, Space
@@ -233,7 +233,7 @@ def test_rules_of_one_model_are_refused_with_another() -> None:
         def add(self, text: str, *at: Any, key: bool = False, of: str = "") -> None:
             self.at.append(at)
 
-    from orchestrator.strategies.campaign_plan import Premises
+    from orchestrator.learning.campaign_plan import Premises
 
     heard = Heard()
     deployment_plan(model="residual", stop=StopSettings(), good_enough=0.01).settings.check(

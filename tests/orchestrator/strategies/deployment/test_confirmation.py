@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from orchestrator.requests import Failed, Outcome, Pour, Poured, Slots
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.deployment_result import Recommended
-from orchestrator.strategies.single_action import Confirmation
-from orchestrator.strategies.strategy import Progress
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.deployment_result import Recommended
+from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Slots
+from orchestrator.learning.single_action import Confirmation
+from orchestrator.learning.strategy import Progress
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import Loss, PourMeasurement
 from tests.support.toy_campaign import SCENE, SPACE, THETA

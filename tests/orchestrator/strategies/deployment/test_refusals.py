@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.config.campaign_checks import touch
-from orchestrator.journal.codec import encode_result
-from orchestrator.requests import Failed, Outcome, Pour, Request, Simulate, Suggest
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.deployment_ledger import MAX_REFUSED
-from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
+from orchestrator.campaigns.campaign_checks import touch
+from orchestrator.learning.deployment.d1 import OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import Hybrid
+from orchestrator.learning.deployment.deployment_ledger import MAX_REFUSED
+from orchestrator.learning.requests import Failed, Outcome, Pour, Request, Simulate, Suggest
+from orchestrator.records.codec import encode_result
+from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.vessel.vessel import build_vessel
@@ -116,6 +116,7 @@ def test_where_nothing_can_be_made_it_ends(name: str) -> None:
     assert len(played.simulations) <= 2 * (MAX_REFUSED + 5)
 
 
+@pytest.mark.slow
 def test_real_vessels_that_touch_are_learnt_in_a_few_refusals() -> None:
     scene = replace(SCENE, fixed={"height": 0.0})
     vessels = build_vessel(scene.pourer), build_vessel(scene.receiver)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import RiskQuery
-from orchestrator.journal.codec import decode_request, decode_result, encode_request, encode_result
-from orchestrator.requests import Failed, Simulate, Suggest
-from orchestrator.run_errors import RunError
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.d1 import OneShotPlanning
+from orchestrator.learning.deployment.disturbances import Disturbances, RiskSettings
+from orchestrator.learning.requests import Failed, Simulate, Suggest
+from orchestrator.learning.run_errors import RunError
+from orchestrator.learning.single_action import RepeatedSimulation
+from orchestrator.records.codec import decode_request, decode_result, encode_request, encode_result
 from orchestrator.runs.stages import with_posterior
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.disturbances import Disturbances, RiskSettings
-from orchestrator.strategies.single_action import RepeatedSimulation
-from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed, replay
+from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed, replay
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss

@@ -13,17 +13,17 @@ import pytest
 
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.config.file_loading import load_campaign
-from orchestrator.config.yaml.yaml_errors import ConfigError
-from orchestrator.journal.codec import digest
-from orchestrator.requests import Suggest
-from orchestrator.runs.fingerprint import fingerprint
-from orchestrator.strategies.campaign_plan import CampaignPlan, DeploymentPlan
-from orchestrator.strategies.deployment.d1 import D1Settings, OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.strategy import Progress
-from orchestrator.strategy_harness import THETA, StrategyHarness
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.campaign_plan import CampaignPlan, DeploymentPlan
+from orchestrator.learning.deployment.d1 import D1Settings, OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import Hybrid
+from orchestrator.learning.requests import Suggest
+from orchestrator.learning.strategy import Progress
+from orchestrator.records.codec import digest
+from orchestrator.runs.strategy_harness import THETA, StrategyHarness
 from sim_engine.action import DEG
 from tests.support.toy_campaign import ToyLaboratory, run_toy
 from tests.support.toy_spillage import narrow_cup

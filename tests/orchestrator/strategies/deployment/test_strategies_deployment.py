@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.journal.codec import encode_result
-from orchestrator.requests import Failed, Pour, Poured, Simulate, Suggest
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.deployment_ledger import MAX_REFUSED
-from orchestrator.strategies.strategy import Strategy
-from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, replay
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.d1 import OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import Hybrid
+from orchestrator.learning.deployment.deployment_ledger import MAX_REFUSED
+from orchestrator.learning.requests import Failed, Pour, Poured, Simulate, Suggest
+from orchestrator.learning.strategy import Strategy
+from orchestrator.records.codec import encode_result
+from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, replay
 from sim_engine.outcome import Loss, PourMeasurement
 from tests.support.plans import deployment_plan
 from tests.support.toy_spillage import narrow_cup, narrow_cup_biased

@@ -10,26 +10,26 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.orchestrator.learning.test_strategies_properties import Shuffled
 
 from actors.optimizer.questions import Data, SpaceFillingQuery
-from orchestrator.requests import Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
-from orchestrator.strategies.calibration.continuous_calibration import ContinuousBayesianCalibration
-from orchestrator.strategies.calibration.pointwise_calibration import (
+from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
+from orchestrator.learning.calibration.pointwise_calibration import (
     BayesianCalibration,
     StratifiedSampling,
     UniformGrid,
 )
-from orchestrator.strategies.calibration.pour_design import DesignedPours
-from orchestrator.strategies.campaign_plan import CalibrationPlan, DeploymentPlan, MeasuredPour
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
+from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.campaign_plan import CalibrationPlan, DeploymentPlan, MeasuredPour
+from orchestrator.learning.deployment.d1 import OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import Hybrid
+from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
+from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, normalised_spillage
 from sim_engine.search_space import Axis, Space
-from tests.orchestrator.strategies.test_strategies_properties import Shuffled
 from tests.support.plans import calibration_plan, deployment_plan
 
 ACTIONS = (

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 
 from actors.optimizer.questions import Data
-from orchestrator.journal.journal import Kind
-from orchestrator.journal.run_record import POOL_RESTS, Occupancy, read_record
-from orchestrator.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
-from orchestrator.strategies.deployment.costing import Costs, CostSettings
-from orchestrator.strategies.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
-from orchestrator.strategies.deployment.model_monitoring import DiscrepancyPolicySettings, subsampled
-from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness
+from orchestrator.learning.deployment.costing import Costs, CostSettings
+from orchestrator.learning.deployment.d3 import MOST_SIMULATIONS, FreeHybrid
+from orchestrator.learning.deployment.model_monitoring import DiscrepancyPolicySettings, subsampled
+from orchestrator.learning.requests import Answered, Ask, Outcome, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.records.journal import Kind
+from orchestrator.records.run_record import POOL_RESTS, Occupancy, read_record
+from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness
 from tests.orchestrator.test_stages import campaign, laboratory
 from tests.support.killed_runs import die_at, finished_times
 from tests.support.plans import deployment_plan
@@ -148,6 +148,7 @@ def test_a_slot_that_falls_free_beside_a_pour_has_its_next_simulation_at_once() 
     assert served > 0.9 * with_room
 
 
+@pytest.mark.slow
 def test_the_next_pour_is_asked_for_with_one_quick_question() -> None:
     """No fit from scratch, no picture, no thousand points, and nothing else first."""
     _, log = played(free(costs=CostSettings(worth=0.0), pours=4, prior_simulations=36), narrow_cup, beside=25)

@@ -13,15 +13,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from orchestrator.journal.codec import decode_result, encode_result
-from orchestrator.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
-from orchestrator.results.console_view import summary_table
-from orchestrator.results.summarise import summarise
-from orchestrator.strategies.deployment.costing import Costing
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.d2 import RealOnly
-from orchestrator.strategies.deployment.d3 import Hybrid
-from orchestrator.strategies.deployment.objectives import (
+from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.d1 import OneShotPlanning
+from orchestrator.learning.deployment.d2 import RealOnly
+from orchestrator.learning.deployment.d3 import Hybrid
+from orchestrator.learning.deployment.objectives import (
     Objective,
     Objectives,
     Retained,
@@ -30,8 +26,12 @@ from orchestrator.strategies.deployment.objectives import (
     Time,
     duration,
 )
-from orchestrator.strategies.deployment.scalarization import scalarised, undominated
-from orchestrator.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
+from orchestrator.learning.deployment.scalarization import scalarised, undominated
+from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
+from orchestrator.records.codec import decode_result, encode_result
+from orchestrator.reports.console_view import summary_table
+from orchestrator.reports.summarise import summarise
+from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
 from sim_engine.action import DEG, Action
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import Fractions, Loss, PourMeasurement

@@ -12,14 +12,14 @@ import pytest
 
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
-from orchestrator.requests import Failed, Simulate
-from orchestrator.results.loss_units import loss_unit
-from orchestrator.results.run_figures import draw_figures
-from orchestrator.results.wording import risk_line, window_line
-from orchestrator.strategies.deployment.d1 import OneShotPlanning
-from orchestrator.strategies.deployment.disturbances import RiskSettings
-from orchestrator.strategies.deployment.safe_window import ROUNDS, SafeWindow
-from orchestrator.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed
+from orchestrator.learning.deployment.d1 import OneShotPlanning
+from orchestrator.learning.deployment.disturbances import RiskSettings
+from orchestrator.learning.deployment.safe_window import ROUNDS, SafeWindow
+from orchestrator.learning.requests import Failed, Simulate
+from orchestrator.reports.loss_units import loss_unit
+from orchestrator.reports.run_figures import draw_figures
+from orchestrator.reports.wording import risk_line, window_line
+from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness, executed
 from sim_engine.outcome import Loss
 from sim_engine.scene import PoseError
 from tests.support import plans, toy_campaign

@@ -1,0 +1,355 @@
+"""The pourer in a gripper: handed over by the operator, checked, and watched while the arm moves.
+
+- `HeldVessel` closes and opens the gripper in agreement with the operator, and checks each grasp: the width of the
+  fingers against that of the vessel, the detected object, and the balance that the vessel stood on.
+- `HoldingArm` is an arm that moves only with a held vessel, and stops as soon as the vessel may have been lost.
+
+A vessel that may have been lost is UNKNOWN: the arm stands still, and the operator is asked. The drivers are in
+`actors.grippers`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import replace
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from actors.arm.arm_device import DeviceArm, Follow, _ignore
+from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError, Executed, PlannedPour
+from actors.arm.arm_settings import ArmSettings
+from actors.balance.weighing_plan import GRIP
+from actors.grippers.gripper_interface import (
+    SMALLEST_GAP,
+    GripLimits,
+    GripperError,
+    GripperSettings,
+    GripperState,
+    VesselLostError,
+)
+from actors.interfaces import LaboratoryError, Notice, OperatorQuestion
+from actors.runtime.remote_object import Device
+from sim_engine.vessel.vessel import Vessel
+
+T = TypeVar("T")
+
+PATIENCE = 60.0
+"""Longest wait for a call of the gripper [s]; its process may still be starting."""
+
+LOOK = 0.2
+"""Time between two readings of the gripper while the arm moves [s of the clock]."""
+
+BLIND = 2
+"""Number of readings in a row without an answer after which the vessel may have been lost."""
+
+BELOW = 0.8
+"""Width to which the fingers close, as a fraction of the vessel's: an object stops them well before."""
+
+TAKES = ("pourer_empty", "pourer_full", "pourer_after", "dose_source")
+"""Questions whose step needs the pourer, which the gripper holds."""
+
+Ask = Callable[[OperatorQuestion], Awaitable[str]]
+
+
+def grip_height(spec: GripperSettings, arm: ArmSettings) -> float:
+    """Height above a pourer's underside at which the fingers grip it [m].
+
+    It is that of the tool centre point in the pourer's frame, unless the gripper's settings state it.
+    """
+    if spec.height is not None:
+        return spec.height
+    grip = getattr(arm, "grip", None)
+    if grip is None:
+        raise LaboratoryError("the arm does not state where it holds the pourer; add 'height' to the gripper")
+    x, y, z, *turn = grip.as_list
+    return float((Rotation.from_rotvec(turn).inv().apply(-np.array([x, y, z])))[2])
+
+
+def grip_limits(vessel: Vessel, spec: GripperSettings, arm: ArmSettings) -> GripLimits:
+    """Widths of the fingers that are a grasp of a vessel.
+
+    Raises:
+        LaboratoryError: the vessel cannot be gripped by this gripper, at this height; the text states why.
+    """
+    name, height = vessel.name, grip_height(spec, arm)
+    if not 0.0 <= height <= vessel.rim_height:
+        raise LaboratoryError(
+            f"the fingers are {1e3 * height:.0f} mm above the underside of '{name}', which is "
+            f"{1e3 * vessel.rim_height:.0f} mm high: see 'grip' of the arm, or 'height' of the gripper"
+        )
+    given = vessel.spec.grip
+    width = vessel.width_at(height) if given is None or given.width is None else given.width
+    if width + SMALLEST_GAP > spec.widest:
+        raise LaboratoryError(
+            f"'{name}' is {1e3 * width:.1f} mm wide where it is gripped, {1e3 * height:.0f} mm above its underside; "
+            f"the gripper opens to {1e3 * spec.widest:.1f} mm"
+        )
+    return GripLimits(name, width, (2e-3 if given is None else given.tolerance) + spec.accuracy)
+
+
+class HeldVessel:
+    """The gripper of a bench, and the pourer in it.
+
+    Args:
+        device: holds the driver.
+        spec: settings of the gripper.
+        arm: settings of the arm.
+        tell: receives notices.
+        weight: reads the balance that the pourer stood on [kg], if nothing else comes to stand on it; None otherwise.
+
+    Attributes:
+        holds: the grasp of the vessel was checked, and it was not lost or let go since.
+        lost: why the vessel may have been lost; '' if it was not.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        spec: GripperSettings,
+        arm: ArmSettings,
+        tell: Callable[[Notice], None],
+        weight: Callable[[], Awaitable[float]] | None = None,
+    ) -> None:
+        self._device, self._spec, self._arm, self._tell, self._weight = device, spec, arm, tell, weight
+        self._limits: GripLimits | None = None
+        self._stood = 0.0
+        self._blind = 0
+        self.holds, self.lost = False, ""
+
+    # ---- the driver
+
+    async def _call(self, method: str, *args: Any, urgent: bool = False) -> Any:
+        return await self._device.call(method, *args, deadline=PATIENCE, urgent=urgent)
+
+    async def state(self) -> GripperState:
+        """The gripper's state."""
+        state: GripperState = await self._call("state", urgent=True)
+        return state
+
+    async def ready(self, vessel: Vessel) -> None:
+        """Connect the gripper before a pour with a vessel. Nothing moves.
+
+        Raises:
+            GripperError: it does not answer.
+            LaboratoryError: it cannot grip this vessel.
+        """
+        self._limits = grip_limits(vessel, self._spec, self._arm)
+        await self._device.revive()
+        await self._call("connect")
+        state = await self.state()
+        self.holds, self.lost = self.holds or (not self.lost and state.detected is True), ""
+
+    def stood(self, mass: float) -> None:
+        """The full pourer stood on the balance, with this weight [kg]."""
+        self._stood = mass
+
+    async def close(self) -> None:
+        """Disconnect; a held vessel stays held."""
+        with contextlib.suppress(LaboratoryError):
+            await self._call("close")
+
+    # ---- with the operator
+
+    async def around(self, question: OperatorQuestion, ask: Ask) -> str:
+        """Ask a question of a pour, and grip or let go of the pourer before or after it.
+
+        Args:
+            question: as the weighings ask it.
+            ask: asks the operator, after nothing can move.
+
+        Raises:
+            LaboratoryError: the gripper does not answer, or the operator gave up.
+        """
+        if question.about in TAKES and self.holds:
+            await self._let_go(ask)
+        answer = await ask(replace(question, text=question.text.replace(GRIP, "")))
+        if not self.holds and (GRIP in question.text or question.about == "dose_cleared"):
+            await self._take(ask)
+        return answer
+
+    async def _take(self, ask: Ask) -> None:
+        """Close the gripper on the pourer that the operator holds, until the grasp is checked."""
+        limits, problem = self._limits, ""
+        assert limits is not None
+        while True:
+            try:
+                await self._activated(ask)
+                opened = min(limits.width + self._spec.clearance, self._spec.widest)
+                await self._agreed(
+                    ask,
+                    "open_gripper",
+                    f"Hands off the gripper. Its fingers open to {1e3 * opened:.0f} mm. May they?",
+                    problem,
+                )
+                await self._call("open", opened)
+                await self._agreed(
+                    ask,
+                    "grasp",
+                    f"Hold '{limits.vessel}' upright between the open fingers, your own fingers away from them. The "
+                    f"gripper closes with {self._spec.applied:.0f} N at once when you say so. May it?",
+                    width_mm=1e3 * limits.width,
+                )
+                state: GripperState = await self._call("grip", BELOW * limits.width, self._spec.applied)
+                problem = limits.problem(state) or await self._still_standing()
+                if not problem and state.detected is None:
+                    problem = await self._unconfirmed(ask)
+            except GripperError as error:
+                problem = str(error)
+            if not problem:
+                break
+        self.holds, self.lost, self._blind = True, "", 0
+        self._tell(Notice("note", f"'{limits.vessel}' is in the gripper: {state}"))
+
+    async def _activated(self, ask: Ask) -> None:
+        if not (await self.state()).problem:
+            return
+        await self._agreed(
+            ask,
+            "activate_gripper",
+            "The gripper is not ready. To get ready, its fingers may open and close fully: nothing may be between "
+            "them, and no hand. May they?",
+        )
+        await self._call("prepare")
+
+    async def _still_standing(self) -> str:
+        """Whether the balance still carries the pourer; the problem if it does."""
+        if self._weight is None or self._stood <= 0.0:
+            return ""
+        mass = await self._weight()
+        if mass > 0.5 * self._stood:
+            return f"the balance shows {1e3 * mass:.1f} g: does the pourer still stand on it?"
+        return ""
+
+    async def _unconfirmed(self, ask: Ask) -> str:
+        """Ask the operator whether the vessel is held, for a gripper that cannot tell."""
+        question = OperatorQuestion(
+            "The gripper cannot tell whether it holds the pourer. Does it, upright and firmly?",
+            "yes or no",
+            about="held",
+        )
+        return "" if _yes(await ask(question)) else "the operator says that the pourer is not held"
+
+    async def _let_go(self, ask: Ask) -> None:
+        """Open the gripper while the operator holds the pourer."""
+        limits = self._limits
+        assert limits is not None
+        await self._agreed(
+            ask,
+            "let_go",
+            f"Hold '{limits.vessel}' in the gripper. Its fingers open at once when you say so. May they?",
+        )
+        await self._call("open", min(limits.width + self._spec.clearance, self._spec.widest))
+        self.holds = False
+
+    async def _agreed(self, ask: Ask, about: str, text: str, problem: str = "", **details: float) -> None:
+        """Ask for a motion of the fingers.
+
+        Raises:
+            LaboratoryError: the operator refused.
+        """
+        if not _yes(await ask(OperatorQuestion(text, "yes or no", problem, about=about, details=details))):
+            raise LaboratoryError("the operator did not let the gripper move")
+
+    # ---- while the arm moves
+
+    async def loss(self, *, sure: bool = True) -> str:
+        """Why the vessel may have been lost since it was gripped; '' if it is held.
+
+        Args:
+            sure: repeat a reading that fails; otherwise only several in a row count.
+        """
+        if not self.holds or self._limits is None:
+            return self.lost
+        found = ""
+        while True:
+            try:
+                state = await self.state()
+            except LaboratoryError as error:  # a driver that died counts, too
+                self._blind += 1
+                found = str(error) if self._blind >= BLIND else ""
+                if not found and sure:
+                    continue
+            else:
+                self._blind, found = 0, self._limits.problem(state)
+            break
+        if found:
+            self.lost, self.holds = found, False
+        return self.lost
+
+
+class HoldingArm(DeviceArm):
+    """An arm with a gripper: each motion needs a held vessel before it, during it and after it.
+
+    After a loss, motions that the operator agrees to are made without: they bring the arm home.
+
+    Args:
+        device: that holds the arm's driver.
+        spec: of the arm.
+        held: the vessel in the gripper.
+    """
+
+    def __init__(self, device: Device, spec: ArmSettings, held: HeldVessel) -> None:
+        super().__init__(device, spec)
+        self._held = held
+
+    async def move_to_start(self, path: PlannedPour, follow: Follow = _ignore) -> None:
+        """See `DeviceArm.move_to_start`."""
+        if not self._held.holds:
+            raise ArmRefusedError("the gripper holds no pourer, as far as it is known; nothing has moved")
+        await self._holding(super().move_to_start(path, follow))
+
+    async def execute(self, path: PlannedPour, follow: Follow) -> Executed:
+        """See `DeviceArm.execute`."""
+        return await self._holding(super().execute(path, follow))
+
+    async def dose(self, path: PlannedPour, longest: float) -> Executed:
+        """See `DeviceArm.dose`."""
+        return await self._holding(super().dose(path, longest))
+
+    async def retreat(self, path: PlannedPour, follow: Follow = _ignore) -> None:
+        """See `DeviceArm.retreat`."""
+        await self._holding(super().retreat(path, follow))
+
+    async def _holding(self, motion: Coroutine[Any, Any, T]) -> T:
+        """Make a motion while the vessel is held.
+
+        Raises:
+            VesselLostError: it may have been lost; the arm stands still.
+        """
+        if self._held.lost:
+            return await motion
+        if loss := await self._held.loss():
+            motion.close()
+            raise await self._lost(loss, None)
+        moving = asyncio.ensure_future(motion)
+        try:
+            while not (await asyncio.wait({moving}, timeout=LOOK))[0]:
+                if loss := await self._held.loss(sure=False):
+                    # The first order lets a dose turn the cup upright, the second one stops the arm where it is.
+                    await asyncio.gather(self.stop(), self.stop(), return_exceptions=True)
+                    executed: Executed | None = None
+                    try:
+                        executed = await moving  # type: ignore[assignment]
+                    except ArmStoppedError as error:
+                        executed = error.executed
+                    raise await self._lost(loss, executed)
+        finally:
+            if not moving.done():
+                moving.cancel()
+        result = await moving
+        if loss := await self._held.loss():
+            raise await self._lost(loss, result if hasattr(result, "poses") else None)  # type: ignore[arg-type]
+        return result
+
+    async def _lost(self, loss: str, executed: Executed | None) -> VesselLostError:
+        text = f"the gripper may have lost the pourer: {loss}. The arm was stopped. Look for the pourer and the liquid"
+        state = await self.state()
+        return VesselLostError(text, "vessel lost", state.phase, state.time, state.tilt, executed)
+
+
+def _yes(answer: str) -> bool:
+    return answer.strip().lower() in ("yes", "y")

@@ -1,0 +1,1 @@
+"""Grippers: their interface, settings and drivers."""

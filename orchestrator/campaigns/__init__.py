@@ -1,0 +1,1 @@
+"""Files of campaigns, laboratories and vessels: sections, validation, the plans made from them, and prior data."""

@@ -1,0 +1,561 @@
+"""Checks of a campaign beyond its file: vessels, reachable actions, and settings that make little sense.
+
+- `check_campaign` and `check_vessels` build the vessels and try actions. Vessels must be valid solids, hold the liquid
+  and not touch; the arm must be able to make some action.
+- `senseless` finds settings that can run but waste pours: streams that miss the receiver (range of a free jet), and
+  tilt speeds that the arm refuses.
+
+No pour and no simulation is made.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from actors.arm.arm_settings import ArmSettings, arm_kind
+from actors.bench.held_vessel import grip_limits
+from actors.bench.pour_feasibility import vessel as built
+from actors.dosing.simulated_dose import check_straight
+from actors.grippers.gripper_interface import GripperSettings
+from actors.interfaces import InvalidActionError, LaboratoryError, UnreachablePlaceError
+from orchestrator.campaigns.yaml.file_access import why_not_writable
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
+from orchestrator.campaigns.yaml.yaml_source import Document, Loc
+from orchestrator.learning.calibration.action_prior import actions_all_over
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan, DispensePlan
+from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.collision import contact_during, describe_contact
+from sim_engine.hydrostatics import level
+from sim_engine.lip_flow import flow_course
+from sim_engine.motion import plan_motion
+from sim_engine.scene import Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselError, VesselSpec
+from sim_engine.vessel.vessel import Vessel, check_holds
+
+BESIDE = 0.015
+"""Largest distance outside the opening at which part of a stream still enters it [m]."""
+
+LEAST = 1.0 / 3.0
+"""Minimum share of a range of offsets from which a stream must hit; below it, most pours of a campaign are wasted."""
+
+MOST_TRIED = 9
+"""Maximum number of pours whose streams are computed, in all dimensions other than x_offset."""
+
+Senseless = tuple[tuple[Loc, ...], str]
+"""Keys that the finding may concern, the most specific first, and the message."""
+
+
+def senseless(
+    plan: CalibrationPlan | DeploymentPlan,
+    scene: Scene,
+    pourer: Vessel,
+    receiver: Vessel,
+    arm: ArmSettings | None,
+    known: dict[tuple[object, ...], float | None],
+) -> list[Senseless]:
+    """Settings of a stage's actions that make little sense in one of its scenes.
+
+    Args:
+        plan: plan of the stage.
+        scene: one of its scenes.
+        pourer, receiver: geometry of the scene's vessels, which hold its load.
+        arm: arm of the laboratory, if it has one.
+        known: landings computed before, which do not depend on the receiver. Filled here.
+    """
+    findings = [_misses(plan.actions, scene, pourer, receiver, known)]
+    if arm is not None and arm.tilt_speed_limit is not None:
+        findings += [
+            _too_fast(plan.actions, scene, name, arm.tilt_speed_limit)
+            for name in ("angular_velocity", "return_velocity")
+        ]
+    return [one for one in findings if one is not None]
+
+
+def _misses(
+    actions: Space, scene: Scene, pourer: Vessel, receiver: Vessel, known: dict[tuple[object, ...], float | None]
+) -> Senseless | None:
+    """An x_offset from which the stream misses the receiver."""
+    half, hits, beside, below = receiver.opening_radius + BESIDE, [], 0.0, False
+    for values in _spread(tuple(axis for axis in actions.axes if axis.name != "x_offset")):
+        try:
+            action = scene.action({"x_offset": 0.0, **values})
+        except ValueError:
+            continue  # no such action, which is reported elsewhere
+        key = (scene.pourer, scene.liquid, scene.pivot, scene.max_hold_time, action)
+        if key not in known:
+            known[key] = _landing(scene, action, pourer, receiver)
+        landing = known[key]
+        if landing is not None and math.isnan(landing):
+            below = True
+        elif landing is not None and abs(action.y_offset) < half:
+            chord = math.sqrt(half**2 - action.y_offset**2)
+            hits.append((landing - chord, landing + chord))
+        elif landing is not None:
+            beside = min(beside or math.inf, abs(action.y_offset))
+    if not hits and below:
+        text = (
+            f"the liquid leaves the lip below the rim of '{scene.receiver.name}'; a larger height would bring it above"
+        )
+        return _where(actions, "height"), text
+    if not hits:
+        if not beside:
+            return None  # no liquid leaves, which is reported elsewhere
+        return (
+            _where(actions, "y_offset"),
+            f"the stream passes {1e3 * beside:.0f} mm beside the axis of '{scene.receiver.name}', whose opening has a "
+            f"radius of {1e3 * receiver.opening_radius:.0f} mm",
+        )
+    low, high = min(low for low, _ in hits), max(high for _, high in hits)
+    axis = next((axis for axis in actions.axes if axis.name == "x_offset"), None)
+    fixed = scene.fixed.get("x_offset")
+    if axis is not None:
+        part = max(0.0, min(high, axis.upper) - max(low, axis.lower)) / (axis.upper - axis.lower)
+        if part >= LEAST:
+            return None
+        share = (
+            "from no x_offset in this range can a stream hit"
+            if part == 0.0
+            else f"only from {100 * part:.0f} % of this range can a stream hit"
+        )
+    elif fixed is not None and not low <= fixed <= high:
+        share = "from this x_offset no stream can hit"
+    else:
+        return None
+    ends = f"{math.ceil(1e3 * low):d} … {math.floor(1e3 * high):d} mm"
+    return (
+        _where(actions, "x_offset"),
+        f"{share} '{scene.receiver.name}': a free jet comes down in it from an x_offset of {ends}",
+    )
+
+
+def _landing(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> float | None:
+    """Where the stream lands if the pourer is above the receiver's axis [m]; None if no liquid leaves.
+
+    NaN if most of the liquid leaves below the receiver's rim.
+    """
+    try:
+        course = flow_course(plan_motion(scene, action, pourer, receiver), scene.liquid, pourer, receiver)
+    except ValueError:
+        return None  # an impossible motion, which is reported elsewhere
+    if course is None:
+        return None
+    return course.landing() if course.quantile(course.fall, 0.5) > 0.0 else math.nan
+
+
+def _too_fast(actions: Space, scene: Scene, name: str, most: float) -> Senseless | None:
+    """A range of speeds whose fastest part the arm refuses."""
+    axis = next((axis for axis in actions.axes if axis.name == name), None)
+    if axis is None or axis.upper <= most * (1.0 + 1e-9):
+        return None
+    middle = {other.name: other.decode(0.5) for other in actions.axes}
+    try:
+        action = scene.action({**middle, name: axis.upper})
+    except ValueError:
+        return None
+    peak = axis.upper
+    if action.angular_acceleration is not None:  # a short rotation does not reach this speed
+        peak = min(peak, math.sqrt(action.max_angle * action.angular_acceleration))
+    if peak <= most * (1.0 + 1e-4):
+        return None
+    unit = ACTION_DIMENSIONS[name]
+    return (
+        _where(actions, name),
+        f"goes up to {axis.upper / unit.factor:.4g} {unit.display_unit}, and the arm turns the pourer at "
+        f"{most / unit.factor:.4g} {unit.display_unit} at most (arm.limits.tilt_speed): faster actions are refused one "
+        "by one. End the range there",
+    )
+
+
+def _where(actions: Space, name: str) -> tuple[Loc, ...]:
+    """Keys that may define an action dimension."""
+    return (("actions", name), ("actions",)) if name in actions.names else (("motion", name),)
+
+
+def _spread(axes: tuple[Axis, ...]) -> list[dict[str, float]]:
+    """The middle, and corners up to the maximum number."""
+    corners = itertools.islice(itertools.product((0.0, 1.0), repeat=len(axes)), MOST_TRIED - 1)
+    points = [(0.5,) * len(axes), *corners] if axes else [()]
+    return [{axis.name: axis.decode(u) for axis, u in zip(axes, point, strict=True)} for point in points]
+
+
+CORNERS, DRAWN = 64, 16
+"""Number of corners and of random actions that are tried, besides the middle, before the whole space counts as
+touching."""
+
+
+@dataclass(frozen=True)
+class _Role:
+    """Role of a scene in a campaign.
+
+    Attributes:
+        text: for messages.
+        section: section of the file that overrides the top level.
+        receiver: places that may name the receiver, the most specific first.
+    """
+
+    text: str
+    section: Loc = ()
+    receiver: tuple[Loc, ...] = ()
+
+    def places(self, *keys: Loc) -> tuple[Loc, ...]:
+        """Places that may contain keys, the most specific first; the section itself comes last."""
+        return (*(self.section + key for key in keys), *keys, self.section)
+
+
+CheckedPlace = tuple[float, float, float]
+
+
+def _place(action: Action) -> CheckedPlace:
+    """Start of a pour, which determines the transfer motion."""
+    return action.x_offset, action.y_offset, action.height
+
+
+def _ignore(findings: object) -> None:
+    """Default callback: does nothing."""
+
+
+@dataclass
+class _Checker:
+    source: Path
+    arm: ArmSettings | None = None
+    gripper: GripperSettings | None = None
+    document: Document | None = None
+    warn: Callable[[Problem], None] = _ignore
+    doing: Callable[[str], None] = _ignore
+    problems: list[Problem] = field(default_factory=list)
+    vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
+    landings: dict[tuple[object, ...], float | None] = field(default_factory=dict)
+
+    def add(self, places: tuple[Loc, ...], text: str) -> None:
+        """Add a problem at the first of these places that exists in the campaign's file."""
+        self.problems.append(self.problem(places, text))
+
+    def problem(self, places: tuple[Loc, ...], text: str) -> Problem:
+        """A problem at the first of these places that exists in the campaign's file."""
+        document = self.document
+        found = None if document is None else next((loc for loc in places if loc in document.marks), None)
+        if document is None or found is None:
+            return Problem(self.source, 0, 0, "", text)
+        return document.problem(found, text)
+
+    def vessel(self, spec: VesselSpec, places: tuple[Loc, ...]) -> Vessel | None:
+        if spec not in self.vessels:
+            where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
+            try:
+                found = self.vessels[spec] = built(spec)
+            except (VesselError, OSError) as error:
+                self.add(places, f"vessel '{spec.name}'{where}: {error}")
+                self.vessels[spec] = None
+            else:
+                for text in found.warnings:
+                    self.warn(self.problem(places, f"vessel '{spec.name}'{where}: {text}"))
+        return self.vessels[spec]
+
+    def scene(
+        self, scene: Scene, role: _Role, wanted: float | None = None, *, dosed: bool = False
+    ) -> tuple[Vessel, Vessel] | None:
+        """The scene's vessels, if both are valid and hold the liquid.
+
+        Args:
+            wanted: volume that the receiver has to hold [m³]; the whole load unless given.
+            dosed: a controller ends the pour at this volume.
+        """
+        places = {"pourer": role.places(("pourer",)), "receiver": (*role.receiver, *role.places(("receiver",)))}
+        pourer = self.vessel(scene.pourer, places["pourer"])
+        receiver = self.vessel(scene.receiver, places["receiver"])
+        if pourer is None or receiver is None:
+            return None
+        ok = self._grippable(pourer, places["pourer"])
+        load = f"the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g)"
+        less = wanted is not None and wanted < scene.liquid.volume
+        for vessel, name in ((pourer, "pourer"), (receiver, "receiver")):
+            what, volume = (
+                (load, scene.liquid.volume) if wanted is None or vessel is pourer else ("what is asked for", wanted)
+            )
+            try:
+                check_holds(vessel, volume)
+            except VesselError as error:
+                ok = False
+                self.add(places[name], f"{role.text}: {name} can't hold {what if less else load}: {error}")
+        if ok and less and not dosed and scene.liquid.volume > receiver.capacity:
+            text = (
+                f"{role.text}: the receiver holds {1e6 * receiver.capacity:.4g} mL, enough for what is asked for, not "
+                f"for {load}: a pour that misses its target may run over"
+            )
+            self.warn(self.problem(places["receiver"], text))
+        return (pourer, receiver) if ok else None
+
+    def reachable(self, plan: CalibrationPlan | DeploymentPlan, scene: Scene, role: _Role) -> None:
+        """At least one action of the space must pour without contact, and the arm must be able to make it."""
+        wanted = plan.wanted(scene) if isinstance(plan, DeploymentPlan) else None
+        vessels = self.scene(scene, role, wanted)
+        self._payload(scene)
+        actions = plan.actions
+        trials = actions_all_over(actions, plan.constraints, corners=CORNERS, drawn=DRAWN)
+        if vessels is None or self._never_pours(scene, trials, vessels[0], role):
+            return
+        first = beyond = ""
+        barred: set[CheckedPlace] = set()
+        for i, chosen in enumerate(trials, start=1):
+            if i > 1:
+                self.doing(f"{role.text}: {len(trials)} actions are tried, none of {i - 1} can be made")
+            try:
+                action = scene.action(chosen)
+                if _place(action) in barred:
+                    continue
+                contact = touch(scene, action, *vessels)
+            except ValueError as error:  # an action out of bounds, or an impossible motion
+                contact = str(error)
+            if contact is None:
+                problem = self._for_the_arm(scene, action, actions, barred)
+                if not problem:
+                    for places, text in senseless(plan, scene, *vessels, self.arm, self.landings):
+                        self.warn(self.problem(role.places(*places), f"{role.text}: {text}"))
+                    return
+                beyond = beyond or problem
+            else:
+                first = first or contact
+        if beyond:
+            text = f"{role.text}: the arm can make none of {len(trials)} actions that were tried; for example {beyond}"
+            self.add(role.places(("actions",)), text)
+            return
+        text = (
+            f"{role.text}: the vessels touch at every action that was tried; for example {first}. "
+            f"A larger x_offset or height would clear them"
+        )
+        self.add(role.places(("actions",)), text)
+
+    def _grippable(self, pourer: Vessel, places: tuple[Loc, ...]) -> bool:
+        """Whether the laboratory's gripper can hold the pourer; if not, a problem is added."""
+        if self.gripper is None or self.arm is None:
+            return True
+        try:
+            grip_limits(pourer, self.gripper, self.arm)
+        except LaboratoryError as error:
+            self.add(places, str(error))
+            return False
+        return True
+
+    def _payload(self, scene: Scene) -> None:
+        """The configured payload of the arm can't be less than the mass of the liquid."""
+        carries = None if self.arm is None else self.arm.payload_limit
+        if carries is None or carries >= scene.liquid.mass:
+            return
+        text = (
+            f"the arm is set to carry {carries * 1e3:g} g (arm.payload), less than the {scene.liquid.name} "
+            f"alone, {scene.liquid.mass * 1e3:g} g; the payload is gripper and filled pourer, in the laboratory's file "
+            "and on the pendant"
+        )
+        self.add((("liquid", "mass"), ("liquid",)), text)
+
+    def _never_pours(self, scene: Scene, trials: Sequence[dict[str, float]], pourer: Vessel, role: _Role) -> bool:
+        """Whether the liquid stays below the lip at the largest tilt of the space; if so, a problem is added."""
+        tilts = []
+        for chosen in trials:
+            try:
+                tilts.append(scene.action(chosen).max_angle)
+            except ValueError:
+                continue  # no such action, which `touch` reports
+        volume = scene.liquid.volume
+        if not tilts or level(pourer, volume, max(tilts)) > 0.0:
+            return False
+        steps = np.radians(np.arange(math.ceil(math.degrees(max(tilts))), 181))
+        lip = next((math.degrees(tilt) for tilt in steps if level(pourer, volume, float(tilt)) > 0.0), None)
+        when = "never reaches the lip" if lip is None else f"reaches the lip at {lip:.0f} deg; raise max_angle"
+        text = (
+            f"{role.text}: no action that was tried pours anything: max_angle is at most "
+            f"{math.degrees(max(tilts)):.4g} deg, and the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g) {when}"
+        )
+        self.add(role.places(("actions", "max_angle"), ("motion", "max_angle")), text)
+        return True
+
+    def _for_the_arm(self, scene: Scene, action: Action, actions: Space, barred: set[CheckedPlace]) -> str:
+        """Reason why the laboratory's arm can't make the action; '' if it can or there is no arm.
+
+        Args:
+            barred: places that the arm can't reach from home with any motion. Filled here.
+        """
+        if self.arm is None:
+            return ""
+        try:
+            arm_kind(self.arm).plan(scene, action)
+        except InvalidActionError as error:
+            if isinstance(error, UnreachablePlaceError):
+                barred.add(_place(action))
+            return f"{action.display(*actions.names)}: {error}"
+        return ""
+
+    def doses(self, plan: DispensePlan, *, simulated: bool) -> None:
+        """Every dose must fit into its receiver and come out of a full source."""
+        for scene in plan.scenes:
+            doses = [one for one in plan.doses if one.receiver == scene.receiver.name]
+            largest = max((one.amount + one.limit for one in doses), default=0.0)
+            role = _Role(f"doses from '{scene.pourer.name}' into '{scene.receiver.name}'", ("dispense",))
+            if self.scene(scene, role, largest / scene.liquid.density, dosed=True) is None:
+                continue
+            if simulated:
+                try:
+                    check_straight(scene)
+                except InvalidActionError as error:
+                    self.add(role.places(("sources",), ("pourer",)), f"{role.text}: {error}")
+            elif self.arm is not None:
+                if not arm_kind(self.arm).doses:
+                    self.add(role.places(), f"an arm of the kind '{self.arm.kind}' can't pour wanted amounts")
+                    continue
+                try:
+                    arm_kind(self.arm).plan(scene, scene.action({}))
+                except InvalidActionError as error:
+                    self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {error}")
+        full = min(scene.liquid.mass for scene in plan.scenes)
+        for i, dose in enumerate(plan.doses):
+            if dose.amount + dose.limit + plan.refill_below >= full:
+                text = (
+                    f"a full source holds {1e3 * full:g} g, and the dose, its tolerance and refill_below need "
+                    f"{1e3 * (dose.amount + dose.limit + plan.refill_below):g} g"
+                )
+                self.add((("dispense", "doses", i, "amount"), ("dispense", "doses")), text)
+
+    def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
+        """Recorded pours were possible: if their vessels touch, the description of the scene is wrong."""
+        vessels = self.scene(scene, role)
+        if vessels is None:
+            return
+        # Sorted by place: pours with the same place and maximum tilt have the same poses.
+        seen = set()
+        for action in recorded:
+            at = (action.x_offset, action.y_offset, action.height)
+            tilts = [a.max_angle for a in recorded if (a.x_offset, a.y_offset, a.height) == at]
+            if at in seen or action.max_angle < max(tilts):
+                continue
+            seen.add(at)
+            contact = touch(scene, action, *vessels)
+            if contact is not None:
+                shown = action.display("x_offset", "height", "max_angle")
+                text = (
+                    f"{role.text}: a recorded pour ({shown}) could not have been made: {contact}. Is the scene right?"
+                )
+                self.add((place, role.section), text)
+                return
+
+
+def _assumed(plan: CampaignPlan) -> Iterator[tuple[Loc, str]]:
+    """What was assumed about the files of weighed pours, with the keys that name them."""
+    if plan.calibration is not None and plan.calibration.records is not None:
+        yield ("calibration", "pours", "from"), plan.calibration.records.assumed
+    if plan.calibration is not None and plan.calibration.transfer is not None:
+        yield ("calibration", "pours", "transfer", "from"), plan.calibration.transfer.assumed
+    if plan.deployment is not None and plan.deployment.data is not None:
+        yield ("deployment", "data", "from"), plan.deployment.data.assumed
+
+
+def check_campaign(
+    plan: CampaignPlan,
+    *,
+    as_written: bool = True,
+    warn: Callable[[Problem], None] = _ignore,
+    doing: Callable[[str], None] = _ignore,
+) -> list[Problem]:
+    """Build the vessels of a campaign and try its actions.
+
+    Also checks that the output folder can be created. For every scene:
+
+    - Both vessels can be built and hold the liquid.
+    - Some action of the space tilts far enough for the liquid to leave.
+    - Some action avoids contact between the vessels, and the laboratory's arm can make it. The middle, corners and a
+      few random actions are tried.
+    - Recorded pours avoid contact.
+
+    Args:
+        plan: plan of the campaign.
+        as_written: whether its vessels are those of its file; otherwise places in the file would be misleading.
+        warn: called with settings that can run but make little sense.
+        doing: called with a description of each slow step.
+
+    Returns:
+        Problems, with their places if the campaign's file has them; empty if the campaign can start.
+    """
+    try:
+        document = Document.read(plan.source) if as_written else None
+    except ConfigError:
+        document = None  # a plan without a file
+    checker = _Checker(plan.source, plan.laboratory.arm, plan.laboratory.gripper, document, warn, doing)
+    at: Loc
+    if (problem := why_not_writable(plan.outputs.folder)) is not None:
+        checker.add((("outputs", "directory"),), problem)
+    for at, assumed in _assumed(plan):
+        if assumed:
+            warn(checker.problem((at,), assumed))
+    if plan.calibration is not None:
+        calibration, section = plan.calibration, ("calibration",)
+        if calibration.records is None:
+            for scene in calibration.poured:
+                checker.reachable(calibration, scene, _Role("calibration", section))
+        else:
+            pours, at = calibration.records.pours, ("calibration", "pours")
+            checker.recorded(calibration.scene, [p.action for p in pours], _Role("calibration.pours", section), at)
+        if calibration.transfer is not None:
+            transfer, at = calibration.transfer, ("calibration", "pours", "transfer")
+            role = _Role("calibration.pours.transfer", section, ((*at, "receiver"),))
+            checker.recorded(transfer.scene, [p.action for p in transfer.pours], role, at)
+    if plan.deployment is not None:
+        for i, scene in enumerate(plan.deployment.scenes):
+            receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
+            role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
+            checker.reachable(plan.deployment, scene, role)
+    if plan.laboratory.pump is not None:
+        for key, stage in (("calibration", plan.calibration), ("deployment", plan.deployment)):
+            if stage is not None:
+                checker.add(((key,),), f"needs an arm; laboratory '{plan.laboratory.name}' doses with a pump")
+    if plan.dispense is not None:
+        balance = plan.laboratory.balance
+        if plan.laboratory.dispenses and (balance is None or balance.placement not in ("receiver", "everything")):
+            text = (
+                f"laboratory '{plan.laboratory.name}': wanted amounts need a connected balance under the receiver; "
+                "write 'balance: {placement: receiver}' and set it up so"
+            )
+            checker.add((("dispense",), ("laboratory",)), text)
+        checker.doses(plan.dispense, simulated=not plan.laboratory.dispenses)
+    return list(dict.fromkeys(checker.problems))
+
+
+def check_vessels(
+    scene: Scene, source: Path, wanted: float | None = None, *, warn: Callable[[Problem], None] = _ignore
+) -> list[Problem]:
+    """Build the vessels of one scene.
+
+    Args:
+        scene: the scene.
+        source: the campaign's file.
+        wanted: volume that the receiver has to hold [m³]; the whole load unless given.
+        warn: called with what makes a vessel doubtful.
+
+    Returns:
+        Problems: a vessel that is invalid, or can't hold the load.
+    """
+    checker = _Checker(source, warn=warn)
+    checker.scene(scene, _Role(f"{scene.pourer.name} into {scene.receiver.name}"), wanted)
+    return checker.problems
+
+
+def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str | None:
+    """Place where the vessels touch during an action, as text; None if they do not touch.
+
+    Raises:
+        ValueError: the motion can't be made.
+    """
+    motion = plan_motion(scene, action, pourer, receiver)
+    found = contact_during(motion, pourer, receiver)
+    if found is None:
+        return None
+    contact, tilt = found
+    return describe_contact(
+        contact, tilt=tilt, pourer=f"pourer '{scene.pourer.name}'", receiver=f"receiver '{scene.receiver.name}'"
+    )

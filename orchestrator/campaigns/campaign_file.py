@@ -1,0 +1,426 @@
+"""File sections of a campaign: keys, types, defaults and their descriptions.
+
+`CampaignFile` is the whole file. Sections of calibration and deployment combine the common keys with the settings of
+each installed strategy. The classes only describe the file; `orchestrator.campaigns.campaign_resolution` converts them
+to a plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import Field, create_model
+
+from actors.laboratory_settings import LaboratorySettings
+from orchestrator.campaigns.search_ranges import Actions, Motion, Parameters
+from orchestrator.campaigns.vessel_file import VesselFile
+from orchestrator.learning.campaign_plan import (
+    CalibrationSettings,
+    DeploymentSettings,
+    Design,
+    OutputSettings,
+    StrategySettings,
+)
+from orchestrator.learning.strategy_registry import OBJECTIVES, STRATEGIES, calibrations, deployments
+from sim_engine.liquids import LiquidSettings
+from sim_engine.outcome import Loss
+from sim_engine.settings.model import (
+    Example,
+    FilePath,
+    Name,
+    PathOr,
+    PositiveCount,
+    PositivePourCount,
+    PositiveSimulationCount,
+    PourCount,
+    Problems,
+    Seed,
+    Settings,
+    SimulationCount,
+    Switch,
+    Text,
+    tagged,
+)
+from sim_engine.settings.quantity import Quantity
+
+
+class PoursFromFile(Settings):
+    """Weighed pours in a file."""
+
+    source: FilePath | None = Field(default=None, alias="from")
+    """Table of weighed pours (CSV or .xlsx), with a column `split`."""
+
+    lip_radius: Annotated[float, Quantity("m", "40 mm", 0.0, 0.5)] | None = None
+    """The pourer's inner radius at the lip, if the file has lip_to_receiver_axis_mm instead of x_offset_mm."""
+
+    columns: dict[Text, Text] = Field(default_factory=dict)
+    """Columns that have another name in the file: {Decant's name: name in the file}."""
+
+    def check_exclusive(self, problems: Problems, keys: Sequence[str], text: str) -> None:
+        """Refuse keys that have a value."""
+        for key in keys:
+            if self.value(key) not in (None, {}):
+                problems.add(text, key, key=True)
+
+
+class TransferSettings(Settings):
+    """Weighed pours in another scene, used only to evaluate the calibration."""
+
+    source: Annotated[FilePath, Example("transfer.csv")] = Field(alias="from")
+    """Table of weighed pours (CSV or .xlsx)."""
+
+    receiver: Annotated[PathOr[VesselFile], Example("cone.yaml")]
+    """Receiver of these pours."""
+
+    motion: Motion | None = None
+    """Values of the motion that differ from calibration's."""
+
+
+class PoursSettings(PoursFromFile):
+    """Pours to calibrate on: to be made (`count`), or weighed already (`from`, `from_run`)."""
+
+    count: PositivePourCount | None = None
+    """Pours to make on the bench."""
+
+    holdout: PourCount | None = None
+    """Number of these pours that are kept for testing; an eighth unless given."""
+
+    design: Design = "stratified"
+    """stratified: spread evenly over the actions; active: each chosen by its information about the deployment."""
+
+    simulations: PositiveSimulationCount | None = None
+    """active: simulations to estimate that information; 64 unless given."""
+
+    holdout_receivers: list[PathOr[VesselFile]] | None = None
+    """Receivers for the test pours, used in turn: they measure how well calibration transfers to other vessels."""
+
+    from_run: FilePath | None = None
+    """Folder of a previous run: its weighed pours in the same scene, with their splits."""
+
+    transfer: TransferSettings | None = None
+    """Weighed pours in another scene, used only for evaluation."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that the pours are from one source, and that some are left to fit."""
+        if self.source is None:
+            text = "belongs to pours that are read 'from' a CSV file"
+            self.check_exclusive(problems, ("lip_radius", "transfer", "columns"), text)
+        if self.source is not None or self.from_run is not None:
+            origin = "a file" if self.source is not None else "a run"
+            text = f"belongs to pours that are still to be made; these are read 'from' {origin}"
+            active = ("design",) if self.design == "active" else ()
+            self.check_exclusive(problems, ("count", "holdout", "holdout_receivers", *active, "simulations"), text)
+            if self.source is not None and self.from_run is not None:
+                problems.add("stands beside 'from'; keep one of them", "from_run", key=True)
+            return
+        if self.simulations is not None and self.design != "active":
+            problems.add("belongs to 'design: active'; remove it, or add that", "simulations", key=True)
+        if self.count is None and problems.valid("count", "from", "from_run"):
+            text = "needs 'count' (pours to make on the bench), 'from' (a CSV file of weighed pours) or 'from_run'"
+            problems.add(text, key=True)
+        if self.count is not None and self.held_out >= self.count:
+            text = f"keeps {self.held_out} of {self.count} pours for testing, so that none is left to fit"
+            problems.add(text, "holdout")
+
+    @property
+    def held_out(self) -> int:
+        """Number of pours to be made that are kept for testing."""
+        count = self.count or 0
+        return max(1, count // 8) if self.holdout is None and count > 1 else self.holdout or 0
+
+    @property
+    def design_simulations(self) -> int:
+        """Number of simulations that an active design spends on its choice."""
+        return (self.simulations or 64) if self.design == "active" and self.count else 0
+
+
+class StageSettings(Settings):
+    """Keys of calibration and deployment that replace those of the campaign."""
+
+    pourer: PathOr[VesselFile] | None = None
+    """Pourer; the campaign's unless given."""
+
+    receiver: PathOr[VesselFile] | None = None
+    """Receiver; the campaign's unless given."""
+
+    receivers: list[PathOr[VesselFile]] | None = None
+    """Several receivers: calibration pours alternate between them, deployment treats one after the other."""
+
+    motion: Motion | None = None
+    """Values that differ from the campaign's `motion`."""
+
+    actions: Actions | None = None
+    """Searched dimensions; the campaign's `actions` unless given."""
+
+
+class CalibrationSection(StageSettings):
+    """Common keys of every calibration, which finds the simulation parameters that reproduce the weighed spillage."""
+
+    pours: Annotated[PoursSettings, Example("{count: 32, holdout: 4}")]
+    """Pours to calibrate on."""
+
+    random_baseline: SimulationCount = 0
+    """Number of random parameter sets that are evaluated for comparison."""
+
+    @property
+    def settings(self) -> CalibrationSettings:
+        """The strategy's own settings."""
+        return settings_in(self, CalibrationSettings)  # type: ignore[type-abstract]
+
+
+class DataSettings(PoursFromFile):
+    """Pours from before the campaign that deployment uses as data: from a file, or from a previous run."""
+
+    source: FilePath | None = Field(default=None, alias="from")
+    """Table of weighed pours (CSV or .xlsx), with the columns of calibration's `pours`; `split` may be left out."""
+
+    run: FilePath | None = None
+    """Folder of a previous run: its weighed pours in the same scenes, from any stage."""
+
+    receiver: Text | None = None
+    """Name of the receiver of the file's pours, if there are several receivers."""
+
+    counts: Switch = False
+    """Whether these pours count against the budget."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that the pours are from one source."""
+        if self.source is not None and self.run is not None:
+            problems.add("stands beside 'from'; keep one of them", "run", key=True)
+        elif self.run is not None:
+            text = "belongs to a CSV file; a run knows it"
+            self.check_exclusive(problems, ("receiver", "lip_radius", "columns"), text)
+        elif self.source is None and problems.valid("from", "run"):
+            text = "needs 'from' (a CSV file of weighed pours) or 'run' (the folder of a former run)"
+            problems.add(text, key=True)
+
+
+AnyObjective: Any = tagged(OBJECTIVES.all)
+
+
+class DeploymentSection(StageSettings):
+    """Common keys of every deployment, which finds actions for vessels that calibration did not use."""
+
+    loss: Loss | None = None
+    """Loss that is minimised."""
+
+    objectives: list[AnyObjective] | None = None
+    """Several objectives instead of a loss."""
+
+    pareto: Switch | None = None
+    """Search for all Pareto-optimal actions; the weights then choose one of them."""
+
+    floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] | None = None
+    """Minimum share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless
+    given."""
+
+    confirm: PourCount = 0
+    """Pours of the recommended action at the end, which measure its outcome and do not influence the choice."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that the objectives replace the loss, and that each is named once."""
+        super().check_values(problems)
+        if self.objectives is None:
+            for key in ("pareto", "floor"):
+                if self.value(key) is not None and problems.valid("objectives"):
+                    problems.add("belongs to 'objectives'; name some, or remove it", key, key=True)
+            return
+        if self.loss is not None:
+            problems.add("stands beside 'objectives'; keep one of them", "loss", key=True)
+        if not self.objectives:
+            problems.add("is empty; name at least one, for example '- {name: spillage}'", "objectives")
+        if self.pareto and len(self.objectives) == 1:
+            problems.add("needs two objectives that can't both be had", "pareto", key=True)
+        names = [part.name for part in self.objectives]
+        for i, name in enumerate(names):
+            if name in names[:i] and problems.within("objectives", i).valid("name"):
+                problems.add(f"{name} stands twice in the list; keep one of them", "objectives", i)
+
+    @property
+    def settings(self) -> DeploymentSettings:
+        """The strategy's own settings."""
+        return settings_in(self, DeploymentSettings)  # type: ignore[type-abstract]
+
+
+class LearningSettings(DeploymentSection):
+    """A deployment that learns from real pours."""
+
+    data: DataSettings | None = None
+    """Pours from before the campaign."""
+
+
+T = TypeVar("T", bound=StrategySettings)
+
+
+def settings_in(section: Settings, kind: type[T]) -> T:
+    """The settings of a section's strategy, without the keys that all strategies have."""
+    model = next(base for base in type(section).__mro__ if issubclass(base, kind) and base in STRATEGIES.all.values())
+    values = {name: getattr(section, name) for name in model.model_fields}
+    return model.model_construct(section.model_fields_set & model.model_fields.keys(), **values)
+
+
+def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Settings]) -> dict[str, type[Settings]]:
+    """The sections of all strategies: their settings, with the common keys of their kind."""
+    found: dict[str, type[Settings]] = {}
+    for name, own in settings.items():
+        learns = issubclass(own, DeploymentSettings) and own.learns_on_pours
+        bases = (own, LearningSettings if learns else base)
+        found[name] = create_model(f"{name}Settings", __base__=bases, __doc__=own.__doc__)
+        found[name].required = own.required | base.required
+    return found
+
+
+CALIBRATIONS = _variants(calibrations(), CalibrationSection)
+DEPLOYMENTS = _variants(deployments(), DeploymentSection)
+"""Sections of all installed strategies, by name."""
+
+AnyCalibration: Any = tagged(CALIBRATIONS)
+AnyDeployment: Any = tagged(DEPLOYMENTS)
+
+
+DoseAmount = Annotated[float, Quantity("kg", "50 g", 0.0, 10.0, positive=True)]
+
+
+class DoseSettings(Settings):
+    """One wanted amount."""
+
+    amount: Annotated[DoseAmount, Example("50 g")]
+    """Wanted in the receiver."""
+
+    position: Text | None = None
+    """Name of the receiver's place; the operator puts this receiver on the balance."""
+
+    tolerance: DoseAmount | None = None
+    """Excess to avoid; the series' unless given."""
+
+    receiver: PathOr[VesselFile] | None = None
+    """Receiver; the campaign's unless given."""
+
+
+class DispenseSettings(Settings):
+    """A series of wanted amounts: the tilt of each dose is decided from the balance while the liquid flows."""
+
+    doses: Annotated[list[DoseSettings], Example("[{amount: 50 g, position: A1}]")]
+    """The amounts, with their receivers."""
+
+    order: Literal["listed", "largest_first"] = "listed"
+    """Order of pouring."""
+
+    tolerance: DoseAmount = 1e-3
+    """Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %."""
+
+    sources: list[PathOr[VesselFile]] | None = None
+    """Source vessels, in the order of use, each with the campaign's liquid; the campaign's pourer unless given."""
+
+    refill_below: Annotated[float, Quantity("kg", "80 g", 0.0, 10.0)] = 0.0
+    """A source that would hold less than this after a dose is filled before."""
+
+    start: Literal["filled", "as_left"] = "filled"
+    """Whether the sources are filled at the beginning, or hold what earlier runs in this laboratory have left."""
+
+    motion: Motion | None = None
+    """Values that differ from the campaign's `motion`."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that there are doses, and that each is larger than its tolerance."""
+        if problems.valid("doses") and not self.doses:
+            problems.add("is empty; name at least one, for example '- {amount: 50 g}'", "doses")
+        for i, dose in enumerate(self.doses or ()):
+            limit = self.tolerance if dose.tolerance is None else dose.tolerance
+            if dose.amount is not None and limit is not None and dose.amount <= limit:
+                problems.add("should be larger than the tolerance", "doses", i, "amount")
+        if self.sources is not None and not self.sources:
+            problems.add("is empty; name at least one vessel, or remove it", "sources")
+
+
+class SimulatorSettings(Settings):
+    """The simulator."""
+
+    parameters: Parameters | None = None
+    """Parameters θ: a value fixes one, a range makes calibration search it; the others have their defaults."""
+
+
+class CampaignFile(Settings):
+    """A campaign: calibrate the simulator, deploy with the calibrated parameters, pour wanted amounts, or several."""
+
+    name: Annotated[Name, Example("narrow-cup")]
+    """Its name in run directories and figures."""
+
+    seed: Seed = 0
+    """Seed of every random choice: same campaign, seed and outcomes → same requests."""
+
+    laboratory: Annotated[PathOr[LaboratorySettings], Example("../laboratories/virtual.yaml")]
+    """Laboratory in which it runs."""
+
+    liquid: Annotated[PathOr[LiquidSettings], Example("{name: water, mass: 200 g}")]
+    """Liquid that is poured."""
+
+    pourer: PathOr[VesselFile] | None = None
+    """The vessel that the robot holds."""
+
+    receiver: PathOr[VesselFile] | None = None
+    """The vessel on the table."""
+
+    receivers: list[PathOr[VesselFile]] | None = None
+    """Several receivers for deployment, one after the other."""
+
+    motion: Motion | None = None
+    """Values of the motion that are not searched, for all sections."""
+
+    actions: Actions | None = None
+    """Searched dimensions, for sections without their own."""
+
+    simulator: SimulatorSettings = SimulatorSettings()
+    """The simulator."""
+
+    calibration: AnyCalibration | None = None
+    """Calibration: find the simulation parameters that reproduce the weighed spillage."""
+
+    deployment: AnyDeployment | None = None
+    """Deployment: find actions for vessels that calibration did not use."""
+
+    dispense: DispenseSettings | None = None
+    """A series of wanted amounts."""
+
+    on_unknown: Literal["ask", "repeat"] = "ask"
+    """Treatment on resume of a pour that had started and has no outcome; 'repeat' on a virtual bench only."""
+
+    parallel_simulations: Annotated[PositiveCount, Field(le=256)] = 2
+    """Logical slots for parallel simulations, independent of the machine: the same seed gives the same requests on any
+    machine."""
+
+    outputs: OutputSettings = OutputSettings()
+    """Outputs in addition to the journal."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that there is something to do, and that calibration searches the ranges of parameters."""
+        calibration, stages = self.calibration, problems.valid("calibration", "deployment", "dispense")
+        if calibration is None and self.deployment is None and self.dispense is None and stages:
+            problems.add("there is nothing to do; add a 'calibration', a 'deployment' or a 'dispense' section")
+        ranges = {} if self.simulator.parameters is None else self.simulator.parameters.ranges()
+        at = ("simulator", "parameters")
+        inner = problems.within(*at)
+        if calibration is None and problems.valid("calibration"):
+            for name in ranges:
+                if inner.valid(name):
+                    text = "is a range, and nothing searches it; write one value, or add a 'calibration' section"
+                    inner.add(text, name)
+        if calibration is None:
+            return
+        if not ranges and problems.within("simulator").valid("parameters"):
+            text = (
+                "has nothing to search; give a range to at least one of simulator.parameters, for example "
+                "'cohesion: [0 N/m, 0.1 N/m]'"
+            )
+            problems.within("calibration").add(text, key=True)
+        if not calibration.settings.has_prior:
+            text = f"belongs to {owners_of_priors()}; {calibration.strategy} takes all values for alike. Write a range"
+            for name, section in ranges.items():
+                if section.measured is not None:
+                    inner.add(text, name, "measured", key=True)
+
+
+def owners_of_priors() -> str:
+    """Names of the calibrations that average over a prior."""
+    return " and ".join(name for name, settings in calibrations().items() if settings.has_prior)

@@ -1,0 +1,389 @@
+"""Converts a campaign's file to a plan and checks the combinations of its keys.
+
+- `resolve_campaign` is the entry point.
+- `resolve_calibration` determines scenes, pours, budgets and priors of the calibration.
+- `resolve_deployment` determines scenes, budgets, loss and existing data of the deployment.
+
+Sections are validated before (`orchestrator.campaigns.yaml.section_validation`); vessels are not built here.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from actors.laboratory_settings import LaboratorySettings
+from actors.optimizer.questions import Linear
+from orchestrator.campaigns.campaign_file import (
+    CalibrationSection,
+    CampaignFile,
+    DeploymentSection,
+    DispenseSettings,
+    LearningSettings,
+    PoursSettings,
+    StageSettings,
+    owners_of_priors,
+)
+from orchestrator.campaigns.run_snapshot import as_file
+from orchestrator.campaigns.scene_builder import SceneBuilder
+from orchestrator.campaigns.search_ranges import ParametersBase
+from orchestrator.campaigns.weighed_pours import read_table, records_of_run, resolve_data, resolve_records
+from orchestrator.campaigns.yaml.file_access import resolved
+from orchestrator.campaigns.yaml.references import References
+from orchestrator.campaigns.yaml.section_validation import PlacedProblems
+from orchestrator.campaigns.yaml.yaml_source import Place, Report
+from orchestrator.learning.campaign_plan import (
+    CalibrationPlan,
+    CampaignPlan,
+    DeploymentPlan,
+    DispensePlan,
+    NormalPrior,
+    PlannedDose,
+    Premises,
+)
+from orchestrator.learning.deployment.objectives import STOPS, Objectives
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
+from sim_engine.scene import Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.vessel.shapes import VesselSpec
+
+
+@dataclass(frozen=True)
+class StageGround:
+    """What calibration and deployment have in common: vessels, actions, and the scenes made of them."""
+
+    builder: SceneBuilder
+    section: StageSettings
+    place: Place
+    pourer: VesselSpec | None
+    receivers: list[VesselSpec | None]
+    actions: Space | None
+    constraints: tuple[Linear, ...]
+
+    @classmethod
+    def of(cls, section: StageSettings, builder: SceneBuilder, place: Place, *, inherit: bool) -> StageGround:
+        """Resolve the vessels and actions of a section; `inherit` includes the campaign's `receivers`."""
+        pourer = builder.pourer(section.pourer, place)
+        receivers = builder.receivers(section, place, inherit=inherit)
+        actions = builder.space(section.actions, section.motion, place)
+        constraints = builder.constraints(section.actions, place, actions)
+        return cls(builder, section, place, pourer, receivers, actions, constraints)
+
+    @property
+    def motions(self) -> tuple[tuple[Any, Place], ...]:
+        """The sections that replace the campaign's motion."""
+        return ((self.section.motion, self.place.at("motion")),)
+
+    def scene(self, name: str, receiver: VesselSpec | None, **options: Any) -> Scene | None:
+        """A scene with one of the receivers; `options` as in `SceneBuilder.scene`."""
+        searched = () if self.actions is None else self.actions.names
+        return self.builder.scene(name, self.pourer, receiver, self.motions, searched, self.place, **options)
+
+
+def _objectives(
+    section: DeploymentSection, place: Place, scene: Scene, actions: Space, report: Report
+) -> Objectives | None:
+    """The objectives that replace a loss; None if none are given."""
+    if section.objectives is None:
+        return None
+    names = [part.name for part in section.objectives]
+    for i, part in enumerate(section.objectives):
+        if not report.is_broken(place.at("objectives", i, "name")):
+            beside = frozenset(names[:i] + names[i + 1 :])
+            part.check(scene, actions, beside, PlacedProblems(place.at("objectives", i), report))
+    floor = 0.5 if section.floor is None else section.floor
+    return Objectives(tuple(section.objectives), floor, bool(section.pareto))
+
+
+def resolve_deployment(
+    section: DeploymentSection, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
+) -> DeploymentPlan | None:
+    """The plan of a deployment. Problems are added to the report; the plan may then be None."""
+    report, settings = builder.report, section.settings
+    known = not report.is_broken(place.at("strategy"))
+    ground = StageGround.of(section, builder, place, inherit=True)
+    actions = ground.actions
+    why = "is what calibration averages over; deployment looks for the best action"
+    builder.refuse_prior(section.actions, place, why)
+    if known:
+        problems = PlacedProblems(place, report, frozenset(DeploymentSection.model_fields))
+        settings.check(Premises(actions, section.objectives is not None), problems)
+    if settings.pours and laboratory is not None and not laboratory.pours:
+        at = place.at("pours") if "pours" in settings.model_fields_set else place
+        hint = "name one with a bench" if settings.learns_on_pours else "'pours: 0' only plans"
+        report.add(at, f"laboratory '{laboratory.name}' has no bench to pour on; {hint}")
+    elif section.confirm and laboratory is not None and not laboratory.pours:
+        text = f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench, or remove it"
+        report.add(place.at("confirm"), text)
+    loss = section.loss or Loss()
+    if actions is not None and section.objectives is None:
+        _check_that_pouring_pays(loss, actions, place.at("loss"), report)
+    scenes = []
+    for receiver in ground.receivers or [None]:
+        name = "deployment" if receiver is None else f"deployment-{receiver.name}"
+        scene = ground.scene(name, receiver, recorded=settings.pours == 0 and not section.confirm)
+        if scene is None:
+            return None  # one cause, one message
+        scenes.append(scene)
+    if actions is None or not known:
+        return None
+    data = None
+    if isinstance(section, LearningSettings) and section.data is not None:
+        data = resolve_data(section.data, place.at("data"), tuple(scenes), actions, laboratory, report)
+    return DeploymentPlan(
+        settings=settings,
+        scenes=tuple(scenes),
+        actions=actions,
+        loss=loss,
+        data=data,
+        objectives=_objectives(section, place, scenes[0], actions, report),
+        constraints=ground.constraints,
+        confirm=section.confirm,
+    )
+
+
+def _check_that_pouring_pays(loss: Loss, actions: Space, place: Place, report: Report) -> None:
+    """If a pour can stop before any liquid leaves, stopping early must not be the optimum."""
+    stops = [name for name in STOPS if name in actions.names]
+    if not stops or (loss.name == "spilled_and_retained" and loss.retained_weight != 0.0):
+        return
+    at, what = (
+        (place.at("retained_weight"), "with 0 the loss")
+        if loss.name == "spilled_and_retained"
+        else (place.at("name"), f"'{loss.name}'")
+    )
+    report.add(
+        at,
+        f"{what} is least where next to nothing is poured, and with {' and '.join(stops)} searched a pour can stop so "
+        f"early; fix {' and '.join(stops)} under motion, use spilled_and_retained with a retained_weight above 0, or "
+        "'objectives' with their 'floor'",
+    )
+
+
+def resolve_calibration(
+    section: CalibrationSection,
+    builder: SceneBuilder,
+    fixed: dict[str, float],
+    searched: dict[str, Axis],
+    place: Place,
+    laboratory: LaboratorySettings | None,
+    known: tuple[NormalPrior, ...] = (),
+) -> CalibrationPlan | None:
+    """The plan of a calibration. Problems are added to the report; the plan may then be None.
+
+    Args:
+        fixed: parameters that are not searched, by name.
+        searched: axes of the searched parameters, by name.
+        place: place of the section.
+        known: priors of searched parameters.
+    """
+    report, at = builder.report, place.at("pours")
+    ground = StageGround.of(section, builder, place, inherit=False)
+    actions, receivers = ground.actions, ground.receivers
+    prior = _prior(section, builder, place, actions, ground.constraints)
+    pours: PoursSettings = section.pours or PoursSettings()  # a draft may lack it, which is reported
+    table = read_table(pours, pours.source, at.at("from"), builder)
+    scene = ground.scene(
+        "calibration",
+        receivers[0] if receivers else None,
+        recorded=pours.source is not None or pours.from_run is not None,
+        constants={} if table is None else table.constants(),
+        unread=table is None and (pours.source is not None or report.is_broken(at.at("from"))),
+    )
+    further = [
+        ground.scene(f"calibration-{other.name}", other)
+        for other in receivers[1:]
+        if other is not None and scene is not None
+    ]
+    if further and pours.source is not None:
+        text = "stands beside pours that are read 'from' a file, which were made into one; keep 'receiver'"
+        report.add(place.at("receivers"), text, key=True)
+    tested: list[Scene | None] = []
+    for i, value in enumerate(pours.holdout_receivers or ()):
+        vessel = builder.references.vessel(value, at.at("holdout_receivers", i))
+        if vessel is not None and scene is not None:
+            name = f"calibration-{vessel.name}"
+            if name in {other.name for other in (*further, *tested) if other is not None}:
+                report.add(at.at("holdout_receivers", i), f"'{vessel.name}' is poured into already")
+            tested.append(ground.scene(name, vessel))
+    others = tuple(other for other in further if other is not None)
+    unseen = tuple(other for other in tested if other is not None)
+    records = transfer = None
+    if pours.source is not None:
+        records, transfer = resolve_records(pours, at, builder, table, actions, scene, ground.pourer, ground.motions)
+    elif pours.from_run is not None:
+        if scene is not None and actions is not None:
+            records = records_of_run(
+                pours.from_run, at.at("from_run"), (scene, *others, *unseen), actions, laboratory, report
+            )
+    elif pours.count and laboratory is not None and not laboratory.pours:
+        text = f"laboratory '{laboratory.name}' has no bench to pour on; name a CSV file with 'from'"
+        report.add(at.at("count"), text)
+    made = pours.source is None and pours.from_run is None
+    count, holdout = (pours.count or 0, pours.held_out) if made else (0, 0)
+    settings = None
+    if not report.is_broken(place.at("strategy")):
+        train = count - holdout if records is None else records.training_pours
+        problems = PlacedProblems(place, report, frozenset(CalibrationSection.model_fields))
+        settings = section.settings.settled(tuple(searched), train, problems)
+    if scene is None or len(others) < len(receivers) - 1 or actions is None or settings is None or not searched:
+        return None
+    return CalibrationPlan(
+        settings=settings,
+        scene=scene,
+        actions=actions,
+        constraints=ground.constraints,
+        prior=prior,
+        parameters=Space(tuple(searched.values())),
+        fixed_parameters=fixed,
+        pour_count=count,
+        holdout=holdout,
+        records=records,
+        transfer=transfer,
+        random_baseline=section.random_baseline,
+        parameter_prior=known,
+        further=others,
+        tested=unseen,
+        design=pours.design,
+        design_simulations=pours.design_simulations if made else 0,
+    )
+
+
+DOSE_MOTION = {"angular_velocity": math.radians(115.0), "max_angle": math.radians(110.0)}
+"""Fastest tilt and range of a dose, where the motion does not limit them."""
+
+PUMP_PLACE = {"x_offset": 0.0, "height": 0.1}
+"""Place of the source of a pump in its scenes; nothing moves there."""
+
+
+def resolve_dispense(
+    section: DispenseSettings, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
+) -> DispensePlan | None:
+    """The plan of a series of doses. Problems are added to the report; the plan may then be None."""
+    report = builder.report
+    if laboratory is not None and not laboratory.pours:
+        report.add(place, f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench", key=True)
+    pourers: list[VesselSpec | None] = (
+        [builder.pourer(None, place)]
+        if section.sources is None
+        else [builder.references.vessel(one, place.at("sources", i)) for i, one in enumerate(section.sources)]
+    )
+    receivers: dict[str, VesselSpec | None] = {}
+    doses = []
+    for i, dose in enumerate(section.doses or ()):
+        vessel = builder.receiver(dose.receiver, place.at("doses", i))
+        if vessel is None or dose.amount is None:
+            continue
+        if receivers.setdefault(vessel.name, vessel) != vessel:
+            report.add(place.at("doses", i), f"two different receivers are both called '{vessel.name}'")
+        limit = section.tolerance if dose.tolerance is None else dose.tolerance
+        doses.append(PlannedDose(dose.amount, limit, vessel.name, dose.position or ""))
+    names = [one.name for one in pourers if one is not None]
+    if len(set(names)) < len(names):
+        report.add(place.at("sources"), "two sources have the same name; give each vessel its own")
+    if report.problems or laboratory is None:
+        return None
+    given: set[str] = set()
+    for motion in (builder.file.motion, section.motion):
+        given |= set() if motion is None else set(motion.fixed())
+    usual = DOSE_MOTION if laboratory.pump is None else DOSE_MOTION | PUMP_PLACE
+    constants = {name: value for name, value in usual.items() if name not in given}
+    scenes = []
+    for pourer, (name, receiver) in itertools.product(pourers, receivers.items()):
+        assert pourer is not None
+        motions = ((section.motion, place.at("motion")),)
+        scene = builder.scene(
+            f"dispense-{pourer.name}-{name}", pourer, receiver, motions, (), place, constants=constants
+        )
+        if scene is None:
+            return None
+        scenes.append(scene)
+    if section.order == "largest_first":
+        doses.sort(key=lambda one: -one.amount)
+    as_left = section.start == "as_left"
+    return DispensePlan(tuple(scenes), tuple(doses), section.refill_below, as_left, laboratory.name)
+
+
+def _prior(
+    section: CalibrationSection,
+    builder: SceneBuilder,
+    place: Place,
+    actions: Space | None,
+    constraints: tuple[Linear, ...],
+) -> tuple[NormalPrior, ...]:
+    """The prior over actions, for a strategy that averages over it."""
+    report, strategy = builder.report, section.settings.strategy
+    if section.settings.has_prior:
+        return builder.prior(section.actions, place, actions, constraints)
+    if not report.is_broken(place.at("strategy")):
+        why = f"belongs to {owners_of_priors()}, which averages over the prior; {strategy} simulates the weighed pours"
+        own = section.actions is not None
+        builder.refuse_prior(section.actions if own else builder.file.actions, place if own else builder.root, why)
+    return ()
+
+
+def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> CampaignPlan | None:
+    """The plan of a campaign. Problems are added to the report; the plan may then be None."""
+    references = References(report)
+    laboratory: LaboratorySettings | None = references.laboratory(file.laboratory, root.at("laboratory"))
+    liquid = references.liquid(file.liquid, root.at("liquid"))
+    builder = SceneBuilder(file, root, references, liquid)
+    for role in ("pourer", "receiver"):  # checked even if the sections override it
+        if file.value(role) is not None:
+            references.vessel(file.value(role), root.at(role))
+    parameters: ParametersBase | None = file.simulator.parameters
+    fixed = {} if parameters is None else parameters.fixed()
+    searched = {} if parameters is None else parameters.searched()
+    default = SimulationParameters().model_dump()
+    fixed = SimulationParameters.from_values(fixed).fixed_values(searched)
+    calibration = deployment = None
+    if file.calibration is not None:
+        calibration = resolve_calibration(
+            file.calibration,
+            builder,
+            fixed,
+            searched,
+            root.at("calibration"),
+            laboratory,
+            () if parameters is None else parameters.priors(),
+        )
+    if file.deployment is not None:
+        deployment = resolve_deployment(file.deployment, builder, root.at("deployment"), laboratory)
+    dispense = None
+    if file.dispense is not None:
+        dispense = resolve_dispense(file.dispense, builder, root.at("dispense"), laboratory)
+    broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))
+    if not broken and (file.calibration is None or file.calibration.actions is not None):
+        builder.refuse_prior(file.actions, root, "decides nothing: no calibration takes its actions from here")
+    if file.on_unknown == "repeat" and laboratory is not None and not _is_virtual(laboratory):
+        report.add(
+            root.at("on_unknown"),
+            f"'repeat' needs a virtual bench, and laboratory '{laboratory.name}' has none; use 'ask'",
+        )
+    if report.problems or laboratory is None:
+        return None
+    directory = file.outputs.folder if file.outputs.directory is None else root.directory / file.outputs.directory
+    outputs = file.outputs.model_copy(update={"directory": str(resolved(directory))})
+    in_force = default if parameters is None else default | parameters.in_force()
+    return CampaignPlan(
+        name=file.name,
+        seed=file.seed,
+        source=root.document.path,
+        laboratory=laboratory if dispense is None else laboratory.in_real_time(),
+        parameters=SimulationParameters.from_values(in_force),
+        calibration=calibration,
+        deployment=deployment,
+        outputs=outputs,
+        parallel_simulations=file.parallel_simulations,
+        on_unknown=file.on_unknown,
+        resolved=as_file(file.model_copy(update={"outputs": outputs}), root, references),
+        laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
+        dispense=dispense,
+    )
+
+
+def _is_virtual(laboratory: LaboratorySettings) -> bool:
+    return laboratory.mode == "virtual" and laboratory.pours

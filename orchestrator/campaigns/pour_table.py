@@ -1,0 +1,275 @@
+"""Files of weighed pours: their columns, and the checks of every line.
+
+`read_records` reads a file. Each problem names the file, the line and the column. How the pours fit to a campaign is
+checked in `orchestrator.campaigns.weighed_pours`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from orchestrator.campaigns.saved_table import SavedTable, TableRow, read_saved_table
+from orchestrator.campaigns.table_columns import FoundColumn, KnownColumn, columns_of
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
+from orchestrator.learning.campaign_plan import RecordedPour
+from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
+from sim_engine.settings.model import MOST_POURS
+
+MASS_COLUMNS = ("poured_g", "spilled_g", "retained_g")
+SPLITS = ("train", "test", "transfer")
+LIP_COLUMN = "lip_to_receiver_axis_mm"
+
+MASS_TOLERANCE = 0.01
+"""Largest relative difference between poured + retained and the load; spills and drips limit the accuracy of a
+weighing."""
+
+NOISE, NOISE_OF_LOAD = 0.3, 1e-3
+"""Largest negative value of a weighed mass: in grams, or as a share of the load if that is larger."""
+
+MOST_ALIKE = 5
+"""Largest number of lines with identical numbers: real pours differ in the last digit."""
+
+ALIASES = {"angular_velocity": ("speed", "tilt_speed"), "max_angle": ("angle", "tilt_angle")}
+"""Other names of dimensions in the headers of tables."""
+
+
+def _column_of(dimension: Dimension) -> KnownColumn:
+    return KnownColumn(dimension.name, dimension.unit, dimension.display_unit, ALIASES.get(dimension.name, ()))
+
+
+def column_name(dimension: Dimension) -> str:
+    """Column of an action dimension: its name and unit, e.g. 'angular_velocity_deg_s'."""
+    return _column_of(dimension).standard
+
+
+DIMENSION_COLUMNS = {column_name(dimension): dimension for dimension in ACTION_DIMENSIONS.values()}
+
+COLUMNS = (
+    *map(_column_of, ACTION_DIMENSIONS.values()),
+    KnownColumn("lip_to_receiver_axis", "m", "mm"),
+    *(KnownColumn(name.removesuffix("_g"), "kg", "g") for name in MASS_COLUMNS),
+    KnownColumn("split"),
+)
+
+
+@dataclass
+class RecordTable:
+    """A file of weighed pours.
+
+    Attributes:
+        path: the file.
+        rows: action dimensions [SI], masses [kg] and split of every valid line.
+        dimensions: action dimensions that have a column.
+        problems: all problems found.
+        assumed: one sentence on the dialect of the file (`SavedTable.note`); empty if it is the plain one.
+    """
+
+    path: Path
+    rows: list[PourRecordRow] = field(default_factory=list)
+    dimensions: tuple[str, ...] = ()
+    problems: list[Problem] = field(default_factory=list)
+    assumed: str = ""
+
+    def varying(self) -> set[str]:
+        """Dimensions that have more than one value."""
+        return {name for name in self.dimensions if len({row.action[name] for row in self.rows}) > 1}
+
+    def constants(self) -> dict[str, float]:
+        """Dimensions that have the same value in all pours."""
+        return {name: self.rows[0].action[name] for name in self.dimensions if name not in self.varying()}
+
+
+@dataclass(frozen=True)
+class PourRecordRow:
+    """One line: action dimensions [SI], masses [kg]."""
+
+    line: int
+    action: dict[str, float]
+    poured: float
+    spilled: float
+    retained: float
+    split: str
+
+    def pour(self, fixed: Mapping[str, float | None]) -> RecordedPour:
+        """The record, completed with the dimensions that have no column.
+
+        Raises:
+            ValueError: the action is incomplete or out of bounds.
+        """
+        action = Action.compose(fixed, self.action)
+        return RecordedPour(action, self.poured, self.spilled, self.retained, self.split)
+
+
+def read_records(
+    path: Path,
+    *,
+    loaded: float,
+    lip_radius: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    split: str | None = None,
+) -> RecordTable:
+    """Read weighed pours.
+
+    Columns: `poured_g`, `spilled_g`, `retained_g`, `split` (train, test or transfer), and one per action dimension that
+    varies, named after it and its unit (`angular_velocity_deg_s`, `max_angle_deg`, `x_offset_mm` …) or with another
+    unit in brackets (`max angle [rad]`). Instead of `x_offset_mm` there may be `lip_to_receiver_axis_mm`, the distance
+    from the pourer's inner lip to the receiver's axis: `lip_radius` is added to it.
+
+    Args:
+        path: the file, in any dialect that `read_saved_table` reads.
+        loaded: mass in the pourer before each pour [kg].
+        lip_radius: the pourer's inner radius at the lip [m].
+        columns: different names in the file, {name above: name in the file}.
+        split: split of all pours if the file has no such column; without it the column is required.
+
+    Returns:
+        The table; its `problems` describe what is wrong with the file.
+    """
+    table = RecordTable(path)
+    try:
+        saved = read_saved_table(path)
+    except ConfigError as error:
+        table.problems.extend(error.problems)
+        return table
+    reader = _PourReader(saved, table, loaded, lip_radius, split)
+    reader.read({theirs: ours for ours, theirs in (columns or {}).items()})
+    table.assumed = saved.note
+    if not table.rows and not table.problems:
+        table.problems.append(Problem(path, 1, 1, "", "has no pours; add a line for each below the header"))
+    return table
+
+
+@dataclass
+class _PourReader:
+    """Fills a table of pours from a saved table; see `read_records`."""
+
+    saved: SavedTable
+    table: RecordTable
+    loaded: float
+    lip_radius: float | None
+    split: str | None
+
+    def read(self, renamed: Mapping[str, str]) -> None:
+        table, saved = self.table, self.saved
+        found = columns_of(saved, COLUMNS, renamed, table.problems)
+        self._check_columns([column.standard for column in found if column is not None])
+        if table.problems:
+            return
+        columns = [column for column in found if column is not None]
+        names = {column.standard for column in columns}
+        table.dimensions = tuple(
+            name
+            for name, dimension in ACTION_DIMENSIONS.items()
+            if column_name(dimension) in names or (name == "x_offset" and LIP_COLUMN in names)
+        )
+        alike: dict[tuple[str | float, ...], list[TableRow]] = {}
+        for line in saved.rows:
+            if len(table.rows) == MOST_POURS:
+                message = f"has more than {MOST_POURS} pours, which no calibration can use; keep the best of them"
+                table.problems.append(saved.problem(line, None, "", message))
+                return
+            alike.setdefault(line.cells, []).append(line)
+            row = self._row(line, columns)
+            if row is not None:
+                table.rows.append(row)
+        for lines in alike.values():
+            if len(lines) > MOST_ALIKE:
+                message = (
+                    f"the same pour stands in {len(lines)} lines; pours that were really made differ in the last "
+                    "digit. Keep the line once"
+                )
+                table.problems.append(saved.problem(lines[1], None, "", message))
+
+    def _check_columns(self, names: list[str]) -> None:
+        """Check that the required columns are there, once each."""
+        header = self.saved.header
+
+        def add(name: str, message: str) -> None:
+            index = names.index(name) if name in names else None
+            where = "" if index is None else str(header.cells[index])
+            self.table.problems.append(self.saved.problem(header, index, where, message))
+
+        if len(names) < len(header.cells):
+            return  # a column that was not recognised may be the one that is missing
+        for name in (*MASS_COLUMNS, *(["split"] if self.split is None else [])):
+            if name not in names:
+                add("", f"column '{name}' is missing")
+        if not any(name in DIMENSION_COLUMNS or name == LIP_COLUMN for name in names):
+            add("", "no column of an action dimension, such as 'angular_velocity_deg_s'")
+        if LIP_COLUMN in names:
+            if "x_offset_mm" in names:
+                add(LIP_COLUMN, "says the same as 'x_offset_mm'; keep one of them")
+            if self.lip_radius is None:
+                text = "needs 'lip_radius' beside 'from' in the campaign, the pourer's inner radius at the lip"
+                add(LIP_COLUMN, text)
+
+    def _row(self, line: TableRow, columns: Sequence[FoundColumn]) -> PourRecordRow | None:
+        saved, problems = self.saved, self.table.problems
+        before = len(problems)
+        index = {column.standard: i for i, column in enumerate(columns)}
+
+        def add(name: str, message: str) -> None:
+            at = index.get(name)
+            where = "" if at is None else str(saved.header.cells[at])
+            problems.append(saved.problem(line, at, where, message))
+
+        if len(line.cells) != len(columns):
+            hint = ""
+            if line.source.count('"') % 2 or any("\n" in str(cell) for cell in line.cells):
+                hint = "; is a quote still open?"
+            elif len(line.cells) > len(columns):
+                hint = "; are there decimal commas? Then save it with semicolons or tabs between the cells"
+            cells = f"{len(line.cells)} cell{'s' * (len(line.cells) > 1)}"
+            add("", f"has {cells}, the header {len(columns)}{hint}")
+            return None
+        values: dict[str, float] = {}
+        written: dict[str, float] = {}
+        for column, cell in zip(columns, line.cells, strict=True):
+            if column.standard == "split":
+                continue
+            try:
+                written[column.standard] = saved.number(cell)
+                values[column.standard] = written[column.standard] * column.factor
+            except ValueError as error:
+                add(column.standard, str(error))
+        split = str(line.cells[index["split"]]) if "split" in index else str(self.split)
+        if split not in SPLITS:
+            add("split", f"{split!r} is not known; should be one of {', '.join(SPLITS)}")
+        action: dict[str, float] = {}
+        for name, value in values.items():
+            dimension = ACTION_DIMENSIONS["x_offset"] if name == LIP_COLUMN else DIMENSION_COLUMNS.get(name)
+            if dimension is None:
+                continue
+            # Rounded to a picometre, so that 44 mm + 40 mm is 84 mm.
+            lip = name == LIP_COLUMN
+            si = round(value * 1e-3 + (self.lip_radius or 0.0), 12) if lip else value * dimension.factor
+            if not dimension.lower <= si <= dimension.upper:
+                k = dimension.factor
+                bounds = f"{dimension.lower / k:g} … {dimension.upper / k:g} {dimension.display_unit}"
+                add(name, f"{written[name]:g} makes {dimension.name} {si / k:g}, outside {bounds}")
+            action[dimension.name] = si
+        if all(name in values for name in MASS_COLUMNS):
+            _check_masses([values[name] for name in MASS_COLUMNS], self.loaded * 1e3, add)
+        if len(problems) > before:
+            return None
+        poured, spilled, retained = (values[name] * 1e-3 for name in MASS_COLUMNS)
+        return PourRecordRow(line.line, action, poured, spilled, retained, split)
+
+
+def _check_masses(masses: list[float], loaded: float, add: Callable[[str, str], None]) -> None:
+    poured, spilled, retained = masses
+    slack = MASS_TOLERANCE * loaded
+    noise = max(NOISE, NOISE_OF_LOAD * loaded)
+    for name, mass in zip(MASS_COLUMNS, masses, strict=True):
+        if mass < -noise:
+            add(name, f"{mass:g} g is less than nothing, by more than a balance's noise of {noise:g} g")
+    if abs(poured + retained - loaded) > slack:
+        add(
+            "poured_g",
+            f"poured {poured:g} g + retained {retained:g} g = {poured + retained:g} g, "
+            f"but {loaded:g} g were loaded (the campaign's liquid.mass)",
+        )
+    if spilled > poured + slack:
+        add("spilled_g", f"spilled {spilled:g} g, more than the {poured:g} g that were poured")

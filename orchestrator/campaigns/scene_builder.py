@@ -1,0 +1,252 @@
+"""Builds scenes and action spaces from a campaign's sections.
+
+`SceneBuilder` combines the campaign's defaults with the overrides of a section, and checks that every dimension has a
+value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from actors.optimizer.questions import Linear
+from orchestrator.campaigns.action_assignments import parse_constraint
+from orchestrator.campaigns.campaign_file import CampaignFile
+from orchestrator.campaigns.search_ranges import EXAMPLES, ActionsBase, MotionBase
+from orchestrator.campaigns.yaml.references import References
+from orchestrator.campaigns.yaml.yaml_errors import dotted
+from orchestrator.campaigns.yaml.yaml_source import Place, Report
+from orchestrator.learning.calibration.action_prior import actions_of_prior
+from orchestrator.learning.campaign_plan import NormalPrior
+from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.liquids import Liquid
+from sim_engine.scene import Pivot, Scene
+from sim_engine.search_space import Space
+from sim_engine.settings.quantity import QuantityError
+from sim_engine.vessel.shapes import VesselSpec
+
+NEEDED = ("angular_velocity", "max_angle", "x_offset", "height")
+"""Dimensions without a default: each campaign fixes or searches them."""
+
+LEAST_LEFT = 64
+"""Minimum number of actions, out of about 30,000 spread over the ranges, that must satisfy the constraints."""
+
+DEFAULTS = Action(angular_velocity=1.0, x_offset=0.0, height=0.0).values()
+
+
+@dataclass
+class SceneBuilder:
+    """Combines the campaign's defaults with a section's overrides.
+
+    Attributes:
+        file: the campaign as written (its valid part).
+        root: place of the file's root.
+        liquid: None after a problem.
+    """
+
+    file: CampaignFile
+    root: Place
+    references: References
+    liquid: Liquid | None
+
+    @property
+    def report(self) -> Report:
+        """The report that receives problems."""
+        return self.references.report
+
+    def space(self, actions: ActionsBase | None, motion: MotionBase | None, place: Place) -> Space | None:
+        """The action space of a section; a searched dimension must not be fixed as well."""
+        own = actions is not None
+        used = actions if own else self.file.actions
+        if used is None:
+            if not self.hidden_by_problems(place, "actions"):
+                message = "searches nothing; add for example 'actions: {angular_velocity: [15 deg/s, 120 deg/s]}'"
+                self.report.add(place, message, key=True)
+            return None
+        at = (place if own else self.root).at("actions")
+        space: Space | None = used.space()
+        if space is None:
+            if not self.hidden_by_problems(place, "actions"):
+                self.report.add(at, "names no dimension; add for example 'angular_velocity: [15 deg/s, 120 deg/s]'")
+            return None
+        beside = [(motion, place.at("motion"))] + ([] if own else [(self.file.motion, self.root.at("motion"))])
+        for fixed, fixed_at in beside:
+            for name in space.names:
+                if fixed is not None and name in fixed.fixed():
+                    searched = dotted(at.at(name).loc)
+                    self.report.add(fixed_at.at(name), f"is searched by {searched} too; keep one of them", key=True)
+        return space
+
+    def constraints(self, actions: ActionsBase | None, place: Place, space: Space | None) -> tuple[Linear, ...]:
+        """The constraints of a section's action space; they must leave a part of it."""
+        used, at = (self.file.actions, self.root) if actions is None else (actions, place)
+        if space is None or used is None or not used.constraints:
+            return ()
+        at, before = at.at("actions").at("constraints"), len(self.report.problems)
+        found = []
+        for i, text in enumerate(used.constraints):
+            try:
+                found.append(parse_constraint(text, space))
+            except QuantityError as error:
+                self.report.add(at.at(i), str(error))
+        if len(self.report.problems) == before:
+            try:
+                actions_of_prior(space, LEAST_LEFT, 0, found)
+            except ValueError:
+                self.report.add(at, "leave next to nothing of the ranges beside them; loosen one, or widen a range")
+        return tuple(found)
+
+    def prior(
+        self, actions: ActionsBase | None, place: Place, space: Space | None, constraints: Sequence[Linear]
+    ) -> tuple[NormalPrior, ...]:
+        """C4's prior over the action space; it must have mass inside the constraints."""
+        used, at = (self.file.actions, self.root) if actions is None else (actions, place)
+        prior: tuple[NormalPrior, ...] = () if space is None or used is None else used.prior()
+        if space is None or not prior:
+            return ()
+        at, before = at.at("actions"), len(self.report.problems)
+        for one in prior:
+            axis, info = space.axes[space.names.index(one.name)], ACTION_DIMENSIONS[one.name]
+            if not axis.lower <= one.mean <= axis.upper:
+                mean, lower, upper = (f"{value / info.factor:g}" for value in (one.mean, axis.lower, axis.upper))
+                text = f"{mean} {info.display_unit} is outside the range, {lower} … {upper} {info.display_unit}"
+                self.report.add(at.at(one.name, "prior", "mean"), text)
+        if constraints and len(self.report.problems) == before:
+            try:
+                actions_of_prior(space, LEAST_LEFT, 0, constraints, prior)
+            except ValueError:
+                text = "leave next to nothing where the prior lies; loosen one, or move or widen the prior"
+                self.report.add(at.at("constraints"), text)
+        return prior
+
+    def refuse_prior(self, actions: ActionsBase | None, place: Place, why: str) -> None:
+        """Report every prior of a section's own dimensions as unused."""
+        for one in () if actions is None else actions.prior():
+            self.report.add(place.at("actions").at(one.name, "prior"), f"{why}; remove it", key=True)
+
+    def scene(
+        self,
+        name: str,
+        pourer: VesselSpec | None,
+        receiver: VesselSpec | None,
+        motions: tuple[tuple[MotionBase | None, Place], ...],
+        searched: tuple[str, ...],
+        place: Place,
+        *,
+        recorded: bool = False,
+        constants: Mapping[str, float] | None = None,
+        constants_win: bool = False,
+        unread: bool = False,
+    ) -> Scene | None:
+        """A scene.
+
+        Args:
+            name: key for journal and strategies.
+            pourer: None after a problem.
+            receiver: None after a problem.
+            motions: sections that override the campaign's motion; the last has priority.
+            searched: dimensions that the action space (or a varying column of a record) gives.
+            place: section of the scene.
+            recorded: the scene replays weighed pours, so that a step and no return are allowed.
+            constants: values that the whole record has; a different value in `motion` is an error, unless
+                `constants_win`.
+            constants_win: the record's scene only inherits the motion, so that its constants have priority.
+            unread: the record could not be read, so that dimensions that it may give are not missed.
+        """
+        fixed: dict[str, float | None] = {k: v for k, v in DEFAULTS.items() if k not in NEEDED}
+        pivot, max_hold_time = Pivot(), 5.0
+        origin: dict[str, Place] = {}
+        for motion, at in ((self.file.motion, self.root.at("motion")), *motions):
+            if motion is None:
+                continue
+            given = motion.fixed()
+            fixed |= given
+            origin |= {dimension: at.at(dimension) for dimension in given}
+            pivot = motion.pivot_value() or pivot
+            max_hold_time = max_hold_time if motion.max_hold_time is None else motion.max_hold_time
+        ok = True
+        for dimension, value in (constants or {}).items():
+            stated = fixed.get(dimension)
+            if dimension in origin and not constants_win and (stated is None or abs(stated - value) > 1e-6):
+                ok = False
+                info = ACTION_DIMENSIONS[dimension]
+                said = f"{value / info.factor:g} {info.display_unit}"
+                self.report.add(origin[dimension], f"the weighed pours were all made at {said}; remove this key")
+            fixed[dimension] = value
+        fixed = {dimension: value for dimension, value in fixed.items() if dimension not in searched}
+        for dimension in NEEDED:
+            if dimension not in fixed and dimension not in searched:
+                ok = False
+                if not unread and not self.hidden_by_problems(place, dimension):
+                    self.report.add(place, self._needs(dimension, place), key=True)
+        for dimension in ("angular_acceleration", "return_velocity"):
+            if not recorded and dimension in fixed and fixed[dimension] is None:
+                ok = False
+                word, example = ACTION_DIMENSIONS[dimension].switched_off, EXAMPLES[dimension]
+                self.report.add(
+                    origin[dimension],
+                    f"'{word}' only replays recorded pours, no arm can do it; write for example '{example}' "
+                    f"(or override it under {dotted(place.at('motion').loc)})",
+                )
+        if pourer is None or receiver is None or self.liquid is None or not ok:
+            return None
+        return Scene(name, pourer, receiver, self.liquid, pivot, fixed, max_hold_time)
+
+    def pourer(self, value: Any, place: Place) -> VesselSpec | None:
+        """A section's pourer, or the campaign's."""
+        return self._vessel("pourer", value, place)
+
+    def receiver(self, value: Any, place: Place) -> VesselSpec | None:
+        """A section's receiver, or the campaign's."""
+        return self._vessel("receiver", value, place)
+
+    def receivers(self, section: Any, place: Place, *, inherit: bool = True) -> list[VesselSpec | None]:
+        """A section's receivers: its own, or the campaign's; `inherit` includes the campaign's 'receivers'."""
+        owners = ((section, place), (self.file, self.root))
+        for owner, at in owners if inherit else owners[:1]:
+            if owner.receiver is not None and owner.receivers is not None:
+                self.report.add(at.at("receiver"), "stands beside 'receivers'; keep one of them", key=True)
+            if owner.receivers is not None:
+                if not owner.receivers:
+                    self.report.add(at.at("receivers"), "is empty; name at least one vessel")
+                vessels = [self.references.vessel(v, at.at("receivers", i)) for i, v in enumerate(owner.receivers)]
+                taken: set[str] = set()
+                for i, vessel in enumerate(vessels):
+                    if vessel is not None and vessel.name in taken:
+                        message = f"a receiver is called '{vessel.name}' already; results need different names"
+                        self.report.add(at.at("receivers", i), message)
+                    taken |= set() if vessel is None else {vessel.name}
+                return vessels
+            if owner.receiver is not None:
+                return [self.references.vessel(owner.receiver, at.at("receiver"))]
+        return [self._vessel("receiver", None, place)]
+
+    def _vessel(self, role: str, value: Any, place: Place) -> VesselSpec | None:
+        if value is not None:
+            return self.references.vessel(value, place.at(role))
+        default = self.file.value(role)
+        if default is not None:
+            return self.references.vessel(default, self.root.at(role))
+        if not self.hidden_by_problems(place, role) and not self.hidden_by_problems(self.root, role):
+            message = f"has no {role}; add for example '{role}: ../vessels/{_SAMPLE[role]}.yaml' here or at the top"
+            self.report.add(place, message, key=True)
+        return None
+
+    def _needs(self, dimension: str, place: Place) -> str:
+        unit = ACTION_DIMENSIONS[dimension].display_unit
+        low, high = {"deg/s": (15, 120), "deg": (70, 125), "mm": (60, 120)}[unit]
+        return (
+            f"{dimension} has no value; fix it under motion ('{dimension}: {EXAMPLES[dimension]}') "
+            f"or search it under {dotted(place.at('actions').loc)} ('{dimension}: [{low} {unit}, {high} {unit}]')"
+        )
+
+    def hidden_by_problems(self, place: Place, word: str) -> bool:
+        """Whether a reported problem may explain that a word has no value: one cause, one message."""
+        return any(
+            path == place.document.path and (word in loc or (loc and loc[-1] in ("motion", "actions")))
+            for path, loc in self.report.broken
+        )
+
+
+_SAMPLE = {"pourer": "beaker", "receiver": "tumbler"}

@@ -1,0 +1,142 @@
+"""Columns of saved tables: names with units in headers, such as 'poured_g', 'poured [kg]' or 'Max angle (rad)'.
+
+A caller lists the columns that it can use (`KnownColumn`); `columns_of` finds them in the header of a table. Which of
+them are required is up to the caller.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from orchestrator.campaigns.saved_table import SavedTable
+from orchestrator.campaigns.yaml.yaml_errors import Problem
+from sim_engine.errors import did_you_mean
+from sim_engine.settings.quantity import QuantityError, parse_unit
+
+_BRACKETS = re.compile(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]")
+
+
+@dataclass(frozen=True)
+class KnownColumn:
+    """A column that a caller can use.
+
+    Attributes:
+        name: its name without the unit, for example 'poured'.
+        unit: SI unit of the quantity; empty for a column of words.
+        display: unit of the standard name, 'poured_g'.
+        aliases: other names.
+    """
+
+    name: str
+    unit: str = ""
+    display: str = ""
+    aliases: tuple[str, ...] = ()
+
+    @property
+    def standard(self) -> str:
+        """The name with its unit: 'poured_g', 'angular_velocity_deg_s'."""
+        return self.name + ("_" + self.display.replace("/", "_").replace("^", "") if self.display else "")
+
+
+@dataclass(frozen=True)
+class FoundColumn:
+    """A column of a file.
+
+    Attributes:
+        standard: `KnownColumn.standard`.
+        factor: value of the file's unit in the unit of the standard name; 1.0 if they are equal.
+        alias: whether the file has one of `KnownColumn.aliases`.
+    """
+
+    standard: str
+    factor: float = 1.0
+    alias: bool = False
+
+
+def columns_of(
+    table: SavedTable, known: Sequence[KnownColumn], renamed: Mapping[str, str], problems: list[Problem]
+) -> list[FoundColumn | None]:
+    """The meaning of each column of the header; None for one that has a problem.
+
+    Args:
+        known: the columns that there may be.
+        renamed: names in the file and the names that they stand for, with or without a unit.
+        problems: problems are added here.
+    """
+    found: list[FoundColumn | None] = []
+    for index, cell in enumerate(table.header.cells):
+        text = str(cell)
+        try:
+            column = _resolved(text, known, renamed)
+        except QuantityError as error:
+            problems.append(table.problem(table.header, index, text, str(error)))
+            found.append(None)
+            continue
+        if any(other is not None and other.standard == column.standard for other in found):
+            same = "" if text == column.standard else f" (as '{column.standard}')"
+            message = f"stands twice in the header{same}; keep one"
+            problems.append(table.problem(table.header, index, text, message))
+        if column.factor != 1.0 or column.alias:
+            table.assumed.append(f"'{text}' as {column.standard}")
+        found.append(column)
+    return found
+
+
+def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str]) -> FoundColumn:
+    """The column that a text in a header names.
+
+    Raises:
+        QuantityError: an unknown name or unit, or no unit; the message is a correction.
+    """
+    if not text:
+        raise QuantityError("a column has no name")
+    bracketed = _BRACKETS.fullmatch(text)
+    stem, unit = (bracketed[1], bracketed[2]) if bracketed else (text, "")
+    name = renamed.get(text) or renamed.get(stem, stem)
+    names = {one.name: one for one in known} | {one.standard: one for one in known}
+    word = re.sub(r"[\s-]+", "_", name.strip()).lower()
+    column = names.get(name) or names.get(word) or next((one for one in known if word in one.aliases), None)
+    alias = column is not None and word in column.aliases
+    standard = column is not None and word == column.standard.lower()
+    if text in renamed and not _is_unit(unit):
+        unit = ""  # a part of the name: 'weight (net)'
+    if column is not None and not unit:
+        if column.unit and not standard:
+            text = f"write '{column.standard}' or '{column.name} [{column.display}]'"
+            raise QuantityError(f"has no unit; {text} if that is what is meant")
+        return FoundColumn(column.standard)
+    if column is None and not unit:
+        column = next((c for c in known if c.unit and re.fullmatch(rf"{c.name}_[a-zµ°%_0-9]+", word)), None)
+        if column is not None:
+            rest = name.strip()[len(column.name) + 1 :]
+            unit = re.sub(r"(?<=[a-z])(?=[0-9])", "^", rest.replace("_", "/"))
+    if column is None:
+        if text in renamed:
+            raise QuantityError(f"'columns' gives it the name '{renamed[text]}', which is not known")
+        guess = did_you_mean(word, names) or did_you_mean(word, [one.standard for one in known])
+        shown = names[guess].standard if guess else ""
+        hint = f"did you mean '{shown}'?" if guess else f"known columns: {', '.join(one.standard for one in known)}"
+        raise QuantityError(f"unknown column; {hint}")
+    if not column.unit:
+        raise QuantityError(f"'{column.name}' has no unit; remove '{unit}'")
+    if unit == column.display:
+        return FoundColumn(column.standard, alias=alias)
+    example = f"1 {column.display}"
+    factor = parse_unit(unit, column.unit, example) / parse_unit(column.display, column.unit, example)
+    if math.isclose(factor, 1.0, rel_tol=1e-12):
+        return FoundColumn(column.standard, alias=alias)
+    if standard and text not in renamed:
+        raise QuantityError(f"has two units; write '{column.name} [{unit}]' or '{column.standard}'")
+    return FoundColumn(column.standard, factor, alias)
+
+
+def _is_unit(text: str) -> bool:
+    """Whether a text is a unit of any kind."""
+    try:
+        parse_unit(text, "1", "1")
+    except QuantityError as error:
+        return not str(error).startswith("unknown unit")
+    return True

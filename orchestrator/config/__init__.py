@@ -1,1 +1,0 @@
-"""Files of campaigns, laboratories and vessels: their sections, their validation, and the plans made from them."""

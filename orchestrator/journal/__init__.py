@@ -1,1 +1,0 @@
-"""The write-ahead record of a run, its checks and its readers."""

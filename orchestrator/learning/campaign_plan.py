@@ -1,0 +1,579 @@
+"""Plans and strategy settings: a resolved campaign as plain values.
+
+- `CampaignPlan`, `CalibrationPlan` and `DeploymentPlan` hold the scenes, spaces, budgets and seeds that the YAML file
+  defines.
+- `StrategySettings` is the base of the settings of all strategies. Its two subclasses, `CalibrationSettings` and
+  `DeploymentSettings`, check the settings and build the strategy.
+- `RecordedPour`, `MeasuredPour`, `RecordSet` and `ExistingPours` hold weighed pours.
+
+A settings class is defined in the module of its strategy. It is registered as an entry point of the group
+`decant.strategies` under the value of its field `strategy`. The YAML keys with their errors, the JSON schema, the
+tables of the documentation, the run's record and its fingerprint are derived from this class.
+
+This module does not read files and runs no strategy.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+
+from actors.laboratory_settings import LaboratorySettings
+from actors.optimizer.questions import BenchOffset, Linear, Point
+from orchestrator.learning.deployment.objectives import Objectives
+from orchestrator.learning.requests import WRITTEN_IF_SET
+from sim_engine.action import Action
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import MINIMUM_POURED, Loss
+from sim_engine.scene import PoseError, Scene
+from sim_engine.search_space import Space
+from sim_engine.settings.model import (
+    NOT_IN_FINGERPRINT,
+    FilePath,
+    PourCount,
+    Problems,
+    Settings,
+    SimulationCount,
+    Switch,
+)
+from sim_engine.settings.quantity import Quantity
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from orchestrator.learning.requests import Order
+    from orchestrator.learning.strategy import Strategy
+
+
+class StrategySettings(Settings):
+    """Settings that all strategies have in common."""
+
+    tag: ClassVar[str] = "strategy"
+    plugins: ClassVar[str] = "decant.strategies"
+
+    strategy: str = ""
+    """Name of the strategy: a literal in each class, equal to the name of its entry point."""
+
+    @classmethod
+    def like(cls, other: StrategySettings, without: Sequence[str] = (), **changes: Any) -> Self:
+        """Build settings from those of another strategy: shared fields are copied, the others keep their defaults.
+
+        Args:
+            without: names of fields that keep their defaults.
+            changes: values of further fields.
+        """
+        shared = cls.model_fields.keys() & type(other).model_fields.keys() - {"strategy", *without}
+        return cls().model_copy(update={name: getattr(other, name) for name in shared} | changes)
+
+
+class CalibrationSettings(StrategySettings):
+    """Settings of a calibration, which fits θ to the weighed spills."""
+
+    default_tag: ClassVar[str] = "C4"
+
+    has_prior: ClassVar[bool] = False
+    """Whether the strategy averages over a prior of actions, so that `actions` may define one."""
+
+    def settled(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
+        """Fill in all numbers. Problems are added to `complaints`, and the result is then None.
+
+        Args:
+            searched: names of the searched θ.
+            train: number of training pours on which a θ can be simulated; 0 if another problem leaves it unknown.
+        """
+        return self
+
+    @property
+    def makes_posterior(self) -> bool:
+        """Whether the result has draws of θ given the pours."""
+        return False
+
+    @abstractmethod
+    def simulations_on(self, train: int) -> int:
+        """Number of single simulated pours that the strategy may spend on `train` training pours."""
+
+    @abstractmethod
+    def build(self, plan: CalibrationPlan, pours: Sequence[MeasuredPour], seed: int) -> Strategy:
+        """Build the strategy."""
+
+
+@dataclass(frozen=True)
+class Premises:
+    """Properties of a deployment that its settings are checked against.
+
+    Attributes:
+        actions: searched action space; None if it is invalid.
+        objectives: whether the deployment minimises objectives instead of a loss.
+    """
+
+    actions: Space | None
+    objectives: bool
+
+
+class DeploymentSettings(StrategySettings):
+    """Settings of a deployment, which pours into vessels that calibration has not used."""
+
+    learns_on_pours: ClassVar[bool] = True
+    """Whether the strategy learns from real pours, including existing ones. If not, `pours: 0` makes it plan only."""
+
+    simulates: ClassVar[bool] = True
+    """Whether the strategy depends on θ."""
+
+    pours: PourCount | None = None
+    """Real pours per receiver."""
+
+    noise: Literal["constant", "varying"] = "constant"
+    """Scatter of a pour: the same for all actions, or varying with the action if at least 20 observations show it."""
+
+    on_failed_pour: Literal["penalise", "ignore"] = "penalise"
+    """How a failed pour enters the data."""
+
+    def check(self, premises: Premises, complaints: Problems) -> None:
+        """Add a problem for each combination of values that is invalid."""
+        if not self.learns_on_pours:
+            return
+        if self.pours is None:
+            complaints.add(
+                f"key 'pours' is missing; {self.strategy} learns on real pours, add for example 'pours: 15'",
+                key=True,
+                of="pours",
+            )
+        elif self.pours == 0:
+            complaints.add(f"{self.strategy} learns on real pours; at least 1 (D1 plans without any)", "pours")
+
+    @property
+    def order(self) -> Order:
+        """Order in which outcomes are reported; 'completion' only for a strategy whose decisions depend on wall-clock
+        time."""
+        return "logical"
+
+    @property
+    def needs_posterior(self) -> bool:
+        """Whether the strategy plans with draws of θ given the pours of a calibration."""
+        return False
+
+    @property
+    def learns_of_benches(self) -> bool:
+        """Whether the strategy uses estimates of the bench from calibration or from pours into another receiver."""
+        return False
+
+    def draws(self, plan: DeploymentPlan, parameters: SimulationParameters, count: int, seed: int) -> Sequence[Draw]:
+        """Deviations from the plan under which a recommended action is predicted; empty: none."""
+        return ()
+
+    @property
+    def simulations(self) -> int:
+        """Maximum number of simulations per receiver."""
+        return 0
+
+    @property
+    def simulations_before(self) -> int:
+        """Simulations before the first pour."""
+        return self.simulations
+
+    @property
+    def simulations_beside(self) -> int:
+        """Simulations that run during each pour."""
+        return 0
+
+    @property
+    def spending(self) -> str:
+        """The budget per receiver, as text."""
+        return f"{self.pours} pours"
+
+    @abstractmethod
+    def build(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, seed: int) -> Strategy:
+        """Build the strategy."""
+
+
+Design = Literal["stratified", "active"]
+"""How calibration pours are chosen: spread evenly, or each by its expected information about deployment."""
+
+
+@dataclass(frozen=True)
+class RecordedPour:
+    """A weighed pour read from a file.
+
+    Attributes:
+        poured, spilled, retained: masses [kg].
+        split: 'train', 'test' or 'transfer'.
+        scene: name of the scene of this pour; '' for the scene of its `RecordSet`.
+    """
+
+    action: Action
+    poured: float
+    spilled: float
+    retained: float
+    split: str
+    scene: str = ""
+
+    @property
+    def poured_fraction(self) -> float:
+        """Poured mass divided by loaded mass."""
+        return self.poured / (self.poured + self.retained)
+
+    @property
+    def normalised_spillage(self) -> float | None:
+        """r = spilled / poured; None if too little was poured to define it."""
+        return None if self.poured_fraction < MINIMUM_POURED else self.spilled / self.poured
+
+
+@dataclass(frozen=True)
+class MeasuredPour:
+    """A weighed pour in the form that calibration and evaluation use.
+
+    Attributes:
+        spillage: r = spilled / poured; None below 5 % poured, where it is undefined.
+        poured: fraction of the load that left the pourer.
+        split: 'train', 'test' or 'transfer'.
+        scene: name of the scene of this pour; '' for the first scene of its calibration.
+    """
+
+    action: Action
+    spillage: float | None
+    poured: float
+    split: str = "train"
+    scene: str = ""
+
+    @classmethod
+    def from_record(cls, record: RecordedPour) -> MeasuredPour:
+        """Convert one row of a file of recorded pours."""
+        return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split, record.scene)
+
+
+@dataclass(frozen=True)
+class KnownSimulation:
+    """A simulation from before a calibration, in one of its scenes.
+
+    Attributes:
+        theta: values of the searched parameters.
+        spillage: simulated spillage c_s.
+    """
+
+    theta: dict[str, float]
+    scene: str
+    action: Action
+    spillage: float
+
+
+@dataclass(frozen=True)
+class RecordSet:
+    """Weighed pours in one scene.
+
+    Attributes:
+        path: the CSV file, or the journal of the run that made the pours.
+        lip_radius: radius used to convert the file's lip_to_receiver_axis_mm to x_offset [m]; None if the file has
+            x_offset_mm.
+        columns: renamed columns, {Decant's name: name in the file}.
+        assumed: one sentence on how the file was read, if it is not in the plain form.
+    """
+
+    scene: Scene
+    pours: tuple[RecordedPour, ...]
+    path: Annotated[Path, NOT_IN_FINGERPRINT]
+    lip_radius: float | None = None
+    columns: dict[str, str] = field(default_factory=dict)
+    assumed: Annotated[str, NOT_IN_FINGERPRINT] = ""
+
+    @property
+    def training_pours(self) -> int:
+        """Number of training pours on which a θ can be simulated and compared."""
+        return sum(pour.split == "train" and pour.normalised_spillage is not None for pour in self.pours)
+
+
+@dataclass(frozen=True)
+class ExistingPours:
+    """Pours weighed before the campaign. Deployment learns from them as from its own pours.
+
+    Attributes:
+        pours: pours by name of their scene; all lie inside the action space.
+        path: the CSV file, or the journal of the run that made the pours.
+        counts: whether the pours count against the pour budget.
+        left_out: reasons why other pours of the file or run are not used, one text each.
+        lip_radius, columns, assumed: as in `RecordSet`.
+    """
+
+    pours: dict[str, tuple[RecordedPour, ...]]
+    path: Annotated[Path, NOT_IN_FINGERPRINT]
+    counts: bool = False
+    left_out: tuple[str, ...] = ()
+    lip_radius: float | None = None
+    columns: dict[str, str] = field(default_factory=dict)
+    assumed: Annotated[str, NOT_IN_FINGERPRINT] = ""
+
+
+@dataclass(frozen=True)
+class NormalPrior:
+    """Prior along one dimension of an action or of θ: a normal distribution, truncated to the dimension's range.
+
+    Attributes:
+        name: name of the dimension or parameter.
+        mean, deviation: moments of the normal distribution before truncation, in SI units.
+    """
+
+    name: str
+    mean: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """Base of the plans for one strategy.
+
+    Attributes:
+        settings: the settings, which also name the strategy.
+    """
+
+    settings: StrategySettings
+
+    @property
+    def strategy(self) -> str:
+        """Name of the strategy."""
+        return self.settings.strategy
+
+    def with_settings(self, **changes: Any) -> Self:
+        """Copy the plan with changed settings of the same strategy."""
+        return replace(self, settings=self.settings.model_copy(update=changes))
+
+
+@dataclass(frozen=True)
+class CalibrationPlan(StagePlan):
+    """Plan of a calibration: find the θ_s that reproduces the weighed spills.
+
+    Attributes:
+        actions: space in which calibration pours are designed and from which the prior g draws.
+        parameters: searched θ_s.
+        fixed_parameters: values of the θ_s that are not searched.
+        pour_count: pours to be made on the bench (0 with `records`).
+        holdout: number of these pours that are kept for testing.
+        records: existing weighed pours to calibrate on instead of new ones (split 'train' and 'test').
+        transfer: weighed pours in another scene; they are scored only.
+        random_baseline: number of random θ that are scored for comparison.
+        constraints: constraints on actions in addition to the bounds of their space.
+        prior: dimensions along which g is not uniform.
+        parameter_prior: searched parameters that were measured before, each with its tolerance.
+        further: scenes in addition to the first one, with other receivers; pours alternate between all of them.
+        tested: scenes of the pours that are kept for testing; empty: the same scenes.
+        design: how the pours are chosen.
+        design_simulations: simulations spent on choosing the pours of an active design.
+        known: existing simulations that are added when the calibration begins.
+    """
+
+    settings: CalibrationSettings
+    scene: Scene
+    actions: Space
+    parameters: Space
+    fixed_parameters: dict[str, float]
+    pour_count: int = 0
+    holdout: int = 0
+    records: RecordSet | None = None
+    transfer: RecordSet | None = None
+    random_baseline: int = 0
+    constraints: tuple[Linear, ...] = ()
+    prior: tuple[NormalPrior, ...] = ()
+    parameter_prior: tuple[NormalPrior, ...] = ()
+    further: tuple[Scene, ...] = ()
+    tested: tuple[Scene, ...] = ()
+    design: Design = "stratified"
+    design_simulations: int = 0
+    known: tuple[KnownSimulation, ...] = ()
+
+    @property
+    def scenes(self) -> tuple[Scene, ...]:
+        """All scenes that calibration learns from."""
+        return (self.scene, *self.further)
+
+    @property
+    def poured(self) -> tuple[Scene, ...]:
+        """All scenes of calibration pours, including those that are used for scoring only."""
+        return (*self.scenes, *self.tested)
+
+    @property
+    def uncalibrated(self) -> SimulationParameters:
+        """θ that is used without a calibration: the fixed values, and those that were measured before."""
+        measured = {prior.name: prior.mean for prior in self.parameter_prior}
+        return SimulationParameters.from_values(self.fixed_parameters | measured)
+
+    @property
+    def simulations(self) -> int:
+        """Number of single simulated pours that the strategy may spend. Pours that are still to be made may partly be
+        lost."""
+        records = self.records
+        return self.settings.simulations_on(
+            self.pour_count - self.holdout if records is None else records.training_pours
+        )
+
+
+@dataclass(frozen=True)
+class DeploymentPlan(StagePlan):
+    """Plan of a deployment: pour into vessels that calibration has not used.
+
+    Attributes:
+        scenes: one per receiver.
+        actions: searched action space.
+        data: pours from before the campaign.
+        objectives: objectives to minimise instead of the loss.
+        constraints: constraints on actions in addition to the bounds of their space.
+        confirm: number of repetitions of the recommended action in each scene after the strategy has ended.
+        thetas: equally likely draws of a posterior, which simulations use in turn. They are given if no calibration of
+            the same campaign provides them; without any, all simulations use θ*.
+        bench: equally likely offsets of the bench from the simulator; empty if nothing is known about it.
+        left_over: residual shift of a calibration (`sim_engine.prediction_band`), given in the same case as `thetas`;
+            None if unknown.
+    """
+
+    settings: DeploymentSettings
+    scenes: tuple[Scene, ...]
+    actions: Space
+    loss: Loss
+    data: ExistingPours | None = None
+    objectives: Objectives | None = None
+    constraints: tuple[Linear, ...] = ()
+    confirm: int = 0
+    thetas: tuple[SimulationParameters, ...] = ()
+    bench: tuple[BenchOffset, ...] = ()
+    left_over: float | None = None
+
+    @property
+    def pours(self) -> int:
+        """Real pours per scene."""
+        return self.settings.pours or 0
+
+    def wanted(self, scene: Scene) -> float:
+        """Volume that should arrive in a scene's receiver [m³]: the whole load unless the objectives request less."""
+        share = 1.0 if self.objectives is None else self.objectives.wanted(scene)
+        return share * scene.liquid.volume
+
+    @property
+    def loss_name(self) -> str:
+        """Name of the minimised quantity in results."""
+        return self.loss.name if self.objectives is None else "objectives"
+
+
+@dataclass(frozen=True)
+class PlannedDose:
+    """One wanted amount.
+
+    Attributes:
+        amount, limit: see `actors.interfaces.DoseTarget` [kg].
+        receiver: name of the receiver's vessel.
+        position: name of the receiver's place; '' if there is only one.
+    """
+
+    amount: float
+    limit: float
+    receiver: str
+    position: str = ""
+
+
+@dataclass(frozen=True)
+class DispensePlan:
+    """Plan of a series of doses.
+
+    Attributes:
+        scenes: one for each source and each receiver vessel; the source is the scene's pourer, its load the content
+            of a full source.
+        doses: in the order of pouring.
+        refill_below: a source that would hold less after a dose is not used before it is filled again [kg].
+        as_left: whether the series begins with what earlier runs left in the sources; otherwise they are filled.
+        laboratory: part of the names under which the content of the sources is tracked; '': the run does not track it.
+        vessels: sources that are vessels of the station, with their ids.
+    """
+
+    scenes: tuple[Scene, ...]
+    doses: tuple[PlannedDose, ...]
+    refill_below: float
+    as_left: bool
+    laboratory: str
+    vessels: Annotated[Mapping[str, str], NOT_IN_FINGERPRINT] = field(default_factory=dict)
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the sources, in the order of use."""
+        return tuple(dict.fromkeys(scene.pourer.name for scene in self.scenes))
+
+    def scene(self, source: str, receiver: str) -> Scene:
+        """The scene of a source and a receiver."""
+        return next(one for one in self.scenes if (one.pourer.name, one.receiver.name) == (source, receiver))
+
+    def tracked(self, source: str) -> str:
+        """Name of a source in the account of the vessels: its id at the station, or laboratory and vessel."""
+        return self.vessels.get(source) or f"{self.laboratory}/{source}"
+
+    def liquid(self, source: str) -> str:
+        """Name of a source's liquid."""
+        return next(one.liquid.name for one in self.scenes if one.pourer.name == source)
+
+
+class OutputSettings(Settings):
+    """Outputs in addition to the journal."""
+
+    directory: FilePath | None = None
+    """Folder of the runs; 'runs' in the working directory unless given."""
+
+    recording: Switch = True
+    """Write a recording for the viewer."""
+
+    figures: Switch = True
+    """Write figures at the end."""
+
+    pour_recordings: Switch = False
+    """Write each weighed pour and dose as a recorded pour into the folder 'recordings' of the run."""
+
+    frame_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
+    """Frames of particles per simulated second."""
+
+    recorded_simulations: SimulationCount = 6
+    """Number of simulations that are recorded with their particles."""
+
+    @property
+    def folder(self) -> Path:
+        """Parent of the runs' folders; absolute in the plan of a campaign."""
+        return Path(self.directory or "runs")
+
+
+@dataclass(frozen=True)
+class CampaignPlan:
+    """A whole campaign.
+
+    Attributes:
+        source: the YAML file.
+        laboratory_source: the file that describes the laboratory; None if the campaign's file does.
+        parameters: θ_s that is used if nothing is calibrated.
+        parallel_simulations: number of logical simulation slots. It belongs to the plan and not to the machine, so that
+            a seed leads to the same requests on every machine.
+        on_unknown: treatment, on resume, of a pour that had started and has no outcome.
+        resolved: the YAML file with all defaults filled in, ready for JSON, as stored with the run.
+        dispense: the series of doses; None without one.
+    """
+
+    name: str
+    seed: int
+    source: Annotated[Path, NOT_IN_FINGERPRINT]
+    laboratory: LaboratorySettings
+    parameters: SimulationParameters
+    calibration: CalibrationPlan | None
+    deployment: DeploymentPlan | None
+    outputs: Annotated[OutputSettings, NOT_IN_FINGERPRINT]
+    parallel_simulations: int = 2
+    on_unknown: Annotated[Literal["ask", "repeat"], NOT_IN_FINGERPRINT] = "ask"
+    resolved: Annotated[dict[str, Any], NOT_IN_FINGERPRINT] = field(default_factory=dict)
+    laboratory_source: Annotated[Path | None, NOT_IN_FINGERPRINT] = field(default=None, compare=False)
+    dispense: DispensePlan | None = field(default=None, metadata=WRITTEN_IF_SET)
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One deviation of a pour from its plan.
+
+    Attributes:
+        error: pose error of the execution; None: as planned.
+        z: standardised errors, in the order of `Disturbances.errors`.
+    """
+
+    error: PoseError | None
+    parameters: SimulationParameters
+    z: Point

@@ -1,0 +1,350 @@
+"""Wanted amounts, one after the other: the strategies of `dispense:` and of `decant dose`.
+
+- `ReadSources` makes no request. Its result is the content of the sources when the series began, so that a resumed run
+  requests the same doses.
+- `Dispense` requests one pour with a `DoseTarget` for each amount; `Dispensed` is its result. It chooses the source,
+  has it filled again, and passes the estimates of each dose to the next one. A dose that failed is not repeated, and
+  the next one is requested.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+from actors.dosing.dose_series import NINETY_PERCENT
+from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget
+from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
+from orchestrator.learning.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
+from orchestrator.learning.stage_result import ResultPart, StageResult
+from orchestrator.learning.strategy import Progress
+from orchestrator.learning.trials import SeedStream
+from sim_engine.outcome import PourMeasurement
+
+DOSE = "dose"
+"""Purpose of these pours."""
+
+FILL_DEVIATION = 0.5e-3
+"""Standard deviation of the content of a source that was filled on a scale [kg]."""
+
+WEIGHED_DEVIATION = 0.3e-3
+"""Standard deviation of the mass that a dose takes from its source beyond the weighed amount [kg]."""
+
+ENOUGH = 3.0
+"""Standard deviations of the content by which a source has to hold more than the amount."""
+
+
+class KnownSource(ResultPart):
+    """Content of a source, and what its doses have shown."""
+
+    mass: float
+    """Expected content [kg]."""
+
+    deviation: float
+    """Standard deviation of the content [kg]."""
+
+    knowledge: dict[str, Any] | None = None
+    """Fields of `actors.interfaces.DoseKnowledge`."""
+
+
+class SourcesRead(StageResult):
+    """Content of the sources when a series began."""
+
+    kind: Literal["sources"] = "sources"
+
+    sources: dict[str, KnownSource]
+    """By name; sources of unknown content are absent."""
+
+
+class ReadSources:
+    """Keeps the content of the sources as a result; it makes no request.
+
+    Args:
+        sources: by name.
+    """
+
+    def __init__(self, sources: Mapping[str, KnownSource]) -> None:
+        self._sources = dict(sources)
+        self.decisions: list[Decision] = []
+
+    @property
+    def finished(self) -> bool:
+        """True: nothing is requested."""
+        return True
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """Return no request."""
+        return []
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """Raises ValueError: nothing was requested."""
+        raise ValueError(f"nothing was asked for: {request}")
+
+    def progress(self) -> Progress:
+        """Return no work."""
+        return Progress()
+
+    def result(self) -> SourcesRead:
+        """The content of the sources."""
+        return SourcesRead(sources=self._sources)
+
+
+class DoseSignals(ResultPart):
+    """Signals of a dose; empty where the bench reports none."""
+
+    times: tuple[float, ...] = ()
+    """Times of the tilt from the first motion [s]."""
+
+    tilt_deg: tuple[float, ...] = ()
+    """Tilt of the pourer [deg]."""
+
+    read_at: tuple[float, ...] = ()
+    """Times of the readings [s]."""
+
+    readings_g: tuple[float, ...] = ()
+    """Readings of the balance, without the receiver [g]."""
+
+
+class Dose(ResultPart):
+    """One dose."""
+
+    number: int
+    """Number of the dose, from 1."""
+
+    wanted_g: float
+    """Wanted amount [g]."""
+
+    received_g: float | None
+    """Amount weighed in the receiver [g]; None if it is unknown."""
+
+    deviation_g: float | None = None
+    """Standard deviation of this amount [g]: steps and noise of the display, and late drops; None if it is unknown."""
+
+    spilled_g: float | None
+    """Mass outside the receiver [g]; None if it is unknown."""
+
+    duration_s: float | None
+    """Time from the first motion until it was weighed [s]."""
+
+    end: str
+    """How the dose ended, or why it failed."""
+
+    position: str = ""
+    """Name of the receiver's place."""
+
+    source: str = ""
+    """Name of the source vessel."""
+
+    filled: bool = False
+    """Whether the source was filled before the dose."""
+
+    left_g: float | None = None
+    """Estimated content of the source after the dose [g]; None if it is unknown."""
+
+    left_deviation_g: float | None = None
+    """Standard deviation of this content [g]."""
+
+    signals: DoseSignals = DoseSignals()
+    """Signals over time."""
+
+    @property
+    def half_interval_g(self) -> float | None:
+        """Half of the interval that contains the true amount with a probability of 90 % [g]."""
+        return None if self.deviation_g is None else NINETY_PERCENT * self.deviation_g
+
+
+class Dispensed(StageResult):
+    """Results of a series of doses."""
+
+    kind: Literal["doses"] = "doses"
+
+    scene: str
+    """Name of the first scene."""
+
+    doses: tuple[Dose, ...]
+    """Completed doses, in the order made."""
+
+
+class Dispense:
+    """Pour amounts, one after the other.
+
+    Args:
+        plan: sources, amounts and their order.
+        seed: seed of a virtual bench's random numbers.
+        known: content of the sources; one that is absent is filled before its first dose.
+        calibrated: what a calibration has shown of sources, by name; it counts until the first dose of each.
+    """
+
+    def __init__(
+        self,
+        plan: DispensePlan,
+        seed: int,
+        known: Mapping[str, KnownSource] | None = None,
+        calibrated: Mapping[str, DoseKnowledge] | None = None,
+    ) -> None:
+        self._plan, self._calibrated = plan, dict(calibrated or {})
+        self._seeds = SeedStream(seed, "dispense")
+        self._constants = self._seeds.next()
+        self._sources: dict[str, KnownSource] = dict(known or {})
+        self._pouring: Pour | None = None
+        self._doses: list[Dose] = []
+        self.decisions: list[Decision] = []
+
+    @property
+    def finished(self) -> bool:
+        """Whether all doses are completed."""
+        return len(self._doses) == len(self._plan.doses)
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """Return the next dose, if none is running."""
+        if self.finished or self._pouring is not None or slots.pours < 1:
+            return []
+        number = len(self._doses) + 1
+        planned = self._plan.doses[number - 1]
+        source = self.next_source(planned)
+        scene = self._plan.scene(source.name, planned.receiver)
+        target = DoseTarget(planned.amount, planned.limit, planned.position, source)
+        self._pouring = Pour(scene.name, scene.action({}), number, self._seeds.next(), purpose=DOSE, dose=target)
+        into = f" into {planned.position}" if planned.position else ""
+        filled = ", filled before" if source.fill else f", which holds {1e3 * source.mass:.0f} g"
+        text = f"dose {number}/{len(self._plan.doses)}: {1e3 * planned.amount:g} g{into} from {source.name}{filled}"
+        if source.knowledge is not None and source.unused:
+            mean, deviation = source.knowledge.onset_flow[0], math.sqrt(source.knowledge.covariance[0])
+            text += f"; onset from the calibration: {math.degrees(mean):+.1f}° ± {math.degrees(deviation):.1f}°"
+        self.decisions.append(Decision(text))
+        return [self._pouring]
+
+    def next_source(self, planned: PlannedDose) -> DoseSource:
+        """The source of a dose: the first one that holds enough; if there is none, the fullest is filled."""
+        names = self._plan.sources
+        for name in names:
+            known = self._sources.get(name)
+            if known is not None and self._holds(known, planned):
+                return self._source(name, known, fill=False)
+        unknown = [name for name in names if name not in self._sources]
+        name = unknown[0] if unknown else max(names, key=lambda one: self._sources[one].mass)
+        scene = self._plan.scene(name, planned.receiver)
+        before = self._sources.get(name)
+        filled = KnownSource(
+            mass=scene.liquid.mass,
+            deviation=FILL_DEVIATION,
+            knowledge=None if before is None else before.knowledge,
+        )
+        source = self._source(name, filled, fill=True)
+        return source if before is None else replace(source, before=before.mass)
+
+    def assume(self, name: str, content: KnownSource) -> None:
+        """Set the content of a source, for a forecast of the doses after it."""
+        self._sources[name] = content
+
+    def _holds(self, known: KnownSource, planned: PlannedDose) -> bool:
+        sure = known.mass - ENOUGH * known.deviation
+        return sure > planned.amount + planned.limit and known.mass - planned.amount >= self._plan.refill_below
+
+    def _source(self, name: str, known: KnownSource, *, fill: bool) -> DoseSource:
+        knowledge = self._calibrated.get(name) if known.knowledge is None else _knowledge(known.knowledge)
+        return DoseSource(name, known.mass, known.deviation, fill, self._constants, knowledge)
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """Record the outcome of a dose.
+
+        Raises:
+            ValueError: the dose was not requested, or has another kind of outcome.
+        """
+        pour = self._pouring
+        if pour is None or request != pour:
+            raise ValueError(f"this dose was not asked for: {request}")
+        assert pour.dose is not None
+        assert pour.dose.source is not None
+        self._pouring = None
+        left = left_after(pour.dose, outcome)
+        if left is None:
+            self._sources.pop(pour.dose.source.name, None)
+        else:
+            self._sources[pour.dose.source.name] = left
+        about: dict[str, Any] = {}
+        received = spilled = None
+        match outcome:
+            case Poured(measured):
+                about = measured.notes.get(DOSE, {})
+                received, outside = 1e3 * float(about.get("received", measured.delivered)), spilled_mass(measured)
+                spilled = None if outside is None else 1e3 * outside
+                end = str(about.get("end", ""))
+            case Failed(kind, reason):
+                end = f"{kind}: {reason}"
+            case _:
+                raise ValueError(f"a dose can't be answered by {type(outcome).__name__}")
+        self._doses.append(
+            Dose(
+                number=pour.number,
+                wanted_g=1e3 * pour.dose.amount,
+                received_g=received,
+                deviation_g=None if "deviation" not in about else 1e3 * about["deviation"],
+                spilled_g=spilled,
+                duration_s=about.get("duration"),
+                end=end,
+                position=pour.dose.position,
+                source=pour.dose.source.name,
+                filled=pour.dose.source.fill,
+                left_g=None if left is None else 1e3 * left.mass,
+                left_deviation_g=None if left is None else 1e3 * left.deviation,
+                signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
+            )
+        )
+
+    def progress(self) -> Progress:
+        """Doses made, and their total number."""
+        return Progress(pours=len(self._doses), of_pours=len(self._plan.doses))
+
+    def result(self) -> Dispensed:
+        """The doses so far."""
+        return Dispensed(scene=self._plan.scenes[0].name, doses=tuple(self._doses))
+
+
+def spilled_mass(measured: PourMeasurement) -> float | None:
+    """Mass outside the receiver [kg]; None after a dose on a bench that does not weigh it."""
+    about: dict[str, Any] = measured.notes.get(DOSE, {})
+    found: float | None = about.get("spilled", measured.spilled)
+    return found
+
+
+def left_after(dose: DoseTarget, outcome: Outcome) -> KnownSource | None:
+    """Content of a dose's source after it, and what the dose has shown; None if the content is unknown.
+
+    Args:
+        dose: with its source.
+        outcome: of its pour.
+    """
+    source = dose.source
+    if source is None:
+        return None
+    before = None if source.knowledge is None or source.unused else _fields(source.knowledge)
+    match outcome:
+        case Poured(measured):
+            about = measured.notes.get(DOSE, {})
+            if "left" in about:
+                mass, deviation = map(float, about["left"])
+                return KnownSource(mass=max(mass, 0.0), deviation=deviation, knowledge=about.get("knowledge", before))
+            mass = max(source.mass - measured.delivered - measured.spilled, 0.0)  # an operator weighed it
+            return KnownSource(mass=mass, deviation=math.hypot(source.deviation, WEIGHED_DEVIATION), knowledge=before)
+        case Failed(kind="invalid_action"):  # nothing was poured
+            return KnownSource(mass=source.mass, deviation=source.deviation, knowledge=before)
+    return None
+
+
+def _fields(knowledge: DoseKnowledge) -> dict[str, Any]:
+    return {name: getattr(knowledge, name) for name in DoseKnowledge.__dataclass_fields__}
+
+
+def _knowledge(fields: Mapping[str, Any]) -> DoseKnowledge:
+    lag = fields["lag"]
+    return DoseKnowledge(
+        tuple(fields["onset_flow"]),
+        tuple(fields["covariance"]),
+        None if lag is None else tuple(lag),
+        float(fields["aim"]),
+        int(fields["doses"]),
+        tuple(fields.get("display", ())),
+    )

@@ -1,0 +1,100 @@
+"""Base of all stage results, and the form in which results show actions and surrogates.
+
+- `StageResult` is the base class. Each kind is defined in the module of its strategy.
+- `displayed_action` and `displayed_map` convert actions and surrogates for display; the units are part of the keys.
+
+Reading and writing of results is in `orchestrator.records.codec`, the list of all kinds in `strategy_registry`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict
+
+from actors.optimizer.questions import SurrogateMap
+from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.search_space import Space
+
+
+class ResultPart(BaseModel):
+    """Part of a result. It is immutable, and its JSON form has exactly the declared fields."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", defer_build=True)
+
+
+class StageResult(ResultPart):
+    """Result of a strategy so far. Each subclass declares its own unique `kind`.
+
+    Journals, study files and `summary.json` hold dumps; `orchestrator.records.codec` reads them back by their
+    kind.
+    """
+
+    KINDS: ClassVar[dict[str, type[StageResult]]] = {}
+    """All kinds that are declared in the imported modules."""
+
+    kind: str
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Register the kind.
+
+        Raises:
+            TypeError: another class has this kind already, or this class declares none.
+        """
+        super().__pydantic_init_subclass__(**kwargs)
+        kind = cls.model_fields["kind"].default
+        if not isinstance(kind, str):
+            raise TypeError(f"{cls.__qualname__} has to declare its kind: kind: Literal['…'] = '…'")
+        known = StageResult.KINDS.setdefault(kind, cls)
+        if (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise TypeError(f"{cls.__qualname__}: {known.__qualname__} has the kind '{kind}' already; choose another")
+
+
+class DisplayedMap(ResultPart):
+    """A surrogate over two axes: row i of `mean` and `deviation` belongs to the i-th value of the second axis."""
+
+    over: tuple[str, ...]
+    """Names of the two axes."""
+
+    held: dict[str, float]
+    """Values [SI] of the other dimensions at which the surrogate is evaluated."""
+
+    axes: dict[str, tuple[float, ...]]
+    """Values [SI] along each of the two axes."""
+
+    mean: tuple[tuple[float, ...], ...]
+    """Posterior mean, in the unit of the cost."""
+
+    deviation: tuple[tuple[float, ...], ...]
+    """Posterior standard deviation, in the unit of the cost."""
+
+
+UNIT_SUFFIXES = {"deg/s": "deg_s", "deg/s^2": "deg_s2", "deg": "deg", "mm": "mm", "s": "s"}
+"""How the names of columns end, by display unit of an action dimension."""
+
+
+def displayed_action(values: Mapping[str, float | None]) -> dict[str, float | None]:
+    """Convert action dimensions from SI to display units: {'angular_velocity_deg_s': 41.2, …}."""
+    shown: dict[str, float | None] = {}
+    for name, value in values.items():
+        dimension = ACTION_DIMENSIONS[name]
+        shown[f"{name}_{UNIT_SUFFIXES[dimension.display_unit]}"] = None if value is None else value / dimension.factor
+    return shown
+
+
+def displayed_map(surrogate: SurrogateMap | None, space: Space) -> DisplayedMap | None:
+    """Convert a surrogate to its form in results; None if there is none."""
+    if surrogate is None:
+        return None
+    size = len(surrogate.mean)
+    places = [i / (size - 1) if size > 1 else 0.5 for i in range(size)]
+    plane = surrogate.plane(space)
+    return DisplayedMap(
+        over=plane.names,
+        held=surrogate.held(space),
+        axes={axis.name: tuple(axis.decode(u) for u in places) for axis in plane.axes},
+        mean=surrogate.mean,
+        deviation=surrogate.deviation,
+    )

@@ -1,0 +1,384 @@
+"""The account of vessels: the content of each one with its uncertainty, across doses, campaigns, orders and restarts.
+
+`VesselAccount` is a small SQLite file in the state directory. Its entries are append-only and state the content after a
+filling, a weighing or a pour; the last entry of a vessel counts. A pour that has begun and has no outcome makes the
+content uncertain by its amount; one with unknown outcome makes it unknown until the vessel is weighed.
+
+    account = VesselAccount.open()
+    account.weigh("virtual/beaker", 0.412, 1e-4, liquid="water")
+    account.content("virtual/beaker")
+
+The command line, the library, runs and the daemon share the file. A vessel of the station has its id as its name, the
+source of a campaign 'LABORATORY/VESSEL'. `VesselAccount.follow` is a subscriber of a run
+(`orchestrator.records.events`). Entries have a key, so that the events of a resumed run are written once.
+
+Limitations: liquids that were poured together become a mixture. Evaporation is not estimated. Of a campaign, the doses
+of `dispense` are in the account; the pourer of other campaigns is refilled by an operator.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from orchestrator.learning.campaign_plan import DispensePlan
+from orchestrator.learning.dispense import KnownSource, left_after
+from orchestrator.learning.requests import Failed, Outcome, Pour, Poured
+from orchestrator.records.events import CampaignOpened, Event, RequestFinished, RequestStarted
+from orchestrator.records.run_registry import make_state_directory, state_directory
+from sim_engine.errors import InvalidArgumentError
+
+FILE_NAME = "vessels.sqlite"
+
+MIXTURE = "mixture"
+"""Liquid of a vessel that several liquids were poured into."""
+
+EntryKind = Literal["filled", "weighed", "begun", "poured", "unknown"]
+
+_SCHEMA = """
+create table if not exists entry (
+    id integer primary key, key text unique not null, vessel text not null, t real not null, kind text not null,
+    mass real, deviation real not null, liquid text not null, pour text not null, by text not null,
+    note text not null, weighed real, knowledge text check (knowledge is null or json_valid(knowledge))
+) strict;
+create index if not exists entry_by_vessel on entry (vessel, id);
+create trigger if not exists entry_is_never_changed before update on entry begin
+    select raise(abort, 'account entries are append-only'); end;
+create trigger if not exists entry_is_never_deleted before delete on entry begin
+    select raise(abort, 'account entries are append-only'); end;
+"""
+
+PATIENCE = 1.0
+"""Longest wait for another process that writes [s]."""
+
+
+@dataclass(frozen=True)
+class VesselContent:
+    """Content of a vessel after one entry of the account.
+
+    Attributes:
+        vessel: its name.
+        time: of the entry, seconds since 1970.
+        kind: 'filled', 'weighed', 'begun' (a pour), 'poured', or 'unknown' (a pour whose amount is not known).
+        mass: [kg]; None if it is unknown.
+        deviation: standard deviation of the mass [kg].
+        liquid: name of the liquid, 'mixture', or '' if it is empty.
+        pour: the pour that changed it; '' after a filling or weighing.
+        by: who made the entry; '' for a run.
+        note: for people.
+        weighed: time of the last filling or weighing; None without one.
+        knowledge: what doses have shown, fields of `actors.interfaces.DoseKnowledge`; None if there are none.
+    """
+
+    vessel: str
+    time: float
+    kind: EntryKind
+    mass: float | None
+    deviation: float
+    liquid: str = ""
+    pour: str = ""
+    by: str = ""
+    note: str = ""
+    weighed: float | None = None
+    knowledge: dict[str, Any] | None = None
+
+    def json_content(self) -> dict[str, Any]:
+        """The content for JSON, masses in g."""
+        return {
+            **{"mass_g": None if self.mass is None else 1e3 * self.mass, "deviation_g": 1e3 * self.deviation},
+            **{"liquid": self.liquid, "since": self.time, "pour": self.pour, "weighed": self.weighed},
+        }
+
+    def json_entry(self) -> dict[str, Any]:
+        """The entry for JSON, masses in g."""
+        content = self.json_content()
+        return {
+            **{"t": self.time, "vessel": self.vessel, "kind": self.kind},
+            **{name: content[name] for name in ("mass_g", "deviation_g", "liquid", "pour")},
+            **{"by": self.by, "note": self.note},
+        }
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Masses that a pour has moved [kg], each with its standard deviation; None: unknown."""
+
+    taken: tuple[float, float] | None
+    received: tuple[float, float] | None
+
+
+class VesselAccount:
+    """The account in one file.
+
+    Args:
+        path: of the file; it need not exist yet.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @classmethod
+    def open(cls, state: Path | None = None) -> VesselAccount:
+        """The account in a state directory.
+
+        Args:
+            state: the directory; None: that of this machine's user.
+
+        Raises:
+            OSError: the state directory can't be made.
+        """
+        folder = state or state_directory()
+        make_state_directory(folder)
+        return cls(folder / FILE_NAME)
+
+    # ---- reading
+
+    def content(self, vessel: str) -> VesselContent | None:
+        """The last entry of a vessel; None without any.
+
+        Raises:
+            OSError: the file can't be read.
+        """
+        found = self.history(vessel, 1)
+        return found[0] if found else None
+
+    def history(self, vessel: str = "", count: int = 1000) -> list[VesselContent]:
+        """The last entries of a vessel ('' for all), the newest first.
+
+        Raises:
+            OSError: the file can't be read.
+        """
+        return self._entries("where ? in ('', vessel) order by id desc limit ?", (vessel, count))
+
+    def all(self) -> list[VesselContent]:
+        """The last entry of every vessel, by name.
+
+        Raises:
+            OSError: the file can't be read.
+        """
+        return self._entries("where id in (select max(id) from entry group by vessel) order by vessel", ())
+
+    def _entries(self, condition: str, values: tuple[Any, ...]) -> list[VesselContent]:
+        if not self._path.is_file():
+            return []
+        with self._connection() as connection:
+            return _read(connection, condition, values)
+
+    def known(self, plan: DispensePlan) -> dict[str, KnownSource]:
+        """Content and knowledge of a series' sources, by the names of the vessels.
+
+        A source of unknown content, or with another liquid, is absent. If the series begins with full sources, all
+        are. The lag of the balance is measured again.
+
+        Raises:
+            OSError: the file can't be read.
+        """
+        found: dict[str, KnownSource] = {}
+        for name in plan.sources if plan.as_left else ():
+            entry = self.content(plan.tracked(name))
+            if entry is not None and entry.mass is not None and entry.liquid == plan.liquid(name):
+                knowledge = None if entry.knowledge is None else {**entry.knowledge, "lag": None}
+                found[name] = KnownSource(mass=entry.mass, deviation=entry.deviation, knowledge=knowledge)
+        return found
+
+    # ---- entries of people and devices
+
+    def fill(
+        self, vessel: str, mass: float, deviation: float, *, liquid: str = "", by: str = "", note: str = "",
+        key: str = "",
+    ) -> None:  # fmt: skip
+        """A vessel was emptied and filled; see `weigh`."""
+        self._set("filled", vessel, mass, deviation, liquid, by, note, key)
+
+    def weigh(
+        self, vessel: str, mass: float, deviation: float, *, liquid: str = "", by: str = "", note: str = "",
+        key: str = "",
+    ) -> None:  # fmt: skip
+        """The content of a vessel was weighed: it replaces the estimate.
+
+        Args:
+            vessel: its name.
+            mass: content, without the vessel [kg].
+            deviation: its standard deviation [kg].
+            liquid: name of the liquid; '' keeps the present one.
+            by: who weighed it.
+            note: for people.
+            key: a second entry with the same key changes nothing; '' for a new one.
+
+        Raises:
+            InvalidArgumentError: a value is invalid, or the vessel was empty and the liquid is missing.
+            OSError: the file can't be written.
+        """
+        self._set("weighed", vessel, mass, deviation, liquid, by, note, key)
+
+    def _set(
+        self, kind: EntryKind, vessel: str, mass: float, deviation: float, liquid: str, by: str, note: str, key: str
+    ) -> None:
+        for name, value in (("mass", mass), ("deviation", deviation)):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise InvalidArgumentError(f"{name}: {value} kg should be a number of 0 or more")
+        with self._writing() as connection:
+            before = _last(connection, vessel)
+            held = liquid or ("" if before is None else before.liquid)
+            if mass > 0.0 and not held:
+                raise InvalidArgumentError(f"{vessel}: is empty so far; name the liquid that it was filled with")
+            now = time.time()
+            knowledge = None if before is None else before.knowledge
+            liquid = held if mass > 0.0 else ""
+            entry = VesselContent(
+                vessel, now, kind, mass, deviation, liquid, by=by, note=note, weighed=now, knowledge=knowledge
+            )
+            _write(connection, key or f"{kind} {vessel} {time.time_ns()}", entry)
+
+    def transfer(self, pour: str, source: str, receiver: str, moved: Transfer, *, by: str = "", note: str = "") -> None:
+        """Enter a pour in the account of both vessels, once: a second call for the same pour changes nothing.
+
+        Args:
+            pour: its unique name.
+            source, receiver: names of the vessels; a vessel without entries is empty.
+            moved: masses.
+            by: who ordered or made it.
+            note: for people.
+
+        Raises:
+            OSError: the file can't be written.
+        """
+        with self._writing() as connection:
+            held, there = (_last(connection, name) or _empty(name) for name in (source, receiver))
+            mixed = held.liquid if there.liquid in ("", held.liquid) else MIXTURE
+            for before, change, sign, liquid, role in (
+                (held, moved.taken, -1.0, held.liquid, "from"),
+                (there, moved.received, 1.0, mixed, "into"),
+            ):
+                kind, mass, deviation = _after(before, change, sign)
+                entry = VesselContent(
+                    before.vessel, time.time(), kind, mass, deviation, liquid, pour, by, note, before.weighed,
+                    before.knowledge,
+                )  # fmt: skip
+                _write(connection, f"{pour} {role}", entry)
+
+    # ---- entries of runs
+
+    def begin(self, vessel: str, pour: Pour, liquid: str, *, key: str) -> None:
+        """A dose begins: until it has an outcome, between nothing and all of its amount may be gone.
+
+        Raises:
+            OSError: the file can't be written.
+        """
+        assert pour.dose is not None
+        if (of := pour.dose.source) is None:
+            return
+        if of.fill:
+            self.fill(vessel, of.mass, of.deviation, liquid=liquid, key=f"{key} filled")
+        half = 0.5 * pour.dose.amount
+        begun = KnownSource(mass=max(of.mass - half, 0.0), deviation=math.hypot(of.deviation, half))
+        self._note_dose(vessel, "begun", begun, f"{key} begun", liquid)
+
+    def finish(self, vessel: str, pour: Pour, outcome: Outcome, liquid: str, *, key: str) -> None:
+        """A dose has an outcome.
+
+        Raises:
+            OSError: the file can't be written.
+        """
+        assert pour.dose is not None
+        left = left_after(pour.dose, outcome)
+        self._note_dose(vessel, "unknown" if left is None else "poured", left, key, liquid)
+
+    def _note_dose(self, vessel: str, kind: EntryKind, left: KnownSource | None, key: str, liquid: str) -> None:
+        with self._writing() as connection:
+            before = _last(connection, vessel) or _empty(vessel)
+            mass, deviation = (None, 0.0) if left is None else (left.mass, left.deviation)
+            knowledge = before.knowledge if left is None or left.knowledge is None else left.knowledge
+            name = key.rpartition("/")[2].removesuffix(" begun")  # without the folder of the run
+            entry = VesselContent(
+                vessel, time.time(), kind, mass, deviation, liquid, name, weighed=before.weighed, knowledge=knowledge
+            )
+            _write(connection, key, entry)
+
+    def follow(self, plan: DispensePlan) -> Callable[[Event], None]:
+        """A subscriber that writes the doses of a run.
+
+        Args:
+            plan: of its series.
+        """
+        run = ""
+
+        def subscriber(event: Event) -> None:
+            nonlocal run
+            match event:
+                case CampaignOpened():
+                    run = str(event.run_directory.resolve())
+                case RequestStarted(request=Pour() as pour) if pour.dose is not None and pour.dose.source is not None:
+                    name = pour.dose.source.name
+                    key = f"{run} {event.stage} {pour.number}"
+                    self.begin(plan.tracked(name), pour, plan.liquid(name), key=key)
+                case RequestFinished(request=Pour() as pour, outcome=Poured() | Failed() as outcome) if (
+                    pour.dose is not None and pour.dose.source is not None
+                ):
+                    name = pour.dose.source.name
+                    key = f"{run} {event.stage} {pour.number}"
+                    self.finish(plan.tracked(name), pour, outcome, plan.liquid(name), key=key)
+
+        return subscriber
+
+    # ---- the file
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """One transaction: nobody else writes between the reading of a content and the entry that follows from it."""
+        with self._connection() as connection:
+            connection.executescript(_SCHEMA)
+            connection.execute("begin immediate")
+            yield connection
+
+    @contextlib.contextmanager
+    def _connection(self) -> Iterator[sqlite3.Connection]:
+        try:
+            with contextlib.closing(sqlite3.connect(self._path, timeout=PATIENCE)) as connection, connection:
+                yield connection
+        except sqlite3.Error as error:
+            raise OSError(f"{self._path}: {error}") from error
+
+
+def _empty(vessel: str) -> VesselContent:
+    return VesselContent(vessel, 0.0, "weighed", 0.0, 0.0)
+
+
+def _after(
+    before: VesselContent, change: tuple[float, float] | None, sign: float
+) -> tuple[EntryKind, float | None, float]:
+    """Kind, mass and deviation of an entry after a pour; a content that was unknown remains so."""
+    if change is None:
+        return "unknown", None, 0.0
+    if before.mass is None:
+        return "poured", None, 0.0
+    return "poured", max(before.mass + sign * change[0], 0.0), math.hypot(before.deviation, change[1])
+
+
+_COLUMNS = "vessel, t, kind, mass, deviation, liquid, pour, by, note, weighed, knowledge"
+
+
+def _read(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> list[VesselContent]:
+    rows = connection.execute(f"select {_COLUMNS} from entry {condition}", values).fetchall()
+    return [VesselContent(*(*row[:-1], None if row[-1] is None else json.loads(row[-1]))) for row in rows]
+
+
+def _last(connection: sqlite3.Connection, vessel: str) -> VesselContent | None:
+    found = _read(connection, "where vessel = ? order by id desc limit 1", (vessel,))
+    return found[0] if found else None
+
+
+def _write(connection: sqlite3.Connection, key: str, one: VesselContent) -> None:
+    knowledge = None if one.knowledge is None else json.dumps(one.knowledge)
+    values = (one.vessel, one.time, one.kind, one.mass, one.deviation, one.liquid, one.pour, one.by, one.note)
+    connection.execute(
+        f"insert or ignore into entry (key, {_COLUMNS}) values ({', '.join('?' * 12)})",
+        (key, *values, one.weighed, knowledge),
+    )

@@ -1,1 +1,0 @@
-"""Progress of a running campaign: progress state, time estimate, console display."""

@@ -1,0 +1,103 @@
+"""Display of results in the terminal: the result document of a run, and tables of text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.run_summary import Advice, RunSummary
+from orchestrator.reports.wording import ResultTable, receiver_table, score_table
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+PLAIN_WIDTH, LONGEST_LINE = 110, 1_000
+"""Minimum and maximum number of columns of the table if stderr is not a terminal."""
+
+
+def summary_table(summary: RunSummary) -> RenderableType:
+    """The document for the terminal: θ*, discrepancies, losses and best actions by receiver, files."""
+    from rich.console import Group
+    from rich.text import Text
+
+    parts: list[RenderableType] = [Text(f"\n{summary.campaign}  seed {summary.seed}", style="bold")]
+    if summary.calibrated_theta is not None:
+        parts.append(Text(f"θ*  {style.display_values(summary.calibrated_theta.model_dump())}"))
+        parts += [Text(f"  {line}", style="dim") for line in summary.theta_sentences]
+    parts += [_table(table) for table in (score_table(summary), receiver_table(summary)) if table.rows]
+    for one in summary.advice:
+        parts += _advice(one)
+    pools = {stage.rpartition(":")[2]: use.text for stage, use in summary.occupancy.items() if use.text}
+    parts += [Text(f"  {stage}: pool {text}", style="dim") for stage, text in pools.items()]
+    files = [*summary.figures.items(), *([("recording", summary.recording)] if summary.recording else [])]
+    if files:
+        width = max(len(name) for name, _ in files)
+        # Each path ends its line without a line break, so that it can be clicked and copied.
+        parts.append(Text("\n".join(f"  {name:<{width}}  {path}" for name, path in files), overflow="fold"))
+    if summary.dropped_events:
+        parts.append(Text(f"  the recording lacks {summary.dropped_events} events: it could not keep up", "yellow"))
+    return Group(*parts)
+
+
+def _advice(one: Advice) -> list[RenderableType]:
+    from rich.text import Text
+
+    action = ", ".join(f"{name} {value}" for name, value in one.action.items())
+    lines = [f"  into {one.receiver}: {action}" if action else f"  into {one.receiver}", *one.sentences, one.window]
+    shown: list[RenderableType] = [Text(line if i == 0 else f"    {line}") for i, line in enumerate(lines) if line]
+    return shown + [Text(f"    {line}", style="yellow") for line in one.open]
+
+
+def print_summary(summary: RunSummary) -> None:
+    """Write the document to stderr."""
+    _print(summary_table(summary), to_stderr=True)
+
+
+def print_table(rows: Sequence[Mapping[str, str]], *, right: Sequence[str] = (), title: str | None = None) -> None:
+    """Write a table to stdout; empty columns are left out.
+
+    Args:
+        rows: head → cell, the same heads in each.
+        right: heads of columns with numbers, which are right-aligned.
+    """
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left", title_style="bold", box=_box(), pad_edge=False)
+    shown = [head for head in rows[0] if any(row[head] for row in rows)] if rows else []
+    for head in shown:
+        table.add_column(Text(head), justify="right" if head in right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(row[head]) for head in shown))
+    _print(table)
+
+
+def _table(content: ResultTable) -> RenderableType:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=Text(content.caption), title_justify="left", box=_box())
+    for place, head in enumerate(content.header):
+        table.add_column(Text(head), justify="right" if place in content.numbers else "left")
+    for row in content.rows:
+        table.add_row(*map(Text, row.cells))
+    return table
+
+
+def _print(table: RenderableType, *, to_stderr: bool = False) -> None:
+    """Print a table. If the output is not a terminal, lines are as long as names and paths need."""
+    from rich.console import Console
+    from rich.measure import Measurement
+
+    console = Console(stderr=to_stderr)
+    if not console.is_terminal:
+        wanted = Measurement.get(console, console.options.update(max_width=LONGEST_LINE), table).maximum
+        console.width = max(PLAIN_WIDTH, wanted)
+    console.print(table)
+
+
+def _box() -> Any:
+    from rich import box
+
+    return box.SIMPLE_HEAD

@@ -1,0 +1,295 @@
+"""Publishing of a run: its figures, result document, θ* and report are written into its folder."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from orchestrator.catalogue.run_reading import read_run
+from orchestrator.learning.calibration.calibration_base import CalibratedTheta
+from orchestrator.learning.calibration.calibration_scores import (
+    UNCALIBRATED,
+    Scores,
+    recommended_theta,
+    shift_left_over,
+)
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.journal_check import check_journal
+from orchestrator.records.run_record import CampaignResult, read_record, read_result
+from orchestrator.records.states import State
+from orchestrator.reports import validity_warnings as regimes
+from orchestrator.reports.html_report import REPORT_NAME, run_page
+from orchestrator.reports.recording_export import export_recordings
+from orchestrator.reports.run_figures import draw_figures
+from orchestrator.reports.run_summary import SUMMARY_NAME, RunSummary, Totals, write_summary
+from orchestrator.reports.stage_views import evaluation_of, theta_of
+from orchestrator.reports.summarise import pool_use, summarise, summarise_record
+from orchestrator.runs.run_folder import read_versions
+
+if TYPE_CHECKING:
+    from orchestrator.runs.run_service import RunHandle, RunRequest
+
+W = TypeVar("W")
+
+FIGURES, THETA_FILE, RECORDING = "figures", "theta.json", "campaign.rrd"
+
+KEPT_THETAS = 50
+"""Draws of the posterior in that file."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Published:
+    """The files that were written about a run.
+
+    Attributes:
+        figures: by name.
+        theta: the file of the recommended θ, for `--parameters`; None where nothing was calibrated.
+        report: the page about the run, for people; None where it could not be written.
+    """
+
+    summary: RunSummary
+    figures: dict[str, Path]
+    recording: Path | None = None
+    theta: Path | None = None
+    report: Path | None = None
+
+
+def publish(
+    plan: CampaignPlan, result: CampaignResult, recording: Path | None = None, dropped_events: int = 0
+) -> Published:
+    """Write a run's figures and recorded pours (if the plan wants any), `theta.json`, `summary.json` and the report.
+
+    A run that has not finished may be published, too: its report describes its state. Safe to call again: the files
+    are then written again.
+
+    Args:
+        plan: of the campaign.
+        result: of the run, as `run_campaign` or `read_result` returns it.
+        recording: its file, closed; by default the one in the run's folder, if there is one.
+        dropped_events: missing in the recording.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    directory = result.directory
+    figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
+    if plan.outputs.pour_recordings:
+        for reason in export_recordings(directory, plan=plan)[1]:
+            _log.warning("not recorded: %s", reason)
+    summary = summary_of(plan, result, figures, recording=recording, dropped_events=dropped_events)
+    write_summary(directory, summary)
+    found = theta_of(result.results)
+    theta = None if found is None else directory / THETA_FILE
+    if theta is not None and found is not None:
+        written = theta_file(found, evaluation_of(result.results))
+        theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
+    report: Path | None = directory / REPORT_NAME
+    try:
+        _write_page(directory / REPORT_NAME, run_page(summary, plan.resolved))
+    except Exception as error:  # days of pouring don't end in a traceback about a page
+        _log.warning("the report was not written: %s: %s", type(error).__name__, error)
+        report = None
+    return Published(summary, figures, summary.recording, theta, report)
+
+
+def publish_run(handle: RunHandle) -> Published:
+    """Close the recording of a finished run, and publish the run. Blocks for seconds.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    assert handle.result is not None, "publish_run() follows wait()"
+    handle.close()
+    recorded = () if handle.recorder is None else (handle.recorder.path, handle.recorder.dropped)
+    return publish(handle.campaign, handle.result, *recorded)
+
+
+def publish_so_far(request: RunRequest) -> Published | None:
+    """Publish a run that has stopped, from its journal.
+
+    Args:
+        request: with the folder of the run.
+
+    Returns:
+        None if the run has no journal.
+
+    Raises:
+        RunError: the journal can't be read.
+        OSError: a file can't be written.
+    """
+    if request.folder is None or not (request.folder / JOURNAL_NAME).is_file():
+        return None
+    return publish(request.campaign, read_result(request.folder))
+
+
+def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
+    """Publish a finished run whose process ended before `summary.json` or `theta.json` was written.
+
+    Returns:
+        Whether anything was missing.
+
+    Raises:
+        OSError: a file can't be written.
+    """
+    expected = [SUMMARY_NAME, *([] if theta_of(result.results) is None else [THETA_FILE])]
+    if result.state is not State.FINISHED or all((result.directory / name).is_file() for name in expected):
+        return False
+    publish(plan, result)
+    return True
+
+
+def summary_of(
+    plan: CampaignPlan,
+    result: CampaignResult,
+    figures: Mapping[str, Path] | None = None,
+    *,
+    recording: Path | None = None,
+    dropped_events: int = 0,
+    live: bool = False,
+) -> RunSummary:
+    """The result document of a run as its folder holds it, of one that is not finished too.
+
+    Args:
+        figures: name → file.
+        recording: its file; by default the one in the run's folder, if there is one.
+        dropped_events: missing in the recording.
+        live: whether the run is in progress.
+
+    Raises:
+        OSError: a file can't be read.
+        RunError: the journal can't be read.
+    """
+    directory = result.directory
+    record = read_record(directory, slots=plan.parallel_simulations)
+    beside = directory / RECORDING
+    return summarise(
+        plan,
+        result.results,
+        record=record,
+        run=directory.name,
+        live=live,
+        versions=read_versions(directory),
+        check=check_journal(directory / JOURNAL_NAME),
+        figures=figures,
+        recording=recording or (beside if beside.is_file() else None),
+        dropped_events=dropped_events,
+        not_covered=worked_out(lambda: regimes.campaign_warnings(plan)),
+        best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
+        totals=Totals(
+            mode=plan.laboratory.mode if record.pours or plan.laboratory.pours else "none",
+            simulations=result.simulations,
+            pours=result.pours,
+            cpu_s=result.cpu_s,
+            seconds=result.seconds,
+            occupancy=pool_use(record.occupancies),
+        ),
+    )
+
+
+def report_on(
+    plan: CampaignPlan,
+    result: CampaignResult,
+    path: Path | None = None,
+    formats: tuple[str, ...] = (".svg",),
+    *,
+    draw: bool = True,
+) -> tuple[Path, dict[str, Path]]:
+    """Draw a run's figures again, and write the page about it, wherever the run stands.
+
+    Args:
+        path: of the page; in the run's folder unless given.
+        formats: of the figures.
+        draw: whether figures are drawn; the page has none otherwise.
+
+    Raises:
+        OSError: a file can't be written.
+        RunError: the journal can't be read.
+    """
+    figures = draw_figures(result.directory / FIGURES, plan, result.results, formats) if draw else {}
+    page = run_page(summary_of(plan, result, figures), plan.resolved)
+    return _write_page(path or result.directory / REPORT_NAME, page), figures
+
+
+def write_reduced_report(path: Path, directory: Path, reason: str) -> Path:
+    """Write the page about a run whose campaign or results can't be read: what its journal has without them.
+
+    Args:
+        path: of the page.
+        directory: of the run.
+        reason: why the whole report can't be made.
+
+    Raises:
+        OSError: it can't be written, or a figure can't be read.
+        RunError: the journal can't be read.
+    """
+    summary = summarise_record(
+        read_record(directory),
+        directory.name,
+        reason=reason,
+        catalogued=read_run(directory).run,
+        versions=read_versions(directory),
+        check=check_journal(directory / JOURNAL_NAME),
+        figures={file.stem.replace("-", " "): file for file in sorted((directory / FIGURES).glob("*.png"))},
+    )
+    return _write_page(path, run_page(summary))
+
+
+def _write_page(path: Path, page: str) -> Path:
+    draft = path.with_suffix(".html.part")
+    draft.write_text(page, encoding="utf-8")
+    draft.replace(path)
+    return path
+
+
+def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str, Any]:
+    """What `theta.json` holds: the recommended θ, what it left over, and where it is known the posterior of θ.
+
+    The posterior is a list of weighted θ, each complete. If the uncalibrated θ is recommended, `calibrated` has θ* and
+    `recommended` is 'uncalibrated', so that predictions do not draw from the posterior unless they are asked to.
+
+    Args:
+        found: by the calibration.
+        scored: θ* on the weighed pours; None: the rest is unknown.
+    """
+    theta = found.theta.model_dump()
+    data: dict[str, Any] = {"theta": recommended_theta(found.theta, scored).model_dump()}
+    if scored is not None and scored.gain is not None:
+        data |= {"recommended": scored.gain.recommended, "why": scored.gain.text}
+        if scored.gain.recommended == UNCALIBRATED:
+            data["calibrated"] = theta
+    left = None if scored is None else shift_left_over(scored, len(found.searched))
+    if left is not None:
+        data["remaining_discrepancy"] = {"shift": left}
+    if found.posterior is not None:
+        draws = found.posterior.thetas
+        kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]
+        data["posterior"] = [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]
+    return data
+
+
+def worked_out(
+    work: Callable[[], dict[str, list[W]]], tell: Callable[[str], None] = _log.warning
+) -> dict[str, list[W]]:
+    """Warnings, or none if they can't be worked out: that is not a reason to lose a summary."""
+    try:
+        return work()
+    except (ValueError, OSError) as error:
+        tell(f"note: whether something is not simulated could not be worked out: {error}")
+        return {}
+
+
+def not_simulated(plan: CampaignPlan, tell: Callable[[str], None] = _log.warning) -> list[str]:
+    """Effects that are not simulated in a campaign's action spaces: lines for the user before it begins.
+
+    Args:
+        plan: of the campaign.
+        tell: called if that can't be worked out.
+    """
+    return regimes.lines(worked_out(lambda: regimes.campaign_warnings(plan), tell))

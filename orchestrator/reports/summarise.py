@@ -1,0 +1,486 @@
+"""Makes the result document of a run from its plan, its record and the results of its stages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from actors.laboratory_settings import MODE_LABELS
+from orchestrator.learning.calibration.calibration_base import CalibratedTheta
+from orchestrator.learning.calibration.calibration_scores import Scores
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.learning.deployment.deployment_result import Deployed
+from orchestrator.learning.single_action import Confirmed, PredictedPour
+from orchestrator.records.codec import Results
+from orchestrator.records.journal_check import JournalCheck
+from orchestrator.records.journal_file import Header
+from orchestrator.records.run_record import Occupancy, RunPour, RunState
+from orchestrator.reports import figure_style as style
+from orchestrator.reports import wording
+from orchestrator.reports.loss_units import (
+    SPILLAGE,
+    LossUnit,
+    deployment_unit,
+    is_calibration,
+    loss_of_pour,
+    minimised_loss,
+    unit_of_pour,
+)
+from orchestrator.reports.run_summary import (
+    NOT_SEARCHED,
+    LogEntry,
+    NotSimulated,
+    ParameterSummary,
+    PoolUse,
+    PourSummary,
+    QuestionSummary,
+    ReceiverSummary,
+    RunSummary,
+    StageSummary,
+    Totals,
+)
+from orchestrator.reports.stage_views import (
+    SPLITS,
+    calibrated_label,
+    calibration_of,
+    confirmations_of,
+    deployments_of,
+    evaluation_of,
+    gain_of,
+    predictions_of,
+    receiver_names,
+    recommended_theta_of,
+    rival_scores,
+    theta_of,
+)
+from sim_engine.model_validity import NotCovered
+from sim_engine.outcome import normalised_spillage
+
+MOST_DECISIONS = 300
+"""Largest number of decisions in a summary, the most recent ones."""
+
+
+def summarise(
+    plan: CampaignPlan,
+    results: Results,
+    *,
+    record: RunState | None = None,
+    run: str = "",
+    live: bool = False,
+    versions: Mapping[str, Any] | None = None,
+    check: JournalCheck | None = None,
+    figures: Mapping[str, Path] | None = None,
+    recording: Path | None = None,
+    dropped_events: int = 0,
+    not_covered: Mapping[str, Sequence[NotSimulated]] | None = None,
+    best_not_covered: Mapping[str, Sequence[NotCovered]] | None = None,
+    totals: Totals | None = None,
+) -> RunSummary:
+    """The result document of a run.
+
+    Args:
+        plan: plan of the campaign.
+        results: results of the stages.
+        record: content of the run's journal.
+        run: name of the run's folder.
+        live: whether the run is in progress, so that a pour without outcome is under way.
+        versions: content of `versions.json`.
+        check: check of the journal.
+        figures: name → file.
+        recording: path of the `.rrd`.
+        dropped_events: number of events missing in the recording.
+        not_covered: effects that are not simulated in the action spaces, by scene.
+        best_not_covered: the same for the recommended actions.
+        totals: costs of the run.
+    """
+    record = record or RunState(Header(plan.name, {}))
+    found, evaluation, gain = theta_of(results), evaluation_of(results), gain_of(results)
+    calibration = calibration_of(results)
+    posterior = None if found is None or found.posterior is None else found.posterior.summary()
+    space = None if plan.calibration is None else plan.calibration.parameters
+    liquid = None if plan.calibration is None else plan.calibration.scene.liquid
+    expected = None if found is None else found.predicted_discrepancy
+    deviation = None if found is None else found.predicted_deviation
+    ended = None if calibration is None else calibration.ended
+    discrepancy = _discrepancies(evaluation)
+    receivers = _receivers(plan, results, best_not_covered or {})
+    advised = wording.advice(plan, receivers)
+    totals = totals or Totals()
+    open_theta = [] if found is None else wording.about_theta(gain, posterior, discrepancy)
+    return RunSummary(
+        **dict(totals),
+        **_of_record(plan, record, run, live, check),
+        campaign=plan.name,
+        seed=plan.seed,
+        advice=advised,
+        without_advice=() if advised else tuple(wording.without_advice(plan, record, calibrated=found is not None)),
+        open_questions=tuple(
+            wording.open_questions(
+                plan, record, open_theta, calibrated=found is not None, dropped_events=dropped_events
+            )
+        ),
+        asked=wording.what_was_asked(plan, record),
+        cost=wording.cost(record, totals.occupancy, _time_scale(plan)),
+        settings=_settings(plan, versions or {}, recording, check, figures=bool(figures)),
+        theta=recommended_theta_of(results),
+        calibrated_theta=None if found is None else found.theta,
+        calibration_gain=gain,
+        predicted_discrepancy=expected,
+        predicted_deviation=deviation,
+        posterior=posterior,
+        parameters=() if found is None else _parameters(plan.calibration, found),
+        theta_sentences=tuple(wording.theta_sentences(expected, deviation, posterior, space, gain, liquid, ended)),
+        discrepancy=discrepancy,
+        loss=None if plan.deployment is None else plan.deployment.loss_name,
+        loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,
+        receivers=receivers,
+        not_covered={scene: tuple(several) for scene, several in (not_covered or {}).items()},
+        figures=dict(figures or {}),
+        recording=recording,
+        dropped_events=dropped_events,
+        results=dict(results),
+    )
+
+
+def summarise_record(
+    record: RunState,
+    run: str,
+    *,
+    reason: str,
+    catalogued: Mapping[str, Any],
+    versions: Mapping[str, Any],
+    check: JournalCheck,
+    figures: Mapping[str, Path],
+) -> RunSummary:
+    """The result document of a run whose campaign or results can't be read, for example because a plug-in is missing.
+
+    Args:
+        record: content of the run's journal.
+        run: name of the run's folder.
+        reason: why the rest can't be read.
+        catalogued: the run's row of the catalogue: mode, seed, θ*, recommended actions.
+        versions: content of `versions.json`.
+        check: check of the journal.
+        figures: name → file.
+    """
+    about = [
+        f"Recommended for {receiver} by {one['strategy']} (degrees, millimetres, seconds): {_plain(one['action'])}."
+        for receiver, one in (catalogued.get("recommended") or {}).items()
+    ]
+    if theta := catalogued.get("theta"):
+        about.append(f"θ* (SI units): {_plain(theta)}.")
+    known = _of_record(None, record, run, False, check)
+    known["standing"] = (f"This report is reduced to what the journal has. {reason}", *known["standing"])
+    return RunSummary(
+        **known,
+        campaign=record.header.name,
+        seed=catalogued.get("seed"),
+        mode=catalogued.get("mode") or "none",
+        without_advice=tuple(about) or ("This run recommends no action that can be read here.",),
+        asked={"campaign": record.header.name},
+        cost=wording.cost(record, {}),
+        settings={
+            "campaign": Path(versions.get("campaign", record.header.name)).name,
+            "seed": str(catalogued.get("seed", "not recorded")),
+            **_programs(versions),
+            "records": check.verdict,
+        },
+        figures=dict(figures),
+    )
+
+
+def _plain(values: Mapping[str, float | None]) -> str:
+    return ", ".join(f"{name} {value:.4g}" for name, value in values.items() if value is not None)
+
+
+def _of_record(
+    plan: CampaignPlan | None, record: RunState, run: str, live: bool, check: JournalCheck | None
+) -> dict[str, Any]:
+    """The fields that come from the journal."""
+    standing = wording.standing(record, run) if run else []
+    return {
+        "run": run,
+        "state": str(record.state),
+        "began_at": record.header.created or None,
+        "ended_at": record.ended or None,
+        "standing": (*(() if check is None else _damage(check)), *standing),
+        "stages": tuple(
+            StageSummary(
+                stage=one.name,
+                state="open" if one.closed_at is None else "closed",
+                pours=one.pours,
+                simulations=one.simulations,
+                unusable_simulations=one.failed_simulations,
+            )
+            for one in record.stages.values()
+        ),
+        "pours_made": tuple(pour_summaries(plan, record, live=live)),
+        "questions": tuple(
+            QuestionSummary(time=one.time, stage=one.stage, question=one.text, answer=one.answer)
+            for one in record.questions
+        ),
+        "notes": tuple(LogEntry(time=when, stage="", text=text) for when, text in record.notes),
+        "decisions": tuple(
+            LogEntry(time=one.time, stage=one.stage, text=one.text) for one in record.decisions[-MOST_DECISIONS:]
+        ),
+    }
+
+
+def _damage(check: JournalCheck) -> list[str]:
+    if not check.problems:
+        return []
+    made = f" The ledger of pours names: {'; '.join(check.pours)}." if check.pours else ""
+    return [
+        "WARNING: the records of this run are damaged or incomplete. Numbers on this page may be wrong or missing. "
+        f"Problems: {'; '.join(check.problems)}.{made}"
+    ]
+
+
+# ---- pours
+
+
+def pour_summaries(plan: CampaignPlan | None, record: RunState, *, live: bool = False) -> list[PourSummary]:
+    """The requested pours of a run, in order.
+
+    Args:
+        plan: plan of the campaign; None if it can't be read.
+        live: whether the run is in progress, so that a pour without outcome is under way.
+    """
+    best: dict[str, tuple[float, int]] = {}
+    for pour in record.pours:
+        if plan is not None and (loss := minimised_loss(plan, pour)) is not None:
+            best[pour.stage] = min(best.get(pour.stage, (loss, pour.id)), (loss, pour.id))
+    chosen = {key for _, key in best.values()}
+    return [pour_summary(plan, pour, live=live, best=pour.id in chosen) for pour in record.pours]
+
+
+def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False, best: bool = False) -> PourSummary:
+    """A pour in numbers and words; see `pour_summaries`."""
+    request, measured, values = pour.request, pour.measured, pour.request.action.values()
+    calibrating, unit, names = True, SPILLAGE, tuple(name for name, value in values.items() if value is not None)
+    loss = None if measured is None else normalised_spillage(measured.fractions)
+    if plan is not None:
+        calibrating, unit = is_calibration(plan, request), unit_of_pour(plan, request)
+        section: CalibrationPlan | DeploymentPlan | None = plan.calibration if calibrating else plan.deployment
+        names = ("angular_velocity", "x_offset") if section is None else section.actions.names
+        loss = None if measured is None else loss_of_pour(plan, request, measured)
+    row = pour.row()
+    spilled = row.get("spilled_g")
+    state = "unknown" if pour.state == "under way" and not live else pour.state
+    came = "" if measured is None else "too little was poured" if loss is None else unit.text(loss)
+    if measured is not None and spilled is None:
+        came = f"{1e3 * measured.delivered:.2f} g received"
+    action = style.display_values({name: values[name] for name in names})
+    if request.dose is not None:
+        action = f"{1e3 * request.dose.amount:g} g wanted"
+        came = "" if measured is None else f"{1e3 * measured.delivered:.1f} g"
+    return PourSummary(
+        stage=pour.stage,
+        number=request.number,
+        receiver=request.scene if plan is None else receiver_names(plan).get(request.scene, request.scene),
+        state=state,
+        calibration=calibrating,
+        action=action,
+        action_si=values,
+        predicted="" if request.predicted is None else unit.prediction(request.predicted),
+        measured=pour.reason if state == "failed" else came,
+        loss=unit.meaning,
+        best=best,
+        remark=_remark(state, pour),
+        loaded_g=row.get("loaded_g"),
+        spilled_g=spilled,
+        retained_g=row.get("retained_g"),
+        spillage=None if measured is None or spilled is None else measured.fractions.spilled,
+        spilled_of_poured=row.get("spillage"),
+        time=pour.time,
+        seconds=pour.seconds,
+    )
+
+
+def _remark(state: str, pour: RunPour) -> str:
+    said = {
+        "unknown": "UNKNOWN: it had begun, and its outcome is not known",
+        "under way": "under way",
+        "asked": "requested, not started",
+        "failed": f"failed: {pour.reason}",
+    }.get(state, "")
+    answer = f"the operator answered: {pour.answer}" if pour.answer else ""
+    return "; ".join(filter(None, (said, answer)))
+
+
+# ---- θ and receivers
+
+
+def _discrepancies(evaluation: Scores | None) -> dict[str, dict[str, float | None]]:
+    label = None if evaluation is None else calibrated_label(evaluation)
+    if evaluation is None or label is None:
+        return {}
+    table: dict[str, dict[str, float | None]] = {}
+    for split in SPLITS:
+        if split in evaluation.discrepancy[label]:
+            table[split] = {"calibrated": evaluation.discrepancy[label][split]}
+            table[split] |= {
+                name: scores[split] for name, scores in rival_scores(evaluation).items() if split in scores
+            }
+    return table
+
+
+def _parameters(calibration: CalibrationPlan | None, found: CalibratedTheta) -> tuple[ParameterSummary, ...]:
+    axes = {} if calibration is None else {axis.name: axis for axis in calibration.parameters.axes}
+    posterior = None if found.posterior is None else found.posterior.summary()
+    rows = []
+    for name, value in found.theta.model_dump().items():
+        axis, region = axes.get(name), "—"
+        if posterior is not None and name in posterior.region:
+            low, high = posterior.region[name]
+            open_end = ", not determined" if name in posterior.open else ""
+            region = style.display_interval(name, low, high) + open_end
+        rows.append(
+            ParameterSummary(
+                name=style.PARAMETER_NAMES.get(name, name.replace("_", " ")),
+                value=style.display_value(name, value),
+                region=region,
+                searched=NOT_SEARCHED if axis is None else style.display_interval(name, axis.lower, axis.upper),
+            )
+        )
+    return tuple(rows)
+
+
+def _receivers(
+    plan: CampaignPlan, results: Results, not_covered: Mapping[str, Sequence[NotCovered]]
+) -> dict[str, ReceiverSummary]:
+    names, predictions, confirmations = receiver_names(plan), predictions_of(results), confirmations_of(results)
+    return {
+        scene: _receiver(
+            plan.deployment,
+            names.get(scene, scene),
+            result,
+            predictions.get(scene),
+            not_covered.get(scene, ()),
+            confirmations.get(scene),
+        )
+        for scene, result in deployments_of(results).items()
+    }
+
+
+def _receiver(
+    plan: DeploymentPlan | None,
+    name: str,
+    result: Deployed,
+    predicted: PredictedPour | None,
+    not_covered: Sequence[NotCovered],
+    confirmed: Confirmed | None,
+) -> ReceiverSummary:
+    pours, best, advised = result.weighed, result.best, result.recommended
+    liquid = None
+    if plan is not None:
+        liquid = next((scene.liquid for scene in plan.scenes if scene.name == result.scene), None)
+    prediction = None if predicted is None else predicted.over_seeds
+    received = None if prediction is None else prediction.get("received")
+    delivered = None if received is None or liquid is None else received.mean * liquid.mass
+    return ReceiverSummary(
+        receiver=name,
+        strategy=result.strategy,
+        pours=len(pours),
+        failed_pours=result.failed_pours,
+        failures=tuple(f"pour {row.number}: {row.reason}" for row in result.pours if row.status == "failed"),
+        refused_pours=result.refused_pours,
+        simulations=result.simulations,
+        first=pours[0] if pours else None,
+        best=best,
+        recommended=advised,
+        model_check=result.model_check,
+        gave_up=result.gave_up,
+        ended=result.ended,
+        pareto_front=result.pareto_front,
+        risk=result.risk,
+        window=result.window,
+        prediction=prediction,
+        prediction_interval=None if predicted is None else predicted.interval,
+        at_bounds=() if plan is None or advised is None else tuple(style.at_ends(advised.action_si, plan.actions.axes)),
+        predicted_delivered_g=None if delivered is None else 1e3 * delivered,
+        predicted_delivered_ml=None if delivered is None or liquid is None else liquid.millilitres(delivered),
+        confirmed=confirmed,
+        not_covered=tuple(not_covered),
+        texts=_receiver_texts(result, confirmed, SPILLAGE if plan is None else deployment_unit(plan)),
+    )
+
+
+def _receiver_texts(result: Deployed, confirmed: Confirmed | None, unit: LossUnit) -> dict[str, str]:
+    pours, best, advised = result.weighed, result.best, result.recommended
+    texts = {"pours": str(len(pours) or ""), "first": "", "best measured": "", "delivered": ""}
+    if pours and pours[0].loss is not None:
+        texts["first"] = unit.text(pours[0].loss)
+    if best is not None:
+        texts["best measured"] = "" if best.loss is None else f"{unit.text(best.loss)} (pour {best.number})"
+        texts["delivered"] = wording.amount_text(best.delivered_g, best.delivered_ml)
+    texts["expected of the best action"] = (
+        ""
+        if advised is None
+        else unit.text(advised.predicted_loss, advised.predicted_deviation) + unit.scatter(advised.predicted_scatter)
+    )
+    texts["poured again"] = ""
+    if confirmed is not None and confirmed.loss is not None:
+        count = "1 pour" if confirmed.loss.count == 1 else f"{confirmed.loss.count} pours"
+        texts["poured again"] = f"{unit.text(confirmed.loss.mean, confirmed.loss.deviation)} ({count})"
+    return texts | {"simulations": str(result.simulations or "")}
+
+
+# ---- costs and settings
+
+
+def pool_use(occupancies: Mapping[str, Occupancy]) -> dict[str, PoolUse]:
+    """Use of the pool by stage."""
+    found = {}
+    for stage, one in occupancies.items():
+        useful, longest = one.useful / one.total if one.total > 0.0 else None, max(one.waits, default=None)
+        found[stage] = PoolUse(
+            pool_busy=one.fraction,
+            pool_useful=useful,
+            arm_longest_wait_s=longest,
+            arm_mean_wait_s=sum(one.waits) / len(one.waits) if one.waits else None,
+            text=wording.pool_line(one.fraction, useful, longest),
+        )
+    return found
+
+
+def _time_scale(plan: CampaignPlan) -> float | None:
+    """How many times as fast as a real one a virtual bench runs; None for a real one."""
+    laboratory = plan.laboratory
+    if laboratory.mode != "virtual":
+        return None
+    scales = (one.time_scale for one in (laboratory.arm, laboratory.pump, laboratory.bench) if one is not None)
+    return next((scale for scale in scales if scale is not None), None)
+
+
+def _settings(
+    plan: CampaignPlan,
+    versions: Mapping[str, Any],
+    recording: Path | None,
+    check: JournalCheck | None,
+    *,
+    figures: bool,
+) -> dict[str, str]:
+    found = {
+        "campaign": Path(versions.get("campaign", plan.source)).name,
+        "seed": str(plan.seed),
+        "minimised": "" if plan.deployment is None else deployment_unit(plan.deployment).label,
+        "laboratory": f"{plan.laboratory.name} ({MODE_LABELS[plan.laboratory.mode]})",
+        "simulations side by side": str(plan.parallel_simulations),
+        **_programs(versions),
+        "recording": "none" if recording is None else f"{recording.name}, next to this page",
+        "every number": "summary.json, resolved.json, versions.json and journal.sqlite, next to this page",
+        "figures": "" if figures else "none were drawn; 'decant report' draws them",
+        "records": "" if check is None else check.verdict,
+    }
+    return {name: text for name, text in found.items() if text}
+
+
+def _programs(versions: Mapping[str, Any]) -> dict[str, str]:
+    packages = {name: text for name, text in dict(versions.get("packages", {})).items() if text != "not installed"}
+    python = f"{versions['python']} on {versions.get('platform', '')}" if "python" in versions else "not recorded"
+    return {
+        "Python": python,
+        "packages": ", ".join(f"{name} {text}" for name, text in packages.items()) or "not recorded",
+    }

@@ -1,0 +1,732 @@
+"""Sentences and tables about a run, each made once.
+
+Sentences are written when the result document is made (`orchestrator.reports.summarise`): `advice`, `standing`,
+`open_questions`, `what_was_asked`, `cost`, `theta_sentences`, and one line each for a risk, a window, a prediction
+interval and the use of the pool. The tables arrange the document's values; the console and the page render them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from orchestrator.learning.calibration.calibration_scores import CalibrationGain
+from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.deployment.deployment_result import ParetoAction, RiskFound
+from orchestrator.learning.deployment.model_monitoring import DOUBT, Believed
+from orchestrator.learning.deployment.real_pours import PredictionCheck
+from orchestrator.learning.deployment.safe_window import WindowFound
+from orchestrator.learning.dispense import Dispensed
+from orchestrator.records.run_record import RunState
+from orchestrator.records.states import State
+from orchestrator.reports import figure_style as style
+from orchestrator.reports.loss_units import (
+    DISCREPANCY,
+    LossUnit,
+    at_least_nothing,
+    deployment_unit,
+    minimised_loss,
+)
+from orchestrator.reports.run_summary import NOT_SEARCHED, Advice, PoolUse, PourSummary, ReceiverSummary, RunSummary
+from orchestrator.reports.stage_views import SPLITS
+from sim_engine.liquids import Liquid
+from sim_engine.prediction_band import PredictionInterval
+from sim_engine.scene import Scene
+from sim_engine.search_space import Axis, Space
+
+
+def trust_line(trust: PredictionCheck | Believed) -> str | None:
+    """The judgement of the pours about the simulator; None if there is none.
+
+    Args:
+        trust: of a deployment's result.
+    """
+    if isinstance(trust, Believed):
+        return trust.text or None
+    return (
+        "the first pours were far from their predictions; the simulator may not fit this vessel"
+        if trust.alarm
+        else None
+    )
+
+
+def risk_line(risk: RiskFound, unit: LossUnit) -> str:
+    """'under pose error and θ: CVaR 90 % 4.10 %, expected 2.30 %, pours differ by ± 1.40 %'."""
+    thetas = f" and {risk.thetas} θ of the posterior" if risk.thetas else ""
+    worst = f"CVaR {100 * risk.level:g} % {unit.text(max(risk.value, 0.0))}, " if risk.measure == "cvar" else ""
+    return (
+        f"best action under errors of execution{thetas}: {worst}expected {unit.text(max(risk.expected, 0.0))}, "
+        f"pours differ by ± {unit.text(risk.spread)}"
+    )
+
+
+def window_line(window: WindowFound, unit: LossUnit) -> str:
+    """'safe window: x offset 118 … 131 mm, angular velocity 34 … 71 deg/s at ≤ 2.00 %, checked by 12 simulations'."""
+    checked = f"checked by {window.simulations} simulations"
+    tolerance = unit.text(window.tolerance)
+    if not window.axes:
+        return f"safe window: none; the loss of the action itself exceeds {tolerance}, {checked}"
+    parts = []
+    for name, ends in window.axes.items():
+        low, high = (end / style.display_factor(name) for end in (ends.low, ends.high))
+        more = {(): "", ("low",): " or less", ("high",): " or more"}.get(ends.cut_off, " or farther")
+        parts.append(f"{name.replace('_', ' ')} {low:.4g} … {high:.4g} {style.display_unit(name)}{more}")
+    return f"safe window: {', '.join(parts)} at ≤ {tolerance}, one dimension varied at a time, {checked}"
+
+
+FEW = 5
+"""Number of pours of an action below which their mean is not reliable."""
+
+
+def advice(plan: CampaignPlan, receivers: Mapping[str, ReceiverSummary]) -> tuple[Advice, ...]:
+    """Advice for each receiver with a deployment result, by scene."""
+    if plan.deployment is None:
+        return ()
+    scenes = {scene.name: scene for scene in plan.deployment.scenes}
+    unit = deployment_unit(plan.deployment)
+    return tuple(_advice(scenes.get(name), row, unit) for name, row in receivers.items())
+
+
+def _advice(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice:
+    window, open_points = "", tuple(_open(row))
+    if row.recommended is None:
+        why = row.gave_up or "there is no result from which to choose an action"
+        said = (f"No action is recommended: {why}.",)
+        return Advice(receiver=row.receiver, action={}, fixed={}, sentences=said, window="", open=open_points)
+    if row.window is not None:
+        window = _sentence(window_line(row.window, unit))
+    else:
+        window = (
+            "No safe window was computed: the tolerance of this action to execution errors is unknown. D1 computes "
+            "one if the campaign contains 'window: {tolerance: …}'."
+        )
+    return Advice(
+        receiver=row.receiver,
+        action=_shown(row.recommended.action_si),
+        fixed={} if scene is None else _shown(scene.fixed),
+        sentences=tuple(_sentences(scene, row, unit)),
+        window=window,
+        open=open_points,
+    )
+
+
+def _shown(values: Mapping[str, float | None]) -> dict[str, str]:
+    return {name.replace("_", " "): style.display_value(name, v).replace("_", " ") for name, v in values.items()}
+
+
+def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> list[str]:
+    load = "" if scene is None else f" {1e3 * scene.liquid.mass:.0f} g of {scene.liquid.name}"
+    cup = "" if scene is None else f" from {scene.pourer.name}"
+    said = [f"To pour{load}{cup} into {row.receiver}, use the recommended action."]
+    if (expected := row.recommended) is not None:
+        mean = unit.text(expected.predicted_loss, expected.predicted_deviation)
+        scatter = unit.scatter(expected.predicted_scatter).removeprefix(", a pour ")
+        said.append(f"Expect {unit.meaning} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
+    if row.prediction is not None:
+        said.append(_prediction(row))
+    if row.prediction_interval is not None:
+        said.append(_sentence(band_line(row.prediction_interval)))
+    if row.confirmed is not None and row.confirmed.loss is not None:
+        loss = row.confirmed.loss
+        times = "once more" if loss.count == 1 else f"{loss.count} more times"
+        said.append(f"Poured {times} after the choice, its measured loss was {unit.text(loss.mean, loss.deviation)}.")
+    if row.texts["best measured"]:
+        best = row.texts["best measured"]
+        said.append(
+            f"The smallest loss of {row.pours} weighed pours was {best}; the smallest of several is partly luck, so "
+            "expect more of the next pour."
+            if row.pours != 1
+            else f"The loss of the only weighed pour was {best}."
+        )
+    if row.risk is not None:
+        said.append(_sentence(risk_line(row.risk, unit)))
+    said += [f"Pareto-optimal: {_compromise(one)}." for one in row.pareto_front or ()]
+    if row.ended:
+        said.append(f"The search ended: {row.ended.rstrip('.')}.")
+    if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
+        said.append(_sentence(trust))
+    return said
+
+
+def _prediction(row: ReceiverSummary) -> str:
+    """'Simulated again with 5 new seeds: spilled / poured 1.20 ± 0.40 %, retained …; delivered 193.2 g, 193.6 mL.'"""
+    assert row.prediction is not None
+    words = {"spillage": "spilled / poured", "spilled": "spilled", "retained": "retained"}
+    shown = {text: row.prediction[name] for name, text in words.items() if name in row.prediction}
+    if not shown:
+        return "No simulation of it with new seeds could be used."
+    count = max(spread.count for spread in shown.values())
+    shares = ", ".join(f"{text} {spread.percent(2)}" for text, spread in shown.items())
+    amount = amount_text(row.predicted_delivered_g, row.predicted_delivered_ml)
+    delivered = f"; delivered {amount} in the mean" if amount else ""
+    return f"Simulated again with {count} new seeds: {shares} (mean ± standard deviation){delivered}."
+
+
+def _compromise(one: ParetoAction) -> str:
+    """'spillage 1.2 ± 0.3 %, time 40.0 ± 1.0 % with angular velocity 41.2 deg/s, …'."""
+    parts = [
+        f"{name.replace('_', ' ')} {100 * at_least_nothing(mean):.1f} ± {100 * one.deviations[name]:.1f} %"
+        for name, mean in one.objectives.items()
+    ]
+    return f"{', '.join(parts)} with {style.display_values(one.action_si)}"
+
+
+def amount_text(grams: float | None, millilitres: float | None) -> str:
+    """'193.2 g, 193.6 mL'; '' if unknown."""
+    return "" if grams is None or millilitres is None else f"{grams:.1f} g, {millilitres:.1f} mL"
+
+
+def band_line(band: PredictionInterval) -> str:
+    """'nine single pours in ten spill 0.8 … 5.7 % of what is poured (simulations ± 0.3, …)'."""
+    causes = {"simulations": band.simulations, "residual of calibration": band.discrepancy}
+    causes["resolution"] = band.resolution
+    said = ", ".join(f"{name} ± {100 * value:.2f}" for name, value in causes.items() if value is not None)
+    lacking = "" if band.discrepancy is not None else "; the residual of calibration is unknown"
+    return f"nine single pours in ten spill {band.percent(2)} of what is poured ({said}{lacking})"
+
+
+def pool_line(busy: float | None, useful: float | None, longest_wait: float | None) -> str:
+    """'97 % busy while there was work (41 % of the time); between two pours the arm waited 0.06 s at most'."""
+    if busy is None:
+        return ""
+    text = f"{100 * busy:.0f} % busy"
+    if useful is not None and useful < 0.995:
+        text += f" while there was work ({100 * useful:.0f} % of the time)"
+    return text + ("" if longest_wait is None else f"; between two pours the arm waited {longest_wait:.2g} s at most")
+
+
+def _is_confirmed(row: ReceiverSummary) -> bool:
+    """Whether the pours confirm the judgement about the simulator without doubt."""
+    trust = row.model_check
+    return isinstance(trust, Believed) and bool(trust.after) and trust.after[-1].ignorance < DOUBT
+
+
+def _open(row: ReceiverSummary) -> list[str]:
+    said = []
+    if row.at_bounds:
+        said.append(f"Better actions may lie outside the searched range: {', '.join(row.at_bounds)}.")
+    if not _is_confirmed(row) and (alarm := trust_line(row.model_check)) is not None:
+        said.append(_sentence(alarm))
+    if row.gave_up and row.recommended is not None:
+        said.append(_sentence(row.gave_up))
+    if row.recommended is not None:
+        said += _poured_again(row)
+    if row.failed_pours:
+        what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
+        why = f": {'; '.join(row.failures)}" if row.failures else ""
+        said.append(f"{what}{why}. They were not weighed.")
+    confirming = () if row.confirmed is None else row.confirmed.pours
+    if lost := [f"pour {pour.number}: {pour.failed}" for pour in confirming if pour.failed]:
+        said.append(f"Confirming pours that failed: {'; '.join(lost)}.")
+    if row.risk is None and row.recommended is not None:
+        said.append("Errors of grip, placement and speed are included only as they occurred in these pours.")
+    return said + [f"Not simulated at this action, {one.kind}: {one.text}." for one in row.not_covered]
+
+
+def _poured_again(row: ReceiverSummary) -> list[str]:
+    """How well the recommended action is known from pours of it."""
+    count = 0 if row.confirmed is None or row.confirmed.loss is None else row.confirmed.loss.count
+    if not row.pours and not count:
+        return ["Nothing was poured into this receiver: the expected loss is simulated, not weighed."]
+    if not count:
+        return [
+            "The recommended action was not poured again after the choice ('confirm' in the campaign does that): its "
+            "expected loss is a prediction."
+        ]
+    if count >= FEW:
+        return []
+    pours = "one pour" if count == 1 else f"{count} pours"
+    return [f"Its loss is known from {pours}; this is too few to estimate how much pours differ."]
+
+
+def open_questions(
+    plan: CampaignPlan, record: RunState, theta: Sequence[str], *, calibrated: bool, dropped_events: int
+) -> list[str]:
+    """Open questions after a run that do not depend on the receiver.
+
+    Args:
+        theta: open questions about θ*, see `about_theta`.
+        calibrated: whether θ* was found.
+        dropped_events: number of events missing in the recording.
+    """
+    said = []
+    if plan.laboratory.mode == "virtual" and (record.pours or plan.laboratory.pours):
+        said.append(
+            "The bench was VIRTUAL: no robot moved and no liquid was weighed. Its hidden liquid "
+            "is simulated, too; a real cup may behave differently."
+        )
+    said += theta
+    if not calibrated and plan.calibration is None:
+        said.append("The simulator was not calibrated in this run: its parameters are those of the campaign.")
+    liquids = {scene.liquid.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
+    if liquids:
+        said.append(
+            f"These results hold for {', '.join(sorted(liquids))}, this load, these vessels and the fixed values of "
+            "the motion. For other ones, plan again."
+        )
+    if dropped_events:
+        said.append(f"The recording lacks {dropped_events} events, because writing was too slow.")
+    return said
+
+
+def about_theta(
+    gain: CalibrationGain | None,
+    posterior: PosteriorSummary | None,
+    discrepancy: Mapping[str, Mapping[str, float | None]],
+) -> list[str]:
+    """Open questions about θ*.
+
+    Args:
+        gain: whether the weighed pours justify θ*.
+        posterior: θ that fit as well.
+        discrepancy: mean |Δ| by split and predictor.
+    """
+    said, used = [], "calibrated"
+    if gain is not None and gain.recommended != used:
+        said, used = [_sentence(gain.text)], gain.recommended
+    if posterior is None:
+        said.append("Other θ may fit the weighed pours as well as θ*; their region was not computed.")
+    elif posterior.open:
+        names = ", ".join(name.replace("_", " ") for name in posterior.open)
+        said.append(f"The pours do not determine {names}: nearly the whole searched range fits them as well as θ*.")
+    unseen = [
+        f"{DISCREPANCY.text(own)} on {SPLITS[split]}"
+        for split, row in discrepancy.items()
+        if split != "train" and (own := row.get(used)) is not None
+    ]
+    if unseen:
+        said.append(
+            f"On pours that calibration did not see, the simulator's spillage was off by {' and '.join(unseen)} in the "
+            "mean."
+        )
+    elif discrepancy:
+        said.append("The simulator was not scored on pours that calibration did not see.")
+    return said
+
+
+def theta_sentences(
+    expected: float | None,
+    deviation: float | None,
+    posterior: PosteriorSummary | None,
+    space: Space | None,
+    gain: CalibrationGain | None,
+    liquid: Liquid | None = None,
+    ended: str | None = None,
+) -> list[str]:
+    """The knowledge of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified.
+
+    Args:
+        ended: reason of the end of an automatic calibration.
+        liquid: of the pours, as declared; its viscosity is stated if the pours determine it.
+    """
+    said = []
+    if expected is not None:
+        said.append(f"Expected {DISCREPANCY.meaning} of θ*: {DISCREPANCY.text(expected, deviation or 0.0)}.")
+    if posterior is not None and space is not None:
+        said += map(_sentence, posterior_lines(posterior, space))
+        if liquid is not None and liquid.is_thick:
+            said += _identified_viscosity(posterior, liquid)
+    if ended is not None:
+        said.append(f"The calibration ended because {ended}.")
+    if gain is not None:
+        said.append(_sentence(gain.text))
+        if posterior is not None and gain.recommended == "calibrated":
+            said.append(POSTERIOR_ADVICE)
+    return said
+
+
+POSTERIOR_ADVICE = (
+    "Plan and predict with theta.json, as the run itself does: it averages over the θ that fit, and transfers better "
+    "to other vessels than θ* alone."
+)
+
+
+def _identified_viscosity(posterior: PosteriorSummary, liquid: Liquid) -> list[str]:
+    """The posterior of the viscosity itself; nothing if it was not searched or the pours do not determine it."""
+    if "viscosity_factor" not in posterior.region or "viscosity_factor" in posterior.open:
+        return []
+    declared = 1e3 * liquid.dynamic_viscosity
+    low, high = (f"{declared * factor:.3g}" for factor in posterior.region["viscosity_factor"])
+    known = f"{low} … {high} mPa*s ({100 * posterior.level:.0f} %; declared {declared:.3g} mPa*s)"
+    return [f"Viscosity of {liquid.name}, by these pours: {known}."]
+
+
+def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
+    """Which parameters the pours determine and which they do not, one sentence per line.
+
+    Args:
+        posterior: posterior of a calibration's result.
+        space: searched θ.
+    """
+    known, unknown = [], []
+    for axis in space.axes:
+        words, searched = axis.name.replace("_", " "), style.display_interval(axis.name, axis.lower, axis.upper)
+        if axis.name in posterior.open:
+            unknown.append(f"{words} ({searched})")
+        else:
+            found = style.display_interval(axis.name, *posterior.region[axis.name])
+            known.append(f"{words} {found} (searched {searched})")
+    lines = []
+    if known:
+        lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
+    if unknown:
+        lines.append(
+            f"the pours do not determine {', '.join(unknown)}: nearly the whole searched range fits them as well as θ*"
+        )
+    return [*lines, *posterior.directions]
+
+
+def without_advice(plan: CampaignPlan, record: RunState, *, calibrated: bool) -> list[str]:
+    """The outcome of a run that recommends no action.
+
+    Args:
+        calibrated: whether θ* was found.
+    """
+    if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
+        said = ["No action is recommended yet: the result of a deployment is written when its stage ends."]
+        losses = {loss: pour for pour in record.weighed if (loss := minimised_loss(plan, pour)) is not None}
+        known = list(losses)
+        if known:
+            action = losses[min(known)].request.action.values()
+            best = style.display_values({name: action[name] for name in plan.deployment.actions.names})
+            unit = deployment_unit(plan.deployment)
+            of = (
+                f"The smallest loss of {len(known)} pours so far"
+                if len(known) > 1
+                else "The loss of the only pour so far"
+            )
+            said.append(f"{of} is {unit.text(min(known))}, with {best}.")
+        return said
+    if calibrated:
+        return [
+            "This run calibrated the simulator; it recommends no action. The parameters to use are in theta.json, "
+            "which 'decant plan CAMPAIGN --parameters' reads."
+        ]
+    return ["This run recommends no action."]
+
+
+def cost(record: RunState, occupancy: Mapping[str, PoolUse], time_scale: float | None = None) -> dict[str, str]:
+    """Costs of a run: pours, grams, minutes.
+
+    Args:
+        time_scale: how many times as fast as a real one a virtual bench runs; 0: it waits for nothing.
+    """
+    weighed = [p.measured for p in record.weighed if p.measured is not None]
+    begun = [pour for pour in record.pours if pour.state != "asked"]
+    found: dict[str, str] = {}
+    if begun:
+        failed, unknown = sum(p.state == "failed" for p in begun), len(record.unknown_pours)
+        more = "".join(f", {n} {word}" for n, word in ((failed, "failed"), (unknown, "of unknown outcome")) if n)
+        found["pours"] = f"{len(begun)} begun, {len(weighed)} weighed{more}"
+    if weighed:
+        loaded, spilled, retained = (
+            1e3 * sum(getattr(m, n) for m in weighed) for n in ("loaded", "spilled", "retained")
+        )
+        delivered = loaded - spilled - retained
+        found["liquid"] = (
+            f"{loaded:.0f} g: {delivered:.0f} g delivered, {spilled:.1f} g spilled, {retained:.1f} g retained"
+        )
+    found["program at work"] = minutes(record.at_work_s)
+    arm = [pour.seconds for pour in begun if pour.seconds]
+    if arm:
+        pace = f" (this bench runs {time_scale:g} times as fast as a real one)" if time_scale not in (None, 1.0) else ""
+        pace = " (this bench waits for nothing)" if time_scale == 0.0 else pace
+        found["of it pouring"] = f"{minutes(sum(arm))}, {sum(arm) / len(arm):.1f} s a pour{pace}"
+    if record.simulations:
+        each = f", {record.cpu_s / record.simulations:.1f} s each" if record.cpu_s else ""
+        found["simulations"] = f"{record.simulations}, {minutes(record.cpu_s)} of CPU time{each}"
+    pools = {f"pool during pours, {stage.rpartition(':')[2]}": use.text for stage, use in occupancy.items()}
+    return found | {name: text for name, text in pools.items() if text}
+
+
+def minutes(seconds: float) -> str:
+    """A duration in a suitable unit."""
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 5400.0 else f"{seconds / 3600:.1f} h"
+
+
+def standing(record: RunState, run: str) -> list[str]:
+    """State of an unfinished run and the next steps; empty for a finished one.
+
+    Args:
+        run: its folder's name.
+    """
+    state = record.state
+    if state is State.FINISHED:
+        return []
+    again = f"the command that began it, with '--resume --run {run}' added"
+    said = [f"This run is not finished. Its state is '{state}'{f': {record.reason}' if record.reason else ''}."]
+    unknown = [f"pour {pour.request.number} of {pour.stage}" for pour in record.unknown_pours]
+    if unknown:
+        said.append(
+            f"{' and '.join(unknown).capitalize()} had begun, and its outcome is not known. The software does "
+            "not repeat it. Weigh the spilled liquid and the liquid in the pourer, and give the answer on resuming."
+        )
+    said += [f"A question is open: {q.text}" for q in record.questions if q.answer is None]
+    match state:
+        case State.FAILED:
+            said.append(f"Finished work is kept. Fix the problem above, then continue with {again}.")
+        case State.PAUSED | State.UNKNOWN:
+            said.append(f"Finished work is kept. Continue with {again}.")
+        case State.QUEUED:
+            said.append("Nothing was started yet.")
+        case _:
+            said.append(
+                "When this page was made, the run was in progress or its process had died; the page shows the "
+                f"journal at that moment. If it no longer runs, continue with {again}."
+            )
+    return said
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+
+
+def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
+    """Names and values: the liquid, and the calibration of the simulator and the search for pours, or the doses."""
+    found: list[tuple[str, str]] = []
+    scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
+        list(plan.deployment.scenes) if plan.deployment is not None else []
+    )
+    scenes += [] if plan.dispense is None else plan.dispense.scenes
+    if scenes:
+        liquid = scenes[0].liquid
+        volume = liquid.millilitres(liquid.mass)
+        found.append(("liquid", f"{1e3 * liquid.mass:g} g of {liquid.name} ({volume:.0f} mL)"))
+        found.append(("poured from", _listed(scene.pourer.name for scene in scenes)))
+    if doses := [pour.request.dose for pour in record.pours if pour.request.dose is not None]:
+        found.append(("wanted", ", ".join(f"{1e3 * dose.amount:g} g" for dose in doses)))
+        return dict(found)
+    if plan.calibration is not None:
+        one = plan.calibration
+        pours = f"{one.pour_count} pours, {one.holdout} of them kept for testing"
+        if one.records is not None:
+            pours = f"{len(one.records.pours)} weighed pours of {one.records.path.name}"
+        found += [
+            ("calibration", f"{one.strategy} on {pours}; {one.simulations} simulations"),
+            ("calibration: into", one.scene.receiver.name),
+            ("calibration: actions", _ranges(one.actions.axes)),
+            ("calibration: searched θ", _ranges(one.parameters.axes)),
+            ("calibration: fixed", _fixed(one.scene)),
+        ]
+    if plan.deployment is not None:
+        two = plan.deployment
+        found += [
+            ("pouring", f"{two.strategy}, into each receiver: {two.settings.spending}"),
+            ("pouring: into", _listed(scene.receiver.name for scene in two.scenes)),
+            ("pouring: minimised", deployment_unit(two).label),
+            ("pouring: actions", _ranges(two.actions.axes)),
+            ("pouring: fixed", _fixed(two.scenes[0]) if two.scenes else ""),
+        ]
+        if two.confirm:
+            found.append(("pouring: afterwards", f"the recommended action is poured {two.confirm} more times"))
+        if two.data is not None:
+            count = sum(len(pours) for pours in two.data.pours.values())
+            found.append(("pouring: known before", f"{count} pours of {two.data.path.name}"))
+    return {name: value for name, value in found if value}
+
+
+def _ranges(axes: Iterable[Axis]) -> str:
+    return ", ".join(_range(axis) for axis in axes)
+
+
+def _range(axis: Axis) -> str:
+    factor, unit = style.display_factor(axis.name), style.display_unit(axis.name)
+    words = style.PARAMETER_NAMES.get(axis.name, axis.name.replace("_", " "))
+    return f"{words} {style.number(axis.lower / factor)} … {style.number(axis.upper / factor)} {unit}".rstrip()
+
+
+def _fixed(scene: Scene) -> str:
+    values = {name.replace("_", " "): style.display_value(name, value) for name, value in scene.fixed.items()}
+    return ", ".join(f"{name} {value}" for name, value in values.items()).replace("_", " ")
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(dict.fromkeys(names))
+
+
+# ---- tables
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """A row of a table; its first cell is the row's name.
+
+    Attributes:
+        look: 'best', 'bad' or ''.
+    """
+
+    cells: Sequence[str]
+    look: str = ""
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """A table of results.
+
+    Attributes:
+        caption: text above the table, read first by screen readers.
+        numbers: columns that are right-aligned.
+    """
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[ResultRow]
+    numbers: frozenset[int] = frozenset()
+
+    def filled(self) -> ResultTable:
+        """A copy without empty columns."""
+        kept = [i for i in range(len(self.header)) if i == 0 or any(row.cells[i].strip("—") for row in self.rows)]
+        rows = [ResultRow([row.cells[i] for i in kept], row.look) for row in self.rows]
+        numbers = frozenset(place for place, i in enumerate(kept) if i in self.numbers)
+        return ResultTable(self.caption, [self.header[i] for i in kept], rows, numbers)
+
+
+def stage_table(summary: RunSummary) -> ResultTable:
+    """Progress of each stage."""
+    rows = [
+        ResultRow(
+            [one.stage, one.state, *(str(n or "") for n in (one.pours, one.simulations, one.unusable_simulations))]
+        )
+        for one in summary.stages
+    ]
+    header = ["stage", "state", "pours", "simulations", "of them unusable"]
+    return ResultTable("Stages, in the order in which they ran", header, rows, frozenset({2, 3, 4})).filled()
+
+
+def cost_table(summary: RunSummary) -> ResultTable:
+    """Costs of the run."""
+    return ResultTable("Cost", ["what", "how much"], [ResultRow(pair) for pair in summary.cost.items()])
+
+
+def question_table(summary: RunSummary) -> ResultTable:
+    """Questions to the operator and their answers."""
+    rows = [
+        ResultRow(
+            [
+                time.strftime("%Y-%m-%d %H:%M", time.localtime(one.time)),
+                one.stage,
+                one.question,
+                "not answered" if one.answer is None else one.answer,
+            ],
+            "bad" if one.answer is None else "",
+        )
+        for one in summary.questions
+    ]
+    return ResultTable("Questions to the operator", ["when", "stage", "question", "answer"], rows)
+
+
+def theta_table(summary: RunSummary) -> ResultTable:
+    """θ* with its region: the searched parameters."""
+    level = "region" if summary.posterior is None else f"{100 * summary.posterior.level:.0f} % of the θ that fit"
+    searched = [one for one in summary.parameters if one.searched != NOT_SEARCHED]
+    rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in searched]
+    return ResultTable("θ* with its region", ["parameter", "θ*", level, "searched"], rows).filled()
+
+
+def fixed_parameters(summary: RunSummary) -> str:
+    """The parameters that were not searched, with their values; empty if all were."""
+    return ", ".join(f"{one.name} {one.value}" for one in summary.parameters if one.searched == NOT_SEARCHED)
+
+
+def score_table(summary: RunSummary) -> ResultTable:
+    """Mean |Δ| of θ* and its rivals by set of pours."""
+    columns = {
+        "calibrated": "θ*",
+        "posterior": "mean over θ's posterior",
+        "uncalibrated": "uncalibrated θ",
+        "random_theta": "random θ (median)",
+        "mean_predictor": "mean of training pours",
+        "regression": "GP regression of training pours",
+    }
+    rows = [
+        ResultRow([SPLITS[split], *("—" if (v := row.get(name)) is None else f"{100 * v:.2f}" for name in columns)])
+        for split, row in summary.discrepancy.items()
+        if any(value is not None for value in row.values())
+    ]
+    caption = "Mean |measured − predicted| spillage [% of the poured liquid]; smaller is better"
+    return ResultTable(caption, ["pours", *columns.values()], rows, frozenset(range(1, len(columns) + 1))).filled()
+
+
+def receiver_table(summary: RunSummary) -> ResultTable:
+    """Comparison of the receivers; those without a result are left out."""
+    shown = [
+        row
+        for row in summary.receivers.values()
+        if row.recommended is not None or any(one is not None and one.loss is not None for one in (row.first, row.best))
+    ]
+    heads = list(dict.fromkeys(head for row in shown for head in row.texts))
+    rows = [
+        ResultRow([row.receiver, row.strategy, *(row.texts.get(head, "") or "—" for head in heads)]) for row in shown
+    ]
+    header = ["receiver", "strategy", *heads]
+    return ResultTable(summary.loss_label, header, rows, frozenset(range(2, len(header)))).filled()
+
+
+def pour_tables(summary: RunSummary) -> list[ResultTable]:
+    """Every requested pour, one table for each stage."""
+    stages = dict.fromkeys(pour.stage for pour in summary.pours_made)
+    return [
+        _dose_table(stage, doses)
+        if isinstance(doses := summary.results.get(stage), Dispensed)
+        else _pour_table(stage, [pour for pour in summary.pours_made if pour.stage == stage])
+        for stage in stages
+    ]
+
+
+def _dose_table(stage: str, dispensed: Dispensed) -> ResultTable:
+    rows = []
+    for dose in dispensed.doses:
+        error = None if dose.received_g is None else dose.received_g - dose.wanted_g
+        cells = [str(dose.number), dose.position or "—", f"{dose.wanted_g:g}"]
+        cells += ["—" if grams is None else f"{grams:.2f}" for grams in (dose.received_g, error, dose.half_interval_g)]
+        cells += ["—" if dose.spilled_g is None else f"{dose.spilled_g:.2f}"]
+        cells += ["—" if dose.duration_s is None else f"{dose.duration_s:.1f}", dose.source or "—"]
+        cells += ["—" if dose.left_g is None else f"{dose.left_g:.0f} ± {2.0 * (dose.left_deviation_g or 0.0):.1f}"]
+        cells += [f"{dose.end}{', source filled before' if dose.filled else ''}"]
+        rows.append(ResultRow(cells, "bad" if dose.received_g is None else ""))
+    header = ["dose", "position", "wanted [g]", "received [g]", "difference [g]", "± (90 %) [g]", "spilled [g]"]
+    header += ["time [s]", "source", "left [g]", "end"]
+    return ResultTable(f"{stage}: {len(rows)} wanted amounts", header, rows, frozenset({0, *range(2, 8), 9})).filled()
+
+
+def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:
+    varied = [name for name in pours[0].action_si if len({pour.action_si[name] for pour in pours}) > 1]
+    searched = varied or ["angular_velocity", "x_offset"]
+    rows = []
+    for pour in pours:
+        cells = [
+            str(pour.number),
+            *(_bare(name, pour.action_si[name]) for name in searched),
+            *("—" if grams is None else f"{grams:.1f}" for grams in (pour.loaded_g, pour.spilled_g, pour.retained_g)),
+            "—" if pour.spilled_of_poured is None else f"{100 * pour.spilled_of_poured:.2f}",
+            pour.predicted or "—",
+            pour.measured if pour.state == "weighed" and not pour.calibration else "—",
+            pour.remark,
+        ]
+        look = "best" if pour.best else "bad" if pour.state in ("failed", "unknown") else ""
+        rows.append(ResultRow(cells, look))
+    header = ["pour", *(style.label(name) for name in searched), "loaded [g]", "spilled [g]", "retained [g]"]
+    header += ["spilled / poured [%]", "expected", "measured", "remark"]
+    what = "" if pours[0].calibration else f"; expected and measured: {pours[0].loss}"
+    what += "; the best is bold" if any(pour.best for pour in pours) else ""
+    caption = f"{stage}: {len(pours)} pours into {pours[0].receiver}{what}"
+    return ResultTable(caption, header, rows, frozenset(range(len(header) - 1))).filled()
+
+
+def _bare(name: str, value: float | None) -> str:
+    """A value without its unit, which is in the column's head."""
+    return style.display_value(name, value).removesuffix(style.display_unit(name)).rstrip()
+
+
+def validity_table(summary: RunSummary) -> ResultTable:
+    """Effects that are not simulated in the action spaces."""
+    rows = [
+        ResultRow([one.receiver, one.kind.replace("_", " "), f"{one.hit} of {one.tried}", one.text])
+        for several in summary.not_covered.values()
+        for one in several
+    ]
+    return ResultTable("At the middle and the corners of the ranges", ["into", "what", "actions", "meaning"], rows)

@@ -1,1 +1,0 @@
-"""Results of a run: summary, tables, figures and HTML report."""
