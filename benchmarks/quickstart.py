@@ -138,7 +138,8 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
     """Run one campaign; return its calibration's error on the test pours, and every pour with its prediction."""
     from decant.running import build_campaign
     from orchestrator.reports.stage_views import deployments_of, evaluation_of, theta_of
-    from orchestrator.runs.run_service import RunRequest, RunResources, RunService, task_request
+    from orchestrator.runs.run_service import RunRequest, RunResources, RunService
+    from orchestrator.runs.run_tasks import run_task
 
     pool = kept_pours(seed, into)
     unscaled: list[tuple[float, float]] = []
@@ -156,7 +157,7 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
         campaign = build_campaign(content, folder)
         assert campaign.deployment is not None
         assert campaign.calibration is not None
-        request = task_request(campaign)
+        request = run_task(campaign)
         if calibration_only:
             request = RunRequest(replace(campaign, deployment=None), calibration_and_test(campaign.calibration))
         handle = RunService().start(request, RunResources(in_process=True, simulators=pool))
@@ -368,12 +369,13 @@ def uncalibrated_plan(seed: int, laboratory: Path, into: Path) -> dict[str, floa
     """Return the predicted loss of the uncalibrated simulator's plan, and its loss on the bench."""
     from decant.running import build_campaign
     from orchestrator.reports.stage_views import deployments_of
-    from orchestrator.runs.run_service import RunResources, RunService, task_request
+    from orchestrator.runs.run_service import RunResources, RunService
+    from orchestrator.runs.run_tasks import plan_task
 
     pool = kept_pours(f"plan-{seed}", into)
     with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
         campaign = build_campaign(on_numbers(seed, laboratory, folder), folder)
-        request = task_request(campaign, "plan", iterations=PLANNED, seeds=1)
+        request = plan_task(campaign, iterations=PLANNED, seeds=1)
         handle = RunService().start(request, RunResources(in_process=True, simulators=pool))
         (plan,) = deployments_of(asyncio.run(handle.wait()).results).values()
         assert campaign.deployment is not None

@@ -48,7 +48,8 @@ from orchestrator.reports.publishing import publish_run
 from orchestrator.reports.stage_views import receiver_names
 from orchestrator.runs.added_pours import weighed_by_hand
 from orchestrator.runs.resume import LOST
-from orchestrator.runs.run_service import RunHandle, RunResources, RunService, RunTaskError, task_request
+from orchestrator.runs.run_service import RunHandle, RunResources, RunService, RunTaskError
+from orchestrator.runs.run_tasks import run_task
 from orchestrator.runs.stages import scenes_of
 from sim_engine.action import Action
 from sim_engine.errors import InvalidArgumentError
@@ -123,7 +124,7 @@ class AskTell:
                 f"laboratory {campaign.laboratory.name} is {campaign.laboratory.mode}, and Decant pours there; write "
                 "'laboratory: {name: …, mode: external}' for pours that your program makes"
             )
-        service, request = RunService(), task_request(campaign)
+        service, request = RunService(), run_task(campaign)
         if not request.pours:
             raise RunTaskError(f"campaign '{campaign.name}' asks for no pours; use decant.run")
         resources = checked(

@@ -36,17 +36,16 @@ from orchestrator.reports.stage_views import evaluation_of
 from orchestrator.runs.bench_check import BenchReport, check_bench
 from orchestrator.runs.motion_approval import read_record
 from orchestrator.runs.run_folder import create_run
-from orchestrator.runs.run_service import (
+from orchestrator.runs.run_service import CheckReport, RunHandle, RunRequest, RunResources, RunService
+from orchestrator.runs.run_tasks import (
     PREDICTION_SEEDS,
-    CheckReport,
+    TASKS,
     GivenTheta,
-    RunHandle,
-    RunRequest,
-    RunResources,
-    RunService,
     Task,
+    calibrate_task,
+    plan_task,
     read_theta,
-    task_request,
+    run_task,
 )
 from orchestrator.runs.stages import POSTERIOR_DRAWS, posterior_draws
 from sim_engine.errors import InvalidArgumentError
@@ -110,7 +109,7 @@ def run(
         LaboratoryError: the laboratory can't be opened.
         RunError: the run can't begin, go on or end; the text says what is kept, and what to do.
     """
-    request = task_request(campaign)
+    request = run_task(campaign)
     resources = checked(request, RunResources(in_process=in_process, subscribers=watch))
     if resume is not None:
         request = replace(request, folder=Path(resume).expanduser(), resume="yes")
@@ -130,7 +129,7 @@ def check(campaign: CampaignPlan, task: Task = "run") -> CheckReport:
     Raises:
         ValueError: the campaign has no section for the task.
     """
-    return RunService().check(task_request(campaign, task))
+    return RunService().check(TASKS[task](campaign))
 
 
 def doctor(laboratory: Path | str) -> BenchReport:
@@ -215,7 +214,7 @@ async def start(campaign: CampaignPlan, *, watch: Sequence[Watch] = (), in_proce
         ValueError, LaboratoryError, RunError: see `run`.
     """
     progress = ProgressState(campaign)
-    request = task_request(campaign)
+    request = run_task(campaign)
     resources = await asyncio.to_thread(
         checked, request, RunResources(in_process=in_process, subscribers=(*watch, progress))
     )
@@ -256,10 +255,10 @@ def calibrate(
             raise ConfigError(
                 replace(one, path=shown) if one.path == table else one for one in error.problems
             ) from None
-        resources = checked(task_request(stage, "calibrate"), RunResources(in_process=in_process, subscribers=watch))
+        resources = checked(calibrate_task(stage), RunResources(in_process=in_process, subscribers=watch))
     directory = create_run(campaign)
     _write_table(directory / table.name, rows)
-    request = task_request(_calibration_of(campaign, directory / table.name), "calibrate")
+    request = calibrate_task(_calibration_of(campaign, directory / table.name))
     return _run(replace(request, folder=directory), resources)
 
 
@@ -306,7 +305,7 @@ def plan(
             raise InvalidArgumentError(f"{name}={value!r}: should be 1 or more")
     vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
     given = _given(theta, campaign)
-    request = task_request(campaign, "plan", given=given, receiver=vessel, iterations=iterations, seeds=seeds)
+    request = plan_task(campaign, given, vessel, iterations, seeds)
     return _run(request, checked(request, RunResources(in_process=in_process, subscribers=watch)))
 
 

@@ -14,6 +14,7 @@ from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.campaign_file import CampaignFile
 from orchestrator.campaigns.campaign_prior import KnownPosterior, PriorSettings
 from orchestrator.campaigns.campaign_resolution import resolve_campaign
+from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.campaigns.yaml.file_access import resolved
 from orchestrator.campaigns.yaml.references import References
@@ -146,6 +147,16 @@ def load_laboratory(path: Path, *, stored: bool = True) -> LaboratorySettings:
     report.raise_if_any()
     assert laboratory is not None, "a laboratory without problems is ready"
     return laboratory
+
+
+def laboratory_record(path: Path) -> dict[str, Any]:
+    """The laboratory of a file as a record, ready for JSON: loading it gives the same. Raises ConfigError."""
+    report = Report()
+    references = References(report)
+    found = references.file(resolved(path), LaboratorySettings)
+    report.raise_if_any()
+    assert found is not None, "a laboratory without problems has settings"
+    return as_file(*found, references)
 
 
 class _LooseQuantity(Quantity):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 from collections.abc import Callable
@@ -33,21 +32,7 @@ if TYPE_CHECKING:
     from orchestrator.learning.campaign_plan import CampaignPlan
     from orchestrator.records.run_record import CampaignResult
     from orchestrator.reports.publishing import Published
-
-
-_TOLD = {
-    "prediction",
-    "prediction_interval",
-    "at_bounds",
-    "predicted_delivered_g",
-    "predicted_delivered_ml",
-    "risk",
-    "window",
-    "not_covered",
-}
-"""Fields of a receiver's summary that a plan for it prints beside the action."""
-
-"""Fields of a receiver's summary that `decant plan` prints besides the action."""
+    from orchestrator.runs.run_service import RunRequest
 
 
 def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[..., None]:
@@ -68,47 +53,42 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
     ) -> None:
         from orchestrator.cli.foreground_run import (
             check_campaign_can_run,
-            check_laboratory_answers,
-            check_somebody_is_there,
             read_campaign,
-            run_in_front_of_people,
+            run_directory,
+            run_task_at_terminal,
         )
-        from orchestrator.cli.motion_control import enable_campaign_motion
+        from orchestrator.cli.motion_control import require_campaign_flag
         from orchestrator.cli.view_command import live_view
         from orchestrator.reports.run_summary import summary_json
-        from orchestrator.runs.run_service import RunResources, RunTaskError, task_request
+        from orchestrator.runs.run_service import RunTaskError
+        from orchestrator.runs.run_tasks import TASKS
 
         with Refused(RunTaskError):
             resumed = functools.partial(run_directory, resume=True, run_id=run_id) if resume else None
-            request = task_request(read_campaign(campaign, laboratory, seed, resumed), task)
+            request = TASKS[task](read_campaign(campaign, laboratory, seed, resumed))
         plan = request.campaign
         check_campaign_can_run(request)
         if answer is not None and not resume:
             raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
-        checksum = enable_campaign_motion(plan, request.stages, enabled=enable_motion, task=task)
-        if request.pours:
-            check_somebody_is_there(plan.laboratory)
-        resources = RunResources(in_process=in_process, approved_checksum=checksum or "")
-        check_laboratory_answers(request, resources)
-        view = live_view(plan, live=live, at=live_at)
-        directory = run_directory(plan, resume=resume, run_id=run_id)
+        require_campaign_flag(request, enabled=enable_motion, task=task)
         flag = "" if laboratory is None else f" --laboratory {laboratory}"
         flag += "" if seed is None else f" --seed {seed}"
         flag += " --enable-motion" if plan.laboratory.mode == "hardware" else ""
-        again = f"decant {task} {campaign} --resume --run {directory.name}{flag}"
-        result, published = run_in_front_of_people(
-            dataclasses.replace(request, folder=directory, resume="yes" if resume else "no"),
-            resources,
-            again=again,
+        result, published = run_task_at_terminal(
+            request,
+            in_process=in_process,
+            again=lambda folder: f"decant {task} {campaign} --resume --run {folder.name}{flag}",
+            resume=resume,
+            run_id=run_id,
             answer=answer,
-            live=view,
+            live=lambda: live_view(plan, live=live, at=live_at),
         )
         if published.theta is not None:
             print_note(f"the parameters to use are in {published.theta}; give them with --parameters")
         if as_json and task == "calibrate":
             print_json(calibration_json(result, published))
         elif as_json:
-            print_json({"run": directory.name, "report": published.report, **summary_json(published.summary)})
+            print_json({"run": result.directory.name, "report": published.report, **summary_json(published.summary)})
 
     work.__name__, work.__doc__ = task, text
     return work
@@ -189,44 +169,41 @@ def plan(
     """
     from orchestrator.cli.foreground_run import (
         check_campaign_can_run,
-        check_laboratory_answers,
         read_campaign,
-        run_in_front_of_people,
+        run_task_at_terminal,
     )
     from orchestrator.cli.simulate_command import prediction_inputs
     from orchestrator.learning.deployment.deployment_result import Deployed
     from orchestrator.learning.single_action import PredictedPour
     from orchestrator.records.codec import result_of
-    from orchestrator.runs.run_service import RunRequest, RunResources
-    from orchestrator.runs.stages import DEPLOYMENT, PREDICTION, deployment_stages, prediction_stages
+    from orchestrator.reports.run_summary import PLANNED
+    from orchestrator.runs.stages import DEPLOYMENT, PREDICTION
 
-    chosen = planning_plan(read_campaign(campaign, laboratory, seed), parameters, receiver, iterations)
+    base = read_campaign(campaign, laboratory, seed)
+    known = prediction_inputs(base, parameters, thetas, seeds)
+    request = planning_request(base, parameters, receiver, iterations, seeds=seeds, draws=known.drawn)
+    chosen = request.campaign
     assert chosen.deployment is not None
-    planning = deployment_stages(chosen, chosen.deployment)
-    request = RunRequest(chosen, planning, as_written=receiver is None)
     check_campaign_can_run(request)
-    known = prediction_inputs(chosen, parameters, thetas, seeds)
-    count = max(seeds, len(known.drawn))
-    stages = [*planning, *prediction_stages(chosen, chosen.deployment, count, known.drawn)]
-    resources = RunResources(in_process=in_process, brief=True)
-    check_laboratory_answers(request, resources)
-    directory = run_directory(chosen, resume=False, run_id=None)
     if parameters is None:
         print_note(
             f"note: no --parameters given; planning with the campaign's ({json.dumps(chosen.parameters.model_dump())})"
         )
-    run_result, published = run_in_front_of_people(
-        dataclasses.replace(request, stages=stages, folder=directory),
-        resources,
-        again=f"Plan again: decant plan {campaign}",
+    run_result, published = run_task_at_terminal(
+        request,
+        in_process=in_process,
+        brief=True,
+        again=lambda folder: f"Plan again: decant plan {campaign}",
         not_resumed="this planning is not resumed; what was simulated",
     )
     answers = []
-    for stage in planning:
+    for stage in (one for one in request.stages if one.name.startswith(DEPLOYMENT)):
         result = result_of(run_result.results, stage.name, Deployed)
         recommended = result.recommended
         if recommended is None:
-            raise RefusalError(f"{stage.name}: no action could be planned; every simulation failed. See {directory}")
+            raise RefusalError(
+                f"{stage.name}: no action could be planned; every simulation failed. See {run_result.directory}"
+            )
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
         repeated = result_of(run_result.results, PREDICTION + receiver_name, PredictedPour).over_seeds
         spillage = repeated.get("spillage")
@@ -241,56 +218,35 @@ def plan(
                 "predicted_spillage_deviation": None if spillage is None else spillage.deviation,
                 "predicted_deviation": recommended.predicted_deviation,
                 "loss": chosen.deployment.loss_name,
-                **told.model_dump(mode="json", include=_TOLD),
+                **told.model_dump(mode="json", include=set(PLANNED)),
             }
         )
     theta = chosen.parameters.model_dump()
     if as_json:
-        totals = {"simulations": run_result.simulations, "cpu_s": run_result.cpu_s, "run": str(directory)}
+        totals = {"simulations": run_result.simulations, "cpu_s": run_result.cpu_s, "run": str(run_result.directory)}
         first = answers[0]
         print_json({**first, "theta": theta, **totals, **({"plans": answers} if len(answers) > 1 else {})})
 
 
-def planning_plan(
-    plan: CampaignPlan,
-    parameters: Path | None,
-    receiver: Path | None,
-    iterations: int | None,
-) -> CampaignPlan:
-    """A campaign turned into D1 without pours, and its record.
+def planning_request(
+    plan: CampaignPlan, parameters: Path | None, receiver: Path | None, iterations: int | None, **prediction: Any
+) -> RunRequest:
+    """The planning of a campaign.
 
     Args:
         parameters: file of the θ to plan with; the campaign's unless given.
         receiver: file of another vessel than the campaign's.
         iterations: as the campaign says unless given.
+        prediction: see `plan_task`.
 
     Raises:
         RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
     """
     from orchestrator.campaigns.file_loading import load_vessel
     from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-    from orchestrator.runs.run_service import RunTaskError, planned, read_theta
+    from orchestrator.runs.run_service import RunTaskError
+    from orchestrator.runs.run_tasks import plan_task, read_theta
 
     with Refused(ConfigError, RunTaskError):
         given = None if parameters is None else read_theta(parameters, plan)
-        return planned(plan, given, None if receiver is None else load_vessel(receiver), iterations)
-
-
-def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:
-    """A new run's directory, or the one to go on with.
-
-    Raises:
-        RefusalError: there is none, or it can't be made (exit code 2).
-    """
-    from orchestrator.learning.run_errors import RunError
-    from orchestrator.runs.run_folder import create_run, find_run
-
-    if run_id is not None and not resume:
-        raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun", BAD_INPUT)
-    try:
-        directory = find_run(plan, run_id) if resume else create_run(plan)
-    except RunError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
-    except OSError as error:
-        raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}", BAD_INPUT) from None
-    return directory
+        return plan_task(plan, given, None if receiver is None else load_vessel(receiver), iterations, **prediction)

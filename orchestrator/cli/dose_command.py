@@ -18,7 +18,6 @@ from orchestrator.cli.console import (
     print_json,
     print_message,
     print_note,
-    print_warning,
 )
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from actors.interfaces import DoseSource
     from orchestrator.learning.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
     from orchestrator.learning.dispense import Dose, KnownSource
-    from sim_engine.scene import Scene
+    from orchestrator.runs.run_service import RunRequest
 
 
 def dose(
@@ -68,10 +67,14 @@ def dose(
     in a journal and weighed, as a small run. A whole series belongs to the section 'dispense' of a campaign: 'decant
     run' pours it, 'decant dose --dry-run' predicts it.
     """
-    plan = dose_plan(campaign, laboratory, receiver, amount, tolerance, as_left=as_left, dry_run=dry_run)
-    plan = dataclasses.replace(plan, seed=plan.seed if seed is None else seed)
+    from orchestrator.cli.foreground_run import check_campaign_can_run
+
+    request = _dose_request(campaign, laboratory, receiver, amount, tolerance, as_left=as_left, dry_run=dry_run)
+    plan = request.campaign
+    check_campaign_can_run(request)
+    request = dataclasses.replace(request, campaign=dataclasses.replace(plan, seed=plan.seed if seed is None else seed))
     if dry_run:
-        _predict(plan, as_json=as_json)
+        _predict(request.campaign, as_json=as_json)
         return
     assert amount is not None
     options = "".join(
@@ -80,23 +83,10 @@ def dose(
         if value is not None
     )
     again = f"Another dose: decant dose {campaign}{options} --amount '{amount[0]}'"
-    pour_doses(plan, in_process=in_process, as_json=as_json, again=again)
+    pour_doses(request, in_process=in_process, as_json=as_json, again=again)
 
 
-def _planned_doses(amounts: Sequence[str], tolerance: str, receiver: str) -> tuple[PlannedDose, ...]:
-    from orchestrator.learning.campaign_plan import PlannedDose
-    from sim_engine.settings.quantity import QuantityError, parse_quantity
-
-    with Refused(QuantityError, at="--tolerance: "):
-        limit = parse_quantity(tolerance, "kg", "1 g")
-    with Refused(QuantityError, at="--amount: "):
-        wanted = [parse_quantity(text, "kg", "50 g") for text in amounts]
-    if limit <= 0.0 or min(wanted) <= limit:
-        raise RefusalError("--amount: every amount should be larger than the tolerance, and both above 0", BAD_INPUT)
-    return tuple(PlannedDose(amount, limit, receiver) for amount in wanted)
-
-
-def dose_plan(
+def _dose_request(
     path: Path,
     laboratory: Path | None,
     receiver: str | None,
@@ -105,61 +95,35 @@ def dose_plan(
     *,
     as_left: bool,
     dry_run: bool,
-) -> CampaignPlan:
-    """The campaign with nothing but a series of doses.
-
-    Args:
-        path: of the campaign.
-        laboratory: another laboratory.
-        receiver: name of the receiver; the first unless given.
-        amounts, tolerance: with units.
-        as_left: the source holds what earlier doses have left.
-        dry_run: the campaign's own series is possible.
+) -> RunRequest:
+    """The series of doses of the command's options.
 
     Raises:
         RefusalError: the campaign can't be read, it has no bench, or a dose is impossible (exit code 2).
     """
-    from orchestrator.campaigns.campaign_checks import check_campaign
     from orchestrator.cli.foreground_run import read_campaign
-    from orchestrator.learning.campaign_plan import DispensePlan
+    from orchestrator.runs.run_tasks import dose_scenes, dose_task
+    from sim_engine.settings.quantity import QuantityError, parse_quantity
 
     plan = read_campaign(path, laboratory)
     if not plan.laboratory.pours:
         raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
-    series = plan.dispense
     if not amounts:
-        if series is None or not dry_run:
-            hint = f"; 'decant run {path}' pours its own series" if series is not None else ", for example '50 g'"
+        if plan.dispense is None or not dry_run:
+            hint = ", for example '50 g'" if plan.dispense is None else f"; 'decant run {path}' pours its own series"
             raise RefusalError(f"--amount: name the wanted amount{hint}", BAD_INPUT)
-        if as_left:
-            series = dataclasses.replace(series, as_left=True)
-    else:
-        found = _scenes(plan)
-        names = [scene.receiver.name for scene in found]
-        if receiver is not None and receiver not in names:
-            known = ", ".join(dict.fromkeys(names))
-            text = f"--receiver {receiver}: the campaign has no such receiver; there are {known}"
-            raise RefusalError(text, BAD_INPUT)
-        scene = found[0 if receiver is None else names.index(receiver)]
-        doses = _planned_doses(amounts, tolerance, scene.receiver.name)
-        series = DispensePlan((scene,), doses, 0.0, as_left, plan.laboratory.name)
-    small = dataclasses.replace(plan, name=f"{plan.name}-dose", calibration=None, deployment=None, dispense=series)
-    problems = check_campaign(small, as_written=not amounts, warn=print_warning)
-    if problems:
-        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
-    return small
-
-
-def _scenes(plan: CampaignPlan) -> list[Scene]:
-    """Scenes to pour doses in; searched dimensions have the middle of their ranges."""
-    from orchestrator.runs.stages import named_scenes
-
-    if plan.dispense is not None:
-        return list(plan.dispense.scenes)
-    return [
-        dataclasses.replace(scene, fixed={**scene.fixed, **{axis.name: axis.decode(0.5) for axis in space.axes}})
-        for scene, space in named_scenes(plan).values()
-    ]
+        return dose_task(plan, as_left=as_left)
+    scenes = {scene.receiver.name: scene for scene in reversed(dose_scenes(plan))}
+    if receiver is not None and receiver not in scenes:
+        known = ", ".join(reversed(scenes))
+        raise RefusalError(f"--receiver {receiver}: the campaign has no such receiver; there are {known}", BAD_INPUT)
+    with Refused(QuantityError, at="--tolerance: "):
+        limit = parse_quantity(tolerance, "kg", "1 g")
+    with Refused(QuantityError, at="--amount: "):
+        wanted = [parse_quantity(text, "kg", "50 g") for text in amounts]
+    if limit <= 0.0 or min(wanted) <= limit:
+        raise RefusalError("--amount: every amount should be larger than the tolerance, and both above 0", BAD_INPUT)
+    return dose_task(plan, wanted, limit, None if receiver is None else scenes[receiver], as_left=as_left)
 
 
 def _known(plan: DispensePlan) -> dict[str, KnownSource]:
@@ -261,11 +225,11 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
     return "\n".join(lines)
 
 
-def pour_doses(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: str) -> Path:
+def pour_doses(request: RunRequest, *, in_process: bool, as_json: bool, again: str) -> Path:
     """Pour a series of doses as a small run of its own: journalled and weighed.
 
     Args:
-        plan: a campaign with nothing but the series.
+        request: of `dose_task`.
         in_process: without Ray.
         as_json: print the doses as JSON.
         again: the next command, for the message after an interruption.
@@ -276,48 +240,20 @@ def pour_doses(plan: CampaignPlan, *, in_process: bool, as_json: bool, again: st
     Raises:
         RefusalError: refused (exit code 2), or not every dose was poured (1).
     """
-    from orchestrator.cli.campaign_commands import run_directory
-    from orchestrator.cli.foreground_run import (
-        check_laboratory_answers,
-        check_somebody_is_there,
-        run_in_front_of_people,
-    )
-    from orchestrator.cli.motion_control import confirm
+    from orchestrator.cli.foreground_run import run_task_at_terminal
     from orchestrator.learning.dispense import Dispensed
     from orchestrator.records.codec import result_of
-    from orchestrator.runs.motion_approval import (
-        SafetyRecordError,
-        campaign_pours,
-        envelope,
-        envelope_lines,
-        required_checksum,
-    )
-    from orchestrator.runs.run_service import RunRequest, RunResources
-    from orchestrator.runs.stages import DOSES, dispense_stages
+    from orchestrator.runs.stages import DOSES
 
-    assert plan.dispense is not None
-    if plan.laboratory.arm is None:  # the recording shows the motions of an arm, and there is none
-        plan = dataclasses.replace(plan, outputs=plan.outputs.model_copy(update={"recording": False}))
-    assert plan.dispense is not None
-    request = RunRequest(plan, dispense_stages(plan.dispense))
-    checksum = ""
-    if plan.laboratory.mode == "hardware":
-        lines = [f"doses          {len(plan.dispense.doses)}"]
-        if plan.laboratory.arm is not None:
-            with Refused(SafetyRecordError):
-                checksum = required_checksum(plan)
-            lines += envelope_lines(envelope(plan.laboratory.arm, campaign_pours(plan, request.stages)))
-        confirm(plan.laboratory, lines)
-    resources = RunResources(in_process=in_process, approved_checksum=checksum)
-    check_somebody_is_there(plan.laboratory)
-    check_laboratory_answers(request, resources)
-    directory = run_directory(plan, resume=False, run_id=None)
-    finished, _ = run_in_front_of_people(
-        dataclasses.replace(request, folder=directory),
-        resources,
-        again=again,
+    assert request.campaign.dispense is not None
+    finished, _ = run_task_at_terminal(
+        request,
+        in_process=in_process,
+        again=lambda folder: again,
         not_resumed="these doses are not resumed; what was weighed of them",
+        motion=(f"doses          {len(request.campaign.dispense.doses)}", None),
     )
+    directory = finished.directory
     result: Dispensed = result_of(finished.results, DOSES, Dispensed)
     if as_json:
         doses = [one.model_dump(mode="json", exclude={"signals"}) for one in result.doses]

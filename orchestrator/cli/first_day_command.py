@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from orchestrator.reports.rig_diagnosis import RigDiagnosis
     from sim_engine.scene import Scene
 
+DOSE_LIMIT = 1e-3
+"""Excess that a dose avoids [kg]."""
+
 PAGE, RESULT, PICTURE = "first-day.html", "first-day.json", "first-day.png"
 
 
@@ -167,50 +170,48 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
         )
         if step.misses:
             print_message("  this pour misses the receiver on purpose: put a tray below it")
-        _pour_step(folder, plan, path, laboratory, step, in_process=in_process, again=again)
+        _pour_step(folder, plan, step, in_process=in_process, again=again)
 
 
 def _pour_step(
     folder: Path,
     plan: CampaignPlan,
-    path: Path,
-    laboratory: Path | None,
     step: DayStep,
     *,
     in_process: bool,
     again: str,
 ) -> None:
     """Pour one step as a run of its own, and move its recording into the folder."""
-    from orchestrator.cli.dose_command import dose_plan, pour_doses
+    from orchestrator.cli.dose_command import pour_doses
+    from orchestrator.cli.foreground_run import check_campaign_can_run
     from orchestrator.cli.pour_command import chosen_pour, pour_weighed
     from orchestrator.reports.recording_export import export_recordings
-
-    outputs: dict[str, Any] = {"directory": folder.absolute() / "runs", "figures": False, "recording": False}
+    from orchestrator.runs.run_tasks import dose_task
 
     def filled(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
         return tuple(
             dataclasses.replace(one, liquid=one.liquid.model_copy(update={"mass": step.fill})) for one in scenes
         )
 
+    assert plan.deployment is not None
+    outputs: dict[str, Any] = {"directory": folder.absolute() / "runs", "figures": False, "recording": False}
+    used = dataclasses.replace(
+        plan,
+        calibration=None,
+        deployment=dataclasses.replace(plan.deployment, scenes=filled(plan.deployment.scenes)[:1]),
+        dispense=plan.dispense and dataclasses.replace(plan.dispense, scenes=filled(plan.dispense.scenes)),
+        outputs=plan.outputs.model_copy(update=outputs),
+    )
     if step.amount is None:
-        assert plan.deployment is not None
-        deployment = dataclasses.replace(plan.deployment, scenes=filled(plan.deployment.scenes)[:1])
-        used = dataclasses.replace(
-            plan,
-            calibration=None,
-            dispense=None,
-            deployment=deployment,
-            outputs=plan.outputs.model_copy(update=outputs),
-        )
+        used = dataclasses.replace(used, dispense=None)
         run = pour_weighed(
             chosen_pour(used, _assignments(used, step)), in_process=in_process, again=again, as_json=False
         )
     else:
-        used = dose_plan(path, laboratory, None, [f"{1e3 * step.amount:g} g"], "1 g", as_left=False, dry_run=False)
-        assert used.dispense is not None
-        series = dataclasses.replace(used.dispense, scenes=filled(used.dispense.scenes))
-        used = dataclasses.replace(used, dispense=series, outputs=used.outputs.model_copy(update=outputs))
-        run = pour_doses(used, in_process=in_process, again=again, as_json=False)
+        request = dose_task(used, [step.amount], DOSE_LIMIT)
+        used = request.campaign
+        check_campaign_can_run(request)
+        run = pour_doses(request, in_process=in_process, again=again, as_json=False)
     written, left_out = export_recordings(run, plan=used)
     if not written:
         raise RefusalError(f"{step.name}: was not recorded: {'; '.join(left_out)}", FAILED)

@@ -1,4 +1,4 @@
-"""What all verbs share: reading a campaign, running one in front of a person.
+"""What all verbs share: reading a campaign, running a task in front of a person.
 
 What a run that was interrupted or broke off leaves behind, and what to do about it, in words.
 
@@ -33,6 +33,7 @@ from orchestrator.cli.console import (
 )
 
 if TYPE_CHECKING:
+    from actors.arm.arm_interface import PathReport
     from actors.interfaces import Operator
     from actors.laboratory_settings import LaboratorySettings
     from orchestrator.learning.campaign_plan import CampaignPlan
@@ -145,6 +146,72 @@ def _why_not_opened(path: Path) -> str | None:
     except (OSError, ValueError) as error:
         return getattr(error, "strerror", None) or str(error)
     return None
+
+
+def run_task_at_terminal(
+    request: RunRequest,
+    *,
+    in_process: bool,
+    again: Callable[[Path], str],
+    brief: bool = False,
+    not_resumed: str = "",
+    motion: tuple[str, PathReport | None] = ("", None),
+    resume: bool = False,
+    run_id: str | None = None,
+    answer: str | None = None,
+    live: Callable[[], LiveView | None] = lambda: None,
+) -> tuple[CampaignResult, Published]:
+    """Run a task that was checked: the operator's consent, the laboratory, the folder, then the run itself.
+
+    Args:
+        request: of the task, without a folder.
+        in_process, brief: see `RunResources`.
+        again: makes the command for the message after an interruption from the folder of the run.
+        not_resumed, answer: see `run_in_front_of_people`.
+        motion: what the operator consents to, if hardware moves; see `consent_to_motion`.
+        resume, run_id: see `run_directory`.
+        live: makes the view to open while it runs.
+
+    Raises:
+        RefusalError: refused (exit code 2), or as `run_in_front_of_people`.
+    """
+    from orchestrator.cli.motion_control import consent_to_motion
+    from orchestrator.runs.run_service import RunResources
+
+    checksum = consent_to_motion(request, *motion)
+    if request.pours:
+        check_somebody_is_there(request.campaign.laboratory)
+    resources = RunResources(in_process=in_process, approved_checksum=checksum, brief=brief)
+    check_laboratory_answers(request, resources)
+    view = live()
+    folder = run_directory(request.campaign, resume=resume, run_id=run_id)
+    return run_in_front_of_people(
+        replace(request, folder=folder, resume="yes" if resume else "no"),
+        resources,
+        again=again(folder),
+        not_resumed=not_resumed,
+        answer=answer,
+        live=view,
+    )
+
+
+def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:
+    """A new run's directory, or the one to go on with.
+
+    Raises:
+        RefusalError: there is none, or it can't be made (exit code 2).
+    """
+    from orchestrator.learning.run_errors import RunError
+    from orchestrator.runs.run_folder import create_run, find_run
+
+    if run_id is not None and not resume:
+        raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun", BAD_INPUT)
+    try:
+        return find_run(plan, run_id) if resume else create_run(plan)
+    except RunError as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except OSError as error:
+        raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}", BAD_INPUT) from None
 
 
 def run_in_front_of_people(

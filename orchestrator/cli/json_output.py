@@ -19,8 +19,9 @@ from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, Question
 from orchestrator.daemon.station_schemas import AccountOut, BatchOut, ContentOut, PourOut
 from orchestrator.learning.dispense import Dose
 from orchestrator.learning.single_action import WeighedPour
-from orchestrator.reports.run_summary import ReceiverSummary, RunSummary
+from orchestrator.reports.run_summary import PLANNED, ReceiverSummary, RunSummary
 from sim_engine.liquids import SimulationParameters
+from sim_engine.prediction_band import SampleStatistics
 from sim_engine.settings.model import DescribedSchema, meanings
 
 
@@ -82,10 +83,6 @@ class _PlannedParts(_Output):
     """Name of the loss that was minimised."""
 
 
-_PLANNED = ("prediction", "prediction_interval", "at_bounds", "predicted_delivered_g", "predicted_delivered_ml", "risk",
-            "window", "not_covered")  # fmt: skip
-
-
 def _part(model: type[BaseModel], names: Any) -> dict[str, Any]:
     """Fields of another model, for `create_model`."""
     found = {}
@@ -100,7 +97,7 @@ PlannedOutput = create_model(
     "PlannedOutput",
     __base__=_PlannedParts,
     __doc__="The planned action for one receiver.",
-    **_part(ReceiverSummary, _PLANNED),
+    **_part(ReceiverSummary, PLANNED),
 )
 PlanOutput = create_model(
     "PlanOutput",
@@ -121,16 +118,6 @@ RunOutput = create_model(
 )
 
 
-class StatisticsOutput(_Output):
-    """Sample statistics over simulations with different seeds."""
-
-    mean: float
-    deviation: float | None
-    """Standard deviation; null for one simulation."""
-
-    count: int
-
-
 class IntervalOutput(_Output):
     """Prediction interval of r = spilled / poured for a single pour."""
 
@@ -144,13 +131,13 @@ class IntervalOutput(_Output):
 
 
 class PredictionOutput(BaseModel):
-    """Prediction over seeds: `StatisticsOutput` by quantity, such as received, spilled, retained and spillage."""
+    """Prediction over seeds: `SampleStatistics` by quantity, such as received, spilled, retained and spillage."""
 
     model_config = ConfigDict(extra="allow", use_attribute_docstrings=True)
 
     band: IntervalOutput | None
     seeds: list[int]
-    __pydantic_extra__: dict[str, StatisticsOutput]
+    __pydantic_extra__: dict[str, SampleStatistics]
 
 
 class SimulateOutput(_Output):
@@ -210,7 +197,7 @@ class ScoredPourOutput(_Output):
     measured: float | None
     """r = spilled / poured as weighed; null if it is undefined."""
 
-    predicted: StatisticsOutput | None
+    predicted: SampleStatistics | None
     band: IntervalOutput | None
     inside: bool | None
     """Whether the measured value is inside the interval."""

@@ -26,10 +26,9 @@ from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_mes
 from orchestrator.runs.motion_approval import SafetyRecordError, required_checksum
 
 if TYPE_CHECKING:
-    from actors.arm.arm_interface import Arm, ArmFacts, Executed, PlannedPour
+    from actors.arm.arm_interface import Arm, ArmFacts, Executed, PathReport, PlannedPour
     from actors.laboratory_settings import LaboratorySettings
-    from orchestrator.learning.campaign_plan import CampaignPlan
-    from orchestrator.runs.stages import StageDefinition
+    from orchestrator.runs.run_service import RunRequest
 
 T = TypeVar("T")
 
@@ -50,49 +49,58 @@ _HELP = """\
   quit"""
 
 
-def enable_campaign_motion(
-    plan: CampaignPlan, stages: Sequence[StageDefinition], *, enabled: bool, task: str
-) -> str | None:
-    """Check the approval of motion before a campaign: hardware needs the flag, a safety record, and a typed name.
+def require_campaign_flag(request: RunRequest, *, enabled: bool, task: str) -> None:
+    """Refuse a campaign that would move hardware without `--enable-motion`; note a flag without effect.
+
+    Raises:
+        RefusalError: exit code 2.
+    """
+    laboratory = request.campaign.laboratory
+    if not request.pours:
+        return
+    require_flag(laboratory, enabled=enabled, again=f"decant {task} {request.campaign.source.name} --enable-motion")
+    if enabled and laboratory.mode != "hardware":
+        print_note(
+            f"note: --enable-motion has no effect: laboratory {laboratory.name} is {laboratory.mode}, and moves nothing"
+        )
+
+
+def consent_to_motion(request: RunRequest, count: str = "", path: PathReport | None = None) -> str:
+    """The operator's consent to the motion of a run: hardware needs a safety record and a typed name.
 
     Args:
-        plan: campaign with its laboratory.
-        stages: stages to run.
-        enabled: whether `--enable-motion` was given.
-        task: name of the command, for messages.
+        request: of the run.
+        count: line with the number of pours; the stages' largest number unless given.
+        path: of the only pour; None: paths from all over the actions are planned.
 
     Returns:
-        The checksum of the accepted safety settings; None without hardware.
+        The checksum of the accepted safety settings; '' without hardware, and for a pump, which has no path.
 
     Raises:
         RefusalError: motion is not enabled (exit code 2).
     """
-    from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count
+    from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count, report_lines
 
-    laboratory = plan.laboratory
-    if not any(stage.pours for stage in stages):
-        return None
-    if laboratory.mode != "hardware":
-        if enabled:
-            print_note(
-                f"note: --enable-motion has no effect: laboratory {laboratory.name} is {laboratory.mode}, and moves "
-                "nothing"
-            )
-        return None
-    require_flag(laboratory, enabled=enabled, again=f"decant {task} {plan.source.name} --enable-motion")
-    if laboratory.arm is None:  # a pump has no path and no safety settings
-        confirm(laboratory, [f"pours          up to {pour_count(plan, stages)}"])
+    plan, laboratory = request.campaign, request.campaign.laboratory
+    if not request.pours or laboratory.mode != "hardware":
+        return ""
+    lines = [count or f"pours          up to {pour_count(plan, request.stages)}"]
+    if laboratory.arm is None:
+        confirm(laboratory, lines)
         return ""
     with Refused(SafetyRecordError):
         checksum = required_checksum(plan)
+    if path is not None:
+        confirm(laboratory, [*lines, *report_lines(path)])
+        return checksum
     print_note(f"planning paths from all over the actions of {plan.name} …")
-    found = envelope(laboratory.arm, campaign_pours(plan, stages))
+    found = envelope(laboratory.arm, campaign_pours(plan, request.stages))
     if not found.reports:
         raise RefusalError(
             f"none of {len(found.refused)} actions could be poured by this arm; the first: {found.refused[0]}",
             BAD_INPUT,
         )
-    confirm(laboratory, [f"pours          up to {pour_count(plan, stages)}", *envelope_lines(found)])
+    confirm(laboratory, [*lines, *envelope_lines(found)])
     return checksum
 
 

@@ -7,7 +7,6 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
     from sim_engine.action import Action
     from sim_engine.scene import Scene
 
-STAGE, RECORD = "pour", "pour.json"
+RECORD = "pour.json"
 
 
 def pour(
@@ -257,59 +256,27 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool)
     Raises:
         RefusalError: refused (exit code 2), or nothing was poured (1).
     """
-    from orchestrator.cli.campaign_commands import run_directory
-    from orchestrator.cli.foreground_run import (
-        check_laboratory_answers,
-        check_somebody_is_there,
-        run_in_front_of_people,
-    )
-    from orchestrator.cli.motion_control import confirm
-    from orchestrator.learning.single_action import OnePour, OnePoured
+    from orchestrator.cli.foreground_run import run_task_at_terminal
+    from orchestrator.learning.single_action import OnePoured
     from orchestrator.records.codec import result_of
-    from orchestrator.runs.motion_approval import SafetyRecordError, report_lines, required_checksum
-    from orchestrator.runs.run_service import RunRequest, RunResources
-    from orchestrator.runs.stages import StageDefinition
+    from orchestrator.runs.run_tasks import POUR, pour_task
 
-    plan = dataclasses.replace(
-        plan_of_scene(chosen.plan, chosen.scene),
-        name=f"{chosen.plan.name}-pour",
-        outputs=chosen.plan.outputs.model_copy(update={"figures": False}),
-    )
-    build: Callable[..., OnePour] = lambda results, seed: OnePour(chosen.scene, chosen.action, seed)  # noqa: E731
-    request = RunRequest(plan, [StageDefinition(STAGE, build, pours=True)])
-    checksum = ""
-    if plan.laboratory.mode == "hardware":
-        assert chosen.path is not None
-        with Refused(SafetyRecordError):
-            checksum = required_checksum(chosen.plan)
-        confirm(plan.laboratory, ["pours          1", *report_lines(chosen.path.report)])
-    check_somebody_is_there(plan.laboratory)
-    resources = RunResources(in_process=in_process, approved_checksum=checksum)
-    check_laboratory_answers(request, resources)
-    directory = run_directory(plan, resume=False, run_id=None)
-    finished, _ = run_in_front_of_people(
-        dataclasses.replace(request, folder=directory),
-        resources,
-        again=again,
+    finished, _ = run_task_at_terminal(
+        pour_task(chosen.plan, chosen.scene, chosen.action),
+        in_process=in_process,
+        again=lambda folder: again,
         not_resumed="this pour is not resumed; what was weighed of it",
+        motion=("pours          1", None if chosen.path is None else chosen.path.report),
     )
-    result = result_of(finished.results, STAGE, OnePoured)
+    result = result_of(finished.results, POUR, OnePoured)
     if result.weighed is None:
         raise RefusalError(result.failed or "nothing was poured", FAILED)
     if as_json:
-        about = {"run": str(directory), "mode": plan.laboratory.mode, "action": chosen.action.values()}
+        about = {"run": str(finished.directory), "mode": chosen.plan.laboratory.mode, "action": chosen.action.values()}
         print_json({**about, **result.weighed.model_dump()})
     else:
         print(told(result.weighed))
-    return directory
-
-
-def plan_of_scene(plan: CampaignPlan, scene: Scene, pours: int = 1) -> CampaignPlan:
-    """The campaign without everything that these pours in one of its scenes do not need."""
-    if plan.deployment is not None and scene in plan.deployment.scenes:
-        deployment = dataclasses.replace(plan.deployment.with_settings(pours=pours), scenes=(scene,))
-        return dataclasses.replace(plan, calibration=None, deployment=deployment)
-    return dataclasses.replace(plan, deployment=None)
+    return finished.directory
 
 
 def told(weighed: WeighedPour) -> str:

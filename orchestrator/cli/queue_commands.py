@@ -151,11 +151,11 @@ def submit(
 
     plan = read_campaign(campaign, laboratory, seed)
     if (parameters, receiver, iterations) != (None, None, None):
-        from orchestrator.cli.campaign_commands import planning_plan
+        from orchestrator.cli.campaign_commands import planning_request
 
         if task != "plan":
             raise RefusalError("--parameters, --receiver and --iterations go with --task plan", BAD_INPUT)
-        plan = planning_plan(plan, parameters, receiver, iterations)
+        plan = planning_request(plan, parameters, receiver, iterations).campaign
     try:
         packed, files = pack(plan, parameters)
     except OSError as error:

@@ -13,20 +13,19 @@ import typer
 from orchestrator.cli.command_options import Assignments, Json
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message
 from orchestrator.cli.queue_commands import CampaignId, State, Url, connected_client
+from orchestrator.daemon.pour_request import PourIn, described
 
 BatchId = Annotated[str, typer.Argument(help="Id of the batch.", show_default=False)]
 
 
 def order(
-    key: Annotated[
-        str, typer.Argument(metavar="ID", help="Your id of the pour: with it, a repeated call pours only once.")
-    ],
-    source: Annotated[str, typer.Option("--from", help="Vessel to pour from: id or bar code.")],
-    receiver: Annotated[str, typer.Option("--into", help="Vessel to pour into: id or bar code.")],
-    amount: Annotated[str | None, typer.Option(help="Wanted amount, for example '30 g'.", show_default=False)] = None,
-    tolerance: Annotated[str, typer.Option(help="Largest error of the amount.")] = "1 g",
+    key: Annotated[str, typer.Argument(metavar="ID", help=described("id"))],
+    source: Annotated[str, typer.Option("--from", help=described("source"))],
+    receiver: Annotated[str, typer.Option("--into", help=described("receiver"))],
+    amount: Annotated[str | None, typer.Option(help=described("amount"), show_default=False)] = None,
+    tolerance: Annotated[str, typer.Option(help=described("tolerance"))] = PourIn.model_fields["tolerance"].default,
     assignments: Assignments = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Predict the pour; nothing moves.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help=described("dry_run"))] = False,
     wait: Annotated[float, typer.Option(min=0, max=600, help="Wait for the result [s].")] = 0.0,
     url: Url = None,
     state: State = None,

@@ -32,7 +32,7 @@ from pydantic import BaseModel, ValidationError, WithJsonSchema
 from orchestrator.daemon.daemon_settings import MadsciSettings, networks
 from orchestrator.daemon.daemon_store import ENDED, DesiredState, QueueItem
 from orchestrator.daemon.ordering import Ordering
-from orchestrator.daemon.station_schemas import PourIn
+from orchestrator.daemon.pour_request import PourIn, described
 from orchestrator.daemon.submissions import Submission, prepare
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.learning.run_errors import RunError
@@ -67,14 +67,9 @@ from node_action left join pour_order on pour_order.id = node_action.id
 """Actions. The order of a pour shows that its action was started: the daemon may end between the two entries."""
 
 _POUR = {
-    "source": ("Vessel to pour from: id or bar code.", True),
-    "receiver": ("Vessel to pour into: id or bar code.", True),
-    "amount": ("Wanted in the receiver, such as '30 g'.", False),
-    "tolerance": ("Largest error, such as '1 g'.", False),
-    "liquid": ("Liquid that the source has to hold.", False),
-    "action": ("Values by dimension, instead of an amount.", False),
-    "rig": ("Rig, if the vessels' positions don't tell it.", False),
-    "predict": ("Whether the pour is predicted first: true or false.", False),
+    name: (described(name), field.is_required())
+    for name, field in PourIn.model_fields.items()
+    if name in ("source", "receiver", "amount", "tolerance", "liquid", "action", "rig", "predict")
 }
 
 ACTIONS: dict[str, tuple[str, dict[str, tuple[str, bool]]]] = {

@@ -18,21 +18,13 @@ from typing import Any
 from actors.interfaces import InvalidActionError, LaboratoryError
 from orchestrator.daemon.daemon_store import QueueItem
 from orchestrator.daemon.materials import SURE, Materials
-from orchestrator.daemon.pour_orders import (
-    POUR,
-    OrderBook,
-    OrderError,
-    PlannedOrder,
-    PourOrder,
-    order_bundle,
-    order_of,
-    resolved_order,
-    settled_pour,
-)
-from orchestrator.daemon.station_schemas import BatchIn, PourIn
-from orchestrator.daemon.submissions import Submission, prepare, run_request
+from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, settled_pour
+from orchestrator.daemon.pour_request import PourIn
+from orchestrator.daemon.station_schemas import BatchIn
+from orchestrator.daemon.submissions import Submission, planned_order, prepare
 from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
 from orchestrator.learning.run_errors import RunError
+from orchestrator.runs.run_tasks import POUR
 
 WAIT = 0.1
 """Interval at which a waiting call reads the state of its pour [s]."""
@@ -116,18 +108,13 @@ class Ordering:
             batch: id of its batch.
         """
         daemon = self._daemon
-        order = order_of(
-            *(request.id, request.source, request.receiver, request.liquid),
-            *(request.amount, request.tolerance, request.action),
-        )
-        order = resolved_order(order, self.materials)
+        order = PourOrder.of(request, self.materials)
         if reason := self._refusal(order):
             raise RequestRefusedError(reason)
         rig = self._rig(order, request.rig)
         daemon.refuse_new_work(rig)
-        text = order_bundle(order, self.materials)
         submission = Submission(
-            text=text, task=POUR, rig=rig, priority=request.priority, order=order, batch=batch, held=request.hold,
+            task=POUR, rig=rig, priority=request.priority, order=order, batch=batch, held=request.hold,
             not_before=request.not_before,
         )  # fmt: skip
         item = await asyncio.to_thread(prepare, daemon.settings, submission, daemon.new_key(), by)
@@ -156,10 +143,8 @@ class Ordering:
 
     async def _predicted(self, item: QueueItem) -> dict[str, Any]:
         settings, warm = self._daemon.settings, self._daemon.warm
-        request = await asyncio.to_thread(run_request, settings, item, settings.rig(item.rig))
-        order = await asyncio.to_thread(PourOrder.read, settings.snapshots / item.id)
-        planned = await asyncio.to_thread(PlannedOrder.of, request.campaign, order)
-        if order.amount is None:
+        planned = await asyncio.to_thread(planned_order, settings, item, settings.rig(item.rig))
+        if planned.order.amount is None:
             await warm.open()
         try:
             return await planned.predict(warm.share)
@@ -335,9 +320,7 @@ class Ordering:
         settings = self._daemon.settings
         try:
             rig = settings.rig(item.rig)
-            found = await asyncio.to_thread(
-                settled_pour, settings.runs / item.run, settings.snapshots / item.id, rig.spec
-            )
+            found = await asyncio.to_thread(settled_pour, settings.runs / item.run, settings.snapshots / item.id, rig)
         except (RunError, OSError, KeyError, ValueError):
             return True  # unreadable: it may have begun
         return found is not None and found.pour.state in ("under way", "unknown")

@@ -1,10 +1,10 @@
 """A pour that another program orders: its request, its run, its prediction and its result.
 
-An order becomes a queued campaign with the task 'pour' and one pour, so that rigs, journal, questions and stops treat
-it as any other campaign. The id of its caller makes it unique: the same order again is the same pour.
+A queued order has the task 'pour' and one pour, so that rigs, journal, questions and stops treat it as any campaign.
+The id of its caller makes it unique: the same order again is the same pour.
 
-- `PourOrder` is the order; `order_bundle` is the campaign of it, `order_request` its run.
-- `predict` predicts it; nothing moves.
+- `PourOrder` is the order with its materials, as its snapshot stores it; `PlannedOrder` is its run.
+- `PlannedOrder.predict` predicts it; nothing moves.
 - `OrderBook` stores orders and results in the daemon's `Store`, and enters pours in the account of `materials`.
 
 Amounts are poured by the strategy of `decant dose`, actions by that of `decant pour`.
@@ -17,9 +17,11 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel, ConfigDict
 
 from actors.arm.arm_settings import arm_kind
 from actors.dosing.dose_series import check_dose
@@ -27,29 +29,40 @@ from actors.dosing.simulated_dose import check_straight
 from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
 from actors.laboratory import predicted_dose
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.campaigns.action_assignments import AssignmentError, assigned_action, set_action
+from orchestrator.campaigns.action_assignments import AssignmentError, assigned_action
 from orchestrator.campaigns.campaign_checks import check_vessels, touch
+from orchestrator.campaigns.file_loading import laboratory_record, load_laboratory, vessel_from
 from orchestrator.campaigns.shipped import shipped
+from orchestrator.campaigns.yaml.yaml_source import Document
+from orchestrator.daemon.daemon_settings import Rig
 from orchestrator.daemon.daemon_store import QueueItem, Store
-from orchestrator.daemon.materials import Materials, mass_of
-from orchestrator.learning.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
+from orchestrator.daemon.materials import Materials, liquid_of, mass_of
+from orchestrator.daemon.pour_request import PourIn
+from orchestrator.learning.campaign_plan import (
+    CampaignPlan,
+    DeploymentPlan,
+    DispensePlan,
+    OutputSettings,
+    PlannedDose,
+)
 from orchestrator.learning.deployment.costing import Costing
+from orchestrator.learning.deployment.d2 import D2Settings
 from orchestrator.learning.dispense import DOSE, Dispense, KnownSource, spilled_mass
 from orchestrator.learning.requests import Failed, Simulated, Slots
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.single_action import OnePour, RepeatedSimulation
-from orchestrator.materials.vessel_account import Transfer
+from orchestrator.materials.vessel_account import MIXTURE, Transfer
 from orchestrator.records.run_record import RunPour, read_record
 from orchestrator.runs.run_service import RunRequest
+from orchestrator.runs.run_tasks import POUR
 from orchestrator.runs.stages import StageDefinition
 from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import plan_motion
-from sim_engine.outcome import PourMeasurement
+from sim_engine.outcome import Loss, PourMeasurement
 from sim_engine.scene import PourTask, Scene
+from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.vessel import build_vessel
-
-POUR = "pour"
-"""Task of an ordered pour, and name of its stage."""
 
 ORDER = "pour.json"
 """File of the order in a campaign's snapshot."""
@@ -74,28 +87,81 @@ class OrderError(RunError):
     exit_code = 2
 
 
-@dataclass(frozen=True)
-class PourOrder:
-    """One pour as ordered. Masses in kg.
+class PourOrder(BaseModel):
+    """One pour as ordered, with its materials. Masses in kg."""
 
-    Attributes:
-        id: of the caller.
-        source, receiver: ids of vessels.
-        liquid: id of the liquid; '' for the one in the source.
-        amount: wanted in the receiver; None: the action is poured.
-        tolerance: of the amount; the excess that the pour avoids.
-        action: values by dimension, such as {'angular_velocity': '60 deg/s'}; for an amount, the place of the pourer.
-        deviation: standard deviation of the content of the source, when the pour begins.
-    """
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     id: str
+    """Of the caller."""
+
     source: str
     receiver: str
-    liquid: str = ""
-    amount: float | None = None
-    tolerance: float = 1e-3
-    action: dict[str, str] = field(default_factory=dict)
+    """Ids of vessels."""
+
+    liquid: str
+    """Id of the liquid."""
+
+    amount: float | None
+    """Wanted in the receiver; None: the action is poured."""
+
+    tolerance: float
+    """Of the amount; the excess that the pour avoids."""
+
+    action: dict[str, str]
+    """Values by dimension, such as {'angular_velocity': '60 deg/s'}; for an amount, the place of the pourer."""
+
+    properties: dict[str, Any]
+    """Of the liquid, as in a campaign, without its mass."""
+
+    pourer: dict[str, Any]
+    vessel: dict[str, Any]
+    """Source and receiver, as in vessel files."""
+
+    load: float
+    """Content of the source when the pour begins."""
+
     deviation: float = 1e-4
+    """Its standard deviation."""
+
+    @classmethod
+    def of(cls, request: PourIn, materials: Materials) -> PourOrder:
+        """The order of a request, with ids instead of bar codes, and with the present content of the source.
+
+        Raises:
+            OrderError: neither amount nor action is given, or a value is invalid.
+            MaterialError: a vessel or the liquid is unknown.
+        """
+        action = request.action
+        try:
+            amount = None if request.amount is None else mass_of(request.amount, "amount")
+            limit = mass_of(request.tolerance, "tolerance")
+        except RunError as error:
+            raise OrderError(str(error)) from None
+        if amount is None and "angular_velocity" not in action:
+            raise OrderError("give an 'amount', such as '30 g', or an 'action' with at least 'angular_velocity'")
+        if amount is not None and not 0.0 < limit < amount:
+            raise OrderError("amount: should be larger than the tolerance, and both above 0 g")
+        for name in ("angular_acceleration", "return_velocity"):
+            if _action(action, _USUAL).values()[name] is None:
+                word = ACTION_DIMENSIONS[name].switched_off
+                raise OrderError(f"action: {name}: '{word}' only replays recorded pours, no arm can do it")
+        source, receiver = materials.vessel(request.source), materials.vessel(request.receiver)
+        content = materials.content(source.id)
+        liquid = materials.liquid_id(request.liquid) if request.liquid else content.liquid
+        return cls(
+            id=request.id,
+            source=source.id,
+            receiver=receiver.id,
+            liquid=liquid,
+            amount=amount,
+            tolerance=limit,
+            action=action,
+            properties={} if liquid in ("", MIXTURE) else materials.properties(liquid),
+            pourer=source.shape,
+            vessel=receiver.shape,
+            load=content.mass or 0.0,
+        )
 
     @property
     def seed(self) -> int:
@@ -103,137 +169,30 @@ class PourOrder:
         return int.from_bytes(hashlib.sha256(self.id.encode()).digest()[:4], "big") >> 1
 
     def write(self, folder: Path) -> None:
-        """Write the order into a snapshot."""
-        (folder / ORDER).write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+        """Write the order into a snapshot; one that is there is replaced at once."""
+        fresh = folder / f"{ORDER}.new"
+        fresh.write_text(self.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        fresh.replace(folder / ORDER)
 
     @classmethod
     def read(cls, folder: Path) -> PourOrder:
-        """Read the order of a snapshot."""
-        return cls(**json.loads((folder / ORDER).read_text(encoding="utf-8")))
+        """Read the order of a snapshot. Raises OSError, ValueError."""
+        return cls.model_validate_json((folder / ORDER).read_text(encoding="utf-8"))
 
 
-def order_of(
-    key: str, source: str, receiver: str, liquid: str, amount: str | None, tolerance: str, action: Mapping[str, str]
-) -> PourOrder:
-    """Return an order from the texts of a request.
-
-    Raises:
-        OrderError: neither amount nor action is given, or a value is invalid.
-    """
-    try:
-        wanted = None if amount is None else mass_of(amount, "amount")
-        limit = mass_of(tolerance, "tolerance")
-    except RunError as error:
-        raise OrderError(str(error)) from None
-    if wanted is None and "angular_velocity" not in action:
-        raise OrderError("give an 'amount', such as '30 g', or an 'action' with at least 'angular_velocity'")
-    if wanted is not None and not 0.0 < limit < wanted:
-        raise OrderError("amount: should be larger than the tolerance, and both above 0 g")
-    try:
-        set_action([f"{name}={value}" for name, value in action.items()], fixed=_DEFAULTS)
-    except AssignmentError as error:
-        raise OrderError(f"action: {error}") from None
-    return PourOrder(key, source, receiver, liquid, wanted, limit, dict(action))
-
-
-_MOTION = {"max_angle": "120 deg", "height": f"{1e3 * HEIGHT:g} mm", "x_offset": "100 mm"}
-"""The same for a campaign."""
-
-_DEFAULTS = {"angular_velocity": 0.5, "x_offset": 0.1, "height": HEIGHT}
+_USUAL = Action(angular_velocity=0.5, x_offset=0.1, height=HEIGHT).values()
 """Values of dimensions that an order may leave out; x_offset is searched."""
 
 
-def resolved_order(order: PourOrder, materials: Materials) -> PourOrder:
-    """Return the order with ids instead of bar codes. Raises MaterialError."""
-    return replace(
-        order,
-        source=materials.vessel(order.source).id,
-        receiver=materials.vessel(order.receiver).id,
-        liquid=materials.liquid_id(order.liquid) if order.liquid else materials.content(order.source).liquid,
-    )
-
-
-def order_bundle(order: PourOrder, materials: Materials) -> str:
-    """Return the campaign of an order, as text. Its load is the present content of the source.
+def renew_load(snapshot: Path, mass: float, deviation: float) -> None:
+    """Set the load of an order that has not begun: other pours may have changed its source.
 
     Args:
-        order: with resolved ids.
-        materials: vessels and liquids.
-
-    Raises:
-        MaterialError: a vessel or the liquid is unknown.
-    """
-    content = materials.content(order.source)
-    speed = order.action.get("angular_velocity", f"{_DEFAULTS['angular_velocity']:g} rad/s")
-    motion = {name: value for name, value in order.action.items() if name != "angular_velocity"}
-    campaign: dict[str, Any] = {
-        "name": POUR,
-        "seed": order.seed,
-        "laboratory": _virtual_laboratory(),  # that of the rig replaces it, if the rig has one
-        "liquid": {"name": "water", **materials.properties(order.liquid), "mass": _grams(content.mass or 0.0)},
-        "pourer": materials.vessel(order.source).shape,
-        "motion": {**_MOTION, **motion},
-        "deployment": {
-            "strategy": "D2",
-            "receiver": materials.vessel(order.receiver).shape,
-            # a campaign searches a range; the pour itself takes the order's value
-            "actions": {"angular_velocity": _range(speed)},
-            "pours": 1,
-        },
-        "outputs": {"recording": False, "figures": False},
-    }
-    return json.dumps(campaign, indent=1, ensure_ascii=False) + "\n"
-
-
-def _range(speed: str) -> list[str]:
-    value = set_action([f"angular_velocity={speed}"], fixed=_DEFAULTS)["angular_velocity"]
-    assert value is not None
-    dimension = ACTION_DIMENSIONS["angular_velocity"]
-    low, high = max(0.99 * value, dimension.lower), min(1.01 * value, dimension.upper)
-    return [f"{end / dimension.factor:.6f} {dimension.display_unit}" for end in (low, high)]
-
-
-def _virtual_laboratory() -> dict[str, Any]:
-    from orchestrator.campaigns.yaml.yaml_source import Document
-
-    found: dict[str, Any] = Document.read(shipped(VIRTUAL)).data
-    return found
-
-
-def _grams(mass: float) -> str:
-    return f"{1e3 * mass:.6f} g"
-
-
-def renew_load(campaign: Path, mass: float, deviation: float) -> None:
-    """Set the load in the snapshot of an order that has not begun: other pours may have changed its source.
-
-    Args:
-        campaign: its file.
+        snapshot: folder of the order.
         mass: present content of the source [kg].
         deviation: its standard deviation [kg].
     """
-    replace(PourOrder.read(campaign.parent), deviation=deviation).write(campaign.parent)
-    content = json.loads(campaign.read_text(encoding="utf-8"))
-    content["liquid"]["mass"] = _grams(mass)
-    fresh = campaign.with_suffix(".new")
-    fresh.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    fresh.replace(campaign)
-
-
-def order_request(plan: CampaignPlan, order: PourOrder) -> RunRequest:
-    """Return the run of an order.
-
-    Args:
-        plan: loaded from its bundle, with the laboratory of its rig.
-        order: of the pour.
-
-    Raises:
-        OrderError: there is no place for the pourer.
-    """
-    chosen = PlannedOrder.of(plan, order)
-    return RunRequest(
-        chosen.plan, [StageDefinition(POUR, chosen.strategy, pours=True)], problems=chosen.problems, as_written=False
-    )
+    PourOrder.read(snapshot).model_copy(update={"load": mass, "deviation": deviation}).write(snapshot)
 
 
 @dataclass(frozen=True)
@@ -246,24 +205,51 @@ class PlannedOrder:
     action: Action
 
     @classmethod
-    def of(cls, plan: CampaignPlan, order: PourOrder) -> PlannedOrder:
-        """Plan an order; see `order_request`. The plan of its run may be given, too."""
-        if plan.dispense is not None:
-            scene = plan.dispense.scenes[0]
-            return cls(plan, order, scene, scene.action({}))
-        assert plan.deployment is not None
-        scene = plan.deployment.scenes[0]
-        if "x_offset" not in order.action:
-            scene = _placed(scene, order)
-            plan = replace(plan, deployment=replace(plan.deployment, scenes=(scene,)))
-        action = _action(scene, order)
-        if order.amount is not None:
-            scene = replace(scene, fixed=action.values())
-            dose = PlannedDose(order.amount, order.tolerance, scene.receiver.name)
+    def of(cls, order: PourOrder, rig: Rig, folder: Path) -> PlannedOrder:
+        """Plan an order.
+
+        Args:
+            order: the order.
+            rig: whose laboratory pours it.
+            folder: of its snapshot.
+
+        Raises:
+            OrderError: there is no place for the pourer.
+            ConfigError: the laboratory's file is invalid.
+        """
+        pourer, receiver = (vessel_from(Document.parse(json.dumps(one), Path("vessel.json")))
+                            for one in (order.pourer, order.vessel))  # fmt: skip
+        liquid = liquid_of(order.liquid, order.properties, round(order.load, 9))
+        scene = Scene(f"deployment-{receiver.name}", pourer, receiver, liquid, fixed=_USUAL)
+        action = _action(order.action, _USUAL) if "x_offset" in order.action else _placed(scene, order)
+        scene = replace(scene, fixed=action.values())
+        laboratory, deployment, series = rig.source or shipped(VIRTUAL), None, None
+        speed = Axis("angular_velocity", action.angular_velocity, math.nextafter(action.angular_velocity, math.inf))
+        if order.amount is None:
+            # nothing is searched; a space needs an axis
+            deployment = DeploymentPlan(D2Settings(pours=1), (scene,), Space((speed,)), Loss())
+        else:
+            dose = PlannedDose(order.amount, order.tolerance, receiver.name)
             # `OrderBook.settle` enters the outcome in the account of both vessels, once
             series = DispensePlan((scene,), (dose,), 0.0, False, laboratory="")
-            plan = replace(plan, deployment=None, dispense=series)
+        plan = CampaignPlan(
+            name=POUR,
+            seed=order.seed,
+            source=folder / ORDER,
+            laboratory=load_laboratory(laboratory),
+            parameters=SimulationParameters(),
+            calibration=None,
+            deployment=deployment,
+            outputs=OutputSettings(recording=False, figures=False),
+            resolved=_record(order, laboratory_record(laboratory), action, speed),
+            dispense=series,
+        )
         return cls(plan, order, scene, action)
+
+    def request(self) -> RunRequest:
+        """The run of the order."""
+        stage = StageDefinition(POUR, self.strategy, pours=True)
+        return RunRequest(self.plan, [stage], problems=self.problems, as_written=False)
 
     @property
     def target(self) -> DoseTarget | None:
@@ -378,24 +364,42 @@ class PlannedOrder:
         }
 
 
-def _action(scene: Scene, order: PourOrder) -> Action:
-    fixed = {**_DEFAULTS, **scene.fixed}
+def _action(assigned: Mapping[str, str], fixed: Mapping[str, float | None]) -> Action:
     try:
-        return assigned_action([f"{name}={value}" for name, value in order.action.items()], fixed=fixed)
+        return assigned_action([f"{name}={value}" for name, value in assigned.items()], fixed=fixed)
     except (AssignmentError, ValueError) as error:
         raise OrderError(f"action: {error}") from None
 
 
-def _placed(scene: Scene, order: PourOrder) -> Scene:
-    """The scene with the smallest distance at which the vessels don't touch, and a margin."""
+def _placed(scene: Scene, order: PourOrder) -> Action:
+    """The order's action at the smallest distance at which the vessels don't touch, and a margin."""
     pourer, receiver = build_vessel(scene.pourer), build_vessel(scene.receiver)
-    offset = pourer.lip_point(0.0)[0]
+    offset = float(pourer.lip_point(0.0)[0])
     while offset < FARTHEST:
-        tried = replace(scene, fixed={**scene.fixed, "x_offset": float(offset)})
-        if touch(tried, _action(tried, order), pourer, receiver) is None:
-            return replace(scene, fixed={**scene.fixed, "x_offset": float(offset) + MARGIN})
+        if touch(scene, _action(order.action, {**_USUAL, "x_offset": offset}), pourer, receiver) is None:
+            return _action(order.action, {**_USUAL, "x_offset": offset + MARGIN})
         offset += STEP
     raise OrderError("action: the vessels touch at every distance; give 'x_offset' and 'height'")
+
+
+def _record(order: PourOrder, laboratory: Mapping[str, Any], action: Action, speed: Axis) -> dict[str, Any]:
+    """The pour in the format of campaign files, for reports and for campaigns that learn from it."""
+    motion = {
+        name: dimension.switched_off if value is None else f"{value!r} {dimension.unit}"
+        for name, dimension in ACTION_DIMENSIONS.items()
+        if (value := action.values()[name]) is not None or dimension.switched_off
+    }
+    del motion[speed.name]
+    outputs: dict[str, Any] = {"recording": False, "figures": False}
+    return {
+        **{"name": POUR, "seed": order.seed, "laboratory": laboratory},
+        "liquid": {"name": "water", **order.properties, "mass": f"{order.load!r} kg"},
+        **{"pourer": order.pourer, "motion": motion, "outputs": outputs},
+        "deployment": {
+            **{"strategy": "D2", "receiver": order.vessel, "pours": 1},
+            "actions": {speed.name: [f"{end!r} rad/s" for end in (speed.lower, speed.upper)]},
+        },
+    }
 
 
 # ---- results
@@ -450,13 +454,13 @@ class SettledPour:
     deviation: float
 
 
-def settled_pour(run: Path, snapshot: Path, laboratory: LaboratorySettings | None) -> SettledPour | None:
+def settled_pour(run: Path, snapshot: Path, rig: Rig) -> SettledPour | None:
     """Read the pour of an order from the journal of its run. Reads files; don't call it in an event loop.
 
     Args:
         run: folder of the run.
-        snapshot: folder with the order and its campaign.
-        laboratory: of the rig; None: the campaign's own.
+        snapshot: folder with the order.
+        rig: where it was poured.
 
     Returns:
         None if no pour was requested.
@@ -467,9 +471,9 @@ def settled_pour(run: Path, snapshot: Path, laboratory: LaboratorySettings | Non
     pours = read_record(run).pours
     if not pours:
         return None
-    if laboratory is None:
-        laboratory = LaboratorySettings.model_validate(_virtual_laboratory())
-    return SettledPour(PourOrder.read(snapshot), pours[0], weighing_deviation(laboratory))
+    return SettledPour(
+        PourOrder.read(snapshot), pours[0], weighing_deviation(rig.spec or load_laboratory(shipped(VIRTUAL)))
+    )
 
 
 class OrderBook:

@@ -22,10 +22,10 @@ from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import ENDED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.materials import Materials
-from orchestrator.daemon.pour_orders import POUR, OrderBook, OrderError, PourOrder, renew_load, settled_pour
+from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, renew_load, settled_pour
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.run_readout import prune_recordings
-from orchestrator.daemon.submissions import CAMPAIGN, run_request
+from orchestrator.daemon.submissions import run_request
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView, recorder_of
@@ -40,6 +40,7 @@ from orchestrator.reports.publishing import not_simulated, publish_run, publish_
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
+from orchestrator.runs.run_tasks import POUR
 from orchestrator.runs.stages import scenes_of
 
 _log = logging.getLogger(__name__)
@@ -137,7 +138,7 @@ class Running:
         if reason := materials.refusal(order.source, order.receiver, order.liquid, order.amount, more, pour=order.id):
             raise OrderError(f"{reason}. Nothing was poured")
         content = materials.content(order.source)
-        await asyncio.to_thread(renew_load, folder / CAMPAIGN, content.mass or 0.0, content.deviation)
+        await asyncio.to_thread(renew_load, folder, content.mass or 0.0, content.deviation)
 
     def _resources(self, request: RunRequest, checksum: str) -> RunResources:
         asking, key, rig = self._shared.asking, self.item.id, self._rig.name
@@ -281,7 +282,7 @@ async def settle(shared: SharedServices, item: QueueItem, rig: Rig, *, ended: bo
         return
     settings = shared.settings
     try:
-        found = await asyncio.to_thread(settled_pour, settings.runs / item.run, settings.snapshots / item.id, rig.spec)
+        found = await asyncio.to_thread(settled_pour, settings.runs / item.run, settings.snapshots / item.id, rig)
         OrderBook(shared.store).settle(item, found, ended=ended)
     except (RunError, OSError, ValueError) as error:
         _log.error("pour of %s is not in the account: %s", item.id, error)

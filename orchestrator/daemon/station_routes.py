@@ -14,6 +14,7 @@ from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from orchestrator.daemon.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.materials import MaterialError, mass_of
 from orchestrator.daemon.ordering import Ordering
+from orchestrator.daemon.pour_request import PourIn
 from orchestrator.daemon.query_routes import campaign_out, found_item
 from orchestrator.daemon.schemas import CampaignOut
 from orchestrator.daemon.station_schemas import (
@@ -25,7 +26,6 @@ from orchestrator.daemon.station_schemas import (
     MaterialsOut,
     PlaceIn,
     PositionIn,
-    PourIn,
     PourOut,
     QueueChangeIn,
     ReservationIn,

@@ -10,85 +10,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from orchestrator.daemon.pour_request import CallerId, PourIn, Quantity, RequestModel
 from orchestrator.daemon.schemas import SubmissionIn
 
-CallerId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,79}$")]
 ResourceId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,59}$")]
-Key = Annotated[str, Field(min_length=1, max_length=80)]
-Quantity = Annotated[str, Field(max_length=40)]
-
-
-class _In(BaseModel):
-    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
 
 
 class _Out(BaseModel):
     model_config = ConfigDict(use_attribute_docstrings=True)
-
-
-class PourIn(_In):
-    """One pour: an amount, or an action."""
-
-    model_config = ConfigDict(
-        extra="forbid",
-        use_attribute_docstrings=True,
-        json_schema_extra={
-            "examples": [
-                {
-                    "id": "plan-17:step-4",
-                    "source": "beaker-1",
-                    "receiver": "vial-7",
-                    "amount": "30 g",
-                    "tolerance": "1 g",
-                },
-                {
-                    "id": "plan-17:step-5",
-                    "source": "beaker-1",
-                    "receiver": "vial-8",
-                    "action": {"angular_velocity": "60 deg/s", "x_offset": "90 mm"},
-                    "dry_run": True,
-                },
-            ]
-        },
-    )
-
-    id: CallerId
-    """Chosen by the caller. The same order with the same id is the same pour: it is never poured twice."""
-
-    source: Key
-    """Vessel to pour from: its id or bar code."""
-
-    receiver: Key
-    """Vessel to pour into: its id or bar code."""
-
-    liquid: str = Field(default="", max_length=80)
-    """Liquid that the source has to hold, by id or bar code; '' for any."""
-
-    amount: Quantity | None = None
-    """Wanted in the receiver, such as '30 g'."""
-
-    tolerance: Quantity = "1 g"
-    """Largest error of the amount. The pour ends before an excess of this size has a probability of 1 %."""
-
-    action: dict[Annotated[str, Field(max_length=40)], Quantity] = Field(default_factory=dict, max_length=10)
-    """Without an amount: the whole motion, at least `angular_velocity`. With an amount: `x_offset` and `height` only
-    where they differ from the default, a distance at which the vessels don't touch."""
-
-    rig: str = Field(default="", max_length=60)
-    """Rig; '' for the one on which the vessels stand."""
-
-    priority: int = Field(default=0, ge=-1000, le=1000)
-    hold: bool = False
-    """Wait in the queue until it is released."""
-
-    not_before: float | None = None
-    """Earliest start."""
-
-    dry_run: bool = False
-    """Check and predict the pour; nothing is queued and nothing moves."""
-
-    predict: bool = True
-    """Predict the pour before it is queued. An action is predicted by simulations, which takes seconds."""
 
 
 class PredictionOut(_Out):
@@ -194,7 +123,7 @@ class PourOut(_Out):
     """Expected time until it ends, while it runs."""
 
 
-class BatchItemIn(_In):
+class BatchItemIn(RequestModel):
     """A pour or a campaign."""
 
     pour: PourIn | None = None
@@ -207,7 +136,7 @@ class BatchItemIn(_In):
         return self
 
 
-class BatchIn(_In):
+class BatchIn(RequestModel):
     """Pours and campaigns that are accepted or refused as a whole. The same id again is the same batch."""
 
     id: CallerId
@@ -251,7 +180,7 @@ class BatchOut(_Out):
     items: list[BatchItemOut]
 
 
-class QueueChangeIn(_In):
+class QueueChangeIn(RequestModel):
     """Changes of a queued campaign or pour."""
 
     hold: bool | None = None
@@ -259,7 +188,7 @@ class QueueChangeIn(_In):
     """Earliest start; 0 removes it."""
 
 
-class ReservationIn(_In):
+class ReservationIn(RequestModel):
     """Reserves a rig for campaigns and pours of its author. What runs already is not interrupted."""
 
     rig: str = Field(max_length=60)
@@ -285,7 +214,7 @@ class ReservationOut(_Out):
     note: str
 
 
-class LiquidIn(_In):
+class LiquidIn(RequestModel):
     """A liquid."""
 
     id: ResourceId
@@ -296,7 +225,7 @@ class LiquidIn(_In):
     """As in a campaign's `liquid`, without its mass: {'name': 'ethanol'}, or density and viscosity."""
 
 
-class PositionIn(_In):
+class PositionIn(RequestModel):
     """A place at a rig where one vessel can stand."""
 
     id: ResourceId
@@ -305,7 +234,7 @@ class PositionIn(_In):
     note: str = Field(default="", max_length=200)
 
 
-class VesselIn(_In):
+class VesselIn(RequestModel):
     """A vessel, registered as empty."""
 
     id: ResourceId
@@ -316,14 +245,14 @@ class VesselIn(_In):
     position: str = Field(default="", max_length=60)
 
 
-class PlaceIn(_In):
+class PlaceIn(RequestModel):
     """Another position of a vessel."""
 
     position: str = Field(max_length=80)
     """Id or code; '' for none."""
 
 
-class WeighingIn(_In):
+class WeighingIn(RequestModel):
     """The content of a vessel, as weighed by an operator."""
 
     mass: Quantity
@@ -336,7 +265,7 @@ class WeighingIn(_In):
     note: str = Field(default="", max_length=200)
 
 
-class HandPourIn(_In):
+class HandPourIn(RequestModel):
     """A pour that a person has made and weighed."""
 
     id: CallerId

@@ -25,15 +25,16 @@ from orchestrator.campaigns.yaml.file_access import confined, out_of_bounds, res
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.daemon.daemon_settings import ANY_RIG, NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import DesiredState, QueueItem
-from orchestrator.daemon.pour_orders import POUR, PourOrder, order_request
+from orchestrator.daemon.pour_orders import PlannedOrder, PourOrder
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_file import whole_copy
-from orchestrator.runs.run_service import RunRequest, RunResources, RunService, RunTaskError, read_theta, task_request
+from orchestrator.runs.run_service import RunRequest, RunResources, RunService, RunTaskError
+from orchestrator.runs.run_tasks import POUR, TASKS, plan_task, read_theta
 
 CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
-"""Names of the campaign's file, and of that with the θ for planning (`orchestrator.runs.run_service.read_theta`)."""
+"""Names of the campaign's file, and of the file with the θ for planning (`orchestrator.runs.run_tasks.read_theta`)."""
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,79}(/[A-Za-z0-9][A-Za-z0-9._-]{0,79}){0,3}")
 _FILES = 100
@@ -155,7 +156,7 @@ def load_confined(campaign: Path, roots: Sequence[Path], laboratory: Path | None
 def run_request(
     settings: DaemonSettings, item: QueueItem, rig: Rig, vessels: Mapping[str, str] | None = None
 ) -> RunRequest:
-    """Make the run of a submitted campaign from its snapshot. Reads files; don't call it in an event loop.
+    """Make the run of a submitted campaign or an order from its snapshot. Reads files; don't call it in an event loop.
 
     Args:
         settings: of the daemon.
@@ -164,25 +165,41 @@ def run_request(
         vessels: ids of the station's vessels at the rig, by the names that a series may give its sources.
 
     Raises:
-        ConfigError, RunTaskError: it can't be used.
+        ConfigError, RunTaskError, OrderError: it can't be used.
     """
     folder = settings.snapshots / item.id
-    plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
-    theta = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
-    # A daemon never repeats a pour by itself: it asks the operator, whatever the campaign says.
-    plan = replace(plan, on_unknown="ask", outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}))
-    # All campaigns use the daemon's simulators. A submission must not make the daemon connect to another machine.
-    plan = replace(plan, laboratory=plan.laboratory.with_values(ray=None))
-    if plan.dispense is not None and vessels:
-        named = {name: vessels[name] for name in plan.dispense.sources if name in vessels}
-        plan = replace(plan, dispense=replace(plan.dispense, vessels=named))
     if item.task == POUR:
-        request = order_request(plan, PourOrder.read(folder))
+        request = planned_order(settings, item, rig).request()
     else:
-        request = task_request(plan, item.task, given=theta)  # type: ignore[arg-type]  # written by us
+        plan = load_confined(folder / CAMPAIGN, [folder.resolve()], rig.source)
+        theta = read_theta(folder / THETA, plan) if (folder / THETA).is_file() else None
+        if plan.dispense is not None and vessels:
+            named = {name: vessels[name] for name in plan.dispense.sources if name in vessels}
+            plan = replace(plan, dispense=replace(plan.dispense, vessels=named))
+        plan = _of_daemon(plan, settings)
+        request = plan_task(plan, theta) if item.task == "plan" else TASKS[item.task](plan)  # type: ignore[index]
     if item.run is None:
         return request
     return replace(request, folder=settings.runs / item.run, resume="if begun")
+
+
+def planned_order(settings: DaemonSettings, item: QueueItem, rig: Rig) -> PlannedOrder:
+    """Plan an order from its snapshot; see `run_request`."""
+    folder = settings.snapshots / item.id
+    found = PlannedOrder.of(PourOrder.read(folder), rig, folder)
+    return replace(found, plan=_of_daemon(found.plan, settings))
+
+
+def _of_daemon(plan: CampaignPlan, settings: DaemonSettings) -> CampaignPlan:
+    """The plan as a daemon runs it."""
+    return replace(
+        plan,
+        # A daemon never repeats a pour by itself: it asks the operator, whatever the campaign says.
+        on_unknown="ask",
+        outputs=plan.outputs.model_copy(update={"directory": str(settings.runs)}),
+        # All campaigns use the daemon's simulators. A submission must not make the daemon connect to another machine.
+        laboratory=plan.laboratory.with_values(ray=None),
+    )
 
 
 class SubmissionError(RunError):
@@ -197,7 +214,7 @@ class Submission:
 
     Attributes:
         rig: name of the rig; '' selects the matching one.
-        order: of an ordered pour, whose campaign `text` is.
+        order: an ordered pour instead of a campaign.
         batch, held, not_before: see `QueueItem`.
     """
 
@@ -255,16 +272,18 @@ def _without_places(text: str, settings: DaemonSettings, folder: Path) -> str:
 
 def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: str) -> QueueItem:
     folder = settings.snapshots / key
-    text, files = submission.text, submission.files or {}
-    if submission.path:
-        text, files = _from_path(settings, submission.path)
-    campaign = unpack(text, files, folder)
     if submission.order is not None:
+        folder.mkdir(parents=True, mode=0o700)
         submission.order.write(folder)
-    plan = load_confined(campaign, [folder.resolve()])
+        name = POUR
+    else:
+        text, files = submission.text, submission.files or {}
+        if submission.path:
+            text, files = _from_path(settings, submission.path)
+        name = load_confined(unpack(text, files, folder), [folder.resolve()]).name
     draft = QueueItem(
         key,
-        plan.name,
+        name,
         submission.task,
         "",
         "none",
@@ -286,7 +305,7 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
     service.check(work).require()
     service.check_laboratory(work, RunResources())
     mode = "none" if rig.name == NO_RIG else work.campaign.laboratory.mode
-    item = replace(draft, id=f"{plan.name[:40]}-{key}", rig=rig.name, mode=mode)
+    item = replace(draft, id=f"{name[:40]}-{key}", rig=rig.name, mode=mode)
     folder.rename(settings.snapshots / item.id)
     return item
 

@@ -24,7 +24,7 @@ from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import ENDED, STOPPED, WITHDRAWN, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.notifications import Counts
-from orchestrator.daemon.pour_orders import POUR, OrderBook
+from orchestrator.daemon.pour_orders import OrderBook
 from orchestrator.daemon.remote_operator import Asking
 from orchestrator.daemon.rig_worker import RigWorker, Running, SharedServices, settle
 from orchestrator.daemon.run_readout import Pours
@@ -32,6 +32,7 @@ from orchestrator.daemon.stop_request import later_stop, recorded_reason, unknow
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.records.run_registry import make_state_directory
+from orchestrator.runs.run_tasks import POUR
 
 LEAVING = 10.0
 """Time for campaigns to stop after Ray has died [s]; then campaigns that don't pour are given up."""

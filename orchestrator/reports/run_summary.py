@@ -282,6 +282,13 @@ class ReceiverSummary(ResultPart):
     """The losses and masses above with their units, by the heads of a table."""
 
 
+PLANNED = (
+    *("prediction", "prediction_interval", "at_bounds", "predicted_delivered_g", "predicted_delivered_ml"),
+    *("risk", "window", "not_covered"),
+)
+"""Fields of a receiver's summary that a plan for it gives beside the action."""
+
+
 class RunSummary(Totals):
     """Summary of a run; missing parts are null or empty."""
 

@@ -1,13 +1,13 @@
 """The one way to run a campaign: the command line, the daemon, the library and the study call it.
 
-    request = task_request(plan, "run")
+    request = run_task(plan)                      # one function for each task: `orchestrator.runs.run_tasks`
     report = RunService().check(request)          # problems and warnings; nothing is written or started
     with closing(RunService().start(request, RunResources(in_process=True))) as handle:
         result = await handle.wait()
     published = publish_run(handle)               # orchestrator.reports.publishing
 
-`task_request` selects the stages of a task, `RunRequest` is what shall run, `RunResources` are the handles of this
-process, and `RunHandle` controls one run. Signals, queues and caches belong to the callers.
+`RunRequest` is what shall run, `RunResources` are the handles of this process, and `RunHandle` controls one run.
+Signals, queues and caches belong to the callers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings, RaySettings
@@ -31,27 +31,11 @@ from orchestrator.records.run_record import CampaignResult, RunState
 from orchestrator.records.states import State
 from orchestrator.runs.resume import AskOperator
 from orchestrator.runs.run_folder import create_run
-from orchestrator.runs.stages import (
-    POSTERIOR_DRAWS,
-    StageDefinition,
-    calibration_stages,
-    deployment_stages,
-    prediction_stages,
-    stages_of,
-)
+from orchestrator.runs.stages import StageDefinition
 
 if TYPE_CHECKING:
     from actors.interfaces import SimulatorPool
     from orchestrator.campaigns.yaml.yaml_errors import Problem
-    from sim_engine.liquids import SimulationParameters
-    from sim_engine.vessel.shapes import VesselSpec
-
-Task = Literal["run", "calibrate", "plan"]
-
-PREDICTION_SEEDS = 5
-
-PLANNED = "-plan"
-"""Suffix of the name of a campaign that is only planned."""
 
 MOVING = ("approach", "tilt", "hold", "return", "dose")
 """Checkpoints of a pour during which the arm moves."""
@@ -413,133 +397,3 @@ def _lacking_posterior(plan: CampaignPlan) -> str | None:
         f"makes, and this campaign {has}; calibrate with {known[0]}, write 'theta: best', or use decant plan "
         "--parameters with the theta.json of a calibration"
     )
-
-
-# ---- tasks: the stages and the plan that a command runs
-
-
-@dataclass(frozen=True)
-class GivenTheta:
-    """θ that a campaign is planned with, of a calibration or written by hand.
-
-    Attributes:
-        theta: the θ itself.
-        draws: of its posterior, which the simulations use in turn; empty if it has none, or if the file recommends the
-            uncalibrated θ.
-        left_over: shift that the calibration left (`sim_engine.prediction_band`); None where it is not known.
-    """
-
-    theta: SimulationParameters
-    draws: tuple[SimulationParameters, ...] = ()
-    left_over: float | None = None
-
-
-def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:
-    """θ from a file, such as the `theta.json` of a calibration.
-
-    Args:
-        path: of the file.
-        plan: whose θ has what the file does not name; if its risk needs draws of a posterior, the file needs them.
-
-    Raises:
-        ConfigError: anything is wrong with the file.
-    """
-    from orchestrator.campaigns.file_loading import (
-        load_discrepancy,
-        load_parameters,
-        load_posterior,
-        predicts_with_posterior,
-    )
-
-    needed = plan.deployment is not None and plan.deployment.settings.needs_posterior
-    needed = needed or predicts_with_posterior(path)
-    draws = load_posterior(path, POSTERIOR_DRAWS, plan.parameters) if needed else ()
-    return GivenTheta(load_parameters(path, plan.parameters), draws, load_discrepancy(path))
-
-
-def task_request(
-    plan: CampaignPlan,
-    task: Task = "run",
-    *,
-    given: GivenTheta | None = None,
-    receiver: VesselSpec | None = None,
-    iterations: int | None = None,
-    seeds: int = PREDICTION_SEEDS,
-) -> RunRequest:
-    """The request for a task of a campaign.
-
-    Args:
-        plan: of the campaign.
-        task: 'run', 'calibrate' or 'plan'.
-        given, receiver, iterations: for 'plan'; see `planned`.
-        seeds: for 'plan': number of new seeds of each prediction.
-
-    Raises:
-        RunTaskError: the campaign has no section for it.
-    """
-    match task:
-        case "run":
-            return RunRequest(plan, stages_of(plan))
-        case "calibrate":
-            if plan.calibration is None:
-                raise RunTaskError(f"{plan.source}: has no 'calibration' section; there is nothing to calibrate")
-            # The deployment stays out: its vessels need not be there yet.
-            return RunRequest(replace(plan, deployment=None), calibration_stages(plan.calibration))
-        case "plan":
-            plan = planned(plan, given, receiver, iterations)
-            assert plan.deployment is not None
-            stages = [*deployment_stages(plan, plan.deployment), *prediction_stages(plan, plan.deployment, seeds)]
-            return RunRequest(plan, stages, as_written=receiver is None)
-
-
-def planned(
-    plan: CampaignPlan,
-    given: GivenTheta | None = None,
-    receiver: VesselSpec | None = None,
-    iterations: int | None = None,
-) -> CampaignPlan:
-    """A campaign turned into D1 without pours, and its record.
-
-    Unless the campaign has D1's own settings, each action is simulated once: simulations of other actions tell about
-    it, too, and its prediction is made with new seeds.
-
-    Args:
-        plan: of the campaign.
-        given: θ to plan with; the campaign's unless given.
-        receiver: instead of the campaign's.
-        iterations: as the campaign says unless given.
-
-    Raises:
-        RunTaskError: it has nothing to plan with.
-    """
-    from orchestrator.campaigns.run_snapshot import record_of
-    from orchestrator.learning.deployment.d1 import D1Settings
-
-    given = given or GivenTheta(plan.parameters)
-    deployment = plan.deployment
-    if deployment is None:
-        raise RunTaskError(
-            f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, motion, loss)"
-        )
-    if deployment.settings.needs_posterior and not given.draws:
-        raise RunTaskError(
-            f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration by "
-            "C4 (in a program: theta), or a calibration in the same run"
-        )
-    scenes = deployment.scenes
-    if receiver is not None:
-        scenes = (replace(scenes[0], name=f"plan:{receiver.name}", receiver=receiver),)
-    changes: dict[str, Any] = {"pours": 0} | ({} if iterations is None else {"iterations": iterations})
-    if not isinstance(deployment.settings, D1Settings):
-        changes["simulations_per_iteration"] = 1
-    settings = D1Settings.like(deployment.settings, **changes)
-    found = replace(
-        plan,
-        name=f"{plan.name.removesuffix(PLANNED)}{PLANNED}",
-        parameters=given.theta,
-        calibration=None,
-        deployment=replace(
-            deployment, settings=settings, scenes=scenes, thetas=given.draws, left_over=given.left_over, confirm=0
-        ),
-    )
-    return replace(found, resolved=record_of(plan.resolved, found))

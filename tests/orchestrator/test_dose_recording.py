@@ -33,7 +33,8 @@ from orchestrator.records.events import (
     RequestStarted,
     StageOpened,
 )
-from orchestrator.runs.run_service import RunResources, RunService, task_request
+from orchestrator.runs.run_service import RunResources, RunService
+from orchestrator.runs.run_tasks import run_task
 from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.vessel import build_vessel
 from tests.support.rerun_recordings import Contents, timeline, views
@@ -117,7 +118,7 @@ def test_a_dose_on_a_simulated_bench_is_shown_while_it_is_poured(
 
     async def scenario() -> Any:
         resources = RunResources(in_process=True, subscribers=[events.append])
-        with contextlib.closing(RunService().start(task_request(plan, "run"), resources)) as handle:
+        with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
             return await handle.wait()
 
     result = asyncio.run(scenario()).results["doses"]

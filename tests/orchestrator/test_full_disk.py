@@ -12,8 +12,7 @@ import pytest
 
 from actors.interfaces import DoseSource, DoseTarget, Notice, ProgressCallback
 from actors.runtime.child_process import child_environment
-from orchestrator.cli.campaign_commands import run_directory
-from orchestrator.cli.foreground_run import BAD_INPUT, RefusalError
+from orchestrator.cli.foreground_run import BAD_INPUT, RefusalError, run_directory
 from orchestrator.learning.campaign_plan import OutputSettings
 from orchestrator.learning.requests import Poured
 from orchestrator.records.events import Event, LogLine

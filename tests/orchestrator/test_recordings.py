@@ -26,7 +26,8 @@ from orchestrator.reports.recording_file import PourRecording, load_recording, l
 from orchestrator.reports.recording_fit import Fit, fit_recordings, judge_recording, read_values
 from orchestrator.reports.recording_replay import ReplayValues, arrivals, replay_recording
 from orchestrator.reports.time_series import read_series
-from orchestrator.runs.run_service import RunResources, RunService, task_request
+from orchestrator.runs.run_service import RunResources, RunService
+from orchestrator.runs.run_tasks import run_task
 from sim_engine.hydrostatics import tilting_cup_outflow
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.vessel.shapes import cylinder
@@ -393,7 +394,7 @@ def test_a_run_records_its_doses_and_they_can_be_exported_again(
     resources = RunResources(in_process=True)
 
     async def scenario() -> None:
-        with contextlib.closing(RunService().start(task_request(plan, "run"), resources)) as handle:
+        with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
             await handle.wait()
             publish_run(handle)
 

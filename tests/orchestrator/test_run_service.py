@@ -21,7 +21,8 @@ from orchestrator.records.events import CampaignOpened, Event
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import JournalDamagedError
 from orchestrator.reports.publishing import publish_run, publish_so_far
-from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService, RunTaskError, task_request
+from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService, RunTaskError
+from orchestrator.runs.run_tasks import calibrate_task, plan_task, run_task
 from tests.golden.world import FormulaLaboratory
 from tests.support.scripted_strategy import Script, one_stage, pour, states
 from tests.support.small_campaign import CAMPAIGN, write_campaign
@@ -53,29 +54,29 @@ def test_a_check_reports_all_problems_and_warnings_and_leaves_the_disk_as_it_was
     plan = campaign(tmp_path, ("[60 mm, 100 mm]", "[60 mm, 300 mm]"), ("strategy: D3", "strategy: D1"), (only_d3, risk))
     without = replace(plan, calibration=None)
     before = everything_in(tmp_path)
-    report = RunService().check(task_request(without))
+    report = RunService().check(run_task(without))
     assert everything_in(tmp_path) == before
     assert any("x_offset" in text for text in report.warnings)
     assert any("this campaign has no calibration" in text for text in report.problems)
     with pytest.raises(RunTaskError) as refused:
         report.require()
     assert str(refused.value) == "\n".join(report.problems)
-    assert RunService().check(task_request(campaign(tmp_path))).problems == ()
+    assert RunService().check(run_task(campaign(tmp_path))).problems == ()
 
 
 def test_a_task_without_its_section_is_refused(tmp_path: Path) -> None:
     plan = campaign(tmp_path)
     with pytest.raises(RunTaskError, match="nothing to calibrate"):
-        task_request(replace(plan, calibration=None), "calibrate")
+        calibrate_task(replace(plan, calibration=None))
     with pytest.raises(RunTaskError, match="has no 'deployment' section"):
-        task_request(replace(plan, deployment=None), "plan")
-    assert not task_request(plan, "plan").pours
-    assert task_request(plan, "calibrate").campaign.deployment is None
+        plan_task(replace(plan, deployment=None))
+    assert not plan_task(plan).pours
+    assert calibrate_task(plan).campaign.deployment is None
 
 
 def test_what_can_not_be_opened_leaves_no_run_folder(tmp_path: Path) -> None:
     plan = campaign(tmp_path)
-    request = task_request(replace(plan, laboratory=plan.laboratory.with_values(bench=None)))
+    request = run_task(replace(plan, laboratory=plan.laboratory.with_values(bench=None)))
     with pytest.raises(LaboratoryError, match="has no bench"):
         RunService().start(request, RunResources(in_process=True))
     assert not (tmp_path / "runs").exists()
@@ -245,7 +246,7 @@ def test_recorder_and_subscribers_get_every_event_and_the_run_is_published(tmp_p
         return recorders[0]
 
     resources = formula(subscribers=[heard.append], recorder=recorder)
-    with closing(RunService().start(task_request(campaign(tmp_path)), resources)) as handle:
+    with closing(RunService().start(run_task(campaign(tmp_path)), resources)) as handle:
         result = asyncio.run(handle.wait())
     assert handle.folder == result.directory
     assert handle.folder.parent == tmp_path / "runs"
@@ -260,7 +261,7 @@ def test_recorder_and_subscribers_get_every_event_and_the_run_is_published(tmp_p
 
 
 def test_a_stopped_run_is_published_as_far_as_it_came(tmp_path: Path) -> None:
-    request = task_request(campaign(tmp_path))
+    request = run_task(campaign(tmp_path))
     assert publish_so_far(request) is None
     request = RunService().with_folder(request)
     assert publish_so_far(request) is None, "it has not begun"
@@ -286,7 +287,7 @@ def test_the_service_the_command_line_and_the_library_make_the_same_decisions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan = campaign(tmp_path)
-    handle = RunService().start(task_request(plan), formula())
+    handle = RunService().start(run_task(plan), formula())
     asyncio.run(handle.wait())
 
     monkeypatch.setattr("actors.laboratory.open_laboratory", lambda *_, **__: FormulaLaboratory())

@@ -35,7 +35,8 @@ from orchestrator.campaigns.shipped import shipped
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.dispense import Dispense, Dispensed
 from orchestrator.learning.requests import Pour, Poured, Slots
-from orchestrator.runs.run_service import RunResources, RunService, task_request
+from orchestrator.runs.run_service import RunResources, RunService
+from orchestrator.runs.run_tasks import run_task
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement
@@ -176,7 +177,7 @@ def test_a_campaign_of_six_beakers_over_the_wires(tmp_path: Path, monkeypatch: p
     service = RunService()
 
     async def scenario() -> Any:
-        handle = service.start(task_request(plan, "run"), RunResources(in_process=True))
+        handle = service.start(run_task(plan), RunResources(in_process=True))
         with contextlib.closing(handle):
             return await handle.wait()
 

@@ -21,7 +21,7 @@ from orchestrator.campaigns.campaign_file import CALIBRATIONS, DEPLOYMENTS, Cali
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.cli.campaign_commands import planning_plan
+from orchestrator.cli.campaign_commands import planning_request
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.study.study_campaigns import campaign_of
@@ -81,9 +81,9 @@ def test_a_planning_run_keeps_the_theta_and_the_vessel_that_it_planned_with(vess
     (tmp_path / "measured.yaml").write_text(MEASURED)
     theta = tmp_path / "theta.json"
     theta.write_text(json.dumps({"theta": {"cohesion": 0.0123456789}}))
-    planned = planning_plan(
+    planned = planning_request(
         campaign, theta, (tmp_path if vessel.startswith("measured") else CONFIGS / "vessels") / vessel, 3
-    )
+    ).campaign
     again = reloaded(planned, tmp_path)
     assert again.parameters.cohesion == 0.0123456789
     assert [scene.receiver for scene in again.deployment.scenes] == [s.receiver for s in planned.deployment.scenes]  # type: ignore[union-attr]

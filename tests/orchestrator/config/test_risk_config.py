@@ -116,16 +116,16 @@ def test_a_posterior_that_nobody_makes_is_refused_before_anything_starts(tmp_pat
 def test_planning_takes_the_posterior_from_parameters_and_nowhere_else(tmp_path: Path) -> None:
     plan = load_campaign(written(tmp_path, {"risk": RISK}))
     with pytest.raises(RefusalError, match="needs --parameters") as refused:
-        campaigns.planning_plan(plan, None, None, None)
+        campaigns.planning_request(plan, None, None, None)
     assert refused.value.code == 2
     theta = tmp_path / "theta.json"
     theta.write_text('{"theta": {"cohesion": 0.02}}', encoding="utf-8")
     with pytest.raises(RefusalError, match="has no 'posterior'") as refused:
-        campaigns.planning_plan(plan, theta, None, None)
+        campaigns.planning_request(plan, theta, None, None)
     assert refused.value.code == 2
     rows = [{"theta": {"cohesion": 0.01}, "weight": 3.0}, {"theta": {"cohesion": 0.05}, "weight": 1.0}]
     theta.write_text(json.dumps({"theta": {"cohesion": 0.02}, "posterior": rows}), encoding="utf-8")
-    planning = campaigns.planning_plan(plan, theta, None, None)
+    planning = campaigns.planning_request(plan, theta, None, None).campaign
     assert planning.deployment is not None
     drawn = [one.cohesion for one in planning.deployment.thetas]
     assert drawn.count(0.01) == 3 * drawn.count(0.05) > 0

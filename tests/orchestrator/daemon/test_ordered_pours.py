@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
+from orchestrator.runs.run_folder import RESOLVED
 from tests.support.station import content, order, rigs_in, set_up, until_pour
 from tests.support.toy_daemon import Served, held, run, serving
 
@@ -43,6 +45,12 @@ def test_an_ordered_pour_is_weighed_and_entered_in_the_account(tmp_path: Path) -
             with zipfile.ZipFile(BytesIO(answer.content)) as archive:
                 rows = archive.read("account.csv").decode().splitlines()
             assert sum(f",order-1,{found['run']}," in row for row in rows) == 2
+            record = load_campaign(tmp_path / "state/runs" / found["run"] / RESOLVED)  # as 'decant report' reads it
+            assert record.deployment is not None
+            (scene,) = record.deployment.scenes
+            assert (scene.pourer.name, scene.receiver.name, scene.liquid.mass) == ("beaker", "vial-1", 0.1)
+            assert scene.fixed["x_offset"] == 0.07
+            assert record.laboratory.name == "numbers"
 
     run(work())
 
@@ -83,6 +91,7 @@ def test_a_source_that_cannot_serve_an_order_refuses_it_before_anything_moves(tm
                 ({"amount": "1 g"}, 422, "larger than the tolerance"),
                 ({"action": {}}, 422, "give an 'amount'"),
                 ({"action": {"angular_velocity": "100 deg/s", "x_offset": "0 mm"}}, 422, "touch"),
+                ({"action": {"angular_velocity": "9 deg/s", "return_velocity": "none"}}, 422, "only replays recorded"),
             ):
                 told = await served.post("/pours", order(**changes), status=status)
                 assert said in told["detail"], (changes, told)

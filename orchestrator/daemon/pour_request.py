@@ -1,0 +1,91 @@
+"""The parameters of one ordered pour: the request of the HTTP API, from which the other interfaces take theirs.
+
+The options of `decant queue pour` and the arguments of the MADSci node have the descriptions of these fields. The
+module imports pydantic alone, so that the command line starts fast.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+CallerId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,79}$")]
+Key = Annotated[str, Field(min_length=1, max_length=80)]
+Quantity = Annotated[str, Field(max_length=40)]
+
+
+class RequestModel(BaseModel):
+    """Base of the models of requests: an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+
+
+class PourIn(RequestModel):
+    """One pour: an amount, or an action."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        use_attribute_docstrings=True,
+        json_schema_extra={
+            "examples": [
+                {
+                    "id": "plan-17:step-4",
+                    "source": "beaker-1",
+                    "receiver": "vial-7",
+                    "amount": "30 g",
+                    "tolerance": "1 g",
+                },
+                {
+                    "id": "plan-17:step-5",
+                    "source": "beaker-1",
+                    "receiver": "vial-8",
+                    "action": {"angular_velocity": "60 deg/s", "x_offset": "90 mm"},
+                    "dry_run": True,
+                },
+            ]
+        },
+    )
+
+    id: CallerId
+    """Chosen by the caller. The same order with the same id is the same pour: it is never poured twice."""
+
+    source: Key
+    """Vessel to pour from: its id or bar code."""
+
+    receiver: Key
+    """Vessel to pour into: its id or bar code."""
+
+    liquid: str = Field(default="", max_length=80)
+    """Liquid that the source has to hold, by id or bar code; '' for any."""
+
+    amount: Quantity | None = None
+    """Wanted in the receiver, such as '30 g'."""
+
+    tolerance: Quantity = "1 g"
+    """Largest error of the amount. The pour ends before an excess of this size has a probability of 1 %."""
+
+    action: dict[Annotated[str, Field(max_length=40)], Quantity] = Field(default_factory=dict, max_length=10)
+    """Without an amount: the whole motion, at least `angular_velocity`. With an amount: `x_offset` and `height` only
+    where they differ from the default, a distance at which the vessels don't touch."""
+
+    rig: str = Field(default="", max_length=60)
+    """Rig; '' for the one on which the vessels stand."""
+
+    priority: int = Field(default=0, ge=-1000, le=1000)
+    hold: bool = False
+    """Wait in the queue until it is released."""
+
+    not_before: float | None = None
+    """Earliest start."""
+
+    dry_run: bool = False
+    """Check and predict the pour; nothing is queued and nothing moves."""
+
+    predict: bool = True
+    """Predict the pour before it is queued. An action is predicted by simulations, which takes seconds."""
+
+
+def described(name: str) -> str:
+    """The description of a field of `PourIn`, in one line."""
+    return " ".join((PourIn.model_fields[name].description or "").split())
