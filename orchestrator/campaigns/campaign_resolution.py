@@ -397,7 +397,7 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
 
 
 POSTERIORS = "orchestrator.catalogue.catalogue:posterior_source"
-"""Opens the posteriors of this machine. It is used by name: the catalogue is a layer above, and few campaigns need it."""
+"""Opens the posteriors of this machine. It is used by name, because the catalogue is a layer above."""
 
 
 def _memory(
