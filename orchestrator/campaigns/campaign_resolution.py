@@ -12,6 +12,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from typing import Any
 
 from actors.laboratory_settings import LaboratorySettings
@@ -35,7 +36,6 @@ from orchestrator.campaigns.yaml.file_access import resolved
 from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.section_validation import PlacedProblems
 from orchestrator.campaigns.yaml.yaml_source import Place, Report
-from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import (
     CalibrationPlan,
@@ -396,6 +396,10 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     )
 
 
+POSTERIORS = "orchestrator.catalogue.catalogue:posterior_source"
+"""Opens the posteriors of this machine. It is used by name, because the catalogue is a layer above."""
+
+
 def _memory(
     file: CampaignFile,
     parameters: ParametersBase | None,
@@ -432,7 +436,7 @@ def _memory(
         report.add(place, f"tells about parameters of the simulator, and {what}; remove it", key=True)
         return None
 
-    return resolve_prior(file.prior, needs, place, references, posterior_source)
+    return resolve_prior(file.prior, needs, place, references, resolve_name(POSTERIORS))
 
 
 def _is_virtual(laboratory: LaboratorySettings) -> bool:
