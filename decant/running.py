@@ -21,11 +21,14 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from decant.run_results import Run
-from orchestrator.campaigns.file_loading import campaign_from, load_campaign, load_laboratory, load_vessel
+from orchestrator.campaigns import file_loading
+from orchestrator.campaigns.file_loading import campaign_from, load_laboratory, load_vessel
 from orchestrator.campaigns.shipped import shipped, starting_set
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document
+from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.learning.calibration.calibration_scores import shift_left_over
+from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.live_view.live_server import recorder_of
 from orchestrator.records.events import Subscriber as Watch
@@ -55,6 +58,27 @@ from sim_engine.vessel.shapes import VesselSpec
 __all__ = ["build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"]
 
 
+def load_campaign(
+    path: Path | str,
+    laboratory: Path | str | None = None,
+    seed: int | None = None,
+    *,
+    memory: CampaignMemory | None = None,
+) -> CampaignPlan:
+    """The plan of a campaign file, with everything that it refers to.
+
+    Args:
+        path: the file.
+        laboratory: a laboratory's file that replaces the campaign's laboratory.
+        seed: replaces the campaign's seed.
+        memory: of the run that is resumed; it replaces the campaign's `prior`, which could find other runs by now.
+
+    Raises:
+        ConfigError: the file or a file that it refers to is invalid; contains all problems.
+    """
+    return file_loading.load_campaign(path, laboratory, seed, memory=memory, posteriors=posterior_source)
+
+
 def build_campaign(content: Mapping[str, Any], folder: Path | str = ".") -> CampaignPlan:
     """A campaign from the keys of a campaign file, with its defaults and its checks.
 
@@ -66,7 +90,9 @@ def build_campaign(content: Mapping[str, Any], folder: Path | str = ".") -> Camp
         ConfigError: anything is wrong with it; all problems at once, with their places.
     """
     path = Path(folder).expanduser().resolve() / "campaign.json"
-    return campaign_from(Document.parse(json.dumps(content, indent=2, ensure_ascii=False), path))
+    return campaign_from(
+        Document.parse(json.dumps(content, indent=2, ensure_ascii=False), path), posteriors=posterior_source
+    )
 
 
 T = TypeVar("T")

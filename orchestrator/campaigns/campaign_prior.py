@@ -239,6 +239,15 @@ class PosteriorSource:
     of_run: Callable[[str], KnownPosterior]
 
 
+def no_posteriors() -> PosteriorSource:
+    """Refuse to look for posteriors, where a campaign is read that has none or keeps its own.
+
+    Raises:
+        RunError: always.
+    """
+    raise RunError("posteriors of earlier runs are not read here")
+
+
 def resolve_prior(
     prior: Any, needs: PriorNeeds, place: Place, references: References, source: Callable[[], PosteriorSource]
 ) -> CampaignMemory | None:

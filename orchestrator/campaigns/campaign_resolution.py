@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pkgutil import resolve_name
 from typing import Any
 
 from actors.laboratory_settings import LaboratorySettings
@@ -27,7 +27,7 @@ from orchestrator.campaigns.campaign_file import (
     StageSettings,
     owners_of_priors,
 )
-from orchestrator.campaigns.campaign_prior import PriorNeeds, PriorSettings, resolve_prior
+from orchestrator.campaigns.campaign_prior import PosteriorSource, PriorNeeds, PriorSettings, resolve_prior
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.scene_builder import SceneBuilder
 from orchestrator.campaigns.search_ranges import ParametersBase
@@ -328,7 +328,9 @@ def _prior(
     return ()
 
 
-def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> CampaignPlan | None:
+def resolve_campaign(
+    file: CampaignFile, root: Place, report: Report, posteriors: Callable[[], PosteriorSource]
+) -> CampaignPlan | None:
     """The plan of a campaign. Problems are added to the report; the plan may then be None."""
     references = References(report)
     laboratory: LaboratorySettings | None = references.laboratory(file.laboratory, root.at("laboratory"))
@@ -361,7 +363,9 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     memory = None
     in_force = default if parameters is None else default | parameters.in_force()
     if file.prior is not None and laboratory is not None and not report.problems:
-        memory = _memory(file, parameters, calibration, deployment, laboratory, root.at("prior"), references)
+        memory = _memory(
+            file, parameters, calibration, deployment, laboratory, root.at("prior"), references, posteriors
+        )
     if memory is not None and calibration is not None:
         calibration = replace(calibration, memory=memory)
     elif memory is not None and deployment is not None:
@@ -396,10 +400,6 @@ def resolve_campaign(file: CampaignFile, root: Place, report: Report) -> Campaig
     )
 
 
-POSTERIORS = "orchestrator.catalogue.catalogue:posterior_source"
-"""Opens the posteriors of this machine. It is used by name, because the catalogue is a layer above."""
-
-
 def _memory(
     file: CampaignFile,
     parameters: ParametersBase | None,
@@ -408,6 +408,7 @@ def _memory(
     laboratory: LaboratorySettings,
     place: Place,
     references: References,
+    posteriors: Callable[[], PosteriorSource],
 ) -> CampaignMemory | None:
     """The prior of a campaign from earlier ones; None after a problem."""
     report, infos = references.report, SimulationParameters.info()
@@ -436,7 +437,7 @@ def _memory(
         report.add(place, f"tells about parameters of the simulator, and {what}; remove it", key=True)
         return None
 
-    return resolve_prior(file.prior, needs, place, references, resolve_name(POSTERIORS))
+    return resolve_prior(file.prior, needs, place, references, posteriors)
 
 
 def _is_virtual(laboratory: LaboratorySettings) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Callable
 from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,7 +13,7 @@ from pydantic import create_model
 
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.campaign_file import CampaignFile
-from orchestrator.campaigns.campaign_prior import KnownPosterior, PriorSettings
+from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource, PriorSettings, no_posteriors
 from orchestrator.campaigns.campaign_resolution import resolve_campaign
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
@@ -35,6 +36,7 @@ def load_campaign(
     seed: int | None = None,
     *,
     memory: CampaignMemory | None = None,
+    posteriors: Callable[[], PosteriorSource] = no_posteriors,
 ) -> CampaignPlan:
     """The plan of a campaign file, with everything that it refers to.
 
@@ -43,12 +45,13 @@ def load_campaign(
         laboratory: a laboratory's file that replaces the campaign's laboratory.
         seed: replaces the campaign's seed.
         memory: of the run that is resumed; it replaces the campaign's `prior`, which could find other runs by now.
+        posteriors: opens those of this machine, for a campaign with a `prior`.
 
     Raises:
         ConfigError: the file or a file that it refers to is invalid; contains all problems.
     """
     other = None if laboratory is None else Path(laboratory)
-    return campaign_from(Document.read(resolved(Path(path))), other, seed, memory)
+    return campaign_from(Document.read(resolved(Path(path))), other, seed, memory, posteriors)
 
 
 def campaign_from(
@@ -56,6 +59,7 @@ def campaign_from(
     laboratory: Path | None = None,
     seed: int | None = None,
     memory: CampaignMemory | None = None,
+    posteriors: Callable[[], PosteriorSource] = no_posteriors,
 ) -> CampaignPlan:
     """The plan of a campaign document; relative paths in it start from the folder of its path.
 
@@ -75,7 +79,7 @@ def campaign_from(
         section = section.model_copy(update={"seed": seed})
     if section is not None and memory is not None:
         section = section.model_copy(update={"prior": PriorSettings.of(memory)})
-    plan = None if section is None else resolve_campaign(section, place, report)
+    plan = None if section is None else resolve_campaign(section, place, report, posteriors)
     report.raise_if_any()
     assert plan is not None, "a campaign without problems has a plan"
     return plan

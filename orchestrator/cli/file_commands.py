@@ -96,8 +96,9 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             return f"daemon, rigs: {', '.join(rig.name for rig in load_settings(path).rigs)}", []
         case _:
             from orchestrator.campaigns.campaign_checks import check_campaign
+            from orchestrator.catalogue.catalogue import posterior_source
 
-            plan = load_campaign(path)
+            plan = load_campaign(path, posteriors=posterior_source)
             for line in () if plan.memory is None else plan.memory.lines:
                 print_note(line)
             warned: list[str] = []

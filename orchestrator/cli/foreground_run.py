@@ -64,10 +64,11 @@ def read_campaign(
     """
     from orchestrator.campaigns.file_loading import load_campaign
     from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+    from orchestrator.catalogue.catalogue import posterior_source
     from orchestrator.runs.run_folder import RESOLVED
 
     with Refused(ConfigError):
-        plan = load_campaign(path, laboratory, seed)
+        plan = load_campaign(path, laboratory, seed, posteriors=posterior_source)
         if resumed is None or plan.memory is None:
             return plan
         memory = load_campaign(resumed(plan) / RESOLVED).memory

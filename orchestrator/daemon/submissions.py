@@ -23,6 +23,7 @@ from actors.interfaces import LaboratoryError
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.file_access import confined, out_of_bounds, resolved
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
+from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.daemon.daemon_settings import ANY_RIG, NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import DesiredState, QueueItem
 from orchestrator.daemon.pour_orders import PlannedOrder, PourOrder
@@ -150,7 +151,7 @@ def load_confined(campaign: Path, roots: Sequence[Path], laboratory: Path | None
         ConfigError: the campaign is invalid, or it refers to a file elsewhere.
     """
     with confined([*roots, *([] if laboratory is None else [laboratory])]):
-        return load_campaign(campaign, laboratory)
+        return load_campaign(campaign, laboratory, posteriors=posterior_source)
 
 
 def run_request(

@@ -19,12 +19,12 @@ import pytest
 from typer.testing import CliRunner
 
 from orchestrator.catalogue import catalogue as index
-from orchestrator.catalogue import run_registry as registry
 from orchestrator.catalogue.catalogue import INDEX_NAME, Catalogue
 from orchestrator.catalogue.queries import moment
 from orchestrator.catalogue.run_reading import POURS, RUNS, RunRead, read_run
 from orchestrator.cli import console
 from orchestrator.cli.app import app
+from orchestrator.records import run_registry as registry
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.records.run_registry import VARIABLE, state_directory
 from orchestrator.runs.run_folder import create_run

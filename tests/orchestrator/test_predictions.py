@@ -29,7 +29,7 @@ from orchestrator.reports.loss_units import loss_unit
 from orchestrator.reports.progress_state import ProgressState
 from orchestrator.reports.summarise import summarise
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
-from orchestrator.runs.run_service import planned
+from orchestrator.runs.run_tasks import plan_task
 from orchestrator.runs.stages import deployment_stages, prediction_stages
 from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness
 from sim_engine.outcome import Loss
@@ -330,6 +330,6 @@ def test_what_is_asked_for_is_simulations_of_the_slots_that_are_free() -> None:
 
 def test_a_plan_simulates_each_action_once_unless_the_campaign_says_how() -> None:
     for name, simulations in ("quickstart", 15), ("recorded", 30):
-        deployment = planned(load_campaign(CAMPAIGNS / f"{name}.yaml")).deployment
+        deployment = plan_task(load_campaign(CAMPAIGNS / f"{name}.yaml")).campaign.deployment
         assert deployment is not None
         assert deployment.settings.simulations == simulations, name

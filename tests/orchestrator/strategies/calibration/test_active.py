@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.orchestrator.learning.calibration.test_nuisances import SEARCHED, TRUTH, spilled, written
 
 from actors.optimizer.questions import CalibrationQuery, Data, DesignQuestion, PosteriorQuestion
 from actors.optimizer.suggest import propose
@@ -22,6 +21,7 @@ from orchestrator.runs.strategy_harness import ACTIONS, SCENE, StrategyHarness, 
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
+from tests.orchestrator.strategies.calibration.test_nuisances import SEARCHED, TRUTH, spilled, written
 from tests.support.plans import calibration_plan, deployment_plan
 
 NARROW = replace(SCENE, name="deployment-narrow", fixed={"height": 0.07})

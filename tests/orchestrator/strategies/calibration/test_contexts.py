@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.orchestrator.learning.calibration.test_nuisances import written
 
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
@@ -22,6 +21,7 @@ from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import cylinder
+from tests.orchestrator.strategies.calibration.test_nuisances import written
 from tests.support.plans import calibration_plan
 
 WIDE = replace(SCENE, name="calibration-wide", receiver=cylinder("wide", inner_radius=0.05, inner_height=0.1))

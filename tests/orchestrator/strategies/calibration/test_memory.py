@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from decant import load_campaign
 from orchestrator.campaigns.campaign_prior import KnownPosterior, arm_of, shape_digest
-from orchestrator.campaigns.file_loading import load_campaign, load_posterior_file
+from orchestrator.campaigns.file_loading import load_posterior_file
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.orchestrator.learning.test_strategies_properties import Shuffled
 
 from actors.optimizer.questions import Data, SpaceFillingQuery
 from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
@@ -30,6 +29,7 @@ from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, normalised_spillage
 from sim_engine.search_space import Axis, Space
+from tests.orchestrator.strategies.test_strategies_properties import Shuffled
 from tests.support.plans import calibration_plan, deployment_plan
 
 ACTIONS = (
