@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from actors.arm.arm_interface import PathReport
 from actors.interfaces import DeviceCheck
+from orchestrator.campaigns.campaign_prior import KnownPosterior
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, StatusOut
 from orchestrator.daemon.station_schemas import AccountOut, BatchOut, ContentOut, PourOut
@@ -437,6 +438,12 @@ class PoursOutput(_Output):
     pours: list[PreviousPour]  # type: ignore[valid-type]
 
 
+class KnownOutput(_Output):
+    """What calibrations have found, by run."""
+
+    posteriors: list[KnownPosterior]
+
+
 class RunCheckOutput(_Output):
     """Check of a run's records."""
 
@@ -659,6 +666,7 @@ OUTPUTS: dict[str, Any] = {
     "runs list": RunsOutput,
     "runs pours": PoursOutput,
     "runs show": PreviousRunDetail,
+    "runs known": KnownOutput,
     "runs check": RunCheckOutput,
     "runs compare": RunComparison,
     "runs export": ExportOutput,

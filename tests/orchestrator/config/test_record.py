@@ -154,7 +154,9 @@ def sensible(section: dict[str, Any]) -> dict[str, Any]:
         kept = {key: value for key, value in kept.items() if key not in (*own, "simulations")}
         kept |= {first: section.get(first, 9)}
         kept["initial_samples"] = (
-            min(kept.get("initial_samples", 8), kept[first]) if "initial_samples" in kept or own[0] != "grid" else 0
+            min(kept.get("initial_samples", 8), 9 if kept[first] == "auto" else kept[first])
+            if "initial_samples" in kept or own[0] != "grid"
+            else 0
         )
         if kept["strategy"] in ("C1", "C2"):
             del kept["initial_samples"]
