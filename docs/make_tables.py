@@ -384,6 +384,7 @@ MEASURED = (
         "limits",
         "convergence",
         "quickstart-coverage",
+        "quickstart-fits",
     ),
     *(
         "cliffs",
