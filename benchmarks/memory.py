@@ -1,6 +1,6 @@
 """Measure a laboratory that remembers: sequences of campaigns with the same arm and liquid, and new cups.
 
-    python benchmarks/memory.py [--laboratories 10] [--first 31001] [--campaigns 5] [--into build/memory]
+    python benchmarks/memory.py [--laboratories 10] [--first 61001] [--campaigns 5] [--into build/memory]
 
 Each laboratory has a hidden place of the receiver, hidden walls and a hidden liquid, drawn with its seed. Each of its
 campaigns has a new pourer and receiver; the receiver is put down anew within 1 mm, and the walls differ a little. The
@@ -14,7 +14,7 @@ campaign is the calibration of quickstart.yaml on the bench of twin.yaml. Compar
 
 The catalogue of each laboratory is a folder of its own. Finished campaigns are kept under `--into`.
 
-Questions, fixed before the first run; seeds from 31001 on were used for nothing else:
+Questions, fixed before the first run; seeds from 61001 on were used for nothing else:
 
 1. Is the mean error of the last campaign with `memory` at most that with `12 pours`?
 2. Is the mean error with a wrong memory at most 1.1 times that of `4 pours`? Is the moved receiver reported as a
@@ -122,7 +122,7 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--laboratories", type=int, default=10)
-    parser.add_argument("--first", type=int, default=31001)
+    parser.add_argument("--first", type=int, default=61001)
     parser.add_argument("--campaigns", type=int, default=5)
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "memory")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # runs one campaign in this process

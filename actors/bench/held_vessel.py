@@ -52,6 +52,9 @@ BELOW = 0.8
 TAKES = ("pourer_empty", "pourer_full", "pourer_after", "dose_source")
 """Questions whose step needs the pourer, which the gripper holds."""
 
+GIVES = ("set_up", "receiver_empty", "tray_before", "dose_source", "dose_cleared")
+"""Questions after whose step the gripper holds the pourer; their instructions contain `GRIP` or need none."""
+
 Ask = Callable[[OperatorQuestion], Awaitable[str]]
 
 
@@ -167,7 +170,7 @@ class HeldVessel:
         if question.about in TAKES and self.holds:
             await self._let_go(ask)
         answer = await ask(replace(question, text=question.text.replace(GRIP, "")))
-        if not self.holds and (GRIP in question.text or question.about == "dose_cleared"):
+        if not self.holds and question.about in GIVES:
             await self._take(ask)
         return answer
 

@@ -261,6 +261,36 @@ class GripLimits:
         return ""
 
 
+CONTROLLER_PORTS = {22, 80, 502, 29999, *range(30001, 30005), *range(30011, 30014), 30020, 50001, 50002}
+"""Ports of a UR controller that serve something else."""
+
+
+def check_port(problems: Problems, port: int, usual: int) -> None:
+    """Add a problem if a port of the controller serves something else than a gripper."""
+    if problems.valid("port") and port in CONTROLLER_PORTS:
+        problems.add(f"{port} is a port of the controller itself; the gripper's URCap listens on {usual}", "port")
+
+
+def opened(state: GripperState, width: float, accuracy: float, where: str) -> GripperState:
+    """The state after opening, if the fingers stand at the requested width.
+
+    Args:
+        state: when the fingers stand.
+        width: that was requested [m].
+        accuracy: see `GripperSettings` [m].
+        where: the gripper and its address, for the message.
+
+    Raises:
+        GripperError: they stand elsewhere.
+    """
+    if abs(state.width - width) > 4.0 * accuracy:
+        raise GripperError(
+            f"{where}: the fingers stand at {1e3 * state.width:.1f} mm instead of {1e3 * width:.1f} mm; is something "
+            "in their way?"
+        )
+    return state
+
+
 def settled(read: Callable[[], GripperState], begin: float, end: float, same: int = 3) -> GripperState:
     """Read a gripper until its fingers stand still.
 

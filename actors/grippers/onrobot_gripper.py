@@ -15,6 +15,7 @@ import threading
 import xmlrpc.client
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
+from xml.parsers.expat import ExpatError
 
 from actors.arm.arm_settings import ArmSettings
 from actors.grippers.gripper_interface import (
@@ -22,9 +23,10 @@ from actors.grippers.gripper_interface import (
     GripperSettings,
     GripperState,
     TcpPort,
+    check_port,
+    opened,
     settled,
 )
-from actors.grippers.robotiq_gripper import check_port
 from sim_engine.settings.model import NOT_IN_FINGERPRINT, Example, Problems
 from sim_engine.settings.quantity import Quantity
 
@@ -153,7 +155,7 @@ class OnRobotGripper:
                     f"{self._where}: no answer to {method}: {error or type(error).__name__}; is the URCap of OnRobot "
                     "installed, and this its port?"
                 ) from None
-            except Exception as error:  # expat reports an invalid document with an exception of its own
+            except ExpatError as error:
                 self._server = self._proxy()
                 raise GripperError(f"{self._where}: {method} was not answered with XML-RPC: {error}") from None
 
@@ -209,13 +211,7 @@ class OnRobotGripper:
 
     def open(self, width: float) -> GripperState:
         """See `Gripper.open`."""
-        state = self._go(width, self._settings.forces[0])
-        if abs(state.width - width) > 4.0 * self._settings.accuracy:
-            raise GripperError(
-                f"{self._where}: the fingers stand at {1e3 * state.width:.1f} mm instead of {1e3 * width:.1f} mm; is "
-                "something in their way?"
-            )
-        return state
+        return opened(self._go(width, self._settings.forces[0]), width, self._settings.accuracy, self._where)
 
     def grip(self, width: float, force: float) -> GripperState:
         """See `Gripper.grip`."""

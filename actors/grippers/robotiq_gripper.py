@@ -30,6 +30,8 @@ from actors.grippers.gripper_interface import (
     GripperState,
     TcpPort,
     Width,
+    check_port,
+    opened,
     settled,
 )
 from sim_engine.settings.model import NOT_IN_FINGERPRINT, Example, Problems
@@ -171,16 +173,6 @@ class RobotiqSettings(GripperSettings):
         """See `GripperSettings.check_laboratory`."""
         super().check_laboratory(problems, mode=mode, arm=arm)
         check_port(problems, self.port, PORT)
-
-
-CONTROLLER_PORTS = {22, 80, 502, 29999, *range(30001, 30005), *range(30011, 30014), 30020, 50001, 50002}
-"""Ports of a UR controller that serve something else."""
-
-
-def check_port(problems: Problems, port: int, usual: int) -> None:
-    """Add a problem if a port of the controller serves something else than a gripper."""
-    if problems.valid("port") and port in CONTROLLER_PORTS:
-        problems.add(f"{port} is a port of the controller itself; the gripper's URCap listens on {usual}", "port")
 
 
 _REPLY = re.compile(rb"([A-Z]{3}) +(\?|-?\d{1,4})\r?\n?")
@@ -350,13 +342,7 @@ class RobotiqGripper:
 
     def open(self, width: float) -> GripperState:
         """See `Gripper.open`."""
-        state = self._go(self._settings.position_at(width), 0)
-        if abs(state.width - width) > 4.0 * self._settings.accuracy:
-            raise GripperError(
-                f"{self._where}: the fingers stand at {1e3 * state.width:.1f} mm instead of {1e3 * width:.1f} mm; is "
-                "something in their way?"
-            )
-        return state
+        return opened(self._go(self._settings.position_at(width), 0), width, self._settings.accuracy, self._where)
 
     def grip(self, width: float, force: float) -> GripperState:
         """See `Gripper.grip`."""

@@ -7,11 +7,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sim_engine.search_space import Space
+
+Array = NDArray[np.float64]
 
 Numbers = tuple[float, ...]
 
@@ -174,6 +180,37 @@ class RememberedGroup:
     centres: Numbers
     deviations: Numbers
     weight: float
+
+    def density(self, points: Array) -> Array:
+        """Density (m,) of the normals at points (m, at least the dimension)."""
+        from scipy.special import ndtr  # slow import
+
+        centres, deviations = np.array(self.centres), np.array(self.deviations)
+        z = (points[:, list(self.axes)] - centres) / deviations
+        inside = ndtr((1.0 - centres) / deviations) - ndtr(-centres / deviations)
+        norms = np.log(deviations * np.maximum(inside, 1e-9)) + 0.5 * math.log(2.0 * math.pi)
+        return np.asarray(np.exp(-0.5 * (z**2).sum(axis=1) - norms.sum()))
+
+    def moved(self, points: Array) -> Array:
+        """Points (m, at least the dimension) of an even design, moved to the same quantiles of the normals."""
+        found = points.copy()
+        for axis, centre, deviation in zip(self.axes, self.centres, self.deviations, strict=True):
+            found[:, axis] = truncated_quantiles(points[:, axis], centre, deviation)
+        return found
+
+
+def truncated_quantiles(uniform: Array, mean: float, deviation: float, lower: float = 0.0, upper: float = 1.0) -> Array:
+    """Quantiles (m,) of a normal distribution that is truncated to [lower, upper].
+
+    Args:
+        uniform: levels (m,), 0 … 1.
+        mean, deviation: before the truncation.
+        lower, upper: bounds.
+    """
+    from scipy.special import ndtr, ndtri  # slow import
+
+    below, above = ndtr((np.array([lower, upper]) - mean) / deviation)
+    return np.asarray(np.clip(mean + deviation * ndtri(below + uniform * (above - below)), lower, upper))
 
 
 @dataclass(frozen=True)

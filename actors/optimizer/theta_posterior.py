@@ -12,12 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
 from actors.optimizer.covariance import matern
 from actors.optimizer.gaussian_process import GaussianProcess
-from actors.optimizer.questions import RememberedGroup
+from actors.optimizer.questions import RememberedGroup, truncated_quantiles
 
 Array = NDArray[np.float64]
 
@@ -107,14 +106,14 @@ def sample_posterior(
             values[inside] -= 0.5 * ((logs - math.log(median)) / width) ** 2
             values[inside] -= 0.5 * (((x[inside, :dimension] - centres) * precision) ** 2).sum(axis=1)
             for group in memory:
-                values[inside] += np.log(group.weight * _remembered(group, x[inside]) + 1.0 - group.weight)
+                values[inside] += np.log(group.weight * group.density(x[inside]) + 1.0 - group.weight)
         return values
 
     assert n > 0
     starts = qmc.Sobol(dimension + 1, rng=rng).random(STARTS)
     starts[:, dimension] = math.log(median) + width * (2.0 * starts[:, dimension] - 1.0)
     for group in memory:  # every second start: a narrow memory would hold few points of an even design
-        _to_memory(starts, group, np.arange(STARTS) % 2 == 1)
+        starts[1::2] = group.moved(starts[1::2])
     at_starts = density(starts)
     weights = np.exp(at_starts - at_starts.max())
     # As many different starts as walkers / 2 span all directions: an ensemble never leaves the subspace in which it
@@ -130,30 +129,9 @@ def sample_posterior(
     chosen = flat[np.linspace(0, len(flat) - 1, count).round().astype(int)]
     held = []
     for group in memory:
-        share = group.weight * _remembered(group, flat)
+        share = group.weight * group.density(flat)
         held.append(float(np.mean(share / (share + 1.0 - group.weight))))
     return Sampled(snap(chosen[:, :dimension]), np.exp(chosen[:, dimension]), _effective(kept), tuple(held))
-
-
-def _remembered(group: RememberedGroup, points: Array) -> Array:
-    """Density (m,) of a group's truncated normals at points (m, at least the dimension)."""
-    centres, deviations = np.array(group.centres), np.array(group.deviations)
-    z = (points[:, list(group.axes)] - centres) / deviations
-    inside = ndtr((1.0 - centres) / deviations) - ndtr(-centres / deviations)
-    norms = np.log(deviations * np.maximum(inside, 1e-9)) + 0.5 * math.log(2.0 * math.pi)
-    return np.asarray(np.exp(-0.5 * (z**2).sum(axis=1) - norms.sum()))
-
-
-def _to_memory(points: Array, group: RememberedGroup, rows: NDArray[np.bool_]) -> None:
-    """Move uniform points to the same quantiles of a group's normals, in place."""
-    for axis, centre, deviation in zip(group.axes, group.centres, group.deviations, strict=True):
-        points[rows, axis] = _quantiles(points[rows, axis], centre, deviation)
-
-
-def _quantiles(u: Array, centre: float, deviation: float) -> Array:
-    """Quantiles of a normal that is truncated to the unit interval."""
-    low, high = ndtr((np.array([0.0, 1.0]) - centre) / deviation)
-    return np.asarray(np.clip(centre + deviation * ndtri(low + u * (high - low)), 0.0, 1.0))
 
 
 def drawn_beforehand(
@@ -164,9 +142,10 @@ def drawn_beforehand(
     points = qmc.Sobol(dimension, rng=rng).random(2 ** math.ceil(math.log2(max(count, 2))))[:count]
     for i, (centre, deviation) in enumerate(prior):
         if deviation > 0.0:
-            points[:, i] = _quantiles(points[:, i], centre, deviation)
+            points[:, i] = truncated_quantiles(points[:, i], centre, deviation)
     for group in memory:
-        _to_memory(points, group, rng.random(len(points)) < group.weight)
+        chosen = rng.random(len(points)) < group.weight
+        points[chosen] = group.moved(points[chosen])
     return np.asarray(points)
 
 

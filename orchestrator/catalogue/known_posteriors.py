@@ -151,18 +151,23 @@ def posterior_text(known: KnownPosterior) -> str:
     """A posterior as a YAML file, with units as they are displayed."""
     from ruamel.yaml import YAML
 
-    table = written(known)
+    text = io.StringIO()
+    yaml = YAML()
+    yaml.default_flow_style = None
+    yaml.width = 110
+    yaml.dump(posterior_table(known), text)
+    return text.getvalue()
+
+
+def posterior_table(known: KnownPosterior) -> dict[str, Any]:
+    """A posterior as the content of its file, with units as they are displayed."""
+    table: dict[str, Any] = written(known)
     infos = SimulationParameters.info()
     table["parameters"] = {
         name: {"mean": _shown(mean, infos[name]), "deviation": _shown(deviation, infos[name])}
         for name, (mean, deviation) in known.estimates.items()
     }
-    text = io.StringIO()
-    yaml = YAML()
-    yaml.default_flow_style = None
-    yaml.width = 110
-    yaml.dump(table, text)
-    return text.getvalue()
+    return table
 
 
 def _shown(value: float, info: ParameterInfo) -> Any:

@@ -248,13 +248,14 @@ def known(
     as_json: Json = False,
 ) -> None:
     """Show what calibrations have found, by run: mean ± standard deviation from the pours of the run alone."""
+    from orchestrator.catalogue.known_posteriors import posterior_table
     from orchestrator.learning.calibration.campaign_memory import RememberedParameter
     from orchestrator.reports.console_view import print_table
 
     with _catalogue() as catalogue, _refusing():
         found = [one for one in catalogue.posteriors() if cup in (None, one.pourer, *one.receivers)]
     if as_json:
-        print_json({"posteriors": [one.model_dump(exclude_none=True) for one in found]})
+        print_json({"posteriors": [posterior_table(one) for one in found]})
         return
     if not found:
         print_note(f"no posterior{'' if cup is None else f' about {cup}'}; a finished calibration with C4 has one")

@@ -44,7 +44,7 @@ class SurrogatePicture:
         best_name: name of the chosen point: 'θ*', 'best action'.
         mean: (R, R) surrogate mean over the unit square, row i at the second axis's i-th place; None without a map.
         deviation: (R, R) its standard deviation.
-        numbers: labels of the points (pours); None: they are dots (simulations).
+        numbers: labels of the points (pours); None: they are dots (simulated θ).
         over: names of the map's two axes; empty if the space has no others.
         held: values of the other axes in the displayed section, SI.
         simulated: points of simulations in addition to the observed pours, SI.
@@ -130,7 +130,8 @@ def _notes(picture: SurrogatePicture) -> list[str]:
     if picture.held:
         note = f"others at {picture.best_name}: {style.display_values(dict(picture.held))}"
         if picture.points:
-            note += f"; the {_things(picture)} were made at any values of them"
+            things = "θ" if picture.numbers is None else "pours"
+            note += f"; the {things} have any values of them"
         notes.append(note)
     if picture.best is not None and (ends := style.at_ends(dict(picture.best), picture.space.axes)):
         notes.append(f"{picture.best_name} has {' and '.join(ends)}: a wider range may hold a better one")
@@ -219,7 +220,7 @@ def _observed(axes: Axes, picture: SurrogatePicture, filled: Mapping[str, Any], 
     xs, ys = (_column(picture.points, axis) for axis in picture.plane.axes)
     size = 26 if picture.numbers is None else 130
     edge = style.INK if isinstance(filled["c"], str) else "white"
-    name = "simulation" if picture.numbers is None else "pour"
+    name = "simulated θ" if picture.numbers is None else "pour"
     axes.scatter(xs, ys, s=size, edgecolors=edge, linewidths=1.0, zorder=5, clip_on=False, label=name, **filled)
     for number, x, y, inked in zip(picture.numbers or (), xs, ys, ~dark, strict=False):
         colour = style.INK if inked else "white"
@@ -248,12 +249,9 @@ def _panel_title(name: str, picture: SurrogatePicture) -> str:
 
 
 def _counted(picture: SurrogatePicture) -> str:
+    # not "simulations": each θ may have been simulated on many pours
     number = len(picture.points)
-    return f"{number} {_things(picture)}" if number != 1 else f"1 {_things(picture)[:-1]}"
-
-
-def _things(picture: SurrogatePicture) -> str:
-    return "simulations" if picture.numbers is None else "pours"
+    return f"{number} θ" if picture.numbers is None else f"{number} pour{'s' * (number != 1)}"
 
 
 def _mark_best(axes: Axes, picture: SurrogatePicture, x_axis: Axis, y_axis: Axis) -> None:
@@ -283,7 +281,7 @@ def _slices(picture: SurrogatePicture) -> Figure:
             linewidths=0.5,
             clip_on=False,
             zorder=3,
-            label="pour" if picture.numbers is not None else "simulation, the other parameters at any values",
+            label="pour" if picture.numbers is not None else "simulated θ, the other parameters at any values",
         )
         if picture.best is not None:
             x = _column([picture.best], axis)[0]

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.optimizer.questions import Linear, Point
+from actors.optimizer.questions import Linear, Point, truncated_quantiles
 from orchestrator.learning.campaign_plan import CalibrationPlan, MeasuredPour, NormalPrior
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
@@ -100,15 +100,12 @@ def region_of(actions: Space, constraints: Sequence[Linear]) -> Region | None:
 
 def _distributed(uniform: Array, actions: Space, prior: Sequence[NormalPrior]) -> Array:
     """Transform uniform points (m, dimension) of the unit cube to the distribution g."""
-    from scipy.special import ndtr, ndtri
-
     points = uniform.copy()
     for one in prior:
         i = actions.names.index(one.name)
         axis = actions.axes[i]
-        below, above = ndtr((np.array([axis.lower, axis.upper]) - one.mean) / one.deviation)
-        values = one.mean + one.deviation * ndtri(below + uniform[:, i] * (above - below))
-        places = [axis.encode(value) for value in np.clip(values, axis.lower, axis.upper)]
+        values = truncated_quantiles(uniform[:, i], one.mean, one.deviation, axis.lower, axis.upper)
+        places = [axis.encode(value) for value in values]
         points[:, i] = np.rint(np.array(places) * FINENESS) / FINENESS
     return points
 

@@ -13,12 +13,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import Annotated
 
 import numpy as np
 
-from actors.optimizer.questions import Point, Posterior, RememberedGroup
+from actors.optimizer.questions import Point, Posterior, RememberedGroup, truncated_quantiles
 from orchestrator.learning.requests import Decision
 from orchestrator.learning.stage_result import ResultPart
 from sim_engine.liquids import ParameterInfo, SimulationParameters
@@ -156,22 +155,14 @@ class CampaignMemory:
 
         infos = [SimulationParameters.info()[one.name] for one in self.parameters]
         rows = qmc.Sobol(len(infos), rng=np.random.default_rng(0)).random(2 ** math.ceil(math.log2(max(count, 2))))
-        found = []
-        for row in rows[:count]:
-            pairs = zip(self.parameters, infos, row, strict=True)
-            values = {
-                one.name: _quantile(one.mean, one.deviation, float(u), info.lower, info.upper) for one, info, u in pairs
-            }
-            found.append(base.model_copy(update=values))
-        return found
-
-
-def _quantile(mean: float, deviation: float, u: float, lower: float, upper: float) -> float:
-    """Quantile of a normal distribution that is truncated to [lower, upper]."""
-    normal = NormalDist(mean, deviation)
-    low, high = normal.cdf(lower), normal.cdf(upper)
-    level = min(max(low + u * (high - low), 1e-12), 1.0 - 1e-12)
-    return min(max(normal.inv_cdf(level), lower), upper)
+        columns = [
+            truncated_quantiles(rows[:count, i], one.mean, one.deviation, info.lower, info.upper)
+            for i, (one, info) in enumerate(zip(self.parameters, infos, strict=True))
+        ]
+        names = [one.name for one in self.parameters]
+        return [
+            base.model_copy(update=dict(zip(names, map(float, row), strict=True))) for row in zip(*columns, strict=True)
+        ]
 
 
 def unit_memory(memory: CampaignMemory | None, space: Space) -> tuple[RememberedGroup, ...] | None:
@@ -199,23 +190,16 @@ def _on_axis(axis: Axis, one: RememberedParameter) -> tuple[float, float]:
 
 def remembered_point(point: Point, groups: Sequence[RememberedGroup]) -> Point:
     """A point (dimension,) of an even design, moved to the same quantiles of the memory."""
-    moved = list(point)
+    moved = np.array([point])
     for group in groups:
-        for axis, centre, deviation in zip(group.axes, group.centres, group.deviations, strict=True):
-            moved[axis] = _quantile(centre, deviation, point[axis], 0.0, 1.0)
-    return tuple(moved)
+        moved = group.moved(moved)
+    return tuple(map(float, moved[0]))
 
 
 def log_memory(point: Point, groups: Sequence[RememberedGroup]) -> float:
     """Logarithm of the prior density at a point (dimension,) of the unit cube; 0 without a memory."""
-    total = 0.0
-    for group in groups:
-        density = 1.0
-        for axis, centre, deviation in zip(group.axes, group.centres, group.deviations, strict=True):
-            normal = NormalDist(centre, deviation)
-            density *= normal.pdf(point[axis]) / max(normal.cdf(1.0) - normal.cdf(0.0), 1e-9)
-        total += math.log(group.weight * density + 1.0 - group.weight)
-    return total
+    at = np.array([point])
+    return sum(math.log(group.weight * float(group.density(at)[0]) + 1.0 - group.weight) for group in groups)
 
 
 class MemoryGroup(ResultPart):

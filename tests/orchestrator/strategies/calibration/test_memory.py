@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.known_posteriors import import_posterior, posterior_text
 from orchestrator.cli.app import app
+from orchestrator.cli.json_output import KnownOutput
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
 from orchestrator.learning.campaign_plan import MeasuredPour
 from orchestrator.records.run_registry import VARIABLE
@@ -232,6 +234,10 @@ def test_a_posterior_is_exported_and_imported_with_its_units(state: Path, tmp_pa
     assert outcome.exit_code == 0, outcome.output
     shown = CliRunner().invoke(app, ["runs", "known", "tumbler"])
     assert "first-1" in shown.output
+    told = CliRunner().invoke(app, ["runs", "known", "--json"]).stdout
+    (again,) = KnownOutput.model_validate(json.loads(told)).posteriors  # as configs/schema/output.json describes it
+    assert "13.9 mm" in told
+    assert again.estimates["receiver_x"] == pytest.approx((0.0139, 0.001))
     with Catalogue(state) as catalogue:
         assert [one.posterior for one in catalogue.posteriors()] == ["first-1"]
     assert load_campaign(with_prior(tmp_path, f"[{path}]")).memory.runs == ("first-1",)  # type: ignore[union-attr]
