@@ -246,6 +246,7 @@ def test_the_death_of_the_arm_fails_the_pour_and_the_next_one_has_a_new_arm(ray_
 
 @pytest.mark.realtime
 @pytest.mark.ray
+@pytest.mark.slow
 def test_a_pour_needs_no_simulator_of_the_pool(ray_running, open_bench, scene, action, task, fake):
     async def play():
         async with open_bench(ray=True, make=fake(4.0)) as laboratory:

@@ -125,6 +125,7 @@ def test_a_replay_makes_the_same_requests_and_lost_simulations_do_no_harm(monkey
     assert strategy.finished
 
 
+@pytest.mark.slow
 def test_the_limit_follows_from_the_number_of_pours_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [simulation_limit(train) for train in (2, 8, 100)] == [100, 400, 1500]
     monkeypatch.setattr(automatic_calibration, "UNCHANGED", 0.0)
