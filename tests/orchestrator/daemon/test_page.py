@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -265,7 +266,9 @@ def test_the_card_of_an_idle_rig_says_why_its_arm_cannot_move_and_what_to_do(pag
             card = page.get_by_role("article", name="rig rig")
             card.get_by_text("Arm: the arm is ready to move").wait_for()
             controller.fault("protective_stop", reason="a test")
-            card.get_by_text("The arm can't move: protective stop is in force").wait_for()
+            card.get_by_text(
+                re.compile(r"The arm can't move \(since [\d:. APM]+\): protective stop is in force")
+            ).wait_for()
             card.get_by_text("Find the cause, then unlock it on the teach pendant").wait_for()
             page.locator("#cells li").filter(has_text="rig: arm can't move").wait_for()
 
