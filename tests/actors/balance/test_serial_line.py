@@ -33,7 +33,7 @@ def test_a_bad_cable_costs_time_but_never_gives_another_weight(driver, dialect):
     far, balance = driver(dialect, settling=SettlingRule(deadline=400.0), answer_time=0.05)
     far.put(0.35)
     balance.tare()
-    far.faults(garbage=0.25, halved=0.15)
+    far.faults(garbage=0.1, halved=0.1)
     for grams in (12.3, 112.3, 2.3, 99.9, 10.0):
         far.put(0.35 + grams / 1e3)
         far.advance(5.0)
