@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 
 from orchestrator.campaigns.file_loading import load_vessel
-from orchestrator.cli.vessel_command import vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel
-from tests.support.measured_vessel import FOCAL, Bench
+from tests.support.measured_vessel import FOCAL, Bench, vessel
 
 PAGE = Path("docs/evidence/results.md")
 PARTICLES = 600

@@ -584,8 +584,12 @@ def json_output() -> str:
 
     schema = output_schema()
     kinds, parts = schema["$defs"], []
+    first: dict[str, str] = {}
     for command, output in schema["properties"].items():
         parts.append(f"## `decant {command} --json`\n")
+        if (shown := first.setdefault(str(output), command)) != command:
+            parts.append(f"As of `decant {shown} --json`.\n")
+            continue
         for reference in output.get("anyOf", [output]):
             model = kinds[reference["$ref"].rpartition("/")[2]]
             rows = [

@@ -167,14 +167,44 @@ _add(
 )
 _add(file_commands.plugins, "decant plugins", "decant plugins --json")
 
+_vessel = _group(
+    "vessel",
+    "Make a vessel file from measurements; one command for each kind of source. It states its uncertainty.",
+    "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
+    "decant vessel mesh scan.stl mug.yaml --unit mm",
+)
 _add(
-    vessel_command.vessel,
-    "decant vessel cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
-    "decant vessel cup.yaml --photo side.png --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
-    "decant vessel mug.yaml --mesh scan.stl --wall '3 mm'",
+    vessel_command.profile,
+    "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
+    "decant vessel profile cup.yaml --height '95 mm' --fill fill.csv --wall '3 mm' --brimful '322 g'",
+    to=_vessel,
     quiet=True,
 )
-
+_add(
+    vessel_command.photo,
+    "decant vessel photo side.png cup.yaml --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
+    to=_vessel,
+    quiet=True,
+)
+_add(
+    vessel_command.points,
+    "decant vessel points cloud.ply cup.yaml --unit mm --wall '3 mm'",
+    to=_vessel,
+    quiet=True,
+)
+_add(
+    vessel_command.depth,
+    "decant vessel depth depth.png cup.yaml --focal 615 --wall '3 mm' --height '95 mm'",
+    to=_vessel,
+    quiet=True,
+)
+_add(
+    vessel_command.mesh,
+    "decant vessel mesh scan.stl mug.yaml --unit mm --wall '3 mm'",
+    "decant vessel mesh cup.stl cup.yaml --drop-bodies --brimful '322 g'",
+    to=_vessel,
+    quiet=True,
+)
 
 _add(
     physics_command.validate_solver,

@@ -6,6 +6,7 @@ import functools
 import inspect
 import os
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -164,6 +165,29 @@ def call(work: Callable[..., None], /, *args: Any, **kwargs: Any) -> None:
         fail(RefusalError(str(error), FAILED if isinstance(error, WrongOutcomeError) else BAD_INPUT))
     except KeyboardInterrupt:
         fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
+
+
+def grouped(work: Callable[..., None]) -> Callable[..., None]:
+    """Replace each parameter whose type is a dataclass by its fields: options that several commands share."""
+    own = inspect.signature(work, eval_str=True)
+    groups: dict[str, Any] = {
+        one.name: one.annotation for one in own.parameters.values() if is_dataclass(one.annotation)
+    }
+    fields = {name: inspect.signature(group, eval_str=True).parameters for name, group in groups.items()}
+    flat = [one for each in own.parameters.values() for one in fields.get(each.name, {each.name: each}).values()]
+    signature = own.replace(parameters=[each.replace(kind=inspect.Parameter.POSITIONAL_OR_KEYWORD) for each in flat])
+
+    @functools.wraps(work)
+    def run(*args: Any, **kwargs: Any) -> None:
+        bound = signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        given = bound.arguments
+        made = {name: group(**{field: given.pop(field) for field in fields[name]}) for name, group in groups.items()}
+        work(**given, **made)
+
+    run.__signature__ = signature  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in flat}
+    return run
 
 
 def command(work: Callable[..., None], *, quiet: bool = False) -> Callable[..., None]:

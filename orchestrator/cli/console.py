@@ -18,7 +18,10 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 """Exit codes in addition to 0 (success) and 3 (an operator must answer; `RunError.exit_code`)."""
@@ -84,9 +87,10 @@ def print_note(text: str) -> None:
         print_message(text)
 
 
-def print_json(data: dict[str, Any]) -> None:
+def print_json(data: BaseModel | dict[str, Any]) -> None:
     """Print one line of JSON on stdout. Numbers without a JSON equivalent become null."""
-    print(json.dumps(_plain(data), ensure_ascii=False), flush=True)
+    plain = data if isinstance(data, dict) else data.model_dump(mode="json", by_alias=True)
+    print(json.dumps(_plain(plain), ensure_ascii=False), flush=True)
 
 
 def _plain(value: Any) -> Any:

@@ -661,7 +661,7 @@ OUTPUTS: dict[str, Any] = {
     "pour": PourOutput | EmptyPourOutput | DryRunOutput,
     "report": ReportOutput,
     "plugins": PluginsOutput,
-    "vessel": VesselOutput,
+    **{f"vessel {source}": VesselOutput for source in ("profile", "photo", "points", "depth", "mesh")},
     "validate-solver": ValidateSolverOutput,
     "runs list": RunsOutput,
     "runs pours": PoursOutput,

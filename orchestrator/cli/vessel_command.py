@@ -1,21 +1,22 @@
-"""The command `decant vessel`: makes a vessel file from measurements of a cup.
+"""The commands `decant vessel ...`: each makes a vessel file from one kind of source.
 
-Turned vessels are fitted to all given measurements; a mesh is repaired and used alone. `Sources` holds them,
-`Made` the result. Tables and images are read in `vessel_tables`; the fits are in `sim_engine.vessel_acquisition`.
+`profile`, `photo`, `points` and `depth` fit a turned vessel to their source and to the sizes and tables that are given
+(`Sizes`); `mesh` repairs a mesh and uses it alone. Tables and images are read in `vessel_tables`; the fits are in
+`sim_engine.vessel_acquisition`.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from orchestrator.cli.command_options import Json
+from orchestrator.cli.command_options import Json, grouped
 from orchestrator.cli.console import (
     BAD_INPUT,
     RefusalError,
@@ -50,110 +51,54 @@ LEVEL = 2.0
 BAND = 2.0
 """Standard deviations that the band shows to either side."""
 
+Out = Annotated[Path, typer.Argument(help="Vessel file to write (YAML).", metavar="OUT", show_default=False)]
+Up = Annotated[str, typer.Option(help="Axis of the file that points out of the opening.")]
+Unit = Annotated[str | None, typer.Option(help="Unit of the file: m, cm, mm, in; default: by its extent.")]
+Wall = Annotated[str | None, typer.Option(help="Thickness of the wall: '3 mm'.")]
+
 
 @dataclass(frozen=True)
-class Sources:
-    """Options of the command line as given; see `vessel`."""
+class Sizes:
+    """Options of all turned vessels."""
 
-    height: str | None = None
-    diameters: str | None = None
-    photo: Path | None = None
-    known_height: str | None = None
-    known_width: str | None = None
-    points: Path | None = None
-    depth: Path | None = None
-    focal: float | None = None
-    centre: str | None = None
-    mesh: Path | None = None
-    unit: str | None = None
-    up: str = "z"
-    drop_bodies: bool = False
-    fill: Path | None = None
-    tilt: Path | None = None
-    brimful: str | None = None
-    density: str = "998 kg/m^3"
-    wall: str | None = None
-    floor: str | None = None
-
-
-def vessel(
-    out: Annotated[Path, typer.Argument(help="Vessel file to write (YAML).", metavar="OUT", show_default=False)],
-    height: Annotated[str | None, typer.Option(help="Depth inside, from floor to rim: '95 mm'.")] = None,
+    height: Annotated[str | None, typer.Option(help="Depth inside, from floor to rim: '95 mm'.")] = None
     diameters: Annotated[
         str | None,
         typer.Option(help="Inner diameters by height above the inner floor: '5 mm: 60 mm, 95 mm: 72 mm'."),
-    ] = None,
-    photo: Annotated[Path | None, typer.Option(help="Photograph from the side, on a plain background.")] = None,
-    known_height: Annotated[str | None, typer.Option(help="Outer height, for the scale of the photograph.")] = None,
-    known_width: Annotated[str | None, typer.Option(help="Largest outer width, for the scale.")] = None,
-    points: Annotated[
-        Path | None, typer.Option(help="Points of the surface: PLY, PCD, XYZ, or CSV with x, y, z.")
-    ] = None,
-    depth: Annotated[Path | None, typer.Option(help="Depth image from the side: PNG of 16 bits, or NPY.")] = None,
-    focal: Annotated[float | None, typer.Option(help="Focal length of the depth camera [pixels].", min=1.0)] = None,
-    centre: Annotated[
-        str | None, typer.Option(help="Column and row of the axis: '318.2, 241.5'; default: the image's centre.")
-    ] = None,
-    mesh: Annotated[Path | None, typer.Option(help="Mesh to repair: STL, OBJ, PLY or GLB.")] = None,
-    unit: Annotated[
-        str | None, typer.Option(help="Unit of points, mesh or depths: m, cm, mm, in; default for depths: mm.")
-    ] = None,
-    up: Annotated[str, typer.Option(help="Axis of points or mesh that points out of the opening.")] = "z",
-    drop_bodies: Annotated[
-        bool, typer.Option("--drop-bodies", help="Leave out separate bodies in a mesh's cavity, such as its liquid.")
-    ] = False,
-    fill: Annotated[Path | None, typer.Option(help="Table of levels and masses: level_mm, mass_g.")] = None,
-    tilt: Annotated[Path | None, typer.Option(help="Table of tilts and retained masses: tilt_deg, mass_g.")] = None,
-    brimful: Annotated[str | None, typer.Option(help="Weighed mass when full to the brim: '322 g'; a check.")] = None,
-    density: Annotated[str, typer.Option(help="Density of the weighed liquid.")] = "998 kg/m^3",
-    wall: Annotated[str | None, typer.Option(help="Thickness of the wall: '3 mm'.")] = None,
-    floor: Annotated[str | None, typer.Option(help="Thickness of the floor; default: as the wall.")] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the vessel; default: the file's name.")] = None,
-    as_json: Json = False,
-) -> None:
-    """Make a vessel file from measurements: callipers, photograph, points, depth image, a mesh, fill or tilt tables.
+    ] = None
+    fill: Annotated[Path | None, typer.Option(help="Table of levels and masses: level_mm, mass_g.")] = None
+    tilt: Annotated[Path | None, typer.Option(help="Table of tilts and retained masses: tilt_deg, mass_g.")] = None
+    wall: Wall = None
+    floor: Annotated[str | None, typer.Option(help="Thickness of the floor; default: as the wall.")] = None
 
-    Several sources of a turned vessel can be combined; each is weighted by its uncertainty. A picture with the section,
-    its uncertainty and the measurements is written next to the file. The measurements are summarised in the file.
-    """
-    from sim_engine.settings.quantity import QuantityError
-    from sim_engine.vessel.shapes import VesselError
-
-    sources = Sources(
-        height, diameters, photo, known_height, known_width, points, depth, focal, centre, mesh, unit, up,
-        drop_bodies, fill, tilt, brimful, density, wall, floor,
-    )  # fmt: skip
-    called = name or out.stem
-    if out.suffix not in (".yaml", ".yml"):
-        raise RefusalError(f"{out}: a vessel file is YAML; write {out.with_suffix('.yaml')}", BAD_INPUT)
-    if not out.parent.is_dir():
-        raise RefusalError(f"{out}: the folder {out.parent} does not exist; make it first", BAD_INPUT)
-    if out.exists():
-        raise RefusalError(f"{out}: exists already; choose another name, or remove it first", BAD_INPUT)
-    try:
-        with waiting_for(lambda: "measuring the vessel"):
-            found = _from_mesh(out, called, sources) if sources.mesh is not None else _turned(out, called, sources)
-    except (VesselError, QuantityError) as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
-    except OSError as error:
-        raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
-    for note in found.notes:
-        print_note(f"note: {note}")
-    for doubt in found.doubts:
-        print_warning(doubt)
-    print_note(f"{out} holds {1e6 * found.capacity:.0f} ± {1e6 * found.deviation:.1f} mL; its picture: {found.picture}")
-    if as_json:
-        print_json(
-            {
-                "file": out,
-                "picture": found.picture,
-                "capacity_mL": 1e6 * found.capacity,
-                "capacity_deviation_mL": 1e6 * found.deviation,
-                "radius_deviation_mm": None if found.radius_deviation is None else 1e3 * found.radius_deviation,
-                "notes": found.notes,
-                "doubts": found.doubts,
-            }
+    def lengths(self) -> tuple[float | None, float | None, float | None]:
+        """Wall, floor and height [m]."""
+        return (
+            _quantity(self.wall, "--wall", "m", "3 mm"),
+            _quantity(self.floor, "--floor", "m", "4 mm"),
+            _quantity(self.height, "--height", "m", "95 mm"),
         )
+
+
+@dataclass(frozen=True)
+class Vessel:
+    """Options of all vessels."""
+
+    brimful: Annotated[str | None, typer.Option(help="Weighed mass when full to the brim: '322 g'; a check.")] = None
+    density: Annotated[str, typer.Option(help="Density of the weighed liquid.")] = "998 kg/m^3"
+    name: Annotated[str | None, typer.Option(help="Name of the vessel; default: the file's name.")] = None
+    as_json: Json = False
+
+    def volume(self, mass: float) -> float:
+        """Volume of a weighed mass [m³]."""
+        density = _quantity(self.density, "--density", "kg/m^3", "998 kg/m^3")
+        assert density is not None
+        return mass / density
+
+    def brimful_volume(self) -> float | None:
+        """Volume of the vessel as weighed [m³]."""
+        mass = _quantity(self.brimful, "--brimful", "kg", "322 g")
+        return None if mass is None else self.volume(mass)
 
 
 @dataclass(frozen=True)
@@ -171,8 +116,194 @@ class Made:
     deviation: float
     radius_deviation: float | None
     picture: Path
-    notes: Sequence[str]
-    doubts: Sequence[str]
+    notes: list[str]
+    doubts: list[str]
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+@grouped
+def profile(out: Out, sizes: Sizes, vessel: Vessel) -> None:
+    """Make the file of a turned vessel from its sizes: callipers, a fill table, a tilt table.
+
+    Give `--height`, `--wall`, and at least one of `--diameters`, `--fill` and `--tilt`. Several are combined, each
+    weighted by its uncertainty. A picture with the section, its uncertainty and the measurements is written next to
+    the file.
+    """
+    _make(out, vessel, lambda notes: _turned(out, sizes, vessel, notes))
+
+
+@grouped
+def photo(
+    picture: Annotated[Path, typer.Argument(help="Photograph from the side.", metavar="PICTURE", show_default=False)],
+    out: Out,
+    known_height: Annotated[str | None, typer.Option(help="Outer height, for the scale of the photograph.")] = None,
+    known_width: Annotated[str | None, typer.Option(help="Largest outer width, for the scale.")] = None,
+    *,
+    sizes: Sizes,
+    vessel: Vessel,
+) -> None:
+    """Make the file of a turned vessel from a photograph on a plain background.
+
+    Take it from ten widths away, level with the middle of the vessel. It shows the outside: give `--wall`, and one
+    outer length for the scale. Sizes and tables of the same vessel are combined with it.
+    """
+
+    def seen(wall: float, floor: float) -> tuple[Radii, float]:
+        from orchestrator.cli.vessel_tables import read_photograph
+        from sim_engine.resources import require
+        from sim_engine.vessel_acquisition.photograph import radii_within, silhouette
+
+        require("skimage", "a photograph")
+        tall = _quantity(known_height, "--known-height", "m", "99 mm")
+        wide = _quantity(known_width, "--known-width", "m", "78 mm")
+        if (tall is None) == (wide is None):
+            raise RefusalError(
+                "a photograph needs one known outer length for its scale: --known-height '99 mm' or --known-width "
+                "'78 mm'",
+                BAD_INPUT,
+            )
+        grey = read_photograph(picture)
+        known: Literal["height", "width"] = "height" if tall is not None else "width"
+        shape = silhouette(grey, known, cast(float, tall or wide))
+        return radii_within(shape, wall, floor), shape.height - floor
+
+    _make(out, vessel, lambda notes: _turned(out, sizes, vessel, notes, seen))
+
+
+@grouped
+def points(
+    cloud: Annotated[
+        Path, typer.Argument(help="Points: PLY, PCD, XYZ, or CSV with x, y, z.", metavar="POINTS", show_default=False)
+    ],
+    out: Out,
+    unit: Unit = None,
+    up: Up = "z",
+    *,
+    sizes: Sizes,
+    vessel: Vessel,
+) -> None:
+    """Make a vessel file from points of its surface; a shape that is not round becomes a mesh.
+
+    Remove the table first. If only one surface is visible, give `--wall`. Sizes and tables of the same vessel are
+    combined with the points.
+    """
+
+    def work(notes: list[str]) -> Made:
+        from orchestrator.cli.vessel_tables import read_points
+        from sim_engine.vessel_acquisition.point_cloud import scan_of
+
+        return _scanned(out, sizes, vessel, notes, scan_of(read_points(cloud, _unit(unit), _axis(up), notes)))
+
+    _make(out, vessel, work)
+
+
+@grouped
+def depth(
+    image: Annotated[
+        Path, typer.Argument(help="Depth image: PNG of 16 bits, or NPY.", metavar="IMAGE", show_default=False)
+    ],
+    out: Out,
+    focal: Annotated[float | None, typer.Option(help="Focal length of the depth camera [pixels].", min=1.0)] = None,
+    centre: Annotated[
+        str | None, typer.Option(help="Column and row of the axis: '318.2, 241.5'; default: the image's centre.")
+    ] = None,
+    unit: Annotated[str | None, typer.Option(help="Unit of the distances: m, cm, mm, in; default: mm.")] = None,
+    *,
+    sizes: Sizes,
+    vessel: Vessel,
+) -> None:
+    """Make the file of a turned vessel from a depth image of it alone on a flat table, 5° to 25° above the horizontal.
+
+    Give `--focal` and `--wall`, and `--height` if you can. Sizes and tables of the same vessel are combined with it.
+    """
+
+    def work(notes: list[str]) -> Made:
+        from orchestrator.cli.vessel_tables import read_depth
+        from sim_engine.vessel_acquisition.point_cloud import points_on_table, scan_of
+
+        if focal is None:
+            raise RefusalError(
+                "a depth image needs its camera's focal length in pixels: --focal 615; the camera's software tells it "
+                "(fx)",
+                BAD_INPUT,
+            )
+        found = points_on_table(read_depth(image, _unit(unit)), focal, _centre(centre))
+        pixel = float(found[:, 1].min()) / focal
+        return _scanned(out, sizes, vessel, notes, scan_of(found, "outer", underside=0.0), pixel)
+
+    _make(out, vessel, work)
+
+
+@grouped
+def mesh(
+    file: Annotated[Path, typer.Argument(help="Mesh: STL, OBJ, PLY or GLB.", metavar="MESH", show_default=False)],
+    out: Out,
+    unit: Unit = None,
+    up: Up = "z",
+    drop_bodies: Annotated[
+        bool, typer.Option("--drop-bodies", help="Leave out separate bodies in the cavity, such as the liquid.")
+    ] = False,
+    wall: Wall = None,
+    *,
+    vessel: Vessel,
+) -> None:
+    """Make a vessel file from a mesh, for spouts and handles; the mesh is repaired if necessary.
+
+    The repaired mesh is written next to the file. Every repair is printed. A sheet without thickness needs `--wall`.
+    """
+
+    def work(notes: list[str]) -> Made:
+        from sim_engine.resources import require
+        from sim_engine.vessel_acquisition.mesh_repair import mended
+
+        require("manifold3d", "the repair of a mesh")
+        thick, axis = _quantity(wall, "--wall", "m", "3 mm"), _axis(up)
+        result = mended(file, unit=_unit(unit), wall=thick, up=axis, drop_bodies=drop_bodies)
+        notes += result.notes
+        return _written_mesh(out, vessel, result.vertices, result.faces, notes, result.warnings, up=axis)
+
+    _make(out, vessel, work)
+
+
+def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
+    """Make a vessel, and print what was made. Nothing is written over."""
+    from sim_engine.settings.quantity import QuantityError
+    from sim_engine.vessel.shapes import VesselError
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise RefusalError(f"{out}: a vessel file is YAML; write {out.with_suffix('.yaml')}", BAD_INPUT)
+    if not out.parent.is_dir():
+        raise RefusalError(f"{out}: the folder {out.parent} does not exist; make it first", BAD_INPUT)
+    if out.exists():
+        raise RefusalError(f"{out}: exists already; choose another name, or remove it first", BAD_INPUT)
+    try:
+        with waiting_for(lambda: "measuring the vessel"):
+            found = work([])
+    except (VesselError, QuantityError) as error:
+        raise RefusalError(str(error), BAD_INPUT) from None
+    except OSError as error:
+        raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
+    for note in found.notes:
+        print_note(f"note: {note}")
+    for doubt in found.doubts:
+        print_warning(doubt)
+    print_note(f"{out} holds {1e6 * found.capacity:.0f} ± {1e6 * found.deviation:.1f} mL; its picture: {found.picture}")
+    if vessel.as_json:
+        from orchestrator.cli.json_output import VesselOutput
+
+        print_json(
+            VesselOutput(
+                file=out,
+                picture=found.picture,
+                capacity_mL=1e6 * found.capacity,
+                capacity_deviation_mL=1e6 * found.deviation,
+                radius_deviation_mm=None if found.radius_deviation is None else 1e3 * found.radius_deviation,
+                notes=found.notes,
+                doubts=found.doubts,
+            )
+        )
 
 
 def _quantity(text: str | None, what: str, unit: str, example: str) -> float | None:
@@ -186,17 +317,26 @@ def _quantity(text: str | None, what: str, unit: str, example: str) -> float | N
         raise RefusalError(f"{what} {text!r}: {error}", BAD_INPUT) from None
 
 
-def _volume(sources: Sources, mass: float) -> float:
-    density = _quantity(sources.density, "--density", "kg/m^3", "998 kg/m^3")
-    assert density is not None
-    return mass / density
-
-
 # -- turned vessels ----------------------------------------------------------------------------------------------------
 
 
-def _turned(out: Path, name: str, sources: Sources) -> Made:
-    """Make a surface of revolution from all measurements."""
+def _turned(
+    out: Path,
+    sizes: Sizes,
+    vessel: Vessel,
+    notes: list[str],
+    seen: Callable[[float, float], tuple[Radii, float]] | None = None,
+    *,
+    wall: float | None = None,
+    pixel: float = 0.0,
+) -> Made:
+    """Make a surface of revolution from all measurements.
+
+    Args:
+        seen: for a wall and a floor, the radii of a source and the height inside [m].
+        wall: as the source shows it, unless it is given [m].
+        pixel: resolution of the source's height [m].
+    """
     import numpy as np
 
     from sim_engine.vessel.shapes import VesselSpec
@@ -204,33 +344,23 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
     from sim_engine.vessel_acquisition.outline_fit import find_outline
     from sim_engine.vessel_acquisition.wall_thickening import RESERVE, fits_grid, least_wall
 
-    notes: list[str] = []
-    wall = _quantity(sources.wall, "--wall", "m", "3 mm")
-    floor = _quantity(sources.floor, "--floor", "m", "4 mm")
-    height = _quantity(sources.height, "--height", "m", "95 mm")
-    seen = _points(sources, wall, floor, notes) if sources.points or sources.depth else None
-    if isinstance(seen, _Uneven):
-        return _written_mesh(out, name, seen.vertices, seen.faces, sources, notes)
-    if seen is not None:
-        wall = wall or seen.wall
+    given, floor, height = sizes.lengths()
+    wall = given or wall
     if wall is None:
         raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'", BAD_INPUT)
     floor = wall if floor is None else floor
     evidence: list[Evidence] = []
     off = HEIGHT
     if seen is not None:
-        evidence.append(seen.radii)
-        if height is None:
-            height, off = seen.height, max(off, seen.pixel)
-    if sources.photo is not None:
-        radii, inside = _photographed(sources, wall, floor)
+        radii, inside = seen(wall, floor)
         evidence.append(radii)
-        height = height or inside
+        if height is None:
+            height, off = inside, max(off, pixel)
     if height is None:
         raise RefusalError(
             "how deep is it inside, from floor to rim? Say it with --height, for example --height '95 mm'", BAD_INPUT
         )
-    evidence += _measured(sources, height)
+    evidence += _measured(sizes, vessel, height)
     outline = find_outline(height, evidence, wall, floor, height_deviation=off)
     width = 2.0 * (float(outline.radii.max()) + wall)
     extent = np.array([width, width, height + floor])
@@ -241,16 +371,16 @@ def _turned(out: Path, name: str, sources: Sources) -> Made:
             f"they were thickened outwards to {1e3 * max(wall, least):.2g} and {1e3 * max(floor, least):.2g} mm"
         )
         outline = replace(outline, wall=max(wall, least), floor=max(floor, least))
-    spec = VesselSpec(name=name, shape=outline.shape())
-    build_vessel(spec)
-    doubts = _doubts(outline, sources)
+    name = vessel.name or out.stem
+    build_vessel(VesselSpec(name=name, shape=outline.shape()))
+    doubts = _doubts(outline, vessel)
     used = [f"{fit.count} from the {fit.name}, off by {fit.rms:.1f} standard deviations (rms)" for fit in outline.fits]
     picture = _draw_outline(name, outline, evidence, out.with_suffix(".png"))
     out.write_text(_profile_file(name, outline, used, doubts))
     return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + used, doubts)
 
 
-def _measured(sources: Sources, height: float) -> list[Evidence]:
+def _measured(sizes: Sizes, vessel: Vessel, height: float) -> list[Evidence]:
     """Read callipers and tables."""
     import numpy as np
 
@@ -258,29 +388,29 @@ def _measured(sources: Sources, height: float) -> list[Evidence]:
     from sim_engine.vessel_acquisition.measurements import FillTable, Radii, TiltTable
 
     found: list[Evidence] = []
-    if sources.diameters is not None:
-        heights, widths = read_diameters(sources.diameters, height)
+    if sizes.diameters is not None:
+        heights, widths = read_diameters(sizes.diameters, height)
         found.append(Radii("callipers", heights, widths / 2.0, np.full(len(heights), CALLIPERS)))
-    balance = _volume(sources, BALANCE)
-    if sources.fill is not None:
+    balance = vessel.volume(BALANCE)
+    if sizes.fill is not None:
         levels, masses = read_fill_table(
-            sources.fill,
+            sizes.fill,
             height=1e3 * height,
             density=1e-6 * BALANCE / balance,
             ruler=1e3 * RULER,
             balance=1e3 * BALANCE,
         )
-        volumes = np.array([_volume(sources, mass) for mass in masses / 1e3])
+        volumes = np.array([vessel.volume(mass) for mass in masses / 1e3])
         radius = float(np.sqrt(volumes.max() / (np.pi * levels.max() / 1e3)))
         found.append(FillTable(levels / 1e3, volumes, RULER, balance, radius))
-    if sources.tilt is not None:
-        tilts, masses = read_tilt_table(sources.tilt, angle=float(np.degrees(ANGLE)), balance=1e3 * BALANCE)
-        volumes = np.array([_volume(sources, mass) for mass in masses / 1e3])
+    if sizes.tilt is not None:
+        tilts, masses = read_tilt_table(sizes.tilt, angle=float(np.degrees(ANGLE)), balance=1e3 * BALANCE)
+        volumes = np.array([vessel.volume(mass) for mass in masses / 1e3])
         found.append(TiltTable(np.radians(tilts), volumes, ANGLE, balance))
     return found
 
 
-def _doubts(outline: FittedOutline, sources: Sources) -> list[str]:
+def _doubts(outline: FittedOutline, vessel: Vessel) -> list[str]:
     """Describe inconsistencies between the measurements."""
     import numpy as np
 
@@ -289,9 +419,7 @@ def _doubts(outline: FittedOutline, sources: Sources) -> list[str]:
         for fit in outline.fits
         if fit.rms > DOUBTFUL
     ]
-    brimful = _quantity(sources.brimful, "--brimful", "kg", "322 g")
-    if brimful is not None:
-        held = _volume(sources, brimful)
+    if (held := vessel.brimful_volume()) is not None:
         apart = (held - outline.capacity) / float(np.hypot(outline.capacity_deviation, 1e-6 + 0.003 * held))
         if abs(apart) > DOUBTFUL:
             doubts.append(
@@ -301,26 +429,12 @@ def _doubts(outline: FittedOutline, sources: Sources) -> list[str]:
     return doubts
 
 
-@dataclass(frozen=True)
-class _Seen:
-    radii: Radii
-    height: float
-    wall: float | None
-    pixel: float
-
-
-@dataclass(frozen=True)
-class _Uneven:
-    vertices: Any
-    faces: Any
-
-
-def _points(sources: Sources, wall: float | None, floor: float | None, notes: list[str]) -> _Seen | _Uneven:
+def _scanned(out: Path, sizes: Sizes, vessel: Vessel, notes: list[str], scan: Scan, pixel: float = 0.0) -> Made:
+    """Make a vessel from a scan; from that of a depth image if a size of its pixels is given [m]."""
     from sim_engine.vessel_acquisition.point_cloud import mesh_of, radii_of, wall_between
 
-    scan, pixel = _scanned(sources, notes)
+    wall, floor, _ = sizes.lengths()
     between = wall_between(scan)
-    thick = wall or between
     surfaces = {"both": "both surfaces", "inner": "the inner surface", "outer": "the outer surface"}[scan.seen]
     notes.append(
         f"{len(scan.points):,} points of {surfaces}, {1e3 * scan.scatter:.2f} mm about it, "
@@ -328,36 +442,19 @@ def _points(sources: Sources, wall: float | None, floor: float | None, notes: li
     )
     if not scan.round:
         notes.append("it is not round: the points became a mesh")
-        return _Uneven(*mesh_of(scan, wall, floor))
-    if thick is None:
+        return _written_mesh(out, vessel, *mesh_of(scan, wall, floor), notes)
+    if (wall or between) is None:
         raise RefusalError(
             "the points are of one surface: how thick is the wall? Say it with --wall, for example --wall '3 mm'",
             BAD_INPUT,
         )
-    below = thick if floor is None else floor
-    radii = radii_of(scan, thick, below)
-    if sources.depth is not None:
-        radii = replace(radii, name="depth image")
-    return _Seen(radii, scan.height - (0.0 if scan.seen == "inner" else below), between, pixel)
 
+    def seen(wall: float, floor: float) -> tuple[Radii, float]:
+        radii = radii_of(scan, wall, floor)
+        named = replace(radii, name="depth image") if pixel else radii
+        return named, scan.height - (0.0 if scan.seen == "inner" else floor)
 
-def _scanned(sources: Sources, notes: list[str]) -> tuple[Scan, float]:
-    """Return the scan, and the size of a depth image's pixel on it [m]; 0 for points."""
-    from orchestrator.cli.vessel_tables import read_depth, read_points
-    from sim_engine.vessel_acquisition.point_cloud import points_on_table, scan_of
-
-    if sources.points is not None and sources.depth is not None:
-        raise RefusalError("--depth goes without --points: give one of them", BAD_INPUT)
-    if sources.points is not None:
-        return scan_of(read_points(sources.points, _unit(sources), _up(sources), notes)), 0.0
-    assert sources.depth is not None
-    if sources.focal is None:
-        raise RefusalError(
-            "a depth image needs its camera's focal length in pixels: --focal 615; the camera's software tells it (fx)",
-            BAD_INPUT,
-        )
-    points = points_on_table(read_depth(sources.depth, _unit(sources)), sources.focal, _centre(sources.centre))
-    return scan_of(points, "outer", underside=0.0), float(points[:, 1].min()) / sources.focal
+    return _turned(out, sizes, vessel, notes, seen, wall=between, pixel=pixel)
 
 
 def _centre(text: str | None) -> tuple[float, float] | None:
@@ -373,38 +470,16 @@ def _centre(text: str | None) -> tuple[float, float] | None:
     return column, row
 
 
-def _photographed(sources: Sources, wall: float, floor: float) -> tuple[Radii, float]:
-    from orchestrator.cli.vessel_tables import read_photograph
-    from sim_engine.resources import require
-    from sim_engine.vessel_acquisition.photograph import radii_within, silhouette
-
-    assert sources.photo is not None
-    require("skimage", "a photograph")
-    tall = _quantity(sources.known_height, "--known-height", "m", "99 mm")
-    wide = _quantity(sources.known_width, "--known-width", "m", "78 mm")
-    if (tall is None) == (wide is None):
-        raise RefusalError(
-            "a photograph needs one known outer length for its scale: --known-height '99 mm' or --known-width '78 mm'",
-            BAD_INPUT,
-        )
-    grey = read_photograph(sources.photo)
-    known: Literal["height", "width"] = "height" if tall is not None else "width"
-    shape = silhouette(grey, known, cast(float, tall or wide))
-    return radii_within(shape, wall, floor), shape.height - floor
+def _unit(text: str | None) -> LengthUnit | None:
+    if text not in (None, "m", "cm", "mm", "in"):
+        raise RefusalError(f"--unit {text!r}: should be m, cm, mm or in", BAD_INPUT)
+    return cast("LengthUnit | None", text)
 
 
-def _unit(sources: Sources) -> LengthUnit | None:
-    if sources.unit is None:
-        return None
-    if sources.unit not in ("m", "cm", "mm", "in"):
-        raise RefusalError(f"--unit {sources.unit!r}: should be m, cm, mm or in", BAD_INPUT)
-    return cast("LengthUnit", sources.unit)
-
-
-def _up(sources: Sources) -> Axis:
-    if sources.up not in ("x", "y", "z", "-x", "-y", "-z"):
-        raise RefusalError(f"--up {sources.up!r}: should be x, y or z, or one of them with a minus", BAD_INPUT)
-    return cast("Axis", sources.up)
+def _axis(text: str) -> Axis:
+    if text not in ("x", "y", "z", "-x", "-y", "-z"):
+        raise RefusalError(f"--up {text!r}: should be x, y or z, or one of them with a minus", BAD_INPUT)
+    return cast("Axis", text)
 
 
 def _profile_file(name: str, outline: FittedOutline, used: Sequence[str], doubts: Sequence[str]) -> str:
@@ -479,34 +554,11 @@ def _draw_outline(name: str, outline: FittedOutline, evidence: Sequence[Evidence
 # -- meshes ------------------------------------------------------------------------------------------------------------
 
 
-def _from_mesh(out: Path, name: str, sources: Sources) -> Made:
-    from sim_engine.resources import require
-    from sim_engine.vessel_acquisition.mesh_repair import mended
-
-    require("manifold3d", "the repair of a mesh")
-    others = {
-        "--diameters": sources.diameters,
-        "--photo": sources.photo,
-        "--points": sources.points,
-        "--depth": sources.depth,
-    }
-    others |= {"--fill": sources.fill, "--tilt": sources.tilt}
-    if given := [option for option, value in others.items() if value is not None]:
-        raise RefusalError(f"{given[0]} goes with turned vessels; a mesh says all of its shape itself", BAD_INPUT)
-    assert sources.mesh is not None
-    wall = _quantity(sources.wall, "--wall", "m", "3 mm")
-    up = _up(sources)
-    result = mended(sources.mesh, unit=_unit(sources), wall=wall, up=up, drop_bodies=sources.drop_bodies)
-    notes, doubts = list(result.notes), list(result.warnings)
-    return _written_mesh(out, name, result.vertices, result.faces, sources, notes, doubts, up=up)
-
-
 def _written_mesh(
     out: Path,
-    name: str,
+    vessel: Vessel,
     vertices: Any,
     faces: Any,
-    sources: Sources,
     notes: list[str],
     doubts: Sequence[str] = (),
     *,
@@ -522,7 +574,7 @@ def _written_mesh(
     from sim_engine.vessel.shapes import VesselError, VesselSpec
     from sim_engine.vessel.vessel import build_vessel
 
-    path = out.with_suffix(".stl")
+    name, path = vessel.name or out.stem, out.with_suffix(".stl")
     if path.exists():
         raise RefusalError(f"{path}: exists already; choose another name, or remove it first", BAD_INPUT)
     trimesh.Trimesh(1e3 * vertices, faces, process=False).export(path)
@@ -537,11 +589,10 @@ def _written_mesh(
             f"its rim is {tilt:.1f}° off level, and the capacity is that to its lowest point: turn the mesh so that "
             "the vessel stands upright"
         )
-    brimful = _quantity(sources.brimful, "--brimful", "kg", "322 g")
-    deviation = 0.01 * built.capacity
-    if brimful is not None and abs(_volume(sources, brimful) - built.capacity) > DOUBTFUL * deviation:
+    held, deviation = vessel.brimful_volume(), 0.01 * built.capacity
+    if held is not None and abs(held - built.capacity) > DOUBTFUL * deviation:
         doubts.append(
-            f"brimful it held {1e6 * _volume(sources, brimful):.0f} mL, and the mesh has {1e6 * built.capacity:.0f} "
+            f"brimful it held {1e6 * held:.0f} mL, and the mesh has {1e6 * built.capacity:.0f} "
             "mL: check its unit, and whether its inside was seen"
         )
     picture = figure_style.save(draw_solid(name, built), out.with_suffix(".png"))

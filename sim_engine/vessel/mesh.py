@@ -114,14 +114,14 @@ def _check_closed(mesh: object, path: Path) -> None:
         raise VesselError(
             f"{path.name}: not watertight: {open_edges} edge(s) belong to an odd number of faces; "
             "close the holes (a vessel is a solid with walls, not a sheet), or let 'decant vessel' repair it: "
-            f"decant vessel NEW.yaml --mesh {path.name}"
+            f"decant vessel mesh {path.name} NEW.yaml"
         )
     if not _edges_cancel(mesh.edges):
         trimesh.repair.fix_winding(mesh)
         if not _edges_cancel(mesh.edges):
             raise VesselError(
                 f"{path.name}: its faces don't agree which side is out, and can't be made to; repair it: "
-                f"decant vessel NEW.yaml --mesh {path.name}"
+                f"decant vessel mesh {path.name} NEW.yaml"
             )
     if mesh.volume < 0.0:
         mesh.invert()
@@ -311,7 +311,7 @@ def _spacing(vertices: Floats, faces: Integers) -> tuple[float, float, VesselErr
         return wall, choose_spacing(extent, wall), None
     except VesselError as error:
         refusal = VesselError(
-            f"{error}, or let 'decant vessel' thicken them outwards: decant vessel NEW.yaml --mesh FILE"
+            f"{error}, or let 'decant vessel' thicken them outwards: decant vessel mesh FILE NEW.yaml"
         )
     wall = typical_wall(vertices, faces)
     try:
@@ -410,7 +410,7 @@ def _doubts(
         VesselError: it has a sheet without thickness, which would be a wall that holds nothing apart.
     """
     name = shape.path.name
-    repair = f"decant vessel NEW.yaml --mesh {name}"
+    repair = f"decant vessel mesh {name} NEW.yaml"
     found = [
         f"a separate body of {body.size} fills a part of the cavity and counts as solid: {body.capacities}. If it is "
         f"the liquid, leave it out: {repair} --drop-bodies"

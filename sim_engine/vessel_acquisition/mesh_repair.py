@@ -185,7 +185,7 @@ def _read(path: Path) -> Any:
     except Exception as problem:  # trimesh's readers raise various errors for damaged files
         raise VesselError(f"{path.name}: not a readable {kind.upper()} file ({problem})") from problem
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise VesselError(f"{path.name}: no triangles in it; if it has points only, use --points")
+        raise VesselError(f"{path.name}: no triangles in it; if it has points only, use decant vessel points")
     if len(mesh.faces) > MOST_FACES:
         raise VesselError(f"{path.name}: {len(mesh.faces):,} triangles; simplify it to at most {MOST_FACES:,}")
     if not np.all(np.isfinite(mesh.vertices)):

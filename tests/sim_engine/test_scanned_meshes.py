@@ -22,7 +22,6 @@ from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.app import app
 from orchestrator.cli.console import RefusalError
 from orchestrator.cli.file_commands import validate
-from orchestrator.cli.vessel_command import vessel
 from orchestrator.cli.vessel_tables import read_points
 from orchestrator.reports.pour_figures import section
 from sim_engine.vessel.exact_cavity import exact_cavity
@@ -30,6 +29,7 @@ from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import VesselError, VesselSpec
 from sim_engine.vessel.vessel import build_vessel
 from sim_engine.vessel_acquisition.mesh_repair import RepairedMesh, mended
+from tests.support.measured_vessel import vessel
 
 MESHES = Path(__file__).parents[1] / "data" / "meshes"
 TRUTH = {"thin_bowl.stl": 655.0}
@@ -207,7 +207,7 @@ def test_a_mesh_in_metres_that_is_called_millimetres_is_refused_with_the_likely_
 
 def test_a_mesh_that_is_not_closed_is_refused_in_a_vessel_file_with_the_command_that_repairs_it(tmp_path: Path) -> None:
     path = unpacked("inner_faces.stl", tmp_path)
-    with pytest.raises(VesselError, match=r"decant vessel NEW\.yaml --mesh inner_faces\.stl"):
+    with pytest.raises(VesselError, match=r"decant vessel mesh inner_faces\.stl NEW\.yaml"):
         build_vessel(VesselSpec(name="cup", shape=MeshShape(path=path, unit="mm")))
 
 
@@ -248,7 +248,7 @@ def test_a_quiet_command_prints_warnings(tmp_path: Path) -> None:
         (
             "body",
             r"a separate body of 68 × 68 × 40 mm fills .* holds (\d+) mL with it and (\d+) mL without it.*"
-            r"decant vessel NEW\.yaml --mesh cup\.stl --drop-bodies",
+            r"decant vessel mesh cup\.stl NEW\.yaml --drop-bodies",
         ),
         ("body that touches", "faces are shared by two bodies, which both count as solid"),
     ],
@@ -279,7 +279,7 @@ def test_a_surface_without_thickness_in_the_cavity_of_a_mesh_is_refused(
     assert refused.value.code == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "bound no solid: a sheet without thickness" in said
-    assert "decant vessel NEW.yaml --mesh cup.stl" in said
+    assert "decant vessel mesh cup.stl NEW.yaml" in said
 
 
 def test_bodies_that_touch_along_an_edge_are_drawn() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 from scipy.ndimage import gaussian_filter
 
+from orchestrator.cli import vessel_command
 from sim_engine.vessel.profile import outer_profile
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec
 from sim_engine.vessel.vessel import build_vessel
@@ -23,6 +25,13 @@ WATER = 998.0
 PIXELS_PER_MM = 6.0
 FOCAL = 320.0
 """Of the depth camera [pixels]."""
+
+
+def vessel(out: Path, **options: Any) -> None:
+    """Run the command of `decant vessel` whose source is among the options: photo, points, depth, mesh, or none."""
+    kind = next((one for one in ("photo", "points", "depth", "mesh") if one in options), "profile")
+    source = [options.pop(kind)] if kind in options else []
+    getattr(vessel_command, kind)(*source, out, **options)
 
 
 @dataclass

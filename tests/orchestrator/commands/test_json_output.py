@@ -104,7 +104,7 @@ def test_a_study_prints_what_is_documented(tmp_path: Path) -> None:
 
 def test_vessels_plugins_and_checks_print_what_is_documented(tmp_path: Path) -> None:
     sizes = "--height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'"
-    validated("vessel", said(f"vessel {tmp_path / 'cup.yaml'} {sizes} --json"))
+    validated("vessel profile", said(f"vessel profile {tmp_path / 'cup.yaml'} {sizes} --json"))
     validated("plugins", said("plugins --json"))
     lines = tmp_path / "lines.txt"
     lines.write_bytes(b"N     +    90.00 g  \r\nT     +    12.00 g  \r\nnothing\r\n")

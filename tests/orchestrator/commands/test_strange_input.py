@@ -93,11 +93,11 @@ BAD: dict[str, str] = {
     "plan campaigns/quickstart.yaml --parameters twice.json": "twice.json:1:29: theta.friction: duplicate key",
     f"simulate campaigns/quickstart.yaml {ACTION} --parameters weight.json": "needs a 'theta' and a 'weight' above 0",
     "plan campaigns/quickstart.yaml --parameters deep.json": "is nested more than 30 deep",
-    f"vessel out.yaml --photo text.png {PHOTO}": "text.png: is not a picture that can be read",
-    f"vessel out.yaml --photo cut.png {PHOTO}": "cut.png: is not a picture that can be read (image file is truncated)",
-    f"vessel out.yaml --photo campaigns {PHOTO}": "campaigns: is a folder; name a file in it",
-    f"vessel out.yaml --photo white.png {PHOTO}": "the photograph shows nothing",
-    f"vessel out.yaml --photo large.png {PHOTO}": "large.png: 10000 × 9000 pixels; make it smaller",
+    f"vessel photo text.png out.yaml {PHOTO}": "text.png: is not a picture that can be read",
+    f"vessel photo cut.png out.yaml {PHOTO}": "cut.png: is not a picture that can be read (image file is truncated)",
+    f"vessel photo campaigns out.yaml {PHOTO}": "campaigns: is a folder; name a file in it",
+    f"vessel photo white.png out.yaml {PHOTO}": "the photograph shows nothing",
+    f"vessel photo large.png out.yaml {PHOTO}": "large.png: 10000 × 9000 pixels; make it smaller",
 }
 
 

@@ -13,11 +13,10 @@ from PIL import ExifTags, Image
 
 from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.console import RefusalError
-from orchestrator.cli.vessel_command import vessel
 from orchestrator.cli.vessel_tables import read_fill_table, read_photograph
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
-from tests.support.measured_vessel import FOCAL, Bench
+from tests.support.measured_vessel import FOCAL, Bench, vessel
 
 VESSELS = Path("configs/vessels")
 
@@ -259,7 +258,6 @@ def written(text: str) -> Door:
         (lambda of, folder: depth(of, folder) | {"centre": "318"}, r"--centre '318': should be a column and a row"),
         (lambda of, folder: {"depth": of.photo(folder / "p.png"), "focal": FOCAL, "wall": "3 mm"}, r"16 bits"),
         (steep, r"no table is seen"),
-        (lambda of, folder: {"mesh": folder / "x.stl", "tilt": folder / "t.csv"}, r"--tilt goes with turned vessels"),
         (written("mass_g\n2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
         (written("level,mass\n1,2\n"), r"fill.csv:1:1: level: has no unit; write 'level_mm' or 'level \[mm\]'"),
         (
