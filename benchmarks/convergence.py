@@ -14,12 +14,11 @@ last rows are the distances of the converged pours from the finest.
 from __future__ import annotations
 
 import argparse
-import json
-from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from machine import write_table
+from machine import KeptRows, write_table
 
 from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import PourSimulator
@@ -29,45 +28,13 @@ VOLUME = 200e-6
 CONVERGED = 0.02
 
 
-@dataclass
-class Store:
-    """Spillage and CPU seconds by pour, number of particles and seed, written to disk after every pour."""
-
-    path: Path
-    known: dict[str, list[float]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.path.exists():
-            self.known = json.loads(self.path.read_text(encoding="utf-8"))
-
-    @staticmethod
-    def key(pour: str, particles: int, seed: int) -> str:
-        """Return the key of one simulation."""
-        return f"{pour} | {particles} | {seed}"
-
-    def put(self, key: str, values: tuple[float, float]) -> None:
-        """Store one simulation's spillage and CPU seconds."""
-        self.known[key] = [round(v, 5) for v in values]
-        part = self.path.with_suffix(".part")
-        part.write_text(json.dumps(self.known, indent=0), encoding="utf-8")
-        part.replace(self.path)
-
-    def of(self, pour: str, particles: int) -> list[list[float]]:
-        """Return the spillage and CPU seconds of a pour for all seeds."""
-        begin = f"{pour} | {particles} | "
-        return [values for key, values in self.known.items() if key.startswith(begin)]
-
-    def numbers(self) -> list[int]:
-        """Return the stored numbers of particles in increasing order."""
-        return sorted({int(key.split(" | ")[1]) for key in self.known})
-
-
-def table(store: Store) -> tuple[list[str], list[list[str]]]:
+def table(made: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
     """Return head and rows: the spillage of each pour by number of particles, and the distances from the finest."""
-    numbers = store.numbers()
-    spilled = {
-        pour.name: np.array([np.mean([one for one, _ in store.of(pour.name, n)]) for n in numbers]) for pour in POURS
-    }
+    numbers = sorted({one["particles"] for one in made})
+    found: dict[tuple[str, int], list[float]] = {}
+    for one in made:
+        found.setdefault((one["pour"], one["particles"]), []).append(one["spillage"])
+    spilled = {pour.name: np.array([np.mean(found[pour.name, n]) for n in numbers]) for pour in POURS}
     converged = {name: bool(abs(row[-1] - row[-3]) <= CONVERGED) for name, row in spilled.items()}
     rows = [[name, *(f"{r:.3f}" for r in row), "yes" if converged[name] else "no"] for name, row in spilled.items()]
     off = np.abs(np.array([row - row[-1] for name, row in spilled.items() if converged[name]]))
@@ -87,7 +54,7 @@ def main() -> None:
     parser.add_argument("--table", action="store_true", help="only print the table")
     parser.add_argument("--write", action="store_true", help="write the table to docs/data/results.json")
     options = parser.parse_args()
-    store = Store(options.store)
+    kept = KeptRows(options.store)
     if not (options.table or options.write):
         simulator = PourSimulator()
         wanted = [(n, seed) for n in options.particles for seed in range(1, options.seeds + 1)]
@@ -95,10 +62,11 @@ def main() -> None:
         for n, seed in wanted:
             theta = SimulationParameters(particles=n, cohesion=0.0, xsph_rate=1.0)
             for pour in POURS:
-                key = store.key(pour.name, n, seed)
-                if key not in store.known:
-                    store.put(key, spillage(simulator, pour, theta, seed))
-    head, rows = table(store)
+                key = {"pour": pour.name, "particles": n, "seed": seed}
+                if all(row | key != row for row in kept.rows):
+                    spilled, cpu_s = spillage(simulator, pour, theta, seed)
+                    kept.add({**key, "spillage": round(spilled, 5), "cpu_s": round(cpu_s, 5)})
+    head, rows = table(kept.rows)
     for row in (head, *rows):
         print(" | ".join(row))
     if options.write:

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+from machine import started
 
 from orchestrator.daemon.daemon_client import Client
 
 PATIENCE = 120.0
 """Longest time to wait for any event [s]."""
-
-_PR_SET_PDEATHSIG = 1
-
-
-def started(command: Sequence[str | Path], **options: Any) -> subprocess.Popen[bytes]:
-    """Start a process that receives SIGTERM when this one ends, even if this one is killed (Linux)."""
-
-    def follow() -> None:
-        if sys.platform == "linux":
-            ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-    return subprocess.Popen(list(command), preexec_fn=follow, **options)  # noqa: PLW1509  no thread runs yet
 
 
 def end_in_order() -> None:
@@ -40,35 +29,50 @@ def end_in_order() -> None:
     signal.signal(signal.SIGTERM, leave)
 
 
-@contextlib.contextmanager
-def serving(folder: Path, *options: str, environment: Mapping[str, str] | None = None) -> Iterator[Client]:
-    """Run a daemon with its state and its log in a folder.
+def launched(
+    folder: Path, *options: str | Path, environment: Mapping[str, str] | None = None
+) -> subprocess.Popen[bytes]:
+    """Start a daemon with its log in a folder.
 
     Args:
         folder: an existing folder.
-        options: arguments of `decant server start`, including a settings file.
+        options: arguments of `decant server start`.
         environment: variables added to this process's own.
     """
+    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "server", "start", *options]
     with (folder / "log").open("a") as log:
-        command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "server", "start", *options]
-        process = started(
-            [*command, "--state", str(folder / "state"), "--port", "0"],
-            stdout=log, stderr=log, start_new_session=True, env={**os.environ, **(environment or {})},
-        )  # fmt: skip
-        try:
-            await_(lambda: process.poll() is not None or (folder / "state/url").exists())
-            if process.poll() is not None:
-                raise SystemExit(f"the daemon did not start:\n{(folder / 'log').read_text()[-2000:]}")
-            with Client(f"{(folder / 'state/url').read_text().strip()}", folder / "state") as client:
-                await_(lambda: client.get("/status")["ready"])
-                yield client
-        finally:
-            process.terminate()
-            try:
-                process.wait(60.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        variables = {**os.environ, **(environment or {})}
+        return started(command, stdout=log, stderr=log, start_new_session=True, env=variables)
+
+
+def await_daemon(process: subprocess.Popen[bytes], folder: Path, ready: Callable[[], Any]) -> None:
+    """Wait until a daemon is ready. Raises SystemExit with the end of its log if it has ended."""
+    await_(lambda: process.poll() is not None or ready())
+    if process.poll() is not None:
+        raise SystemExit(f"the daemon did not start:\n{(folder / 'log').read_text()[-2000:]}")
+
+
+def end(process: subprocess.Popen[bytes], number: int = signal.SIGTERM) -> None:
+    """End a daemon with a signal; kill it if that takes more than a minute."""
+    process.send_signal(number)
+    try:
+        process.wait(60.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+@contextlib.contextmanager
+def serving(folder: Path, *options: str) -> Iterator[Client]:
+    """Run a daemon with its state and its log in a folder."""
+    process = launched(folder, *options, "--state", folder / "state", "--port", "0")
+    try:
+        await_daemon(process, folder, (folder / "state/url").exists)
+        with Client(f"{(folder / 'state/url').read_text().strip()}", folder / "state") as client:
+            await_(lambda: client.get("/status")["ready"])
+            yield client
+    finally:
+        end(process)
 
 
 def await_(happened: Callable[[], Any], patience: float = PATIENCE) -> Any:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import statistics
 import subprocess
@@ -26,7 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from daemon_page import keep
-from daemon_process import await_, end_in_order, serving, started
+from daemon_process import await_, end_in_order, serving
+from machine import started
 from ruamel.yaml import YAML
 
 from orchestrator.campaigns.file_loading import load_campaign
@@ -183,15 +183,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=10)
     parser.add_argument("--loads", nargs="+", choices=list(LOADS), default=list(LOADS))
-    parser.add_argument("--to", type=Path, help="write to this file instead of the page")
     arguments = parser.parse_args()
     end_in_order()
     with tempfile.TemporaryDirectory() as name:
-        found = measured(Path(name), arguments.times, arguments.loads)
-    if arguments.to is None:
-        keep("stops", found)
-    else:
-        arguments.to.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        keep("stops", measured(Path(name), arguments.times, arguments.loads))
 
 
 if __name__ == "__main__":

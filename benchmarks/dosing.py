@@ -7,20 +7,17 @@ A series is six doses from one source vessel, in random order: 10, 25, 50, 100, 
 draws cup, filling, balance and their errors; the bench draws the rest. If the source holds too little, it is refilled
 and weighed. Development uses the seeds 0 to 99. The final seeds begin at 9000. Earlier final runs were at 5000 to 5059,
 6000 to 6059 and 7000 to 7049; their results led to changes, which were made on development seeds.
-
-With `--dump FILE` each series is written when it is complete, and an interrupted run continues after the last one.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +25,7 @@ import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseOrder, fine_flow
+from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
@@ -169,6 +167,11 @@ class Series:
         self.bench.refill(self._refills.pop() * capacity)
         return True
 
+    def controlled(self, placed: Sequence[DoseReading]) -> DoseSeries:
+        """Return the doses of Decant's controller, which begin with the receiver as placed."""
+        content, rng = SourceContent(self.weighed_content()), np.random.default_rng((self.seed, 3))
+        return DoseSeries(self.cup, DosingSettings(), content, placed, rng, particles=PARTICLES, step=self.scale.step)
+
     def doses(self, pour: Callable[[float, bool], tuple[Any, str]]) -> Iterator[Dose]:
         """Yield all doses; `pour` takes the amount and whether the source was refilled, and returns record and end."""
         for place, amount in enumerate(self.amounts):
@@ -193,18 +196,12 @@ class Series:
 
 def with_particles(series: Series) -> list[Dose]:
     """Pour a series with the dose controller."""
-    rng = np.random.default_rng((series.seed, 3))
     started: list[DoseSeries] = []
 
     def pour(amount: float, filled: bool) -> tuple[Any, str]:
         placed = series.bench.place_receiver()
         if not started:
-            content = SourceContent(series.weighed_content())
-            started.append(
-                DoseSeries(
-                    series.cup, DosingSettings(), content, placed, rng, particles=PARTICLES, step=series.scale.step
-                )
-            )
+            started.append(series.controlled(placed))
         elif filled:
             started[0].fill(SourceContent(series.weighed_content()))
         order = DoseOrder(amount, receiver_mass=series.bench.receiver_mass)
@@ -304,75 +301,24 @@ def cup_flows() -> Callable[[str, bool], CupFlow]:
 
 
 def measure(
-    groups: Sequence[str],
-    controllers: Sequence[str],
-    seeds: Callable[[Group], range],
-    *,
-    say: Callable[[str], None],
-    dump: Path | None = None,
-    pour: bool = True,
+    groups: Sequence[str], controllers: Sequence[str], seeds: Callable[[Group], range]
 ) -> dict[str, dict[str, list[Dose]]]:
     """Pour all doses by group and controller; every controller pours a series before the next series begins.
 
     Args:
         groups, controllers: names.
         seeds: returns the seeds of a group's series.
-        say: receives the progress.
-        dump: file of all doses, one JSON line per series and controller; its doses are not poured again.
-        pour: pour the doses that the file lacks; otherwise return only those in the file.
     """
     flow = cup_flows()
-    known: dict[tuple[str, str, int], list[Dose]] = {}
-    if dump is not None and dump.exists():
-        for line in dump.read_text(encoding="utf-8").splitlines():
-            one = json.loads(line)
-            known[one["group"], one["controller"], one["seed"]] = [Dose(**dose) for dose in one["doses"]]
-    result: dict[str, dict[str, list[Dose]]] = {}
-    for name in groups:
-        group = GROUPS[name]
-        result[name] = {controller: [] for controller in controllers}
-        for seed in seeds(group):
+    result: dict[str, dict[str, list[Dose]]] = {name: {one: [] for one in controllers} for name in groups}
+    for name, by in result.items():
+        for seed in seeds(GROUPS[name]):
             for controller in controllers:
-                doses = known.get((name, controller, seed))
-                if doses is None and not pour:
-                    continue
-                if doses is None:
-                    doses = CONTROLLERS[controller](Series(group, seed, flow))
-                    if dump is not None:
-                        entry = {
-                            "group": name,
-                            "controller": controller,
-                            "seed": seed,
-                            "doses": list(map(asdict, doses)),
-                        }
-                        with dump.open("a", encoding="utf-8") as file:
-                            file.write(json.dumps(entry) + "\n")
-                result[name][controller] += doses
-            if pour:
-                say(f"{name}: series {seed}")
-        say(f"{name}\n{HEAD}")
-        for controller, doses in result[name].items():
-            say(row(controller, figures(doses)))
+                by[controller] += CONTROLLERS[controller](Series(GROUPS[name], seed, flow))
+            print(f"{name}: series {seed}", flush=True)
+        for controller, doses in by.items():
+            print(controller, json.dumps(figures(doses)), flush=True)
     return result
-
-
-HEAD = (
-    f"{'':15} {'doses':>5} {'mean':>6} {'bias':>6} {'95 %':>6} {'worst':>6} {'>+1g':>6} {'first':>6} {'95 %':>6} "
-    f"{'spill':>6} {'95 %':>6} {'t50':>6} {'t200':>6} {'t med':>6} {'ended':>5}"
-)
-
-
-def row(name: str, f: dict[str, Any]) -> str:
-    """Return one row of the table [g], [s]."""
-    keys = ("mean", "bias", "p95", "worst", "over_1g", "first_mean", "first_p95", "spill_mean", "spill_p95")
-    times = ("time_50_p95", "time_200_p95", "time_median")
-    values = [f"{f[k]:6.1%}" if k == "over_1g" else f"{_or_nan(f[k]):6.2f}" for k in keys]
-    values += [f"{_or_nan(f[k]):6.1f}" for k in times]
-    return f"{name:15} {f['doses']:5d} {' '.join(values)} {f['aborted']:5d}"
-
-
-def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
 
 
 def picture(path: Path, seed: int = 3) -> None:
@@ -449,15 +395,7 @@ def faults(count: int = 10) -> list[dict[str, Any]]:
             if series.bench.content < 0.15:
                 series.bench.refill(0.8 * series.bench.cup.capacity * series.density)
             placed = series.bench.place_receiver()
-            doses = DoseSeries(
-                series.cup,
-                DosingSettings(),
-                SourceContent(series.weighed_content()),
-                placed,
-                np.random.default_rng((seed, 3)),
-                particles=PARTICLES,
-                step=series.scale.step,
-            )
+            doses = series.controlled(placed)
             controller = doses.controller(DoseOrder(0.1, receiver_mass=series.bench.receiver_mass), seed=seed)
             record = series.bench.dose(controller, fault)
             result = controller.result
@@ -494,11 +432,8 @@ def main() -> None:
     parser.add_argument("--final", action="store_true", help="use the final seeds instead of the development seeds")
     parser.add_argument("--series", type=int, help="number of series; default: 20, or all final seeds")
     parser.add_argument("--first", type=int, default=0, help="first development seed")
-    parser.add_argument("--groups", type=int, nargs="*", help="numbers of groups, from 0")
     parser.add_argument("--controllers", nargs="*", choices=list(CONTROLLERS), default=list(CONTROLLERS))
     parser.add_argument("--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}")
-    parser.add_argument("--dump", type=Path, help="file of all doses; continue if it exists")
-    parser.add_argument("--as-dumped", action="store_true", help="pour nothing; use the doses in --dump")
     parser.add_argument("--picture", type=Path, help="only draw one dose")
     parser.add_argument("--faults", action="store_true", help="only pour doses with one fault each")
     options = parser.parse_args()
@@ -513,21 +448,13 @@ def main() -> None:
 
             write({"faults": {"rows": rows, "seeds": [FIRST_FAULT_SEED, 10], "machine": describe()}})
         return None
-    names = list(GROUPS) if options.groups is None else [list(GROUPS)[k] for k in options.groups]
 
     def seeds(group: Group) -> range:
         if options.final:
             return range(FIRST_FINAL_SEED, FIRST_FINAL_SEED + (options.series or group.final))
         return range(options.first, min(options.first + (options.series or 20), 100))
 
-    result = measure(
-        names,
-        options.controllers,
-        seeds,
-        say=lambda text: print(text, flush=True),
-        dump=options.dump,
-        pour=not options.as_dumped,
-    )
+    result = measure(list(GROUPS), options.controllers, seeds)
     for name, by in result.items():
         if "particles" in by:
             for rival, doses in by.items():

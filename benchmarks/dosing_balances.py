@@ -1,11 +1,11 @@
-"""Pour doses with balances that repeat, delay and lose readings, beside an earlier version of the dosing code.
+"""Pour doses with balances that repeat, delay and lose readings.
 
     python benchmarks/dosing_balances.py --final --json   # the evidence page's table: docs/data/dosing-balances.json
     python benchmarks/dosing_balances.py --series 10      # development seeds, for tuning
 
 Every series is two doses of 100 g from the round beaker, whose outflow, lip and balance's filter the seed draws as in
 `benchmarks/dosing.py`. What differs between the rows is the display. The final seeds begin at 30000; development uses
-100 to 299. `--before COMMIT` pours the same series with the dosing code of that commit, on the same bench.
+100 to 299.
 
 The coverage is the share of doses whose true amount lies within the stated interval (90 %) of the weighed one. A false
 stop is an end other than "reached" that the bench gave no reason for.
@@ -15,10 +15,8 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
-import subprocess
 import sys
-import types
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -29,9 +27,10 @@ from typing import Any
 import numpy as np
 
 from actors.balance.display_behaviour import IDEAL, DisplayBehaviour
+from actors.dosing.dose_controller import DoseOrder
+from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import TrueScale, VirtualDosingBench
-from actors.runtime.child_process import child_environment
 from sim_engine.liquids import Liquid
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -39,9 +38,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 from dosing import CUPS, PARTICLES, ROOT, cup_flows
 
 DATA = ROOT / "docs" / "data" / "dosing-balances.json"
-BEFORE = "d2b6a1ff"
-"""The dosing code that took an unchanged reading as evidence that nothing had arrived."""
-
 CUP, AMOUNT, DOSES = "round beaker", 0.1, 2
 FIRST_SEED, FIRST_FINAL_SEED, SERIES = 100, 30000, 150
 
@@ -84,8 +80,8 @@ class Poured:
     Attributes:
         error: in the receiver minus wanted.
         reported: weighed minus truly received; None if nothing was reported.
-        deviation: stated standard deviation of the weighed amount; nan before it was stated.
-        innovations: mean squared innovation over its variance; nan likewise.
+        deviation: stated standard deviation of the weighed amount.
+        innovations: mean squared innovation over its variance.
     """
 
     seed: int
@@ -100,40 +96,16 @@ class Poured:
 
 
 @cache
-def program(commit: str) -> tuple[Any, Any]:
-    """The modules `dose_series` and `dose_controller` of a commit; '' is the present code."""
-    from actors.dosing import dose_controller, dose_series
-
-    if not commit:
-        return dose_series, dose_controller
-    package = types.ModuleType("before")
-    package.__path__ = []
-    sys.modules["before"] = package
-    for name in ("dose_estimator", "dose_controller", "dose_series"):
-        shown = ["git", "show", f"{commit}:actors/dosing/{name}.py"]
-        source = subprocess.run(
-            shown, cwd=ROOT, check=True, capture_output=True, text=True, env=child_environment()
-        ).stdout
-        module = types.ModuleType(f"before.{name}")
-        sys.modules[f"before.{name}"] = module
-        exec(
-            compile(source.replace("actors.dosing.dose_", "before.dose_"), f"{name}@{commit}", "exec"), module.__dict__
-        )
-    return sys.modules["before.dose_series"], sys.modules["before.dose_controller"]
-
-
-@cache
 def _flow() -> Any:
     return cup_flows()(CUP, False)
 
 
-def pour_series(name: str, seed: int, commit: str = "") -> list[Poured]:
+def pour_series(name: str, seed: int) -> list[Poured]:
     """Pour one series of a row."""
-    return list(_doses(DISPLAYS[name], seed, commit))
+    return list(_doses(DISPLAYS[name], seed))
 
 
-def _doses(display: Display, seed: int, commit: str) -> Iterator[Poured]:
-    series_module, controller_module = program(commit)
+def _doses(display: Display, seed: int) -> Iterator[Poured]:
     rng = np.random.default_rng((seed, 11))
     kind = str(rng.choice(["first", "fourth", "average", "switching"]))
     scale = TrueScale(
@@ -155,25 +127,24 @@ def _doses(display: Display, seed: int, commit: str) -> Iterator[Poured]:
         if filled:
             bench.refill(0.9 * capacity)
         placed = bench.place_receiver()
-        content = series_module.SourceContent(bench.content + weighing.pop())
+        content = SourceContent(bench.content + weighing.pop())
         if series is None:
-            series = series_module.DoseSeries(
-                _flow(), DosingSettings(), content, placed, own, particles=PARTICLES, step=display.step
-            )
+            series = DoseSeries(_flow(), DosingSettings(), content, placed, own, particles=PARTICLES, step=display.step)
         elif filled:
             series.fill(content)
-        order = controller_module.DoseOrder(AMOUNT, receiver_mass=bench.receiver_mass)
+        order = DoseOrder(AMOUNT, receiver_mass=bench.receiver_mass)
         controller = series.controller(order, seed=seed)
         record = bench.dose(controller)
         result = controller.result
+        assert result is not None
         series.finish(result)
         yield Poured(
             seed,
             place,
             1e3 * (record.received - AMOUNT),
             None if result.amount is None else 1e3 * (result.amount - record.received),
-            1e3 * getattr(result, "deviation", math.nan),
-            getattr(result, "innovations", math.nan),
+            1e3 * result.deviation,
+            result.innovations,
             record.duration,
             result.top_ups,
             str(result.end),
@@ -195,28 +166,13 @@ def figures(doses: list[Poured]) -> dict[str, Any]:
         "p95": float(np.quantile(sizes, 0.95)),
         "worst": float(sizes.max()),
         "reported": float(np.mean([error for error, _ in reported])),
-        "coverage": None if math.isnan(doses[0].deviation) else float(np.mean(covered)),
-        "innovations": None if math.isnan(doses[0].deviation) else float(np.mean([d.innovations for d in doses])),
+        "coverage": float(np.mean(covered)),
+        "innovations": float(np.mean([d.innovations for d in doses])),
         "time": float(np.median([one.duration for one in doses])),
         "top_ups": float(np.mean([one.top_ups for one in doses])),
         "false_stops": sum(one.end != "reached" for one in doses),
+        "ends": dict(Counter(one.end for one in doses)),
     }
-
-
-HEAD = (
-    f"{'':26} {'doses':>5} {'mean':>6} {'95 %':>6} {'worst':>6} {'bias':>6} {'covers':>6} {'innov.':>6} {'time':>5} "
-    f"{'stops':>5}"
-)
-
-
-def row(name: str, f: dict[str, Any]) -> str:
-    """Return one row of the table."""
-    covers = "" if f["coverage"] is None else f"{f['coverage']:.0%}"
-    innovations = "" if f["innovations"] is None else f"{f['innovations']:.2f}"
-    return (
-        f"{name:26} {f['doses']:5d} {f['mean']:6.2f} {f['p95']:6.2f} {f['worst']:6.2f} {f['bias']:+6.2f} {covers:>6} "
-        f"{innovations:>6} {f['time']:5.1f} {f['false_stops']:5d}"
-    )
 
 
 def main() -> None:
@@ -226,40 +182,20 @@ def main() -> None:
     parser.add_argument("--series", type=int, default=SERIES, help="number of series of two doses")
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="first development seed")
     parser.add_argument("--rows", type=int, nargs="*", help="numbers of rows, from 0")
-    parser.add_argument("--before", default="", metavar="COMMIT", help="pour with the code of a commit, too; -: none")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument(
-        "--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}; implies --before {BEFORE}"
-    )
+    parser.add_argument("--json", action="store_true", help=f"write {DATA.relative_to(ROOT)}")
     options = parser.parse_args()
     first = FIRST_FINAL_SEED if options.final else options.first
-    before = "" if options.before == "-" else options.before or (BEFORE if options.json else "")
     names = list(DISPLAYS) if options.rows is None else [list(DISPLAYS)[k] for k in options.rows]
     data = json.loads(DATA.read_text(encoding="utf-8")) if options.json and DATA.exists() else {"rows": {}}
-    print(HEAD, flush=True)
+    seeds = range(first, first + options.series)
     with ProcessPoolExecutor(options.workers) as pool:
         for name in names:
-            found: dict[str, Any] = {}
-            for commit in dict.fromkeys(("", before)):
-                seeds = range(first, first + options.series)
-                poured = [
-                    one
-                    for series in pool.map(pour_series, [name] * len(seeds), seeds, [commit] * len(seeds))
-                    for one in series
-                ]
-                found["before" if commit else "now"] = figures(poured) | {"ends": _ends(poured)}
-                print(row(name + (f" @{commit}" if commit else ""), found["before" if commit else "now"]), flush=True)
+            found = figures([one for poured in pool.map(pour_series, [name] * len(seeds), seeds) for one in poured])
+            print(f"{name}: {json.dumps(found)}", flush=True)
             if options.json:
-                about = {"seeds": [first, first + options.series - 1]}
-                data["rows"][name] = found | about
+                data["rows"][name] = {"now": found, "seeds": [seeds[0], seeds[-1]]}
                 DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-
-
-def _ends(doses: list[Poured]) -> dict[str, int]:
-    ends: dict[str, int] = {}
-    for one in doses:
-        ends[one.end] = ends.get(one.end, 0) + 1
-    return ends
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import argparse
 import json
 import math
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,6 @@ import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseOrder
-from actors.dosing.dose_series import DoseSeries, SourceContent
-from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DoseRecord
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -41,7 +39,7 @@ from sim_engine.vessel.vessel import build_vessel
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from dosing import AMOUNTS, CUPS, DATA, GROUPS, PARTICLES, Series, cup_flows
+from dosing import AMOUNTS, CUPS, DATA, GROUPS, Series, cup_flows
 
 FIRST_SEED = 7100
 RESOLUTION = 500
@@ -98,11 +96,9 @@ def compare(simulator: PourSimulator, flow: CupFlow, seed: int, amount: float) -
     """
     series = Series(GROUPS[GROUP], seed, lambda *_: flow)
     series.refill_for(amount)
-    bench, rng = series.bench, np.random.default_rng((seed, 3))
+    bench = series.bench
     load, placed = bench.content, bench.place_receiver()
-    content = SourceContent(series.weighed_content())
-    doses = DoseSeries(flow, DosingSettings(), content, placed, rng, particles=PARTICLES, step=series.scale.step)
-    controller = doses.controller(DoseOrder(amount, receiver_mass=bench.receiver_mass), seed=seed)
+    controller = series.controlled(placed).controller(DoseOrder(amount, receiver_mass=bench.receiver_mass), seed=seed)
     record = bench.dose(controller)
     scene = Scene("dose", POURER, RECEIVER, Liquid(mass=load))
     task = PourTask(
@@ -144,21 +140,13 @@ def main() -> None:
     parser.add_argument("--doses", type=int, default=20)
     parser.add_argument("--first", type=int, default=FIRST_SEED, help="first seed")
     parser.add_argument("--json", action="store_true", help="write docs/data/dosing.json")
-    parser.add_argument("--dump", type=Path, help="file of all doses; continue if it exists")
     options = parser.parse_args()
-    known: dict[int, Comparison] = {}
-    if options.dump is not None and options.dump.exists():
-        lines = options.dump.read_text(encoding="utf-8").splitlines()
-        known = {one.seed: one for one in (Comparison(**json.loads(line)) for line in lines)}
     simulator, flow = PourSimulator(), cup_flows()("round beaker", False)
     found: list[Comparison] = []
     for k in range(options.doses):
         seed, amount = options.first + k, AMOUNTS[1 + k % 4]
-        one = known.get(seed) or compare(simulator, flow, seed, amount)
+        one = compare(simulator, flow, seed, amount)
         found.append(one)
-        if options.dump is not None and seed not in known:
-            with options.dump.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(one)) + "\n")
         print(
             f"{seed}: {one.wanted:g} g wanted, {one.bench:.1f} g on the bench, {one.particles:.1f} g with particles "
             f"({one.onset:+.2f}°), {one.cpu_s:.0f} CPU s",

@@ -33,7 +33,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from machine import ROOT, say, write_table
+from machine import ROOT, KeptRows, say, write_table
 from quickstart import KeptPours, calibration_and_test
 
 from decant.running import build_campaign, load_campaign
@@ -182,19 +182,19 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--write", action="store_true", help="write the table to docs/data/results.json")
     asked = parser.parse_args()
-    kept: Path = asked.kept
+    kept = KeptRows(asked.kept)
     what, first = asked.what, asked.first or {"viscosity": 501, "dribbling": 601}[asked.what]
-    runs = [json.loads(line) for line in kept.read_text(encoding="utf-8").splitlines()] if kept.exists() else []
     groups = [(bench, nominal) for nominal in (GUESSES if what == "viscosity" else (None,)) for bench in BENCHES[what]]
     chosen: dict[tuple[str, float | None], list[dict[str, Any]]] = {group: [] for group in groups}
     for seed in range(first, first + asked.seeds):
         for bench, nominal in groups:
-            known = [run for run in runs if (run["bench"], run.get("nominal"), run["seed"]) == (bench, nominal, seed)]
+            known = [
+                run for run in kept.rows if (run["bench"], run.get("nominal"), run["seed"]) == (bench, nominal, seed)
+            ]
             if not known:
                 known = [dribbling(bench, seed) if nominal is None else viscosity(bench, nominal, seed)]
                 say(json.dumps(known[0]))
-                with kept.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(known[0]) + "\n")
+                kept.add(known[0])
             chosen[bench, nominal] += known[:1]
     rows = [row(those) for those in chosen.values()]
     for line in rows:

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +110,7 @@ def main() -> None:
     parser.add_argument("--kept", type=Path, help="runs of mismatch.py")
     parser.add_argument("--write", action="store_true", help="write the table to docs/data/results.json")
     asked = parser.parse_args()
-    kept: dict[str, Any] = {"level": LEVEL, "runs": {}, "seconds": {}}
+    kept: dict[str, Any] = {"level": LEVEL, "runs": {}}
     if CURVES.exists():
         kept = json.loads(CURVES.read_text())
     for line in asked.kept.read_text().splitlines() if asked.kept else ():
@@ -123,10 +122,7 @@ def main() -> None:
         for arm in asked.arms:
             done = kept["runs"].setdefault(arm, {})
             missing = [seed for seed in seeds if seed not in done]
-            begun = time.process_time()
             done |= {seed: [round(x, 5) for x in run(arm, int(seed))] for seed in missing}
-            if missing:
-                kept["seconds"][arm] = round((time.process_time() - begun) / len(missing), 2)
             say(f"{arm}: done")
             CURVES.write_text(json.dumps(kept, indent=1) + "\n")
     table = rows(kept, seeds)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import ctypes
 import datetime
 import functools
 import json
 import os
 import platform
+import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -106,21 +109,18 @@ def say(text: str) -> None:
 
 
 def show(result: dict[str, Any], as_json: bool) -> None:
-    """Print the result to stdout: one line of JSON, or one line per value."""
-    print(json.dumps(result) if as_json else "\n".join(_lines(result)))
+    """Print the result to stdout as JSON: on one line, or indented."""
+    print(json.dumps(result, indent=None if as_json else 1, ensure_ascii=False))
 
 
-def _lines(result: dict[str, Any], indent: str = "") -> Iterator[str]:
-    for name, value in result.items():
-        if isinstance(value, dict):
-            yield f"{indent}{name}:"
-            yield from _lines(value, indent + "    ")
-        elif isinstance(value, list) and value and isinstance(value[0], dict):
-            yield f"{indent}{name}:"
-            for row in value:
-                yield f"{indent}    " + ", ".join(f"{k} {v}" for k, v in row.items())
-        else:
-            yield f"{indent}{name:{max(32 - len(indent), 1)}s} {value}"
+def started(command: Sequence[str | Path], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a process that receives SIGTERM when this one ends, even if this one is killed (Linux)."""
+
+    def follow() -> None:
+        if sys.platform == "linux":
+            ctypes.CDLL(None).prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG
+
+    return subprocess.Popen(list(command), preexec_fn=follow, **options)  # noqa: PLW1509  no thread runs yet
 
 
 def run_self(script: str, *arguments: str, cache: Path | None = None) -> dict[str, Any]:
@@ -138,11 +138,47 @@ def run_self(script: str, *arguments: str, cache: Path | None = None) -> dict[st
     if cache is not None:
         environment[ENVIRONMENT_VARIABLE] = str(cache)
     command = [sys.executable, script, *arguments]
-    done = subprocess.run(command, check=False, stdout=subprocess.PIPE, text=True, env=environment)
-    if done.returncode != 0:
-        raise SystemExit(f"{Path(script).name} {' '.join(arguments)} ended with {done.returncode}")
-    result: dict[str, Any] = json.loads(done.stdout.strip().splitlines()[-1])
+    child = started(command, stdout=subprocess.PIPE, env=environment)
+    printed, _ = child.communicate()
+    if child.returncode != 0:
+        raise SystemExit(f"{Path(script).name} {' '.join(arguments)} ended with {child.returncode}")
+    result: dict[str, Any] = json.loads(printed.strip().splitlines()[-1])
     return result
+
+
+def run_decant(*words: str | Path, environment: dict[str, str]) -> tuple[str, float, float]:
+    """Run the command line in a new process; return its stdout, and its wall and CPU seconds.
+
+    Raises:
+        SystemExit: it failed; the message has its words and its messages.
+    """
+    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", *map(str, words)]
+    before, begun = os.times(), time.monotonic()
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    after, seconds = os.times(), time.monotonic() - begun
+    if done.returncode != 0:
+        raise SystemExit(f"decant {' '.join(map(str, words))}: {done.stderr}")
+    spent = after.children_user + after.children_system - before.children_user - before.children_system
+    return done.stdout, seconds, spent
+
+
+class KeptRows:
+    """Results of finished runs in a file of JSON lines, so that an interrupted comparison continues.
+
+    Attributes:
+        rows: all rows, oldest first.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+        self.rows: list[dict[str, Any]] = [json.loads(line) for line in lines]
+
+    def add(self, *rows: dict[str, Any]) -> None:
+        """Append rows, and write them at once."""
+        self.rows += rows
+        with self._file.open("a", encoding="utf-8") as file:
+            file.writelines(json.dumps(row) + "\n" for row in rows)
 
 
 def single_threaded() -> dict[str, str]:

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import page_figures
-import page_many
 import page_sections as sections
 from machine import ROOT, run_self, say
 
@@ -61,21 +60,21 @@ def page_text(records: dict[str, Any]) -> str:
         records: measurements by name, as returned by `measure`.
     """
     pours = pour_records(records)
-    scaling = records.get("scaling")
+    scaling = records["scaling"]
     parts = [
         sections.introduction(),
         sections.machines(records.values()),
         *stale(records),
         sections.targets(pours),
         sections.beside_the_peer(pours),
-        sections.passes(records.get("profile")),
+        sections.passes(records["profile"]),
         sections.cost(scaling),
         sections.memory(scaling),
-        sections.start_up(records.get("start-up")),
-        sections.engines(records.get("engines")),
-        page_many.plan(records.get("plan")),
-        page_many.validate(records.get("validate")),
-        page_many.pool(records.get("pool")),
+        sections.start_up(records["start-up"]),
+        sections.engines(records["engines"]),
+        sections.plan(records["plan"]),
+        sections.validate(records["validate"]),
+        sections.pool(records["pool"]),
         sections.finished(),
     ]
     return "\n".join(parts)
@@ -114,17 +113,8 @@ def draw(records: dict[str, Any], images: Path) -> None:
 
 
 def write(folder: Path) -> Path:
-    """Write page and figures from the measurements in a folder.
-
-    Raises:
-        SystemExit: the measurements are missing or unreadable.
-    """
-    try:
-        records = json.loads((folder / DATA).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise SystemExit(f"{folder / DATA}: there is no such file; make it with --measure") from None
-    except ValueError as problem:
-        raise SystemExit(f"{folder / DATA}: not JSON: {problem}") from None
+    """Write page and figures from the measurements in a folder."""
+    records = json.loads((folder / DATA).read_text(encoding="utf-8"))
     text = page_text(records)
     draw(records, folder / "images")
     (folder / PAGE).parent.mkdir(parents=True, exist_ok=True)
@@ -154,9 +144,6 @@ def main() -> None:
         if name not in PLAN:
             raise SystemExit(f"--measure {name}: there is no such measurement, only {', '.join(PLAN)}")
     for name in names:
-        if not (BENCHMARKS / PLAN[name][0]).exists():
-            say(f"{name}: there is no {PLAN[name][0]}; left as it is")
-            continue
         keep(options.folder, name, measure(name))
     say(f"written: {write(options.folder)}")
 

@@ -12,6 +12,9 @@ from standard_pour import LEFT, LEFT_LIMIT
 TARGETS = {2_000: (1.5, 0.6), 5_000: (5.0, 2.0), 10_000: (12.0, 5.0)}
 """Required and target CPU seconds of the standard pour, by particles."""
 
+SLOWEST = 3
+"""Number of checked files that are shown by name."""
+
 PHYSICS = ("left at 2.3 s", "2.7 s", "3.1 s", "", "delivered", "density inside")
 
 Record = Mapping[str, Any]
@@ -39,8 +42,6 @@ The standard pour: 200 mL in a straight cup (R 40 mm, H 100 mm), turned about it
 
 def targets(pours: Sequence[Record]) -> str:
     """Return the section that compares speed with its targets, together with physical results."""
-    if not pours:
-        return missing("Against the targets", "pour_speed.py --particles 2000")
     rows, physics = [], []
     for record in pours:
         r = record["result"]
@@ -91,8 +92,6 @@ def targets(pours: Sequence[Record]) -> str:
 def beside_the_peer(pours: Sequence[Record]) -> str:
     """Return the section on the peer's figures, measured in the same session."""
     both = [record for record in pours if "peer" in record["result"]]
-    if not both:
-        return missing("Compared with the fastest peer", "pour_speed.py --particles 2000 --peer")
     rows, physics = [], []
     for record in both:
         r, peer = record["result"], record["result"]["peer"]
@@ -129,11 +128,9 @@ Its physics, measured as ours:
 """
 
 
-def passes(record: Record | None) -> str:
+def passes(record: Record) -> str:
     """Return the section on the profile."""
     title = "Where the time goes"
-    if record is None:
-        return missing(title, "profile_passes.py")
     r = record["result"]
     moments = page_figures.MOMENTS
     rows = [
@@ -162,11 +159,9 @@ def passes(record: Record | None) -> str:
 {settings([record])}"""
 
 
-def cost(record: Record | None) -> str:
+def cost(record: Record) -> str:
     """Return the section on CPU seconds against N."""
     title = "Cost against the number of particles"
-    if record is None:
-        return missing(title, "scaling.py")
     r = record["result"]
     rows = [
         (
@@ -193,11 +188,9 @@ def cost(record: Record | None) -> str:
 {settings([record])}"""
 
 
-def memory(record: Record | None) -> str:
+def memory(record: Record) -> str:
     """Return the section on resident memory."""
     title = "Memory"
-    if record is None or not record["result"]["memory"]:
-        return missing(title, "scaling.py")
     first, *_, last = record["result"]["memory"]
     text = prose(
         f"""A process with one simulator has {first["process_mb"]:.0f} MB early in a pour with {first["particles"]:,}
@@ -208,11 +201,9 @@ def memory(record: Record | None) -> str:
     return f"## {title}\n\n{text}\n\n{settings([record])}"
 
 
-def start_up(record: Record | None) -> str:
+def start_up(record: Record) -> str:
     """Return the section on the first outcome of a new process."""
     title = "Start-up"
-    if record is None:
-        return missing(title, "start_up.py")
     r = record["result"]
     phases = tuple(r["warm"]["phases"])
     rows = [
@@ -238,11 +229,9 @@ def start_up(record: Record | None) -> str:
 {settings([record])}"""
 
 
-def engines(record: Record | None) -> str:
+def engines(record: Record) -> str:
     """Return the section that compares the packages that can compile the solver."""
     title = "Engines"
-    if record is None:
-        return missing(title, "engines.py")
     r = record["result"]
     rows = [
         (
@@ -275,6 +264,74 @@ def engines(record: Record | None) -> str:
     return f"## {title}\n\n{about}\n\n{table(head, rows, 'lrrlrrrr')}\n{settings([record])}"
 
 
+def plan(record: Record) -> str:
+    """Return the section on the duration of a plan for a new cup."""
+    title = "Planning"
+    r = record["result"]
+    rows = [
+        (
+            row["receiver"],
+            f"{row['seconds']:.1f}",
+            f"{row['cpu_s']:.1f}",
+            str(row["simulations"]),
+            f"{100 * row['predicted_spillage']:.1f} %",
+        )
+        for row in r["plans"]
+    ]
+    about = prose(
+        f"""Seconds of `decant plan` for the quickstart's pour into unseen cups: fresh processes with start, figures and
+        report; kernels cached. Required on two cores: {r["limit_s"]:g} s (median {r["seconds"]:.1f},
+        {_met(r["within_limit"])})."""
+    )
+    titles = ("into", "s", "CPU s", "simulations", "predicted to spill")
+    return f"## {title}\n\n{about}\n\n{table(titles, rows, 'lrrrr')}\n{settings([record])}"
+
+
+def validate(record: Record) -> str:
+    """Return the section on the cost of checking every shipped file."""
+    title = "Checking a file"
+    r = record["result"]
+    files = sorted(r["files"], key=lambda row: float(row["cpu_s"]), reverse=True)
+    rows = [(f"`{row['file']}`", f"{row['cpu_s']:.2f}") for row in files[:SLOWEST]]
+    rest = f"{files[-1]['cpu_s']:.2f} to {files[SLOWEST]['cpu_s']:.2f}" if len(files) > SLOWEST else "none"
+    rows.append(("all others", rest))
+    about = prose(
+        f"""CPU seconds of `decant validate` for {len(files)} shipped files: medians of {r["repeats"]} fresh processes
+        with a warm cache, with their start. Required: {r["limit_s"]:g} ({_met(r["within_limit"])})."""
+    )
+    return f"## {title}\n\n{about}\n\n{table(('file', 'CPU s'), rows, 'lr')}\n{settings([record])}"
+
+
+def pool(record: Record) -> str:
+    """Return the section on `pool_speed.py`."""
+    title = "Pool and cluster"
+    r = record["result"]
+    about = prose(
+        f"""{r["workers"]} simulators of the pool (Ray actors) compared with {r["workers"]} plain processes, the same
+        {r["pours"]} standard pours with {r["particles"]:,} particles, in turns; medians. Overhead: time of a busy
+        worker without simulating, per simulation."""
+    )
+    rows = [
+        ("pours a minute, pool", f"{r['pours_per_minute_pool']:.0f}", "", ""),
+        ("pours a minute, plain processes", f"{r['pours_per_minute_plain']:.0f}", "", ""),
+        ("pool over plain", f"**{r['throughput_ratio']:.3f}**", "≥ 0.95", _met(r["throughput_met"])),
+        ("the same by CPU seconds", f"{r['throughput_ratio_by_cpu']:.3f}", "", ""),
+        ("workers busy while work was queued", f"{100 * r['busy_fraction']:.1f} %", "", ""),
+        ("CPU of all other processes", f"{100 * r['cpu_beside_the_workers']:.1f} %", "", ""),
+        (
+            f"overhead a simulation, pours of {r['tiny_pour_ms']:.0f} ms",
+            f"**{r['overhead_ms']:.1f} ms**",
+            "≤ 10 ms",
+            _met(r["overhead_met"]),
+        ),
+        ("the same with a simulator that does nothing", f"{r['empty_overhead_ms']:.1f} ms", "", ""),
+        ("one such simulation, there and back", f"{r['empty_round_trip_ms']:.1f} ms", "", ""),
+        ("first answer after opening a laboratory", f"{r['start_s']['first answer after opening']:.1f} s", "", ""),
+    ]
+    shown = table(("", "", "required", ""), rows, "lrll")
+    return f"## {title}\n\n{about}\n\n{shown}\n{settings([record])}"
+
+
 def finished() -> str:
     """Return the section on measurements that are not repeated."""
     return """## Not measured again
@@ -285,11 +342,6 @@ Made with commit 46022671, on the same machine:
   surfaces, makes 6.5 M particle-iterations/s with lists built in every step, and 13 M with lists kept for 8. The pour
   made 5.1 M: 79 % and 38 % of that.
 """
-
-
-def missing(title: str, command: str) -> str:
-    """Return the section for a benchmark without results."""
-    return f"## {title}\n\nNot measured yet: `python benchmarks/{command} --json`\n"
 
 
 def machines(records: Iterable[Record]) -> str:
@@ -346,3 +398,7 @@ def _physics(result: Record) -> tuple[str, ...]:
     off = max(abs(value - reference) for value, reference in zip(left, LEFT, strict=True))
     word = "right" if off <= LEFT_LIMIT else "**off**"
     return (*(f"{value:.3f}" for value in left), word, f"{result['delivered']:.3f}", f"{result['density_at_rest']:.3f}")
+
+
+def _met(met: bool) -> str:
+    return "met" if met else "**missed**"

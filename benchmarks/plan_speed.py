@@ -11,17 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import statistics
-import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
-from machine import ROOT, as_a_second_time, describe, say, show
+from machine import ROOT, as_a_second_time, describe, run_decant, say, show
 
 LIMIT = 15.0
 """Required time of a plan for a new cup on two cores [s]."""
@@ -30,24 +26,11 @@ RECEIVERS = ("cone", "narrow", "bowl", "mug")
 
 
 def plan(configs: Path, receiver: str, environment: dict[str, str]) -> dict[str, Any]:
-    """Run one plan in a new process.
-
-    Raises:
-        SystemExit: it failed.
-    """
-    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "plan", "--json"]
-    command += [
-        str(configs / "campaigns" / "quickstart.yaml"),
-        "--receiver",
-        str(configs / "vessels" / f"{receiver}.yaml"),
-    ]
-    before, begun = os.times(), time.monotonic()
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    after, seconds = os.times(), time.monotonic() - begun
-    if done.returncode != 0:
-        raise SystemExit(f"{receiver}: {done.stderr}")
-    cpu = after.children_user + after.children_system - before.children_user - before.children_system
-    answer = json.loads(done.stdout.splitlines()[-1])
+    """Run one plan in a new process. Raises SystemExit if it failed."""
+    vessel = configs / "vessels" / f"{receiver}.yaml"
+    words = ("plan", "--json", configs / "campaigns" / "quickstart.yaml", "--receiver", vessel)
+    printed, seconds, cpu = run_decant(*words, environment=environment)
+    answer = json.loads(printed.splitlines()[-1])
     return {
         "receiver": receiver,
         "seconds": round(seconds, 1),

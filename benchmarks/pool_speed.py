@@ -195,7 +195,6 @@ async def throughput(options: argparse.Namespace) -> dict[str, Any]:
         "busy_fraction": round(statistics.median(a.busy for a, _ in rounds), 4),
         "cpu_beside_the_workers": round(statistics.median(a.beside_s / a.cpu_s for a, _ in rounds), 4),
         "tiny_pour_ms": round(1e3 * statistics.median(block.cpu_s for block in tiny) / options.tiny, 1),
-        "tiny_busy_fraction": round(statistics.median(block.busy for block in tiny), 4),
         "overhead_ms": round(statistics.median(overheads), 2),
         "overhead_met": statistics.median(overheads) <= OVERHEAD_LIMIT_MS,
         "rounds": [

@@ -209,11 +209,8 @@ def profile(particles: int, plain_cpu_s: float) -> dict[str, Any]:
         "particles": particles,
         "whole pour": shares(calls),
         **moments,
-        "cpu_s": round(plain_cpu_s, 3),
         "slower": round(run.cpu_s / plain_cpu_s, 3),
         "explained": round(sum(own for _, own, _ in calls) / run.cpu_s, 3),
-        "iterations_per_step": round(run.iterations / run.outcome.steps, 3),
-        "particle_iterations_per_s": round(particles * run.iterations / plain_cpu_s),
     }
 
 

@@ -1,7 +1,7 @@
 """Measure the quickstart: benefit of its calibration, losses of its pours, and number of pours until it stops.
 
-    python benchmarks/quickstart.py [--seeds 10] [--first 401] [--arms shipped ...] [--calibration-only] [--random 256]
-                                    [--plans 4] [--fits 10] [--laboratory FILE] [--into build/quickstart] [--write]
+    python benchmarks/quickstart.py [--seeds 10] [--first 401] [--arms shipped ...] [--calibration-only] [--fits 10]
+                                    [--laboratory FILE] [--into build/quickstart] [--write]
 
 The benchmark runs the shipped campaign unchanged, on a simulated bench with the ground truth of its own laboratory. It
 only skips the scores of random θ, on which the deployment does not depend. Each seed runs in its own process, which
@@ -10,9 +10,6 @@ seed thus share their calibration and all other identical pours. Finished runs a
 comparison continues.
 
 - `--calibration-only` skips the deployment, and scores only the test pours.
-- `--random` pours this number of random actions of the deployment on the bench, drawn with the seed `--first`.
-- `--plans` pours this number of plans of the uncalibrated simulator.
-- With `--seeds 0` only `--random` and `--plans` are done.
 - `--arms "all pours"` makes 15 pours per seed and does not stop before, for the coverage of the prediction intervals.
 - `--fits` compares calibrations only, for this number of seeds from `--first` on, on two benches: that of the
   laboratory file, and one whose receiver stands 14 mm farther away. θ* of `simulations: auto` is compared with θ* of 30
@@ -22,13 +19,11 @@ comparison continues.
 
 Questions, fixed before the first run on seeds from 401 on; seeds below 400 are for tuning or were used before:
 
-1. Do fewer than 10 % of random actions lose less than 1 %?
-2. Does the action planned by the uncalibrated simulator lose more than 5 % on the bench?
-3. Does calibration halve the mean error on the test pours, on at least 9 of 10 seeds?
-4. Is no pour above 10 % after the first below 1 %? Is the median number of pours until it stops four or fewer?
-5. (`all pours`.) Are 85 to 95 % of at least 300 pours in their 90 % intervals? Is the mean interval score better than
+1. Does calibration halve the mean error on the test pours, on at least 9 of 10 seeds?
+2. Is no pour above 10 % after the first below 1 %? Is the median number of pours until it stops four or fewer?
+3. (`all pours`.) Are 85 to 95 % of at least 300 pours in their 90 % intervals? Is the mean interval score better than
    that of intervals that are not scaled by a campaign's earlier pours?
-6. (`--fits`.) Is θ* on the training pours in the mean at most 0.3 points above the best of the grid, and never above
+4. (`--fits`.) Is θ* on the training pours in the mean at most 0.3 points above the best of the grid, and never above
    the uncalibrated θ? Is its mean error on 12 further pours at most 2 points? Do 85 to 95 % of these lie in their 90 %
    intervals?
 """
@@ -40,9 +35,7 @@ import asyncio
 import itertools
 import json
 import math
-import os
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -53,7 +46,7 @@ from typing import Any
 from unittest.mock import patch
 
 import numpy as np
-from machine import ROOT, run_self, say, write_table
+from machine import ROOT, KeptRows, run_self, say, write_table
 from players import by_turn, coverage, interval
 
 from actors.bench.ground_truth import draw_pose_error
@@ -89,9 +82,6 @@ GOOD, BAD = 0.01, 0.10
 TRUTH = ("liquid", "pose_error", "pose_noise")
 """Settings of a bench that are unknown to the simulator."""
 
-PLANNED = 12
-"""Number of simulated actions of the uncalibrated plan."""
-
 CAMPAIGN = ROOT / "configs" / "campaigns" / "quickstart.yaml"
 
 
@@ -116,11 +106,8 @@ class KeptPours(WorkerPool):
 
     def __init__(self, file: Path, *, make: Callable[[], Simulator] = pour_simulator) -> None:
         super().__init__(1, partial(ThreadWorker, make), separate=False)
-        self._file, self._known = file, dict[str, Any]()
-        self.simulated = 0
-        if file.exists():
-            rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-            self._known = {row["task"]: row["outcome"] for row in rows}
+        self._file, self.simulated = KeptRows(file), 0
+        self._known: dict[str, Any] = {row["task"]: row["outcome"] for row in self._file.rows}
 
     async def simulate(self, task: PourTask, user: object = None) -> SimulatedPour:
         """See `SimulatorPool.simulate`; without frames."""
@@ -129,8 +116,7 @@ class KeptPours(WorkerPool):
             found = await super().simulate(task, user)
             self._known[key] = to_json(found.outcome, PourOutcome)
             self.simulated += 1
-            with self._file.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"task": key, "outcome": self._known[key]}) + "\n")
+            self._file.add({"task": key, "outcome": self._known[key]})
         return SimulatedPour(from_json(self._known[key], PourOutcome))
 
 
@@ -365,27 +351,6 @@ def calibration_and_test(plan: CalibrationPlan) -> tuple[StageDefinition, ...]:
     return (*stages, StageDefinition(EVALUATION, evaluation))
 
 
-def uncalibrated_plan(seed: int, laboratory: Path, into: Path) -> dict[str, float]:
-    """Return the predicted loss of the uncalibrated simulator's plan, and its loss on the bench."""
-    from decant.running import build_campaign
-    from orchestrator.reports.stage_views import deployments_of
-    from orchestrator.runs.run_service import RunResources, RunService
-    from orchestrator.runs.run_tasks import plan_task
-
-    pool = kept_pours(f"plan-{seed}", into)
-    with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
-        campaign = build_campaign(on_numbers(seed, laboratory, folder), folder)
-        request = plan_task(campaign, iterations=PLANNED, seeds=1)
-        handle = RunService().start(request, RunResources(in_process=True, simulators=pool))
-        (plan,) = deployments_of(asyncio.run(handle.wait()).results).values()
-        assert campaign.deployment is not None
-        assert plan.recommended is not None
-        action = campaign.deployment.scenes[0].action(dict(plan.recommended.action_si))
-        loss = asyncio.run(lost(campaign, action, seed, pool))
-        asyncio.run(pool.close())
-    return {"seed": seed, "expected": plan.recommended.predicted_loss, "loss": loss}
-
-
 def kept_pours(seed: int | str, into: Path) -> KeptPours:
     """Return the pool of a seed."""
     from sim_engine.solver_fingerprint import solver_fingerprint
@@ -408,42 +373,6 @@ def on_numbers(seed: int, laboratory: Path, folder: str) -> dict[str, Any]:
     content["laboratory"]["bench"] = bench | {"time_scale": 3000}  # only speeds the bench up; the results are the same
     content["calibration"]["random_baseline"] = 0
     return content
-
-
-async def lost(campaign: CampaignPlan, action: Action, seed: int, pool: KeptPours) -> float:
-    """Return the true loss of an action on the bench; 1 if the cups touch."""
-    assert campaign.deployment is not None
-    scene, bench = campaign.deployment.scenes[0], campaign.laboratory.bench
-    assert bench is not None
-    error = draw_pose_error(bench, seed)
-    outcome = (await pool.simulate(PourTask(scene, action, bench.theta, seed, pose_error=error))).outcome
-    loss = campaign.deployment.loss(outcome.fractions, loaded_mass=scene.liquid.mass, particles=bench.theta.particles)
-    return 1.0 if loss is None else loss
-
-
-def random_losses(count: int, seed: int, laboratory: Path, into: Path) -> list[float]:
-    """Return true losses of random actions of the deployment on the bench, from a scrambled Sobol sequence.
-
-    Args:
-        seed: seed of the scrambling and, times 1000, of the first pour.
-    """
-    from scipy.stats import qmc
-
-    from decant.running import build_campaign
-
-    with tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder:
-        campaign = build_campaign(on_numbers(0, laboratory, folder), folder)
-    assert campaign.deployment is not None
-    scene, actions, pool = campaign.deployment.scenes[0], campaign.deployment.actions, kept_pours("random", into)
-
-    async def all_of_them() -> list[float]:
-        places = qmc.Sobol(actions.dimension, scramble=True, rng=np.random.default_rng(seed)).random(count)
-        asked = [scene.action(actions.decode(tuple(u))) for u in places]
-        found = [await lost(campaign, action, 1000 * seed + k, pool) for k, action in enumerate(asked)]
-        await pool.close()
-        return found
-
-    return asyncio.run(all_of_them())
 
 
 def figures(run: dict[str, Any]) -> dict[str, float]:
@@ -472,28 +401,6 @@ def held(pour: dict[str, Any]) -> bool:
     """Return whether a pour lies in its 90 % interval."""
     low, high = pour["band"]
     return bool(low <= pour["loss"] <= high)
-
-
-def table(runs: list[dict[str, Any]]) -> str:
-    """Return Markdown: one row per seed, and the summary."""
-    shown = pours_table(runs)
-    lines = [shown["head"], ["---"] * len(shown["head"]), *shown["rows"]]
-    return "\n".join([*(f"| {' | '.join(cells)} |" for cells in lines), "", summary(runs)])
-
-
-def pours_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return head and rows: one row per seed."""
-    rows = []
-    found = [figures(run) for run in runs]
-    for run, one in zip(runs, found, strict=True):
-        shown = ", ".join(f"{100 * pour['loss']:.1f}" for pour in run["pours"])
-        good = "none" if one["good"] > one["pours"] else f"{one['good']:g}"
-        why = "all pours made" if run["ended"] is None else run["ended"].split(":")[0]
-        cells = [str(run["seed"]), f"{shown} %", f"{one['pours']:g}", good]
-        cells += ["" if math.isnan(one[key]) else f"{100 * one[key]:.1f} %" for key in ("after", "best", "final")]
-        rows.append([*cells, why])
-    head = ["seed", "lost, pour by pour", "pours", "first below 1 %", "worst after it", "best", "recommended"]
-    return {"head": [*head, "why it ended"], "rows": rows}
 
 
 def coverage_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
@@ -552,58 +459,33 @@ def calibration_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
     return {"head": [*head, "receiver found at"], "rows": rows}
 
 
-def _end_with_parent() -> None:
-    """End this process when its parent has ended for any reason."""
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _run_missing(asked: argparse.Namespace, runs: list[dict[str, Any]], file: Path) -> None:
+def _run_missing(asked: argparse.Namespace, kept: KeptRows) -> None:
     """Make the missing runs, one process each."""
     places = [f"--{name}={path.resolve()}" for name, path in vars(asked).items() if isinstance(path, Path)]
     places += ["--calibration-only"] if asked.calibration_only else []
     for seed in range(asked.first, asked.first + asked.seeds):
         for arm in asked.arms:
-            known = [run for run in runs if (run["seed"], run["arm"]) == (seed, arm)]
+            known = [run for run in kept.rows if (run["seed"], run["arm"]) == (seed, arm)]
             if any("pours" in run or asked.calibration_only for run in known):
                 continue
             run = run_self(__file__, f"--one={seed}", "--arms", arm, *places)
-            runs[:] = [run, *(other for other in runs if other not in known)]
-            with file.open("a", encoding="utf-8") as kept:
-                kept.write(json.dumps(run) + "\n")
-            test = run["test"]
-            losses = ", ".join(
-                f"{100 * pour['loss']:.2f} % ({100 * pour['band'][0]:.1f} … {100 * pour['band'][1]:.1f})"
-                for pour in run.get("pours", ())
-            )
-            say(
-                f"seed {seed}, {arm}: test {test['theta']:.4f} with θ*, {test['uncalibrated']:.4f} uncalibrated; pours "
-                f"{losses or 'not made'} "
-                f"({run['cpu_s']:.0f} CPU s, {run['simulated']} simulated)"
-            )
+            kept.add(run)
+            losses = [round(100 * pour["loss"], 2) for pour in run.get("pours", ())]
+            say(f"seed {seed}, {arm}: test {run['test']}, lost {losses} %; {run['cpu_s']} CPU s")
 
 
 def _compare_fits(asked: argparse.Namespace) -> None:
     """Make the missing comparisons, one process for each seed and bench, and print or write their table."""
-    file = asked.into / "fits.jsonl"
-    rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
+    kept = KeptRows(asked.into / "fits.jsonl")
     places = [f"--{name}={getattr(asked, name).resolve()}" for name in ("laboratory", "into")]
     wanted = range(asked.first, asked.first + asked.fits)
     for seed, bench in itertools.product(wanted, () if asked.write else BENCHES):
-        if any((row["seed"], row["bench"]) == (seed, bench) for row in rows):
+        if any((row["seed"], row["bench"]) == (seed, bench) for row in kept.rows):
             continue
         new = run_self(__file__, f"--one={seed}", f"--bench={bench}", *places)["rows"]
-        rows += new
-        with file.open("a", encoding="utf-8") as kept:
-            kept.writelines(json.dumps(row) + "\n" for row in new)
+        kept.add(*new)
         say(f"seed {seed}, {bench}: {[(row['program'], row['simulations'], row['cpu_s']) for row in new]}")
-    shown = fits_table(sorted((row for row in rows if row["seed"] in wanted), key=lambda row: row["seed"]))
+    shown = fits_table(sorted((row for row in kept.rows if row["seed"] in wanted), key=lambda row: row["seed"]))
     print(
         "\n".join(f"| {' | '.join(cells)} |" for cells in (shown["head"], ["---"] * len(shown["head"]), *shown["rows"]))
     )
@@ -620,8 +502,6 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=401)
     parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["shipped"])
     parser.add_argument("--calibration-only", action="store_true", help="skip the deployment")
-    parser.add_argument("--random", type=int, default=0, help="number of random actions to pour on the bench")
-    parser.add_argument("--plans", type=int, default=0, help="number of uncalibrated plans to pour on the bench")
     parser.add_argument("--fits", type=int, default=0, help="number of seeds to compare calibrations on")
     parser.add_argument("--bench", choices=list(BENCHES), help=argparse.SUPPRESS)
     parser.add_argument("--laboratory", type=Path, default=ROOT / "configs" / "laboratories" / "twin.yaml")
@@ -631,7 +511,6 @@ def main() -> None:
     asked = parser.parse_args()
     asked.into.mkdir(parents=True, exist_ok=True)
     if asked.one is not None:
-        _end_with_parent()
         if asked.bench is not None:
             print(json.dumps({"rows": fitted(asked.one, asked.bench, asked.laboratory, asked.into)}))
             return
@@ -641,19 +520,10 @@ def main() -> None:
     if asked.fits:
         _compare_fits(asked)
         return
-    if asked.random:
-        losses = random_losses(asked.random, asked.first, asked.laboratory, asked.into)
-        good, bad = sum(loss < GOOD for loss in losses), sum(loss > BAD for loss in losses)
-        print(f"{good} of {asked.random} random actions lose less than 1 %, {bad} more than 10 %")
-    for seed in range(asked.first, asked.first + asked.plans):
-        plan = uncalibrated_plan(seed, asked.laboratory, asked.into)
-        print(f"seed {seed}: the uncalibrated plan expects {plan['expected']:.3f} and loses {plan['loss']:.3f}")
-    file = asked.into / "runs.jsonl"
-    lines = file.read_text(encoding="utf-8").splitlines() if file.exists() else []
-    latest = {(run["seed"], run["arm"]): run for run in map(json.loads, lines)}
-    runs = list(latest.values())
+    kept = KeptRows(asked.into / "runs.jsonl")
     if not asked.write:
-        _run_missing(asked, runs, file)
+        _run_missing(asked, kept)
+    runs = {(run["seed"], run["arm"]): run for run in kept.rows}.values()  # the latest of each
     wanted = range(asked.first, asked.first + asked.seeds)
     for arm in asked.arms:
         chosen = sorted(
@@ -661,7 +531,7 @@ def main() -> None:
         )
         poured = [run for run in chosen if "pours" in run]
         if poured:
-            print(f"{arm}\n\n{table(poured)}\n")
+            print(f"{arm}: {summary(poured)}")
         seeds = f"--seeds {asked.seeds} --first {asked.first}"
         bench = "quickstart.yaml on a simulated bench with the ground truth of virtual.yaml"
         command = f"python benchmarks/quickstart.py {seeds}"
@@ -673,9 +543,6 @@ def main() -> None:
         if asked.write and arm == "shipped":
             shown = f"{command} --calibration-only"
             write_table("quickstart-calibration", **calibration_table(chosen), command=shown, settings=bench)
-            if poured:
-                settings = f"{bench}. {summary(poured)}"
-                write_table("quickstart", **pours_table(poured), command=command, settings=settings)
 
 
 if __name__ == "__main__":

@@ -14,24 +14,26 @@ measured with the same settings.
 from __future__ import annotations
 
 import argparse
+import asyncio
+import contextlib
 import json
+import tempfile
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
-from typing import Any, cast
+from typing import Any
 
-from machine import ROOT, TABLES, describe, provenance, run_self, say, write_table
+from machine import ROOT, TABLES, KeptRows, describe, provenance, run_self, say, write_table
+from quickstart import KeptPours
 
+from actors.interfaces import InvalidActionError
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.learning.calibration.calibration_scores import ScoredPour
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
-from orchestrator.learning.requests import Failed, Outcome, Request, Simulate, Simulated, Suggest, Suggested
-from orchestrator.learning.strategy import Strategy
 from orchestrator.records.codec import digest
-from orchestrator.runs.stage_scheduler import PendingRequest, free_slots, next_to_tell
+from orchestrator.runs.run_service import RunRequest, RunResources, RunService
 from orchestrator.runs.stages import (
     CALIBRATION,
     calibrated_theta,
@@ -41,7 +43,6 @@ from orchestrator.runs.stages import (
     scenes_of,
     stage_seed,
 )
-from sim_engine.errors import InvalidSceneError
 from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import band
 from sim_engine.resources import cache_directory
@@ -52,56 +53,6 @@ PREDICTIONS = TABLES.with_name("recorded-predictions.json")
 GOAL = 0.02
 
 
-def play(strategy: Strategy, answer: Callable[[Request], Outcome], slots: int, label: str) -> None:
-    """Run the ask–tell loop until the strategy has finished, in the order of a campaign run."""
-    flights: dict[int, PendingRequest] = {}
-    asked, begun, told = 0, time.monotonic(), 0
-    while not strategy.finished:
-        for request in strategy.ask(free_slots(list(flights.values()), slots)):
-            flights[asked] = PendingRequest(asked, request)
-            asked += 1
-        for flight in flights.values():
-            if flight.outcome is None:
-                flight.outcome = answer(flight.request)
-        flight = cast("PendingRequest", next_to_tell(list(flights.values()), "logical"))
-        assert flight.outcome is not None
-        del flights[flight.id]
-        strategy.tell(flight.request, flight.outcome)
-        progress = strategy.progress()
-        done, total = progress.done, progress.total
-        if done >= told + 20 or done == total > told:
-            told = done
-            say(f"{label}: {done}/{total} simulations, {time.monotonic() - begun:.0f} s")
-
-
-class Answers:
-    """Evaluates suggestion queries and simulates pours in this process."""
-
-    def __init__(self, plan: CampaignPlan) -> None:
-        from sim_engine.simulator import PourSimulator
-
-        self._simulator = PourSimulator()
-        self._scenes = scenes_of(plan)
-
-    def __call__(self, request: Request) -> Outcome:
-        """Return the outcome of a request."""
-        from actors.optimizer.suggest import propose
-
-        if isinstance(request, Suggest):
-            return Suggested(propose(request.query))
-        assert isinstance(request, Simulate)
-        task = PourTask(self._scenes[request.scene], request.action, request.parameters, request.seed)
-        try:
-            outcome = self._simulator.simulate(task).outcome
-        except InvalidSceneError as error:
-            return Failed("invalid_action", str(error))
-        return Simulated(outcome) if outcome.invalid is None else Failed("simulation", outcome.invalid)
-
-    def close(self) -> None:
-        """Close the simulator; compiled kernels remain cached for the next process."""
-        self._simulator.close()
-
-
 def recorded(plan: CalibrationPlan) -> list[ScoredPour]:
     """Return all recorded pours, with those of the other receiver last."""
     transfer = () if plan.transfer is None else plan.transfer.pours
@@ -109,65 +60,38 @@ def recorded(plan: CalibrationPlan) -> list[ScoredPour]:
     return [*measured_pours(plan, {}), *others]
 
 
-class Kept:
-    """Store of finished calibrations, keyed by everything that determines them; one file each."""
-
-    def __init__(self, *, fresh: bool) -> None:
-        self._folder = cache_directory() / "recorded-predictions"
-        self._folder.mkdir(exist_ok=True)
-        if fresh:
-            for path in self._folder.glob("*.json"):
-                path.unlink()
-
-    def find(self, key: Any) -> dict[str, Any] | None:
-        """Return the stored result, or None."""
-        path = self._path(key)
-        return cast("dict[str, Any]", json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
-
-    def get(self, key: Any, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-        """Return the stored result, or compute and store it."""
-        found = self.find(key)
-        if found is not None:
-            return found
-        path, result = self._path(key), make()
-        unfinished = path.with_suffix(".tmp")
-        unfinished.write_text(json.dumps(result), encoding="utf-8")
-        unfinished.replace(path)
-        return result
-
-    def _path(self, key: Any) -> Path:
-        return self._folder / f"{digest(key)[:24]}.json"
-
-
-def predictions(plan: CampaignPlan, seed: int, draws: int, label: str) -> dict[str, Any]:
+def predictions(plan: CampaignPlan, seed: int, draws: int) -> dict[str, Any]:
     """Calibrate, and predict the unseen pours.
 
     Returns:
         θ*, and for each pour its split, the recorded r, the mean of the simulated r and the ends of their interval.
     """
-    calibration = plan.calibration
+    calibration, begun, rows = plan.calibration, time.process_time(), []
     assert calibration is not None
-    answers, begun = Answers(plan), time.process_time()
-    (stage,) = (stage for stage in calibration_stages(calibration) if stage.name == CALIBRATION)
-    strategy = stage.build({}, stage_seed(seed, stage.name))
-    play(strategy, answers, plan.parallel_simulations, label)
-    found = calibrated_theta({CALIBRATION: strategy.result()})
-    drawn = posterior_draws(found, draws)
-    rows = []
-    for one in recorded(calibration):
-        if one.pour.split == "train" or one.pour.spillage is None:
-            continue
-        values = []
-        for k, theta in enumerate(drawn):
-            outcome = answers(Simulate(one.scene, one.pour.action, theta, stage_seed(seed, f"draw {k}"), "predict"))
-            if isinstance(outcome, Simulated) and outcome.outcome.invalid is None:
-                r = normalised_spillage(outcome.outcome.fractions)
-                values += [] if r is None else [r]
-        if values:
-            interval = band(values, found.theta.particles)
-            row = {"split": one.pour.split, "recorded": one.pour.spillage, "predicted": fmean(values)}
-            rows.append({**row, "low": interval.low, "high": interval.high})
-    answers.close()
+    with tempfile.TemporaryDirectory(prefix="decant-recorded-") as folder:
+        pool = KeptPours(Path(folder) / "pours.jsonl")
+        outputs = plan.outputs.model_copy(update={"directory": Path(folder), "recording": False, "figures": False})
+        stages = [stage for stage in calibration_stages(calibration) if stage.name == CALIBRATION]
+        handle = RunService().start(
+            RunRequest(replace(plan, seed=seed, outputs=outputs), stages), RunResources(True, simulators=pool)
+        )
+        found = calibrated_theta(asyncio.run(handle.wait()).results)
+        scenes, drawn = scenes_of(plan), posterior_draws(found, draws)
+        for one in recorded(calibration):
+            if one.pour.split == "train" or one.pour.spillage is None:
+                continue
+            values = []
+            for k, theta in enumerate(drawn):
+                task = PourTask(scenes[one.scene], one.pour.action, theta, stage_seed(seed, f"draw {k}"))
+                with contextlib.suppress(InvalidActionError):
+                    outcome = asyncio.run(pool.simulate(task)).outcome
+                    r = normalised_spillage(outcome.fractions) if outcome.invalid is None else None
+                    values += [] if r is None else [r]
+            if values:
+                interval = band(values, found.theta.particles)
+                row = {"split": one.pour.split, "recorded": one.pour.spillage, "predicted": fmean(values)}
+                rows.append({**row, "low": interval.low, "high": interval.high})
+        asyncio.run(pool.close())
     best = {name: found.theta.model_dump()[name] for name in found.searched}
     return {"theta": best, "pours": rows, "cpu_s": round(time.process_time() - begun, 1)}
 
@@ -211,7 +135,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=list(range(11, 21)))
     parser.add_argument("--simulations", type=int, default=108, help="budget per calibration")
     parser.add_argument("--draws", type=int, default=5, help="posterior draws per prediction")
-    parser.add_argument("--fresh", action="store_true", help="discard stored results")
     parser.add_argument("--write", action="store_true", help="make no calibrations; write the stored ones")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)  # runs one calibration in this process
     options = parser.parse_args()
@@ -219,16 +142,19 @@ def main() -> None:
     assert plan.calibration is not None
     plan = replace(plan, calibration=plan.calibration.with_settings(simulations=options.simulations), deployment=None)
     if options.one is not None:
-        print(json.dumps(predictions(plan, options.one, options.draws, f"seed {options.one}")))
+        print(json.dumps(predictions(plan, options.one, options.draws)))
         return
-    machine, kept = describe(), Kept(fresh=options.fresh)
+    machine, kept = describe(), KeptRows(cache_directory() / "recorded-predictions.jsonl")
     same = [f"--simulations={options.simulations}", f"--draws={options.draws}"]
 
     def find(seed: int) -> dict[str, Any] | None:
-        key = [machine["fingerprint"], fingerprint(plan), seed, options.draws]
+        key = digest([machine["fingerprint"], fingerprint(plan), seed, options.draws])
+        found = next((row for row in kept.rows if row["key"] == key), None)
         if options.write:
-            return kept.find(key)
-        found = kept.get(key, lambda: run_self(__file__, *same, "--one", str(seed)))
+            return found
+        if found is None:
+            found = {"key": key, **run_self(__file__, *same, "--one", str(seed))}
+            kept.add(found)
         errors = ", ".join(f"{split} {error(found, split):.3f}" for split in ("test", "transfer"))
         say(f"seed {seed}: {errors} ({found['cpu_s']:.0f} CPU s)")
         return found

@@ -31,7 +31,6 @@ import signal
 import socket
 import statistics
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -43,7 +42,7 @@ from typing import Any
 
 import psutil
 from daemon_page import keep
-from daemon_process import PATIENCE, await_, end_in_order, started
+from daemon_process import PATIENCE, await_daemon, end, end_in_order, launched
 from ruamel.yaml import YAML
 from scipy import stats
 
@@ -130,9 +129,6 @@ ORDER = (
 FULL_FOR = 30.0
 """Duration of a full disk [s]."""
 
-ENDS_WITHIN = 60.0
-"""Longest time for the daemon to end after a signal [s]."""
-
 ENDED = ("finished", "stopped", "withdrawn")
 RESTS = ("paused", "failed", "unknown")
 
@@ -170,22 +166,14 @@ class Laboratory:
     def start(self) -> None:
         """Start the daemon and wait until it serves requests."""
         begun = time.monotonic()
-        with (self.folder / "log").open("a") as log:
-            command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "server", "start"]
-            options = [str(self.folder / "settings.yaml"), "--state", str(self.state), "--port", str(self._port)]
-            self._process = started(
-                [*command, *options], stdout=log, stderr=log, start_new_session=True,
-                env={**os.environ, "TMPDIR": self.mark},
-            )  # fmt: skip
-        process = self._process
+        options = self.folder / "settings.yaml", "--state", self.state, "--port", str(self._port)
+        self._process = launched(self.folder, *options, environment={"TMPDIR": self.mark})
 
         def up() -> bool:
-            if process.poll() is not None:
-                raise SystemExit(f"the daemon did not start:\n{(self.folder / 'log').read_text()[-2000:]}")
             with self.client() as client:
                 return bool(client.get("/status"))
 
-        await_(up)
+        await_daemon(self._process, self.folder, up)
         self.restarts.append(time.monotonic() - begun)
 
     def end(self, number: int = signal.SIGTERM) -> None:
@@ -193,12 +181,7 @@ class Laboratory:
         self.spent += _cpu(self.mark)
         process, self._process = self._process, None
         if process is not None:
-            process.send_signal(number)
-            try:
-                process.wait(ENDS_WITHIN)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            end(process, number)
 
     def client(self) -> Client:
         """Return a client; the daemon may not be running."""
@@ -479,7 +462,6 @@ def sampling(lab: Laboratory, every: float, begun: float) -> None:
 
 def look(lab: Laboratory) -> dict[str, Any]:
     """Return everything that may grow: memory [MB], counts, sizes on disk [MB]."""
-    memory: collections.Counter[str] = collections.Counter()
     totals: collections.Counter[str] = collections.Counter()
     for process in ours(lab.mark):
         with contextlib.suppress(psutil.Error, OSError):
@@ -487,20 +469,16 @@ def look(lab: Laboratory) -> dict[str, Any]:
                 name = _name(process)
                 found: dict[str, Any] = {"own": _own_memory(process.pid), "pss": process.memory_full_info().pss / 1e6}
                 found |= {"threads": process.num_threads(), "handles": process.num_fds(), "processes": 1}
-            memory[name] += found["own"]
             totals.update(found)
             if name == "daemon":
                 totals.update({f"daemon {k}": v for k, v in found.items() if k != "processes"})
     sizes = {path.name: path.stat().st_size / 1e6 for path in lab.state.glob("*.sqlite*")}
     sizes["runs"], sizes["campaigns"] = (_size(lab.state / name) / 1e6 for name in ("runs", "campaigns"))
-    sizes["ray"] = _size(Path(lab.mark)) / 1e6
     return {
         "time": time.time(),
         "starts": len(lab.restarts),
-        "items": lab.counts["items"],
         "cpu": round(lab.spent + _cpu(lab.mark), 1),
         **{key: round(value, 2) for key, value in totals.items()},
-        "memory of": {key: round(value, 1) for key, value in memory.items()},
         "size of": {key: round(value, 3) for key, value in sizes.items()},
     }
 
@@ -523,14 +501,7 @@ def _own_memory(pid: int) -> float:
 
 
 def _name(process: psutil.Process) -> str:
-    words = process.cmdline()
-    line = " ".join(words)
-    if "server" in words and "start" in words:
-        return "daemon"
-    for part, name in (("SimulatorProcess", "simulators"), ("Proposer", "optimiser"), ("live_view", "recording")):
-        if part in line:
-            return name
-    return "Ray" if "ray" in line else process.name()
+    return "daemon" if {"server", "start"} <= set(process.cmdline()) else process.name()
 
 
 def _size(folder: Path) -> int:
@@ -558,7 +529,7 @@ def _append(path: Path, row: dict[str, Any]) -> None:
 # ---- the complete soak
 
 
-def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) -> None:
+def soak(folder: Path, minutes: float, campaigns: int, every: float) -> None:
     """Keep a daemon busy, then check its records.
 
     Args:
@@ -566,11 +537,9 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
         minutes: duration [min].
         campaigns: largest number of campaigns of each of the four clients.
         every: time between two samples [s].
-        ray: run simulator, arm and balance as processes of Ray instead of threads of the daemon.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    settings = SETTINGS.replace("in_process: true\n", "") if ray else SETTINGS
-    (folder / "settings.yaml").write_text(settings, encoding="utf-8")
+    (folder / "settings.yaml").write_text(SETTINGS, encoding="utf-8")
     for rig, text in RIGS.items():
         (folder / f"{rig}.yaml").write_text(text, encoding="utf-8")
     with small_disk(folder / "disk") as disk, tempfile.TemporaryDirectory(prefix="k", dir="/tmp") as mark:
@@ -612,7 +581,6 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float, ray: bool) 
     result = {
         "minutes": round(took / 60.0, 1),
         "time_scale": TIME_SCALE,
-        "ray": ray,
         "restart_s": [round(one, 1) for one in lab.restarts],
         "cpu_s": round(lab.spent, 1),
         "counts": dict(lab.counts),
@@ -690,7 +658,7 @@ def draw(folder: Path) -> dict[str, Any]:
     samples = [json.loads(line) for line in (folder / "samples.jsonl").read_text().splitlines()]
     result: dict[str, Any] = json.loads((folder / "result.json").read_text())
     last = max(one["starts"] for one in samples)
-    size = {name: partial(_kept, name) for name in ("daemon", "events", "vessels", "ray", "runs", "campaigns")}
+    size = {name: partial(_kept, name) for name in ("daemon", "events", "vessels", "runs", "campaigns")}
     figure, panels = style.new_figure(2, 2, size=(9.2, 6.0), sharex=True)
     memory, handles, threads, disk = panels.flat
     for starts in range(1, last + 1):
@@ -705,8 +673,8 @@ def draw(folder: Path) -> dict[str, Any]:
                 label = name if starts == last else None
                 axes.plot(minutes, [one[key] for one in rows], "o-", color=colour, ms=3, lw=1.2, label=label)
     minutes = [one["minute"] for one in samples]
-    names = {"daemon": "queue, questions, audit entries", "events": "events", "vessels": "materials", "ray": "Ray"}
-    colours = (style.MEASURED, style.PREDICTED, style.GOOD, style.BEST)
+    names = {"daemon": "queue, questions, audit entries", "events": "events", "vessels": "materials"}
+    colours = (style.MEASURED, style.PREDICTED, style.GOOD)
     for (key, name), colour in zip(names.items(), colours, strict=True):
         disk.plot(minutes, [size[key](one) for one in samples], "o-", color=colour, ms=3, lw=1.2, label=name)
     titles = {memory: "Memory [MB]", handles: "Open handles", threads: "Threads and processes", disk: "On disk [MB]"}
@@ -724,7 +692,6 @@ def draw(folder: Path) -> dict[str, Any]:
         "queue, questions, audit entries with their WAL [MB]": size["daemon"],
         "events with their WAL [MB]": size["events"],
         "materials with their WAL [MB]": size["vessels"],
-        "Ray's folder [MB]": size["ray"],
         "run folders [MB]": size["runs"],
         "submitted campaigns [MB]": size["campaigns"],
     }
@@ -739,7 +706,6 @@ def draw(folder: Path) -> dict[str, Any]:
         "orders ended": result["orders ended"],
         "counts": counts,
         "restart [s]": round(statistics.median(result["restart_s"][1:]), 1),
-        "ray": result["ray"],
         "cpu share": round(result["cpu_s"] / 60.0 / result["minutes"], 3),
         "finished": result["requests finished"],
         "lost or doubled": {
@@ -787,7 +753,6 @@ def main() -> None:
     parser.add_argument("--into", type=Path, default=Path("soak"))
     parser.add_argument("--campaigns", type=int, default=1000, help="campaigns per client, at most (four clients)")
     parser.add_argument("--every", type=float, default=60.0, help="seconds between two samples")
-    parser.add_argument("--ray", action="store_true", help="use processes of Ray; takes several times as long")
     parser.add_argument("--draw", type=Path, help="draw the results in this folder")
     arguments = parser.parse_args()
     if arguments.draw is not None:
@@ -795,7 +760,7 @@ def main() -> None:
         return
     end_in_order()
     os.environ.pop("DECANT_STATE", None)
-    soak(arguments.into.resolve(), arguments.minutes, arguments.campaigns, arguments.every, arguments.ray)
+    soak(arguments.into.resolve(), arguments.minutes, arguments.campaigns, arguments.every)
 
 
 if __name__ == "__main__":

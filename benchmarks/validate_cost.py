@@ -9,35 +9,17 @@ the grids of meshes are cached by one initial run per file, which is not counted
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from machine import ROOT, as_a_second_time, describe, say, show, single_threaded
+from machine import ROOT, as_a_second_time, describe, run_decant, say, show, single_threaded
 
 LIMIT = 2.0
 """Required time for the check of a shipped file [CPU s]."""
 
 FOLDERS = ("campaigns", "studies", "laboratories", "vessels")
-
-
-def cost(file: Path, environment: dict[str, str]) -> float:
-    """Return the CPU seconds of one check.
-
-    Raises:
-        SystemExit: the file was refused.
-    """
-    before = os.times()
-    command = [sys.executable, "-c", "from orchestrator.cli.app import main; main()", "validate", str(file)]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
-    after = os.times()
-    if done.returncode != 0:
-        raise SystemExit(f"{file}: {done.stderr}")
-    return after.children_user + after.children_system - before.children_user - before.children_system
 
 
 def main() -> None:
@@ -54,8 +36,8 @@ def main() -> None:
         for folder in FOLDERS:
             for file in sorted((ROOT / "configs" / folder).glob("*.yaml")):
                 name = file.relative_to(ROOT).as_posix()
-                cost(file, environment)
-                seconds = [cost(file, environment) for _ in range(options.repeats)]
+                runs = [run_decant("validate", file, environment=environment) for _ in range(options.repeats + 1)]
+                seconds = [cpu for _, _, cpu in runs[1:]]
                 rows.append({"file": name, "cpu_s": round(statistics.median(seconds), 2)})
                 say(f"{name}: {rows[-1]['cpu_s']:.2f} CPU s")
     result = {

@@ -469,12 +469,12 @@ def dosing_balances() -> str:
     """Doses with displays that repeat, delay and lose readings."""
     data = json.loads((FOLDER / "data" / "dosing-balances.json").read_text(encoding="utf-8"))["rows"]
     head = (
-        *("balance", "mean error g", "95 % g", "worst g", "earlier: mean, 95 %, worst g", "interval covers"),
-        *("innovations", "weighed after s", "false stops", "earlier"),
+        *("balance", "mean error g", "95 % g", "worst g", "interval covers"),
+        *("innovations", "weighed after s", "false stops"),
     )
     rows = []
     for name, found in data.items():
-        now, before = found["now"], found.get("before")
+        now = found["now"]
         low, high = now["mean_interval"]
         rows.append(
             (
@@ -482,12 +482,10 @@ def dosing_balances() -> str:
                 f"{now['mean']:.2f} ({low:.2f} … {high:.2f})",
                 f"{now['p95']:.2f}",
                 f"{now['worst']:.1f}",
-                "" if before is None else f"{before['mean']:.2f}, {before['p95']:.1f}, {before['worst']:.1f}",
                 f"{100 * now['coverage']:.0f} %",
                 f"{now['innovations']:.2f}",
                 f"{now['time']:.1f}",
                 str(now["false_stops"]),
-                "" if before is None else str(before["false_stops"]),
             )
         )
     one = next(iter(data.values()))

@@ -1,4 +1,4 @@
-"""`benchmarks/recorded_predictions.py` counts errors and intervals, and keeps finished calibrations."""
+"""`benchmarks/recorded_predictions.py` counts errors and intervals."""
 
 from __future__ import annotations
 
@@ -32,23 +32,3 @@ def test_rows_have_errors_and_pours_in_their_intervals(benchmark: ModuleType) ->
         ["11", "0.000", "0.020", "2 of 2"],
         ["12", "0.010", "0.050", "1 of 2"],
     ]
-
-
-def test_what_was_made_is_kept_and_what_broke_off_is_not(
-    benchmark: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path))
-    made: list[int] = []
-
-    def make() -> dict[str, int]:
-        made.append(len(made))
-        if len(made) == 1:
-            raise SystemExit("killed")
-        return {"number": len(made)}
-
-    with pytest.raises(SystemExit):
-        benchmark.Kept(fresh=False).get(["a"], make)
-    assert benchmark.Kept(fresh=False).get(["a"], make) == {"number": 2}
-    assert benchmark.Kept(fresh=False).get(["a"], make) == {"number": 2}
-    assert benchmark.Kept(fresh=False).get(["b"], make) == {"number": 3}
-    assert benchmark.Kept(fresh=True).get(["a"], make) == {"number": 4}
