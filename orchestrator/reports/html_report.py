@@ -33,10 +33,10 @@ LARGEST_VECTOR = 1_500_000
 
 _THETA_FIGURES = ("discrepancy", "posterior", "test discrepancy")
 
-_FIRST_FIGURES = ("spillage", "loss map")
-"""Figures at the top of the page."""
+_FIRST_FIGURES = ("recommended pour", "spillage", "loss map")
+"""Figures at the top of the page, in this order."""
 
-_NARROW = ("test discrepancy", "spillage", "loss map", "posterior")
+_NARROW = ("test discrepancy", "spillage", "loss map", "uncertainty", "posterior")
 """Figures that can be placed next to each other."""
 
 _FIGURES: dict[str, tuple[str, str]] = {
@@ -60,8 +60,7 @@ _FIGURES: dict[str, tuple[str, str]] = {
     ),
     "spillage": (
         "Loss of every pour in the order made, with its prediction and the best so far.",
-        "Loss of every pour (dots), its prediction (bars: nine in ten such pours lie inside), and the best so far "
-        "(line).",
+        "Loss of every pour (dots), its prediction (bars: nine in ten lie inside), and the best so far (line).",
     ),
     "dose ": (
         "Readings of the balance and tilt of the pourer over the time of a dose.",
@@ -71,6 +70,14 @@ _FIGURES: dict[str, tuple[str, str]] = {
         "Map of the expected loss over the searched actions with the pours as numbered dots and the recommended action "
         "as a star.",
         "Expected loss by action. Numbers are pours in their order, the star is the recommended action.",
+    ),
+    "uncertainty": (
+        "Map of the standard deviation of the expected loss over the searched actions.",
+        "How uncertain the expected loss is: its standard deviation.",
+    ),
+    "recommended pour": (
+        "Film strip of the recommended pour as simulated: vessels cut open, with coloured particles.",
+        "Blue: in the pourer; light blue: falling; green: received; red: spilled.",
     ),
     "safe window": (
         "Loss along each dimension of the action, with the recommended action, the tolerance and the range inside "
@@ -116,7 +123,7 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         scores=wording.score_table(summary),
         theta_figures=[one for name, one in pictures.items() if name.startswith(_THETA_FIGURES)],
         receivers=wording.receiver_table(summary),
-        first=[one for name, one in pictures.items() if name.startswith(_FIRST_FIGURES)],
+        first=[one for start in _FIRST_FIGURES for name, one in pictures.items() if name.startswith(start)],
         figures=[one for name, one in pictures.items() if not name.startswith((*_THETA_FIGURES, *_FIRST_FIGURES))],
         pours=wording.pour_tables(summary),
         not_simulated=wording.validity_table(summary),

@@ -1,6 +1,7 @@
 """Figures of pours, simulated and planned, and of vessels, as cross-sections in the plane y = 0.
 
 - `draw_pour` and `simulation_figure`: snapshots of a pour from the side, and the shares of the liquid over time.
+- `film_strip`: the snapshots alone.
 - `section` and `place`: outlines of a mesh in its plane y = 0, and their transformation by a pose.
 - `draw_solid`: a mesh of a vessel.
 - `draw_path`: an arm's planned path: the pour from the side, and the arm in its cell.
@@ -12,6 +13,7 @@ import itertools
 import math
 import textwrap
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -190,47 +192,87 @@ def draw_pour(
     Raises:
         ValueError: the result has no frames.
     """
-    frames = result.frames
-    if frames is None or len(frames.times) == 0:
-        raise ValueError("this simulation kept no frames to draw; simulate it with a record rate above 0")
-    times = np.asarray(frames.times, dtype=float)
-    shares = _shares(frames.states)
-    chosen = _moments(times, shares, snapshots)
-    outlines = [section(np.asarray(v.solid_vertices, float), np.asarray(v.solid_faces)) for v in (pourer, receiver)]
-    stand = UPRIGHT + np.array([receiver_shift[0], 0, receiver_shift[1], 0, 0, 0, 0])
-    window = _window(outlines, np.asarray(frames.pourer_poses, float)[chosen], stand)
-    aspect = (window[3] - window[2]) / (window[1] - window[0])
-    width = 3.1 * snapshots
+    shown = _Snapshots(result, pourer, receiver, receiver_shift, snapshots)
     figure, grid = style.new_figure(
         2,
         snapshots,
-        size=(width, 3.0 * min(max(aspect, 0.7), 1.9) + 2.6),
-        height_ratios=[3.0 * min(max(aspect, 0.7), 1.9), 1.5],
+        size=(3.1 * snapshots, 3.0 * shown.aspect + 2.6),
+        height_ratios=[3.0 * shown.aspect, 1.5],
         squeeze=False,
     )
     figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.01, ha="left")
-    for axes, index in zip(grid[0], chosen, strict=True):
-        _snapshot(
-            axes,
-            np.asarray(frames.positions[index], float),
-            np.asarray(frames.states[index]),
-            [
-                [place(loop, np.asarray(frames.pourer_poses[index], float)) for loop in outlines[0]],
-                [place(loop, stand) for loop in outlines[1]],
-            ],
-            window,
-            result.outcome.spacing,
-        )
-        axes.set_title(f"{times[index]:.2f} s", fontsize=10.5, loc="left", color=style.INK)
-    _scale_bar(grid[0, 0], window)
+    shown.draw(grid[0])
     for axes in grid[1, 1:]:
         axes.remove()
     timeline = grid[1, 0]
     timeline.set_subplotspec(timeline.get_gridspec()[1, :])
-    _timeline(timeline, times, shares, times[chosen])
+    _timeline(timeline, shown.times, shown.shares, shown.times[shown.chosen])
     if note:
         figure.supxlabel(note, fontsize=8.5, color=style.GREY, x=0.01, ha="left")
     return figure
+
+
+STRIP = 6
+"""Number of snapshots of a film strip."""
+
+
+def film_strip(task: PourTask, result: SimulatedPour, *, title: str) -> Figure:
+    """Snapshots of a simulated pour from the side, in one row.
+
+    Args:
+        task: its scene and placement.
+        result: its result, with frames.
+        title: above them.
+
+    Raises:
+        ValueError: the result has no frames.
+    """
+    from sim_engine.vessel.vessel import build_vessel
+
+    vessels = build_vessel(task.scene.pourer), build_vessel(task.scene.receiver)
+    shown = _Snapshots(result, *vessels, (task.placement.x, task.placement.z), STRIP)
+    figure, grid = style.new_figure(1, STRIP, size=(2.0 * STRIP, 2.0 * shown.aspect + 0.6), squeeze=False)
+    figure.suptitle(title, fontsize=12.5, color=style.INK, x=0.01, ha="left")
+    shown.draw(grid[0])
+    return figure
+
+
+class _Snapshots:
+    """Moments of a simulated pour, and the part of the plane y = 0 that shows both vessels in all of them."""
+
+    def __init__(
+        self, result: SimulatedPour, pourer: Solid, receiver: Solid, receiver_shift: tuple[float, float], count: int
+    ) -> None:
+        frames = result.frames
+        if frames is None or len(frames.times) == 0:
+            raise ValueError("this simulation kept no frames to draw; simulate it with a record rate above 0")
+        self._frames, self._spacing = frames, result.outcome.spacing
+        self.times = np.asarray(frames.times, dtype=float)
+        self.shares = _shares(frames.states)
+        self.chosen = _moments(self.times, self.shares, count)
+        self._outlines = [
+            section(np.asarray(v.solid_vertices, float), np.asarray(v.solid_faces)) for v in (pourer, receiver)
+        ]
+        self._stand = UPRIGHT + np.array([receiver_shift[0], 0, receiver_shift[1], 0, 0, 0, 0])
+        self._window = _window(self._outlines, np.asarray(frames.pourer_poses, float)[self.chosen], self._stand)
+        left, right, low, high = self._window
+        self.aspect = min(max((high - low) / (right - left), 0.7), 1.9)
+
+    def draw(self, row: Sequence[Axes]) -> None:
+        for axes, index in zip(row, self.chosen, strict=True):
+            _snapshot(
+                axes,
+                np.asarray(self._frames.positions[index], float),
+                np.asarray(self._frames.states[index]),
+                [
+                    [place(loop, np.asarray(self._frames.pourer_poses[index], float)) for loop in self._outlines[0]],
+                    [place(loop, self._stand) for loop in self._outlines[1]],
+                ],
+                self._window,
+                self._spacing,
+            )
+            axes.set_title(f"{self.times[index]:.2f} s", fontsize=10.5, loc="left", color=style.INK)
+        _scale_bar(row[0], self._window)
 
 
 def _shares(states: Any) -> Floats:
@@ -292,6 +334,7 @@ def _snapshot(
             edgecolors=(1.0, 1.0, 1.0, 0.35),
             linewidths=0.2,
             zorder=1,
+            rasterized=True,  # as lines, thousands of particles make a page slow
         )
     )
     for loops in vessels:

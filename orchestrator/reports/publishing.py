@@ -29,14 +29,14 @@ from orchestrator.reports.run_figures import draw_figures
 from orchestrator.reports.run_summary import SUMMARY_NAME, RunSummary, Totals, write_summary
 from orchestrator.reports.stage_views import evaluation_of, theta_of
 from orchestrator.reports.summarise import pool_use, summarise, summarise_record
-from orchestrator.runs.run_folder import read_versions
+from orchestrator.runs.run_folder import FIGURES, read_versions
 
 if TYPE_CHECKING:
     from orchestrator.runs.run_service import RunHandle, RunRequest
 
 W = TypeVar("W")
 
-FIGURES, THETA_FILE, RECORDING = "figures", "theta.json", "campaign.rrd"
+THETA_FILE, RECORDING = "theta.json", "campaign.rrd"
 
 KEPT_THETAS = 50
 """Draws of the posterior in that file."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +26,7 @@ from orchestrator.records.codec import Results
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.figure_style import safe_name
 from orchestrator.reports.loss_units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
+from orchestrator.reports.pour_figures import film_strip
 from orchestrator.reports.stage_views import (
     SPLITS,
     all_of,
@@ -43,7 +44,10 @@ from orchestrator.reports.surrogate_figures import (
     draw_trials,
     draw_window,
 )
+from orchestrator.runs.run_folder import film_file, read_film
+from orchestrator.runs.stages import recommended_pours, scenes_of
 from sim_engine.prediction_band import LEVEL
+from sim_engine.scene import PourTask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -73,7 +77,7 @@ def draw_figures(
         Name of each figure → its PNG.
     """
     drawn: dict[str, Path] = {}
-    for name, draw in _drawings(plan, results).items():
+    for name, draw in _drawings(plan, results, directory).items():
         try:
             drawn[name] = style.save(draw(), directory / f"{safe_name(name.replace(' ', '-'))}.png", formats)
         except Exception as error:
@@ -86,8 +90,12 @@ def figures_of(plan: CampaignPlan, results: Results) -> dict[str, Figure]:
     return {name: draw() for name, draw in _drawings(plan, results).items()}
 
 
-def _drawings(plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Figure]]:
-    """The functions that draw the figures, by name."""
+def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = None) -> dict[str, Callable[[], Figure]]:
+    """The functions that draw the figures, by name.
+
+    Args:
+        directory: folder with the films of recommended pours.
+    """
     found: dict[str, Callable[[], Figure]] = {}
     calibration, evaluation, theta = calibration_of(results), evaluation_of(results), theta_of(results)
     if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
@@ -111,10 +119,27 @@ def _drawings(plan: CampaignPlan, results: Results) -> dict[str, Callable[[], Fi
     for scene, result in deployments_of(results).items():
         picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
         if picture is not None:
-            found[f"loss map {name}"] = partial(draw_surrogate, picture)
+            found[f"loss map {name}"] = partial(draw_surrogate, replace(picture, deviation=None))
+        if picture is not None and picture.deviation is not None:
+            found[f"uncertainty of the loss {name}"] = partial(draw_surrogate, replace(picture, mean=None))
         if result.window is not None:
             found[f"safe window {name}"] = partial(draw_window, result, picture, unit=unit, receiver=name)
+    if directory is not None:
+        scenes = scenes_of(plan)
+        for name, pour in recommended_pours(plan, results).items():
+            if (file := film_file(directory, name)).is_file():
+                task = PourTask(scenes[pour.scene], pour.action, pour.parameters, pour.seed)
+                found[f"recommended pour {name}"] = partial(_recommended, task, file)
     return found
+
+
+def _recommended(task: PourTask, file: Path) -> Figure:
+    pour = read_film(file)
+    got = pour.outcome
+    shares = (
+        f"{100 * got.received:.1f} % received, {100 * got.spilled:.1f} % spilled, {100 * got.retained:.1f} % retained"
+    )
+    return film_strip(task, pour, title=f"The recommended pour into {task.scene.receiver.name}, simulated: {shares}")
 
 
 def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,10 +84,11 @@ def draw_surrogate(picture: SurrogatePicture) -> Figure:
     Raises:
         ValueError: there is nothing to draw.
     """
-    if not picture.points and picture.mean is None:
+    mapped = picture.mean is not None or picture.deviation is not None
+    if not picture.points and not mapped:
         raise ValueError(f"'{picture.title}': neither a surrogate nor a single observation to draw")
-    mapped = picture.space.dimension == 2 or (picture.mean is not None and picture.space.dimension > 2)
-    return _maps(picture) if mapped else _slices(picture)
+    two = picture.space.dimension == 2 or (mapped and picture.space.dimension > 2)
+    return _maps(picture) if two else _slices(picture)
 
 
 def draw_trials(picture: SurrogatePicture) -> Figure:
@@ -112,13 +113,16 @@ def _maps(picture: SurrogatePicture) -> Figure:
     shown: list[tuple[str, NDArray[np.float64] | None]] = [panel for panel in panels if panel[1] is not None] or [
         ("observations", None)
     ]
-    figure, axes = style.new_figure(1, len(shown), size=(5.6 * len(shown), 4.8), squeeze=False)
+    alone = len(shown) == 1  # then the legend has no room beside the title
+    figure, axes = style.new_figure(1, len(shown), size=(6.4 if alone else 5.6 * len(shown), 4.8), squeeze=False)
     style.entitle(figure, picture.title)
     for place, (name, grid) in enumerate(shown):
         _map_panel(figure, axes[0, place], picture, name, grid)
     marked = {name: h for h, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
     if marked:
-        figure.legend(marked.values(), marked.keys(), loc="outside upper right", ncols=3, fontsize=9, frameon=False)
+        where: Literal["outside lower center", "outside upper right"]
+        where = "outside lower center" if alone else "outside upper right"
+        figure.legend(marked.values(), marked.keys(), loc=where, ncols=3, fontsize=9, frameon=False)
     if notes := _notes(picture):
         figure.supxlabel("\n".join(notes), fontsize=8.5, color=style.INK, x=0.02, ha="left")
     return figure

@@ -32,7 +32,7 @@ from actors.interfaces import (
 )
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
 from orchestrator.learning.run_errors import RunError
-from sim_engine.outcome import RecordedFrames
+from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 
 
@@ -205,6 +205,9 @@ def _lasts(outcome: Outcome) -> bool:
     return isinstance(outcome, Simulated) or (isinstance(outcome, Failed) and outcome.kind == "invalid_action")
 
 
+FILM_RATE = 25.0
+"""Frames of a film [1/s]."""
+
 SUGGESTIONS = 3
 """Attempts per query to the optimiser. A query is idempotent, and its process may have failed by chance."""
 
@@ -269,8 +272,16 @@ class RequestExecutor:
         with self.speculation.asked_for():
             return await self._simulated(request, record=record)
 
-    async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
-        rate = self._frame_rate if record else 0.0
+    async def film(self, request: Simulate) -> SimulatedPour | None:
+        """A simulation with frames for a picture; None if it fails. No decision depends on it."""
+        try:
+            found = await self._pooled(request, FILM_RATE)
+        except (InvalidActionError, SimulationError, TimeoutError):
+            _raise_if_cancelled()
+            return None
+        return found if found.frames is not None and found.outcome.invalid is None else None
+
+    async def _pooled(self, request: Simulate, rate: float) -> SimulatedPour:
         scene = self._scene(request.scene)
         task = PourTask(
             scene.drawn(request.seed) if request.drawn_shapes else scene,
@@ -280,9 +291,12 @@ class RequestExecutor:
             frame_rate=rate,
             pose_error=request.pose_error,
         )
+        async with asyncio.timeout(self.deadlines.simulate):
+            return await self._laboratory.simulators.simulate(task)
+
+    async def _simulated(self, request: Simulate, *, record: bool = False) -> tuple[Outcome, RecordedFrames | None]:
         try:
-            async with asyncio.timeout(self.deadlines.simulate):
-                result = await self._laboratory.simulators.simulate(task)
+            result = await self._pooled(request, self._frame_rate if record else 0.0)
         except InvalidActionError as error:
             return Failed("invalid_action", str(error)), None
         except SimulationError as error:

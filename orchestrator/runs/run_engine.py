@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from actors.interfaces import Laboratory, Notice, Telling
+from actors.interfaces import Laboratory, LaboratoryError, Notice, Telling
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
@@ -45,9 +45,9 @@ from orchestrator.runs.resume import (
     settle_open_questions,
     settle_unknown_pours,
 )
-from orchestrator.runs.run_folder import write_provenance
+from orchestrator.runs.run_folder import FIGURES, film_file, write_film, write_provenance
 from orchestrator.runs.stage_scheduler import StageScheduler
-from orchestrator.runs.stages import StageDefinition, scenes_of, stage_seed, stages_of
+from orchestrator.runs.stages import StageDefinition, recommended_pours, scenes_of, stage_seed, stages_of
 
 
 async def run_campaign(
@@ -190,6 +190,8 @@ class _Run:
             try:
                 for index, stage in enumerate(self._stages, start=1):
                     results[stage.name] = await self._run_stage(stage, index, histories[stage.name], results, executor)
+                if self._plan.outputs.figures:
+                    await self._film(results, executor)
             finally:
                 await executor.speculation.close()
             self._enter(State.FINISHED)
@@ -235,6 +237,18 @@ class _Run:
             text = f"{count} simulation(s) of {stage.name} were made while the arm was pouring before"
             self._journal.log("note", text, stage=stage.name, kept=True)
         return result
+
+    async def _film(self, results: Results, executor: RequestExecutor) -> None:
+        """Simulate the recommended pours once more and keep their particles, for the report's pictures."""
+        for receiver, request in recommended_pours(self._plan, results).items():
+            path = film_file(self._directory / FIGURES, receiver)
+            if path.is_file():
+                continue
+            try:
+                if (found := await executor.film(request)) is not None:
+                    write_film(path, found)
+            except (LaboratoryError, OSError) as error:  # a picture less
+                self._journal.log("warning", f"no picture of the recommended pour into {receiver}: {error}")
 
     @contextmanager
     def _speculating(

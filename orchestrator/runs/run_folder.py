@@ -18,22 +18,28 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.installed_plugins import packages as plugin_packages
 from orchestrator.learning.campaign_plan import CampaignPlan
-from orchestrator.records.codec import digest
+from orchestrator.records.codec import digest, from_json, to_json
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader
 from orchestrator.records.journal_check import LEDGER_NAME, check_journal, has_begun, readable_lines
 from orchestrator.records.journal_file import TO_BEGIN, JournalError, require_space
 from orchestrator.records.run_registry import make_state_directory, register, state_directory
 from orchestrator.records.states import State
 from sim_engine.engine_package import engine_version
+from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 from sim_engine.solver_fingerprint import ROOT, folder_digest, solver_fingerprint
 
 RESOLVED, VERSIONS = "resolved.json", "versions.json"
 """Files with the resolved plan of a run and with the versions of the program that began it."""
 
+
+FIGURES = "figures"
+"""Folder of a run's pictures."""
 
 SIMULATOR, SIMULATOR_FILE = "simulator", "simulator.json"
 """Key of the solver's version in `versions.json`, and the file of the state directory that keeps it."""
@@ -120,6 +126,42 @@ def simulator_version() -> str:
             make_state_directory(path.parent)
             _write_json(path, {"files": files, "version": version})
     return version
+
+
+def film_file(figures: Path, receiver: str) -> Path:
+    """File with the simulated particles of a recommended pour, in the folder of a run's pictures."""
+    name = re.sub(r"[^\w.-]", "_", receiver)
+    return figures / f"recommended-pour-{name}.npz"
+
+
+def write_film(path: Path, pour: SimulatedPour) -> None:
+    """Write a simulated pour with its frames.
+
+    Raises:
+        OSError: it can't be written.
+    """
+    frames = pour.frames
+    assert frames is not None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(
+        path,
+        outcome=np.array(json.dumps(to_json(pour.outcome, PourOutcome))),
+        times=frames.times,
+        positions=np.stack(frames.positions),
+        states=np.stack(frames.states),
+        poses=frames.pourer_poses,
+    )
+
+
+def read_film(path: Path) -> SimulatedPour:
+    """Read a pour that `write_film` has written.
+
+    Raises:
+        OSError, ValueError: it can't be read.
+    """
+    with np.load(path) as kept:
+        frames = RecordedFrames(kept["times"], list(kept["positions"]), list(kept["states"]), kept["poses"])
+        return SimulatedPour(from_json(json.loads(str(kept["outcome"])), PourOutcome), frames)
 
 
 def missing_plugins(versions: Mapping[str, Any]) -> list[str]:

@@ -43,7 +43,7 @@ from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import displacement
 from orchestrator.learning.dispense import Dispense, ReadSources, SourcesRead
-from orchestrator.learning.requests import Order
+from orchestrator.learning.requests import Order, Simulate
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.single_action import Confirmation, RepeatedSimulation
 from orchestrator.learning.strategy import Strategy
@@ -381,6 +381,17 @@ def by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
     """Scenes by the names of their receivers, or by their own names if receivers are shared."""
     distinct = len({scene.receiver.name for scene in deployment.scenes}) == len(deployment.scenes)
     return {scene.receiver.name if distinct else scene.name: scene for scene in deployment.scenes}
+
+
+def recommended_pours(plan: CampaignPlan, results: Results) -> dict[str, Simulate]:
+    """A simulation of each receiver's recommended pour with the θ that its deployment used, by receiver."""
+    found = {}
+    for name, scene in by_receiver(plan.deployment).items() if plan.deployment is not None else ():
+        result = results.get(DEPLOYMENT + name)
+        if isinstance(result, Deployed) and result.recommended is not None:
+            action, seed = scene.action(dict(result.recommended.action_si)), stage_seed(plan.seed, f"film:{name}")
+            found[name] = Simulate(scene.name, action, _theta(plan, results), seed, purpose="film")
+    return found
 
 
 def _theta(plan: CampaignPlan, results: Results) -> SimulationParameters:

@@ -30,11 +30,15 @@ from orchestrator.reports.html_report import run_page
 from orchestrator.reports.publishing import Published, publish
 from orchestrator.reports.run_summary import summary_json
 from orchestrator.reports.summarise import summarise
+from orchestrator.runs.request_executor import FILM_RATE
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
+from sim_engine.outcome import SimulatedPour
+from sim_engine.scene import PourTask
+from tests.support import example_run
 from tests.support.example_results import shown
 from tests.support.small_campaign import CAMPAIGN, write_campaign
-from tests.support.toy_campaign import ToyBench, ToyLaboratory
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToySimulators
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -64,8 +68,16 @@ class Asked:
         return Proposer().suggest(problem)
 
 
+class Filming(ToySimulators):
+    """Simulators that keep frames of the recommended pour."""
+
+    async def simulate(self, task: PourTask) -> SimulatedPour:
+        found = await super().simulate(task)
+        return replace(found, frames=example_run.frames()) if task.frame_rate == FILM_RATE else found
+
+
 def laboratory(bench: ToyBench | None = None, optimizer: Asked | None = None) -> ToyLaboratory:
-    return ToyLaboratory(bench=bench or ToyBench(), optimizer=optimizer or Asked())  # type: ignore[arg-type]
+    return ToyLaboratory(Filming(), bench or ToyBench(), optimizer or Asked())  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +149,8 @@ def test_ranges_of_theta_have_the_unit_of_their_value(made: Made) -> None:
 
 
 def test_pictures_come_first_and_parameters_that_were_not_searched_in_one_line(made: Made) -> None:
-    assert made.page.index("<figure") < made.page.index("<h2>Summary</h2>")
+    first = made.page[: made.page.index("<h2>Summary</h2>")]
+    assert re.findall(r'alt="(\w+ \w+)', first) == ["recommended pour", "spillage against", "loss map"]
     shown = texts(made.page)
     table = shown[shown.index("θ* with its region") : shown.index("Not searched: ")]
     assert "not searched" not in table
