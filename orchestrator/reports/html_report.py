@@ -77,7 +77,8 @@ _FIGURES: dict[str, tuple[str, str]] = {
     ),
     "recommended pour": (
         "Film strip of the recommended pour as simulated: vessels cut open, with coloured particles.",
-        "Blue: in the pourer; light blue: falling; green: received; red: spilled.",
+        "One simulation of the recommended pour. Blue: in the pourer, light blue: falling, green: received, red: "
+        "spilled.",
     ),
     "safe window": (
         "Loss along each dimension of the action, with the recommended action, the tolerance and the range inside "
