@@ -19,9 +19,10 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from orchestrator.daemon import PHYSICAL
 from orchestrator.daemon.access_tokens import Person, Role, Tokens, TooManyFailuresError
+from orchestrator.daemon.campaign_queue import CampaignQueue
 from orchestrator.daemon.daemon_settings import LOOPBACK
-from orchestrator.daemon.stop_request import stop_path
-from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.daemon.emergency_stop import EmergencyStops, stop_path
+from orchestrator.daemon.rig_worker import SharedServices
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -172,13 +173,18 @@ def needs(role: Role, advice: str = "") -> Callable[..., Awaitable[Person]]:
     return person
 
 
-async def the_daemon(request: Request) -> Supervisor:
-    """Return the daemon that the application serves. Asynchronous: a stop must not wait for a free thread."""
-    found: Supervisor = request.app.state.daemon
+def part(name: str) -> Callable[..., Any]:
+    """Make the dependency that returns a part of the served daemon."""
+
+    async def found(request: Request) -> Any:  # asynchronous: a stop must not wait for a free thread
+        return getattr(request.app.state, name)
+
     return found
 
 
-Daemon = Annotated[Supervisor, Depends(the_daemon)]
+Daemon = Annotated[SharedServices, Depends(part("daemon"))]
+Queue = Annotated[CampaignQueue, Depends(part("queue"))]
+Stops = Annotated[EmergencyStops, Depends(part("stops"))]
 Viewer = Annotated[Person, Depends(needs(Role.VIEWER))]
 Stopping = Annotated[
     Person,

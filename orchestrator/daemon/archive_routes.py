@@ -25,8 +25,8 @@ from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
 from orchestrator.daemon.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.materials import Materials
+from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.run_readout import REPORT
-from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.learning.run_errors import RunError
 from sim_engine.resources import MissingExtraError
 
@@ -101,7 +101,7 @@ class NotesOut(BaseModel):
     notes: list[Note]
 
 
-async def _in_catalogue(daemon: Supervisor, query: Callable[[Catalogue], T]) -> T:
+async def _in_catalogue(daemon: SharedServices, query: Callable[[Catalogue], T]) -> T:
     """Query the catalogue in a thread: the first query may read many journals."""
 
     def work() -> T:

@@ -11,17 +11,28 @@ import asyncio
 import contextlib
 import logging
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Path, Request, Response
 from fastapi.responses import JSONResponse
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Stopping
+from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Queue, Stopping, Stops
+from orchestrator.daemon.campaign_queue import RequestRefusedError
 from orchestrator.daemon.daemon_store import ENDED, QueueItem
+from orchestrator.daemon.emergency_stop import (
+    ALL_STOPPED,
+    BODY_TIME,
+    RIG_TIME,
+    UNSTORED,
+    ArmStops,
+    StopBody,
+    read_stop,
+)
 from orchestrator.daemon.query_routes import campaign_out, found_item, status
 from orchestrator.daemon.remote_operator import AnswerError, question_json
+from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.schemas import (
     AnswerIn,
     CampaignOut,
@@ -35,9 +46,7 @@ from orchestrator.daemon.schemas import (
     SubmissionIn,
     WhatMovesOut,
 )
-from orchestrator.daemon.stop_request import ALL_STOPPED, BODY_TIME, RIG_TIME, StopBody, read_stop
 from orchestrator.daemon.submissions import Submission, SubmissionError, prepare, run_request
-from orchestrator.daemon.supervisor import UNSTORED, ArmStops, RequestRefusedError, Supervisor
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count, required_checksum
 
@@ -48,7 +57,7 @@ class MotionNotEnabledError(RunError):
     """Motion can't be enabled; the message gives the reason."""
 
 
-def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
+def what_moves(daemon: SharedServices, item: QueueItem) -> WhatMovesOut:
     """Plan the campaign's motions again and describe them for the operator. Takes seconds.
 
     Raises:
@@ -75,7 +84,7 @@ def what_moves(daemon: Supervisor, item: QueueItem) -> WhatMovesOut:
     return WhatMovesOut(laboratory=work.campaign.laboratory.name, arm=arm.title, lines=lines)
 
 
-def enable_motion(daemon: Supervisor, item: QueueItem, moves: WhatMovesOut, typed: str, by: str) -> QueueItem:
+def enable_motion(daemon: SharedServices, item: QueueItem, moves: WhatMovesOut, typed: str, by: str) -> None:
     """Enable motion.
 
     Raises:
@@ -88,99 +97,95 @@ def enable_motion(daemon: Supervisor, item: QueueItem, moves: WhatMovesOut, type
     daemon.store.change(item.id, motion_enabled=True)
     daemon.note(by, "enable motion", item.id, moves.laboratory)
     daemon.wake()
-    return daemon.item(item.id)
 
 
 router = APIRouter()
 
 
 @router.post("/campaigns", status_code=201, operation_id="submit")
-async def submit(request: Request, daemon: Daemon, person: Operator, body: SubmissionIn) -> CampaignOut:
+async def submit(daemon: Daemon, queue: Queue, person: Operator, body: SubmissionIn) -> CampaignOut:
     """Queue a campaign. It is checked as by `decant run`, and later changes of its files don't affect it."""
     if bool(body.text) == bool(body.path) or (body.path and body.files):
         raise HTTPException(422, "give either 'text' (with 'files') or 'path'")
     with _refusing():
-        daemon.refuse_new_work()
+        queue.refuse_new_work()
     try:
         submission = Submission(**body.model_dump())
-        item = await asyncio.to_thread(prepare, daemon.settings, submission, daemon.new_key(), person.name)
+        item = await asyncio.to_thread(prepare, daemon.settings, submission, queue.new_key(), person.name)
     except SubmissionError as error:
         raise HTTPException(422, str(error)) from None
     with _refusing():
         try:
-            return campaign_out(request, daemon, daemon.submit(item))
+            return campaign_out(daemon, *queue.submit([item]))
         except RequestRefusedError:
             await asyncio.to_thread(shutil.rmtree, daemon.settings.snapshots / item.id, ignore_errors=True)
             raise
 
 
 @router.post("/campaigns/{key}/pause", operation_id="pause")
-async def pause(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
+async def pause(daemon: Daemon, queue: Queue, person: Operator, key: str) -> CampaignOut:
     """Pause at the next checkpoint; a pour that has started is finished and weighed."""
-    return _done(request, daemon, key, lambda: daemon.pause(key, person.name))
+    with _refusing():
+        return campaign_out(daemon, queue.pause(key, person.name))
 
 
 @router.post("/campaigns/{key}/stop", operation_id="stop")
-async def stop(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
+async def stop(daemon: Daemon, queue: Queue, person: Operator, key: str) -> CampaignOut:
     """Stop at the next checkpoint and publish the results so far. The campaign does not continue by itself."""
-    return _done(request, daemon, key, lambda: daemon.stop(key, person.name))
+    with _refusing():
+        return campaign_out(daemon, queue.stop(key, person.name))
 
 
 @router.post("/campaigns/{key}/abort", operation_id="abort")
-async def abort(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
+async def abort(daemon: Daemon, queue: Queue, person: Operator, key: str) -> CampaignOut:
     """Stop the motion. A tilted vessel is brought upright after the operator agrees, or left after a second abort."""
-    found_item(daemon, key)
     with _refusing():
-        return campaign_out(request, daemon, await daemon.abort(key, person.name))
+        return campaign_out(daemon, await queue.abort(key, person.name))
 
 
 @router.post("/campaigns/{key}/resume", operation_id="resume")
-async def resume(request: Request, daemon: Daemon, person: Operator, key: str) -> CampaignOut:
+async def resume(daemon: Daemon, queue: Queue, person: Operator, key: str) -> CampaignOut:
     """Resume a paused campaign. If the outcome of a pour is unknown, the operator enters it first."""
-    return _done(request, daemon, key, lambda: daemon.resume(key, person.name))
+    with _refusing():
+        return campaign_out(daemon, queue.resume(key, person.name))
 
 
 @router.post("/campaigns/{key}/move", operation_id="move")
-async def move(request: Request, daemon: Daemon, person: Operator, key: str, body: MoveIn) -> CampaignOut:
+async def move(daemon: Daemon, queue: Queue, person: Operator, key: str, body: MoveIn) -> CampaignOut:
     """Move a campaign to another place in the queue."""
     if body.before:
-        found_item(daemon, body.before)
-    return _done(
-        request, daemon, key, lambda: daemon.move(key, person.name, before=body.before, priority=body.priority)
-    )
-
-
-def _done(request: Request, daemon: Supervisor, key: str, command: Callable[[], QueueItem]) -> CampaignOut:
-    """Run a command on a campaign; the daemon may refuse it."""
-    found_item(daemon, key)
+        found_item(queue, body.before)
     with _refusing():
-        return campaign_out(request, daemon, command())
+        return campaign_out(daemon, queue.move(key, person.name, before=body.before, priority=body.priority))
 
 
 @contextlib.contextmanager
 def _refusing() -> Iterator[None]:
-    """Convert a refusal to a response with status 409 and the reason."""
+    """Convert a refusal to a response with status 409 and the reason, an unknown campaign to one with status 404."""
     try:
         yield
+    except KeyError as error:
+        raise HTTPException(404, f"there is no campaign '{error.args[0][:80]}'") from None
     except (RequestRefusedError, MotionNotEnabledError) as error:
         raise HTTPException(409, str(error)) from None
 
 
 @router.get("/campaigns/{key}/motion", operation_id="motion")
-async def motion(daemon: Daemon, person: Operator, key: str) -> WhatMovesOut:
+async def motion(daemon: Daemon, queue: Queue, person: Operator, key: str) -> WhatMovesOut:
     """Describe the motion of this campaign, to be read before motion is enabled."""
-    item = found_item(daemon, key)
+    item = found_item(queue, key)
     with _refusing():
         return await asyncio.to_thread(what_moves, daemon, item)
 
 
 @router.post("/campaigns/{key}/enable", operation_id="enable")
-async def enable(request: Request, daemon: Daemon, person: Operator, key: str, body: EnableIn) -> CampaignOut:
+async def enable(daemon: Daemon, queue: Queue, person: Operator, key: str, body: EnableIn) -> CampaignOut:
     """Enable motion in the coming part of this campaign's run."""
-    item = found_item(daemon, key)
+    item = found_item(queue, key)
     with _refusing():
         moves = await asyncio.to_thread(what_moves, daemon, item)
-        return campaign_out(request, daemon, enable_motion(daemon, item, moves, body.laboratory, person.name))
+        enable_motion(daemon, item, moves, body.laboratory, person.name)
+        return campaign_out(daemon, queue.item(item.id))
 
 
 @router.post("/questions/{number}/answer", operation_id="answer")
@@ -199,17 +204,17 @@ async def answer(
 
 
 @router.post("/queue/pause", operation_id="pause_queue")
-async def pause_queue(request: Request, daemon: Daemon, person: Operator) -> StatusOut:
+async def pause_queue(daemon: Daemon, queue: Queue, stops: Stops, person: Operator) -> StatusOut:
     """Start no further campaigns. Running campaigns continue."""
-    daemon.pause_queue(True, person.name)
-    return await status(request, daemon, person)
+    queue.pause_all(True, person.name)
+    return await status(daemon, stops, person)
 
 
 @router.post("/queue/resume", operation_id="resume_queue")
-async def resume_queue(request: Request, daemon: Daemon, person: Operator) -> StatusOut:
+async def resume_queue(daemon: Daemon, queue: Queue, stops: Stops, person: Operator) -> StatusOut:
     """Start campaigns again."""
-    daemon.pause_queue(False, person.name)
-    return await status(request, daemon, person)
+    queue.pause_all(False, person.name)
+    return await status(daemon, stops, person)
 
 
 @router.post(
@@ -228,7 +233,7 @@ async def resume_queue(request: Request, daemon: Daemon, person: Operator) -> St
         "requestBody": {"content": {"application/json": {"schema": EmergencyIn.model_json_schema()}}},
     },
 )
-async def emergency_stop(request: Request, daemon: Daemon, person: Stopping) -> Response:
+async def emergency_stop(request: Request, daemon: Daemon, stops: Stops, person: Stopping) -> Response:
     """Stop every arm, or the arm of one rig, and give up its work. The rig takes no new work until the stop is cleared.
 
     A viewer's token is sufficient. The stop is given before the body is read, and nothing in the body prevents it:
@@ -239,24 +244,24 @@ async def emergency_stop(request: Request, daemon: Daemon, person: Stopping) -> 
     body = StopBody(request.receive)
     named = list(dict.fromkeys(request.query_params.getlist("rig")))
     rig: object = named[0] if len(named) == 1 else named
-    stops: ArmStops = {}
+    arms: ArmStops = {}
     if not named:
-        if len(daemon.rig_names) < 2:  # the only arm is meant in any case
-            await daemon.stop_arms("".join(daemon.rig_names), stops)
+        if len(stops.rig_names) < 2:  # the only arm is meant in any case
+            await stops.stop_arms("".join(stops.rig_names), arms)
         await body.read(RIG_TIME)
         rig = read_stop(body.content).rig if body.complete else ""
-    scope, notes = daemon.stop_scope(rig)
-    await daemon.stop_arms(scope, stops)
-    daemon.latch_stop(person.name, "", scope)
+    scope, notes = stops.scope(rig)
+    await stops.stop_arms(scope, arms)
+    stops.latch(person.name, "", scope)
     await body.read(BODY_TIME)
     said = read_stop(body.content)
     if said.rig not in ("", rig):
         notes.append(("the query names another rig than the body" if named else "the rig came too late") + ALL_STOPPED)
         scope = ""
     notes += [*body.notes(malformed=bool(request.scope.get("state", {}).get("malformed"))), *said.notes]
-    notes = await daemon.emergency_stop(person.name, said.reason, scope, stops=stops, notes=notes)
+    notes = await stops.stop(person.name, said.reason, scope, arms=arms, notes=notes)
     try:
-        found: dict[str, Any] = (await status(request, daemon, person)).model_dump(mode="json")
+        found: dict[str, Any] = (await status(daemon, stops, person)).model_dump(mode="json")
     except UNSTORED as error:
         _log.error("the state can't be read after an emergency stop: %s", error)
         found = {}
@@ -266,27 +271,20 @@ async def emergency_stop(request: Request, daemon: Daemon, person: Stopping) -> 
 
 
 @router.post("/emergency-stop/clear", operation_id="clear")
-async def clear(request: Request, daemon: Daemon, person: Admin, body: ClearIn | None = None) -> StatusOut:
+async def clear(daemon: Daemon, stops: Stops, person: Admin, body: ClearIn | None = None) -> StatusOut:
     """Clear an emergency stop of one rig, or of all. Work that was given up rests until an operator resumes it."""
     rig = "" if body is None else body.rig
-    with _known_rig(rig):
-        daemon.clear(person.name, rig)
-    return await status(request, daemon, person)
-
-
-@contextlib.contextmanager
-def _known_rig(rig: str) -> Iterator[None]:
-    """Convert an unknown rig to a response with status 404."""
     try:
-        yield
+        stops.clear(person.name, rig)
     except KeyError:
         raise HTTPException(404, f"there is no rig '{rig}'") from None
+    return await status(daemon, stops, person)
 
 
 @router.post("/shutdown", status_code=202, operation_id="shutdown")
-async def shutdown(request: Request, daemon: Daemon, person: Admin) -> StatusOut:
+async def shutdown(request: Request, daemon: Daemon, stops: Stops, person: Admin) -> StatusOut:
     """Shut the daemon down at the next safe point; a second request does so at once."""
     daemon.note(person.name, "shutdown")
-    found = await status(request, daemon, person)
+    found = await status(daemon, stops, person)
     request.app.state.shutdown()
     return found

@@ -109,6 +109,9 @@ class DesiredState(StrEnum):
     ABORT = "abort"
 
 
+PAUSED = "paused"
+"""Flag: the queue is paused."""
+
 STOPPED, WITHDRAWN = "stopped", "withdrawn"
 """States of a campaign in addition to those of its run: ended by an operator, after or before its run started."""
 

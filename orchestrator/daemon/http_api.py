@@ -19,7 +19,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 from orchestrator.daemon import archive_routes, command_routes, query_routes, station_routes
-from orchestrator.daemon.access_control import Daemon, RequestGuard
+from orchestrator.daemon.access_control import Daemon, RequestGuard, Stops
 from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.daemon_store import StoreError
 from orchestrator.daemon.ordering import Ordering
@@ -48,9 +48,6 @@ _ERRORS: dict[int | str, dict[str, Any]] = {
     }.items()
 }
 
-Live = Callable[[str | None], str | None]
-"""Returns the URL of a campaign's live view, or of the common view for None; None if there is none."""
-
 
 def create_app() -> FastAPI:
     """Make the application without a daemon."""
@@ -78,25 +75,23 @@ def create_app() -> FastAPI:
     for kind in (StoreError, OSError):
         app.add_exception_handler(kind, _not_stored)
     app.add_exception_handler(AnyHTTPException, _refused)
-    app.state.live = _nowhere
     app.state.shutdown = _nothing
     return app
 
 
-def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None], live: Live | None = None) -> FastAPI:
+def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None]) -> FastAPI:
     """Make the application for a daemon, with access control.
 
     Args:
         daemon: daemon to serve.
         tokens: accepted tokens.
         shutdown: starts the daemon's shutdown.
-        live: URL of the live view.
     """
-    app = create_app()
-    app.state.daemon, app.state.tokens, app.state.shutdown = daemon, tokens, shutdown
-    app.state.ordering = Ordering(daemon)
-    app.state.live = live or _nowhere
-    app.add_middleware(RequestGuard, limit=daemon.settings.body_limit, host=daemon.settings.host)
+    app, settings = create_app(), daemon.shared.settings
+    app.state.daemon, app.state.queue, app.state.stops = daemon.shared, daemon.queue, daemon.stops
+    app.state.tokens, app.state.shutdown = tokens, shutdown
+    app.state.ordering = Ordering(daemon.shared, daemon.queue)
+    app.add_middleware(RequestGuard, limit=settings.body_limit, host=settings.host)
     return app
 
 
@@ -124,11 +119,11 @@ async def _health(daemon: Daemon) -> HealthOut:
     return HealthOut(ok=True)
 
 
-async def _readiness(daemon: Daemon, response: Response) -> HealthOut:
+async def _readiness(daemon: Daemon, stops: Stops, response: Response) -> HealthOut:
     """Check that simulators are running and no problem is open. Needs no token and returns no details."""
     problems = [] if daemon.warm.ready else ["simulators are starting"]
     problems += [f"problem: {key}" for key in daemon.problems]
-    if daemon.emergency is not None or daemon.emergencies:
+    if stops.active:
         problems.append("emergency stop")
     if daemon.stopping:
         problems.append("ending")
@@ -149,10 +144,6 @@ async def _not_stored(request: Request, error: Exception) -> JSONResponse:
         raise error
     _log.error("%s %s: %s", request.method, request.url.path, error)
     return JSONResponse({"detail": "the daemon can't use its disk; is it full? Make room, then repeat the call"}, 507)
-
-
-def _nowhere(campaign: str | None) -> str | None:
-    return None
 
 
 def _nothing() -> None:

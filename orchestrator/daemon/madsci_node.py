@@ -121,7 +121,8 @@ class MadsciNode:
     """
 
     def __init__(self, daemon: Supervisor, ordering: Ordering, name: str) -> None:
-        self._daemon, self._ordering, self._name, self._store = daemon, ordering, name, daemon.store
+        self._daemon, self._queue, self._stops = daemon.shared, daemon.queue, daemon.stops
+        self._ordering, self._name, self._store = ordering, name, daemon.shared.store
         self._starting: dict[str, asyncio.Task[None]] = {}
 
     def info(self) -> dict[str, Any]:
@@ -172,13 +173,12 @@ class MadsciNode:
 
     def _flags(self) -> dict[str, bool]:
         daemon = self._daemon
-        stopped = daemon.emergency is not None or bool(daemon.emergencies)
         rigs = [daemon.workers[rig.name] for rig in daemon.settings.rigs]
         return {
             "busy": all(worker.running is not None for worker in rigs),
             "paused": daemon.queue_paused,
             "locked": daemon.store.flag(LOCKED) is not None,
-            "stopped": stopped,
+            "stopped": self._stops.active,
             "errored": bool(daemon.problems),
             "disconnected": False,
             "initializing": not daemon.warm.ready and daemon.settings.quick_start,
@@ -203,7 +203,7 @@ class MadsciNode:
             return ""
         if worker is None:
             return f"an administrator has to add rig {item.rig} to the daemon's settings again"
-        if daemon.is_stopped(item.rig):
+        if self._stops.holds(item.rig):
             return "an administrator has to clear the emergency stop: 'decant estop --clear'"
         if item.desired_state != DesiredState.RUN:
             return f"an operator has to resume it: 'decant queue resume {item.id}'"
@@ -280,17 +280,16 @@ class MadsciNode:
             )
 
     async def _submit(self, action: NodeAction) -> None:
-        daemon = self._daemon
         path, rig = str(action.args.get("path", "")), str(action.args.get("rig", ""))
         submission = Submission(path=path, rig=rig)
-        item = await asyncio.to_thread(prepare, daemon.settings, submission, daemon.new_key(), PERSON)
+        item = await asyncio.to_thread(prepare, self._daemon.settings, submission, self._queue.new_key(), PERSON)
 
         def enter(at: int) -> None:  # in the transaction of the campaign: both are stored, or none
             self._store.write(
                 "update node_action set started = ?, campaign = ? where id = ?", time.time(), item.id, action.id
             )
 
-        daemon.submit_all([item], enter)
+        self._queue.submit([item], enter)
 
     async def result(self, key: str) -> dict[str, Any]:
         """Return `RestActionResult`. Raises KeyError."""
@@ -302,7 +301,7 @@ class MadsciNode:
         if action.json_result is not None:
             return _result(action, "succeeded", action.json_result)
         assert action.campaign is not None
-        item = self._daemon.item(action.campaign)
+        item = self._queue.item(action.campaign)
         if action.name == "run_campaign":
             status, reason = _CAMPAIGN_STATUS.get(item.state, "running"), item.reason or ""
             about: dict[str, Any] = {"campaign": item.id, "state": item.state, "run": item.run, "reason": reason}
@@ -330,20 +329,20 @@ class MadsciNode:
         daemon = self._daemon
         match name:
             case "safety_stop":
-                await daemon.emergency_stop(PERSON, "safety_stop")
+                await self._stops.stop(PERSON, "safety_stop")
             case "pause":
-                daemon.pause_queue(True, PERSON)
+                self._queue.pause_all(True, PERSON)
             case "resume":
-                daemon.pause_queue(False, PERSON)
+                self._queue.pause_all(False, PERSON)
             case "cancel":
                 for item in daemon.store.items():
                     if item.by == PERSON and item.state not in _CAMPAIGN_STATUS:
-                        daemon.stop(item.id, PERSON)
+                        self._queue.stop(item.id, PERSON)
             case "lock" | "unlock":
                 daemon.store.set_flag(LOCKED, {"time": time.time()} if name == "lock" else None)
                 daemon.note(PERSON, name)
             case "reset":
-                if daemon.emergency is not None or daemon.emergencies:
+                if self._stops.active:
                     return _refused("an administrator clears the emergency stop: decant estop --clear")
             case _:
                 return _refused(f"'{name[:40]}' is not offered; an administrator ends the daemon: decant server stop")

@@ -16,13 +16,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from actors.interfaces import InvalidActionError, LaboratoryError
+from orchestrator.daemon.campaign_queue import CampaignQueue, RequestRefusedError
 from orchestrator.daemon.daemon_store import QueueItem
 from orchestrator.daemon.materials import SURE, Materials
 from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, settled_pour
 from orchestrator.daemon.pour_request import PourIn
+from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.station_schemas import BatchIn
 from orchestrator.daemon.submissions import Submission, planned_order, prepare
-from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.run_tasks import POUR
 
@@ -54,11 +55,13 @@ class Ordering:
     """Orders of one daemon.
 
     Args:
-        daemon: whose queue takes them.
+        daemon: what the parts of the daemon share.
+        queue: takes the orders.
     """
 
-    def __init__(self, daemon: Supervisor) -> None:
-        self._daemon, self.materials, self.book = daemon, Materials(daemon.store), OrderBook(daemon.store)
+    def __init__(self, daemon: SharedServices, queue: CampaignQueue) -> None:
+        self._daemon, self._queue = daemon, queue
+        self.materials, self.book = Materials(daemon.store), OrderBook(daemon.store)
         self._placing: dict[str, asyncio.Task[Any]] = {}
 
     async def pour(self, request: PourIn, by: str) -> dict[str, Any]:
@@ -97,7 +100,7 @@ class Ordering:
                 )
             return
         prepared = await self._prepared(request, by)
-        await self._queue([prepared])
+        await self._enqueue([prepared])
 
     async def _prepared(self, request: PourIn, by: str, batch: str = "") -> Prepared:
         """Check an order and store its snapshot.
@@ -107,17 +110,17 @@ class Ordering:
             by: who orders it.
             batch: id of its batch.
         """
-        daemon = self._daemon
+        settings = self._daemon.settings
         order = PourOrder.of(request, self.materials)
         if reason := self._refusal(order):
             raise RequestRefusedError(reason)
         rig = self._rig(order, request.rig)
-        daemon.refuse_new_work(rig)
+        self._queue.refuse_new_work(rig)
         submission = Submission(
             task=POUR, rig=rig, priority=request.priority, order=order, batch=batch, held=request.hold,
             not_before=request.not_before,
         )  # fmt: skip
-        item = await asyncio.to_thread(prepare, daemon.settings, submission, daemon.new_key(), by)
+        item = await asyncio.to_thread(prepare, settings, submission, self._queue.new_key(), by)
         try:
             predicted = await self._predicted(item) if request.predict or request.dry_run else None
         except BaseException:
@@ -168,10 +171,16 @@ class Ordering:
             **{"run": None, "created": None, "ended": None},
         }
 
-    async def _queue(self, prepared: Sequence[Prepared]) -> None:
-        """Add submissions to the queue, all or none."""
+    async def _enqueue(self, prepared: Sequence[Prepared], first: Callable[[], object] = lambda: None) -> None:
+        """Add submissions to the queue, all or none; `first` is called in the same transaction."""
+
+        def enter(at: int) -> None:
+            if at == 0:
+                first()
+            self._enter(prepared[at])
+
         try:
-            self._daemon.submit_all([one.item for one in prepared], lambda at: self._enter(prepared[at]))
+            self._queue.submit([one.item for one in prepared], enter)
         except BaseException:
             await self._forget([one.item for one in prepared])
             raise
@@ -207,7 +216,7 @@ class Ordering:
             if known[0]["body"] != body:
                 raise DifferentOrderError(f"id {request.id} belongs to another batch. Nothing was queued")
             return
-        self._daemon.refuse_new_work()
+        self._queue.refuse_new_work()
         prepared: list[Prepared] = []
         at = 0
         try:
@@ -228,7 +237,7 @@ class Ordering:
                         **item.campaign.model_dump(),
                         batch=request.id, held=request.hold, not_before=request.not_before,
                     )  # fmt: skip
-                    key = self._daemon.new_key()
+                    key = self._queue.new_key()
                     prepared.append(
                         Prepared(await asyncio.to_thread(prepare, self._daemon.settings, submission, key, by))
                     )
@@ -241,16 +250,8 @@ class Ordering:
             raise
         values = request.id, request.name, by, time.time(), body
 
-        def enter(at: int) -> None:
-            if at == 0:
-                store.write("insert into batch (id, name, by, created, body) values (?, ?, ?, ?, ?)", *values)
-            self._enter(prepared[at])
-
-        try:
-            self._daemon.submit_all([one.item for one in prepared], enter)
-        except BaseException:
-            await self._forget([one.item for one in prepared])
-            raise
+        statement = "insert into batch (id, name, by, created, body) values (?, ?, ?, ?, ?)"
+        await self._enqueue(prepared, lambda: store.write(statement, *values))
 
     async def batch_out(self, key: str) -> dict[str, Any]:
         """Return a batch as `BatchOut`. Raises KeyError."""
@@ -284,7 +285,7 @@ class Ordering:
         row = self.book.find(key)
         if row is None:
             raise KeyError(key)
-        item = self._daemon.item(row["campaign"])
+        item = self._queue.item(row["campaign"])
         state, reason = await self._state(item, row)
         row = self.book.find(key) or row
         progress = self._daemon.progress(item)

@@ -17,19 +17,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Header, HTTPException, Query, Response
 from fastapi.responses import FileResponse, StreamingResponse
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.access_control import Daemon, Viewer
-from orchestrator.daemon.daemon_store import QueueItem
+from orchestrator.daemon.access_control import Daemon, Queue, Stops, Viewer
+from orchestrator.daemon.campaign_queue import CampaignQueue
+from orchestrator.daemon.daemon_store import ENDED, QueueItem
+from orchestrator.daemon.emergency_stop import EmergencyStops
 from orchestrator.daemon.remote_operator import question_json
+from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.run_readout import REPORT, summary_of
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, RigOut, StatusOut
 from orchestrator.daemon.submissions import run_request
-from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import free_space
@@ -46,9 +48,8 @@ router = APIRouter()
 
 
 @router.get("/status", operation_id="status")
-async def status(request: Request, daemon: Daemon, person: Viewer) -> StatusOut:
+async def status(daemon: Daemon, stops: Stops, person: Viewer) -> StatusOut:
     """Return the state of the daemon."""
-    emergency = daemon.emergency
     return StatusOut.model_validate(
         {
             "version": importlib.metadata.version(DISTRIBUTION),
@@ -58,31 +59,31 @@ async def status(request: Request, daemon: Daemon, person: Viewer) -> StatusOut:
             "ready": daemon.warm.ready and not daemon.problems and not daemon.stopping,
             "problems": list(daemon.problems.values()),
             "queue_paused": daemon.queue_paused,
-            "emergency": emergency,
+            "emergency": stops.of_all,
             "simulators": daemon.warm.size,
-            "rigs": rigs_out(daemon),
+            "rigs": rigs_out(daemon, stops),
             "campaigns": daemon.store.counts(),
             "questions": len(daemon.store.questions()),
             "last_event": daemon.feed.last,
-            "live": request.app.state.live(None),
+            "live": daemon.live_url,
         }
     )
 
 
 @router.get("/rigs", operation_id="rigs")
-async def rigs(daemon: Daemon, person: Viewer) -> list[RigOut]:
+async def rigs(daemon: Daemon, stops: Stops, person: Viewer) -> list[RigOut]:
     """List the laboratories, with the campaign that leases each."""
-    return rigs_out(daemon)
+    return rigs_out(daemon, stops)
 
 
-def rigs_out(daemon: Supervisor) -> list[RigOut]:
+def rigs_out(daemon: SharedServices, stops: EmergencyStops) -> list[RigOut]:
     """Convert the rigs to their response models."""
     found = []
     for name, worker in daemon.workers.items():
         running = worker.running
         checkpoint = "" if running is None else running.checkpoint
         campaign = None if running is None else running.item.id
-        stop, arm = daemon.emergencies.get(name), worker.arm
+        stop, arm = stops.of_rigs.get(name), worker.arm
         found.append(
             RigOut.model_validate(
                 {
@@ -107,20 +108,19 @@ def rigs_out(daemon: Supervisor) -> list[RigOut]:
 
 @router.get("/campaigns", operation_id="campaigns")
 async def campaigns(
-    request: Request,
     daemon: Daemon,
     person: Viewer,
     state: Annotated[list[str] | None, Query(max_length=20, description="Only campaigns in these states.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
 ) -> list[CampaignOut]:
     """List campaigns: running ones, then the queue in its order, then the others, newest first."""
-    return [campaign_out(request, daemon, item) for item in daemon.store.items(state or (), limit)]
+    return [campaign_out(daemon, item) for item in daemon.store.items(state or (), limit)]
 
 
 @router.get("/campaigns/{key}", operation_id="campaign")
-async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -> CampaignDetailOut:
+async def campaign(daemon: Daemon, queue: Queue, person: Viewer, key: str) -> CampaignDetailOut:
     """Return one campaign with its pours and its summary."""
-    item = found_item(daemon, key)
+    item = found_item(queue, key)
     summary: dict[str, Any] | None = None
     pours: list[PourSummary] = []
     if item.run is not None:
@@ -139,7 +139,7 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
             pours, summary = await asyncio.to_thread(read)
         except (ConfigError, RunError, KeyError):  # for example, a rig that the settings no longer contain
             summary = await asyncio.to_thread(summary_of, directory)
-    table = campaign_out(request, daemon, item).model_dump()
+    table = campaign_out(daemon, item).model_dump()
     audit = daemon.store.audit(item.id)
     return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "audit": audit})
 
@@ -150,9 +150,9 @@ async def campaign(request: Request, daemon: Daemon, person: Viewer, key: str) -
     response_class=FileResponse,
     responses={200: {"content": {"text/html": {}}, "description": "A self-contained HTML page."}},
 )
-async def report(daemon: Daemon, person: Viewer, key: str) -> FileResponse:
+async def report(daemon: Daemon, queue: Queue, person: Viewer, key: str) -> FileResponse:
     """Return the report of a campaign's run."""
-    item = found_item(daemon, key)
+    item = found_item(queue, key)
     path = None if item.run is None else daemon.settings.runs / item.run / REPORT
     if path is None or not path.is_file():
         raise HTTPException(404, f"{item.id} has no report yet")
@@ -182,6 +182,7 @@ async def questions(
 )
 async def events(
     daemon: Daemon,
+    queue: Queue,
     person: Viewer,
     campaign: Annotated[str | None, Query(max_length=80, description="Only events of this campaign.")] = None,
     after: Annotated[int | None, Query(ge=0, description="Id of the last event seen; 0 for all stored events.")] = None,
@@ -193,7 +194,7 @@ async def events(
         raise HTTPException(503, f"{READERS} readers are at it already")
     if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
         after = int(last_event_id[:18])
-    only = None if campaign is None else found_item(daemon, campaign).id
+    only = None if campaign is None else found_item(queue, campaign).id
     newest = daemon.feed.last
 
     async def stream() -> AsyncIterator[str]:
@@ -221,31 +222,31 @@ async def events(
     response_class=Response,
     responses={200: {"content": {"text/plain": {}}, "description": "Prometheus' text format."}},
 )
-async def metrics(daemon: Daemon, person: Viewer) -> Response:
+async def metrics(daemon: Daemon, stops: Stops, person: Viewer) -> Response:
     """Return the metrics in Prometheus' text format."""
-    return Response(measures(daemon), media_type="text/plain; version=0.0.4; charset=utf-8")
+    return Response(measures(daemon, stops), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
-def found_item(daemon: Supervisor, key: str) -> QueueItem:
+def found_item(queue: CampaignQueue, key: str) -> QueueItem:
     """Return a campaign by its id or a prefix of it. Raises HTTPException 404."""
     try:
-        return daemon.item(key)
+        return queue.item(key)
     except KeyError:
         raise HTTPException(404, f"there is no campaign '{key[:80]}'") from None
 
 
-def campaign_out(request: Request, daemon: Supervisor, item: QueueItem) -> CampaignOut:
+def campaign_out(daemon: SharedServices, item: QueueItem) -> CampaignOut:
     """Convert a campaign to its response model."""
-    table = asdict(item)
-    waits = item.state not in ("finished", "stopped", "withdrawn") and daemon.progress(item) is None
+    table, progress = asdict(item), daemon.progress(item)
+    waits = item.state not in ENDED and progress is None
     run: Path | None = None if item.run is None else daemon.settings.runs / item.run
     return CampaignOut.model_validate(
         {
             **table,
             "needs_enabling": item.mode == "hardware" and not item.motion_enabled and waits,
-            "progress": daemon.progress(item),
+            "progress": progress,
             "report": run is not None and (run / REPORT).is_file(),
-            "live": request.app.state.live(item.id) if daemon.progress(item) is not None else None,
+            "live": None if progress is None else daemon.live_url,
         }
     )
 
@@ -253,8 +254,8 @@ def campaign_out(request: Request, daemon: Supervisor, item: QueueItem) -> Campa
 class _Collector:
     """Reads the current values when Prometheus collects them."""
 
-    def __init__(self, daemon: Supervisor) -> None:
-        self._daemon = daemon
+    def __init__(self, daemon: SharedServices, stops: EmergencyStops) -> None:
+        self._daemon, self._stops = daemon, stops
 
     def collect(self) -> Iterable[Metric]:
         """Yield the metrics, as prometheus_client's collectors do."""
@@ -276,10 +277,7 @@ class _Collector:
         yield words
         single = {
             "decant_questions_open": ("Questions that wait for an answer.", len(daemon.store.questions())),
-            "decant_emergency_stop": (
-                "Whether an emergency stop is latched.",
-                daemon.emergency is not None or bool(daemon.emergencies),
-            ),
+            "decant_emergency_stop": ("Whether an emergency stop is latched.", self._stops.active),
             "decant_queue_paused": ("Whether no campaign is begun.", daemon.queue_paused),
             "decant_simulators": ("Simulators in the pool.", daemon.warm.size),
             "decant_events_last": ("Number of the newest event.", daemon.feed.last),
@@ -295,10 +293,10 @@ class _Collector:
             yield GaugeMetricFamily(name, text, value=float(value))
 
 
-def measures(daemon: Supervisor) -> bytes:
+def measures(daemon: SharedServices, stops: EmergencyStops) -> bytes:
     """Return all metrics in Prometheus' text format."""
     registry = CollectorRegistry()
-    registry.register(_Collector(daemon))
+    registry.register(_Collector(daemon, stops))
     return generate_latest(registry)
 
 

@@ -12,19 +12,20 @@ import time
 from collections.abc import Awaitable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.daemon_settings import DaemonSettings, Rig
-from orchestrator.daemon.daemon_store import ENDED, STOPPED, DesiredState, QueueItem, Store
+from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
+from orchestrator.daemon.daemon_store import ENDED, PAUSED, STOPPED, DesiredState, QueueItem, Store
 from orchestrator.daemon.event_feed import Feed
 from orchestrator.daemon.materials import Materials
+from orchestrator.daemon.notifications import Counts
 from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, renew_load, settled_pour
 from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
-from orchestrator.daemon.run_readout import prune_recordings
+from orchestrator.daemon.run_readout import Pours, found_at, prune_recordings
 from orchestrator.daemon.submissions import run_request
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
@@ -34,6 +35,7 @@ from orchestrator.records.events import CampaignStateChanged, Event
 from orchestrator.records.journal_file import MB, JournalError, free_space
 from orchestrator.records.run_clock import run_time
 from orchestrator.records.run_record import CampaignResult
+from orchestrator.records.run_registry import make_state_directory
 from orchestrator.records.states import State
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
 from orchestrator.reports.publishing import not_simulated, publish_run, publish_so_far
@@ -46,16 +48,85 @@ from orchestrator.runs.stages import scenes_of
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
 class SharedServices:
-    """What all campaigns of a daemon share."""
+    """What the parts of a daemon share: settings, store, events, questions, simulators, rig workers.
 
-    settings: DaemonSettings
-    store: Store
-    feed: Feed
-    asking: Asking
-    warm: WarmSimulators
-    live: LiveView | None = None
+    Args:
+        settings: settings in force.
+        live: open live view for the runs.
+
+    Attributes:
+        workers: the rig workers, by the names of their rigs.
+        problems: problems for the operator, by subject.
+        stopping: whether nothing starts any more.
+        suspect: whether the simulators may have failed for good: they are restarted when no campaign uses them.
+    """
+
+    def __init__(self, settings: DaemonSettings, live: LiveView | None = None) -> None:
+        make_state_directory(settings.state)
+        settings.runs.mkdir(parents=True, exist_ok=True)
+        settings.snapshots.mkdir(parents=True, exist_ok=True)
+        self.settings, self.live = settings, live
+        self.store = Store(settings.state / "daemon.sqlite")
+        self.feed = Feed(settings.state / "events.sqlite", settings.events, self._feed_broken)
+        self.asking = Asking(self.store, self.feed.publish)
+        self.warm = WarmSimulators(
+            settings.simulators, in_process=settings.in_process, ray=settings.ray, tell=self.warn
+        )
+        self.workers = {rig.name: RigWorker(self, rig) for rig in (*settings.rigs, Rig(NO_RIG))}
+        self.problems: dict[str, str] = {}
+        self.notification_counts: dict[str, Counts] = {}
+        self.pours = Pours()
+        self.stopping = self.suspect = False
+        self.began = time.time()
+
+    @property
+    def live_url(self) -> str | None:
+        """URL of the live view; None if there is none."""
+        return None if self.live is None else self.live.url
+
+    @property
+    def queue_paused(self) -> bool:
+        """Whether the queue is paused."""
+        return self.store.flag(PAUSED) is not None
+
+    def running(self, item: QueueItem) -> Running | None:
+        """Return the part of a campaign's run that is in progress; None if it rests."""
+        worker = self.workers.get(item.rig)
+        return worker.running if worker is not None and worker.holds(item.id) else None
+
+    def progress(self, item: QueueItem) -> dict[str, Any] | None:
+        """Return the progress of a running campaign; None for others."""
+        running = self.running(item)
+        return None if running is None else running.progress()
+
+    def wake(self) -> None:
+        """Wake all rig workers after a change."""
+        for worker in self.workers.values():
+            worker.wake.set()
+
+    def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
+        """Store, publish and log an audit entry."""
+        self.store.note(by, what, campaign, detail)
+        self.feed.publish("AuditEntry", {"by": by, "what": what, "detail": detail}, campaign)
+        _log.info("%s: %s %s", by, what, campaign, extra={"by": by, "what": what, "campaign": campaign})
+
+    def problem(self, key: str, text: str | None) -> None:
+        """Report a problem for the operator, or remove it with None."""
+        if text is None:
+            self.problems.pop(key, None)
+        elif self.problems.get(key) != text:
+            self.problems[key] = text
+            self.warn(text)
+
+    def warn(self, text: str) -> None:
+        """Log and publish a warning."""
+        _log.warning(text)
+        self.feed.publish("LogLine", {"level": "warning", "text": text, "stage": ""})
+
+    def _feed_broken(self, text: str) -> None:
+        self.problems["events"] = text
+        _log.error(text)
 
 
 def _prepared(request: RunRequest) -> tuple[RunRequest, list[str]]:
@@ -156,7 +227,7 @@ class Running:
             ray=self._shared.warm.ray,
             optimizer=self._shared.warm.optimizer(),
             operator=RemoteOperator(asking, key, rig, self._announce) if asks else None,
-            ask_operator=RunQuestions(asking, self._shared.store, key, rig, load, lambda: self._look(plan)),
+            ask_operator=RunQuestions(asking, self._shared.store, key, rig, load, lambda: found_at(plan.laboratory)),
             approved_checksum=checksum,
             subscribers=[self._shared.feed.subscriber(key), self._progress, self._note_state],
             recorder=recorder,
@@ -179,11 +250,6 @@ class Running:
 
     def _announce(self, text: str, seconds: float) -> None:
         self._shared.feed.publish("Announced", {"rig": self._rig.name, "text": text, "seconds": seconds}, self.item.id)
-
-    def _look(self, plan: CampaignPlan) -> dict[str, str]:
-        from orchestrator.daemon.run_readout import found_at
-
-        return found_at(plan.laboratory)
 
     # ---- ending it sooner
 
@@ -269,27 +335,6 @@ class Running:
         return self.checkpoint != ""
 
 
-async def settle(shared: SharedServices, item: QueueItem, rig: Rig, *, ended: bool) -> None:
-    """Store the result of an ordered pour and enter it in the account, if its journal has an outcome.
-
-    Args:
-        shared: services of the daemon.
-        item: campaign of the order.
-        rig: where it was poured.
-        ended: whether the campaign does not continue.
-    """
-    if item.run is None:
-        return
-    settings = shared.settings
-    try:
-        found = await asyncio.to_thread(settled_pour, settings.runs / item.run, settings.snapshots / item.id, rig)
-        OrderBook(shared.store).settle(item, found, ended=ended)
-    except (RunError, OSError, ValueError) as error:
-        _log.error("pour of %s is not in the account: %s", item.id, error)
-        text = f"its outcome could not be entered in the account of the materials: {error}"
-        shared.feed.publish("LogLine", {"level": "error", "text": text, "stage": ""}, item.id)
-
-
 RETRY = 30.0
 """Before a lane that was kept from beginning looks again [s]."""
 
@@ -314,47 +359,22 @@ def _readiness(arm: ArmSettings) -> DeviceCheck | None:
         return DeviceCheck("motion", "fail", str(error), "see 'decant robot check'")
 
 
-class DaemonState(Protocol):
-    """What a lane needs of the daemon that it is a part of.
-
-    Attributes:
-        lanes: all of them, by their rigs' names.
-        stopping: nothing is begun any more.
-        suspect: the simulators may be gone.
-    """
-
-    workers: dict[str, RigWorker]
-    stopping: bool
-    suspect: bool
-
-    def is_stopped(self, rig: str) -> bool:
-        """Whether an emergency stop is latched that holds for a rig."""
-        ...
-
-    @property
-    def queue_paused(self) -> bool:
-        """Whether nothing is begun from the queue."""
-        ...
-
-    def problem(self, key: str, text: str | None) -> None:
-        """Something is wrong, or (None) is no longer."""
-        ...
-
-
 class RigWorker:
     """What happens at one rig: one campaign after the other.
 
     Args:
-        daemon: whose queue it serves.
+        shared: what the rigs share.
         rig: that campaigns lease here.
-        common: what all of them share.
+
+    Attributes:
+        latched: whether an emergency stop holds for the rig; see `EmergencyStops`.
     """
 
-    def __init__(self, daemon: DaemonState, rig: Rig, common: SharedServices) -> None:
-        self._daemon, self.rig, self._shared = daemon, rig, common
+    def __init__(self, shared: SharedServices, rig: Rig) -> None:
+        self._shared, self.rig = shared, rig
         self.running: Running | None = None
         self.wake = asyncio.Event()
-        self.latched = daemon.is_stopped(rig.name)
+        self.latched = False
         self.arm: ArmStatus | None = None
         self._reading_arm = asyncio.Lock()
         self._background: set[asyncio.Task[None]] = set()
@@ -394,7 +414,7 @@ class RigWorker:
             return
         while True:
             async with self._reading_arm:
-                if self.running is None and not self._daemon.stopping:
+                if self.running is None and not self._shared.stopping:
                     check = await asyncio.to_thread(_readiness, spec.arm)
                     self._show_arm(check)
             await asyncio.sleep(self._shared.settings.arm_interval)
@@ -419,8 +439,27 @@ class RigWorker:
         self._background.add(task)
         task.add_done_callback(self._background.discard)
 
+    async def settle(self, item: QueueItem, *, ended: bool) -> None:
+        """Store the result of an ordered pour and enter it in the account, if its journal has an outcome.
+
+        Args:
+            item: campaign of the order.
+            ended: whether the campaign does not continue.
+        """
+        if item.run is None:
+            return
+        settings = self._shared.settings
+        try:
+            run, snapshot = settings.runs / item.run, settings.snapshots / item.id
+            found = await asyncio.to_thread(settled_pour, run, snapshot, self.rig)
+            OrderBook(self._shared.store).settle(item, found, ended=ended)
+        except (RunError, OSError, ValueError) as error:
+            _log.error("pour of %s is not in the account: %s", item.id, error)
+            text = f"its outcome could not be entered in the account of the materials: {error}"
+            self._shared.feed.publish("LogLine", {"level": "error", "text": text, "stage": ""}, item.id)
+
     def _next(self) -> QueueItem | None:
-        if self.latched or self._daemon.stopping or self._shared.warm.lost:
+        if self.latched or self._shared.stopping or self._shared.warm.lost:
             return None
         store = self._shared.store
         mine = store.wanted(self.rig.name)
@@ -434,7 +473,7 @@ class RigWorker:
             and (one.not_before is None or one.not_before <= now)
             and other in (None, one.by)
         ]
-        if self._daemon.queue_paused:
+        if self._shared.queue_paused:
             queued = []
         found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.motion_enabled), None)
         return found if found is not None and self._has_room() else None
@@ -451,7 +490,7 @@ class RigWorker:
             f"{free / MB:.0f} MB are free on the disk of {settings.state}, and no campaign is begun below "
             f"{settings.keep_free / MB:.0f} MB (keep_free): make room"
         )
-        self._daemon.problem("disk", text if free < settings.keep_free else None)
+        self._shared.problem("disk", text if free < settings.keep_free else None)
         return free >= settings.keep_free
 
     async def _run(self, running: Running) -> None:
@@ -459,8 +498,8 @@ class RigWorker:
         self._show_arm(None)
         store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), motion_enabled=False)
         feed.publish("CampaignLeased", {"rig": self.rig.name}, item.id)
-        if self._daemon.suspect and not any(one.running for one in self._daemon.workers.values() if one is not self):
-            self._daemon.suspect = False
+        if self._shared.suspect and not any(one.running for one in self._shared.workers.values() if one is not self):
+            self._shared.suspect = False
             await self._shared.warm.close()
         state, reason, desired = "failed", "", DesiredState.PAUSE
         result: CampaignResult | None = None
@@ -478,7 +517,7 @@ class RigWorker:
             state, reason, desired = "unknown", str(error), self._kept_desired_state(item)
         except (RunError, LaboratoryError, ConfigError, OSError) as error:
             needs_person = getattr(error, "exit_code", 1) == 3
-            self._daemon.suspect |= isinstance(error, LaboratoryError | RequestExecutorError)
+            self._shared.suspect |= isinstance(error, LaboratoryError | RequestExecutorError)
             state, reason = ("paused" if needs_person else "failed"), str(error)
         except Exception as error:
             state, reason = "failed", f"{type(error).__name__}: {error}"
@@ -512,7 +551,7 @@ class RigWorker:
     async def _leave(self, running: Running, state: str, reason: str, desired: DesiredState) -> None:
         store, key = self._shared.store, running.item.id
         if running.item.task == POUR:
-            await settle(self._shared, running.item, self.rig, ended=desired is DesiredState.STOP)
+            await self.settle(running.item, ended=desired is DesiredState.STOP)
         if desired is DesiredState.STOP and state != "finished":
             state = STOPPED
             try:
@@ -525,6 +564,6 @@ class RigWorker:
         self.running = None  # whoever hears that it rests may have it go on
         self._shared.feed.publish("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
         with contextlib.suppress(OSError):
-            busy = {one.running.item.run for one in self._daemon.workers.values() if one.running is not None}
+            busy = {one.running.item.run for one in self._shared.workers.values() if one.running is not None}
             await asyncio.to_thread(prune_recordings, self._shared.settings, {name for name in busy if name})
             await self._shared.warm.tidy()

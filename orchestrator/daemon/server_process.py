@@ -31,10 +31,10 @@ from actors.runtime.ray_cluster import check_cluster
 from actors.simulators.job_runner import few_arenas
 from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
+from orchestrator.daemon.emergency_stop import StopProtocol
 from orchestrator.daemon.http_api import serve_app
 from orchestrator.daemon.madsci_node import create_node
 from orchestrator.daemon.notifications import OCCASIONS, Notifier, NotifyError, pass_on
-from orchestrator.daemon.stop_request import StopProtocol
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
@@ -140,7 +140,7 @@ class RayWatch:
         self._closed.set()
 
     def _watch(self) -> None:
-        while not (lost := self._daemon.lost):
+        while not (lost := self._daemon.shared.warm.lost):
             if self._closed.wait(LOOKING):
                 return
         if not self._renewal.possible:
@@ -148,7 +148,7 @@ class RayWatch:
                 f"Ray has lost its {lost}, and that {MOST + 1} times within {WITHIN / 3600.0:.0f} h: is this machine "
                 "short of memory? End the daemon and start it again; what ran goes on from its journal"
             )
-            self._loop.call_soon_threadsafe(self._daemon.problem, "ray", text)
+            self._loop.call_soon_threadsafe(self._daemon.shared.problem, "ray", text)
             return
         begun = time.monotonic()
         self._loop.call_soon_threadsafe(self._daemon.leave, lost)
@@ -249,7 +249,7 @@ async def _serve_with(
     """Serve until the end is requested or Ray dies; return True in the latter case, after all work has stopped."""
     daemon = Supervisor(settings, live)
     ending = _Ending(daemon)
-    app = serve_app(daemon, tokens, ending, None if live is None else lambda campaign: live.url)
+    app = serve_app(daemon, tokens, ending)
     node = None if settings.madsci is None else _node_server(daemon, app, settings.madsci)
     server = _Server(
         uvicorn.Config(
@@ -271,8 +271,8 @@ async def _serve_with(
         loop.add_signal_handler(number, ending)
     serving = asyncio.create_task(server.serve([listening]))
     serving_node: asyncio.Task[None] | None = None
-    notifying = None if notifier is None else asyncio.create_task(pass_on(daemon.feed.read(), notifier))
-    daemon.notification_counts = {} if notifier is None else notifier.counts
+    notifying = None if notifier is None else asyncio.create_task(pass_on(daemon.shared.feed.read(), notifier))
+    daemon.shared.notification_counts = {} if notifier is None else notifier.counts
     url = _url(settings, listening)
     settings.address.write_text(url + "\n", encoding="utf-8")
     watch = RayWatch(daemon, restart, ending.asked.is_set)

@@ -9,13 +9,15 @@ import contextlib
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
+from fastapi import APIRouter, Depends, HTTPException, Query, Response
 
-from orchestrator.daemon.access_control import Daemon, Operator, Viewer
+from orchestrator.daemon.access_control import Daemon, Operator, Queue, Viewer, part
+from orchestrator.daemon.campaign_queue import RequestRefusedError
 from orchestrator.daemon.materials import MaterialError, mass_of
 from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.pour_request import PourIn
 from orchestrator.daemon.query_routes import campaign_out, found_item
+from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.schemas import CampaignOut
 from orchestrator.daemon.station_schemas import (
     AccountOut,
@@ -34,7 +36,6 @@ from orchestrator.daemon.station_schemas import (
     WeighingIn,
 )
 from orchestrator.daemon.submissions import SubmissionError
-from orchestrator.daemon.supervisor import RequestRefusedError, Supervisor
 from orchestrator.learning.run_errors import RunError
 
 LONGEST_WAIT = 600.0
@@ -43,12 +44,7 @@ LONGEST_WAIT = 600.0
 router = APIRouter(tags=["station"])
 
 
-async def _ordering(request: Request) -> Ordering:
-    found: Ordering = request.app.state.ordering
-    return found
-
-
-Orders = Annotated[Ordering, Depends(_ordering)]
+Orders = Annotated[Ordering, Depends(part("ordering"))]
 Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT, description="Return as soon as the pour rests [s].")]
 
 
@@ -113,28 +109,28 @@ async def pour(orders: Orders, person: Viewer, key: str, wait: Wait = 0.0) -> di
 
 
 @router.post("/pours/{key}/cancel", operation_id="cancel_pour", response_model=PourOut)
-async def cancel_pour(daemon: Daemon, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
+async def cancel_pour(queue: Queue, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
     """Remove a pour from the queue. A pour that has begun is finished and weighed."""
     with _answering():
         campaign = orders.campaign_of(key)
-        if (await orders.pour_out(key))["result"] is None and daemon.item(campaign).state != "withdrawn":
-            daemon.stop(campaign, person.name)
+        if (await orders.pour_out(key))["result"] is None and queue.item(campaign).state != "withdrawn":
+            queue.stop(campaign, person.name)
         return await orders.pour_out(key)
 
 
 @router.post("/pours/{key}/pause", operation_id="pause_pour", response_model=PourOut)
-async def pause_pour(daemon: Daemon, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
+async def pause_pour(queue: Queue, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
     """Pause before the pour begins. A pour that has begun is finished and weighed."""
     with _answering():
-        daemon.pause(orders.campaign_of(key), person.name)
+        queue.pause(orders.campaign_of(key), person.name)
         return await orders.pour_out(key)
 
 
 @router.post("/pours/{key}/resume", operation_id="resume_pour", response_model=PourOut)
-async def resume_pour(daemon: Daemon, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
+async def resume_pour(queue: Queue, orders: Orders, person: Operator, key: str) -> dict[str, Any]:
     """Resume a paused pour. If its outcome is unknown, an operator is asked first."""
     with _answering():
-        daemon.resume(orders.campaign_of(key), person.name)
+        queue.resume(orders.campaign_of(key), person.name)
         return await orders.pour_out(key)
 
 
@@ -164,7 +160,9 @@ async def batch(orders: Orders, person: Viewer, key: str) -> dict[str, Any]:
 
 
 @router.post("/batches/{key}/{change}", operation_id="change_batch", response_model=BatchOut)
-async def change_batch(daemon: Daemon, orders: Orders, person: Operator, key: str, change: str) -> dict[str, Any]:
+async def change_batch(
+    daemon: Daemon, queue: Queue, orders: Orders, person: Operator, key: str, change: str
+) -> dict[str, Any]:
     """Hold or release the queued items of a batch, or cancel them: `hold`, `release` or `cancel`."""
     if change not in ("hold", "release", "cancel"):
         raise HTTPException(404, f"'{change[:80]}' is no change of a batch; there are hold, release, cancel")
@@ -172,44 +170,42 @@ async def change_batch(daemon: Daemon, orders: Orders, person: Operator, key: st
         await orders.batch_out(key)
         for item in daemon.store.batch_items(key):
             if item.state == "queued" and change == "cancel":
-                daemon.stop(item.id, person.name)
+                queue.stop(item.id, person.name)
             elif item.state == "queued":
-                daemon.change(item.id, person.name, hold=change == "hold")
+                queue.change(item.id, person.name, hold=change == "hold")
         return await orders.batch_out(key)
 
 
 @router.post("/campaigns/{key}/change", operation_id="change_queued")
-async def change_queued(
-    request: Request, daemon: Daemon, person: Operator, key: str, body: QueueChangeIn
-) -> CampaignOut:
+async def change_queued(daemon: Daemon, queue: Queue, person: Operator, key: str, body: QueueChangeIn) -> CampaignOut:
     """Hold or release a queued campaign or pour, or change its earliest start."""
-    found_item(daemon, key)
+    found_item(queue, key)
     with _answering():
-        found = daemon.change(key, person.name, hold=body.hold, not_before=body.not_before)
-        return campaign_out(request, daemon, found)
+        found = queue.change(key, person.name, hold=body.hold, not_before=body.not_before)
+        return campaign_out(daemon, found)
 
 
 @router.post("/reservations", status_code=201, operation_id="reserve", response_model=ReservationOut)
-async def reserve(daemon: Daemon, person: Operator, body: ReservationIn) -> dict[str, Any]:
+async def reserve(daemon: Daemon, queue: Queue, person: Operator, body: ReservationIn) -> dict[str, Any]:
     """Reserve a rig: between two times, only campaigns and pours of this user start there."""
     if body.rig not in daemon.workers:
         raise HTTPException(404, f"there is no rig '{body.rig}'")
     with _answering():
-        return daemon.reserve(body.rig, person.name, body.begins, body.ends, body.note)
+        return queue.reserve(body.rig, person.name, body.begins, body.ends, body.note)
 
 
 @router.get("/reservations", operation_id="reservations", response_model=list[ReservationOut])
-async def reservations(daemon: Daemon, person: Viewer) -> list[dict[str, Any]]:
+async def reservations(queue: Queue, person: Viewer) -> list[dict[str, Any]]:
     """List reservations that have not ended."""
-    return daemon.reservations()
+    return queue.reservations()
 
 
 @router.post("/reservations/{number}/cancel", operation_id="cancel_reservation")
-async def cancel_reservation(daemon: Daemon, person: Operator, number: int) -> list[ReservationOut]:
+async def cancel_reservation(queue: Queue, person: Operator, number: int) -> list[ReservationOut]:
     """Cancel a reservation."""
     with _answering():
-        daemon.cancel_reservation(number, person.name)
-    return [ReservationOut.model_validate(one) for one in daemon.reservations()]
+        queue.cancel_reservation(number, person.name)
+    return [ReservationOut.model_validate(one) for one in queue.reservations()]
 
 
 # ---- materials
@@ -288,6 +284,6 @@ async def place_vessel(daemon: Daemon, orders: Orders, person: Operator, key: st
     return _changed(daemon, orders, person.name, "place vessel", f"{key}: {body.position or 'nowhere'}")
 
 
-def _changed(daemon: Supervisor, orders: Ordering, by: str, what: str, detail: str) -> Any:
+def _changed(daemon: SharedServices, orders: Ordering, by: str, what: str, detail: str) -> Any:
     daemon.note(by, what, detail=detail)
     return orders.materials.everything()

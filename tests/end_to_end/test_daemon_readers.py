@@ -54,10 +54,10 @@ def test_last_event_id_is_understood_as_browsers_send_it(real: Real) -> None:
     import httpx
 
     real.tell(10)
-    headers = {"Authorization": f"Bearer {real.token()}", "Last-Event-ID": str(real.daemon.feed.last - 3)}
+    headers = {"Authorization": f"Bearer {real.token()}", "Last-Event-ID": str(real.daemon.shared.feed.last - 3)}
     answer = httpx.get(f"{real.url}/api/v1/events", params={"until": "true"}, headers=headers, trust_env=False)
     assert [line for line in answer.text.splitlines() if line.startswith("id:")] == [
-        f"id: {real.daemon.feed.last - back}" for back in (2, 1, 0)
+        f"id: {real.daemon.shared.feed.last - back}" for back in (2, 1, 0)
     ]
 
 
@@ -68,15 +68,15 @@ def test_a_reader_that_never_reads_costs_nothing_and_holds_nobody_up(real: Real)
             f"GET /api/v1/events?after=0 HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {real.token()}\r\n\r\n"
         )
         slow.sendall(request.encode())
-        while not real.daemon.feed.readers:
+        while not real.daemon.shared.feed.readers:
             time.sleep(0.01)
         real.tell(8_000, size=2_000)  # 16 MB, more than any buffer between the two
         with real.client() as client:
             begin = time.monotonic()
-            assert client.get("/status")["last_event"] == real.daemon.feed.last
+            assert client.get("/status")["last_event"] == real.daemon.shared.feed.last
             assert time.monotonic() - begin < PATIENCE
-        assert len(real.daemon.feed._ring) <= 4_000
-        assert real.daemon.feed.readers == 1
+        assert len(real.daemon.shared.feed._ring) <= 4_000
+        assert real.daemon.shared.feed.readers == 1
     finally:
         slow.close()
 
@@ -101,7 +101,7 @@ def test_two_hundred_read_at_once_and_a_stop_is_heard_all_the_same(real: Real) -
         limits = httpx.Limits(max_connections=None)
         async with httpx.AsyncClient(headers=headers, limits=limits, timeout=PATIENCE, trust_env=False) as client:
             readers = [asyncio.create_task(read(client, number)) for number in range(count)]
-            while real.daemon.feed.readers < count:
+            while real.daemon.shared.feed.readers < count:
                 await asyncio.sleep(0.02)
             await asyncio.to_thread(real.tell, 30)
             stopped = await client.post(f"{real.url}/api/v1/emergency-stop", json={})

@@ -17,8 +17,8 @@ import pytest
 import uvicorn
 
 from orchestrator.daemon.access_tokens import Role, Tokens
+from orchestrator.daemon.emergency_stop import StopProtocol
 from orchestrator.daemon.http_api import serve_app
-from orchestrator.daemon.stop_request import StopProtocol
 from tests.support.small_campaign import write_campaign
 from tests.support.toy_daemon import CAMPAIGN, Make, Served, held, serving
 from tests.support.waiting import PATIENCE
@@ -86,7 +86,7 @@ def on_port(folder: Path, make: Make = held, **settings: Any) -> Iterator[OnPort
         async with serving(folder, make, **settings) as served:
             tokens = Tokens(served.daemon.settings.tokens)
             listening = socket.create_server(("127.0.0.1", 0))
-            app = serve_app(served.daemon, tokens, lambda: None)
+            app = serve_app(served.supervisor, tokens, lambda: None)
             config = uvicorn.Config(
                 app, http=StopProtocol, ws="none", log_config=None, lifespan="off", timeout_graceful_shutdown=1
             )

@@ -52,7 +52,7 @@ class Real:
     def tell(self, count: int, size: int = 10) -> None:
         async def tell() -> None:
             for number in range(count):
-                self.daemon.feed.publish("LogLine", {"level": "info", "text": f"{number} " + "x" * size})
+                self.daemon.shared.feed.publish("LogLine", {"level": "info", "text": f"{number} " + "x" * size})
                 if number % 100 == 0:
                     await asyncio.sleep(0)
 

@@ -21,6 +21,7 @@ import uvicorn
 
 from actors.runtime.child_process import child_environment
 from orchestrator.daemon import ordering, rig_worker
+from orchestrator.daemon.campaign_queue import CampaignQueue
 from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
 from orchestrator.daemon.madsci_node import create_node
@@ -50,17 +51,17 @@ def die_at(stage: str) -> None:
     """Kill this process when an order reaches a stage."""
     match stage:
         case "checked":
-            ordering.Ordering._queue = die  # type: ignore[method-assign]
+            ordering.Ordering._enqueue = die  # type: ignore[method-assign]
         case "queued":
-            ordering.Ordering._queue = _async_after(ordering.Ordering._queue)  # type: ignore[method-assign]
+            ordering.Ordering._enqueue = _async_after(ordering.Ordering._enqueue)  # type: ignore[method-assign]
         case "submitting":
-            Supervisor.submit_all = die  # type: ignore[method-assign]
+            CampaignQueue.submit = die  # type: ignore[method-assign]
         case "submitted":
-            Supervisor.submit_all = after(Supervisor.submit_all)  # type: ignore[method-assign]
+            CampaignQueue.submit = after(CampaignQueue.submit)  # type: ignore[method-assign]
         case "leased":
             rig_worker.renew_load = after(rig_worker.renew_load)
         case "poured":
-            rig_worker.settle = die
+            rig_worker.RigWorker.settle = die  # type: ignore[method-assign]
         case "in the account":
             VesselAccount.transfer = after(VesselAccount.transfer)  # type: ignore[method-assign]
         case "weighed":
@@ -115,7 +116,7 @@ async def serve(folder: Path, stage: str, port: int = 0, node_port: int = 0) -> 
     sockets = [listener(port), listener(node_port)]
     await daemon.start()
     if stage in ("node", "station", "held"):
-        materials = Materials(daemon.store)
+        materials = Materials(daemon.shared.store)
         materials.add_liquid("water", "", {})
         for vessel, shape in (("beaker", BEAKER), ("vial-1", VIAL), *([("vial-2", VIAL)] if stage == "held" else [])):
             materials.add_vessel(vessel, "", shape, "", "test")

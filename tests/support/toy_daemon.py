@@ -18,6 +18,7 @@ from orchestrator.daemon.access_tokens import Role, Tokens, token_of
 from orchestrator.daemon.daemon_settings import DaemonSettings
 from orchestrator.daemon.daemon_store import AT_REST
 from orchestrator.daemon.http_api import serve_app
+from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.submissions import pack
 from orchestrator.daemon.supervisor import Supervisor
 from sim_engine.outcome import PourMeasurement
@@ -93,12 +94,16 @@ class HeldLaboratory(ToyLaboratory):
 class Served:
     """A running daemon and ways to talk to it."""
 
-    daemon: Supervisor
+    supervisor: Supervisor
     http: httpx.AsyncClient
     tokens: dict[Role, str]
     laboratories: list[HeldLaboratory]
     campaign: Path
     ended: list[bool] = field(default_factory=list)
+
+    @property
+    def daemon(self) -> SharedServices:
+        return self.supervisor.shared
 
     def headers(self, role: Role = Role.ADMIN) -> dict[str, str]:
         return {"Authorization": f"Bearer {self.tokens[role]}"}
@@ -179,7 +184,7 @@ async def serving(folder: Path, make: Make = HeldLaboratory, **settings: Any) ->
             finally:
                 for laboratory in made:
                     laboratory.bench.go.set()
-                daemon.stopping = True
+                daemon.shared.stopping = True
                 daemon.hurry()
                 await daemon.close()
 

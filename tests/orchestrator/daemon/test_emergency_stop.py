@@ -67,7 +67,7 @@ def tilting(lab: OnPort) -> Iterator[list[Arm]]:
         yield arms
     finally:
         workers |= before
-        for name in ("", *lab.served.daemon.rig_names):
+        for name in ("", *lab.served.supervisor.stops.rig_names):
             lab.do(lab.served.post("/emergency-stop/clear", {"rig": name}, role=Role.ADMIN))
 
 
@@ -297,7 +297,7 @@ def test_a_disk_that_cannot_be_used_prevents_no_stop(tmp_path: Path, monkeypatch
 @pytest.mark.parametrize("rig", ["", "Nothing", None])
 def test_the_supervisor_stops_for_any_reason_and_rig(lab: OnPort, reason: Any, rig: Any) -> None:
     with tilting(lab) as (arm,):
-        notes = lab.do(lab.served.daemon.emergency_stop("library", reason, rig))
+        notes = lab.do(lab.served.supervisor.stops.stop("library", reason, rig))
         assert arm.arm_stops == 1
         assert ("there is no rig" in "".join(notes)) == (rig != "")
         record = lab.do(lab.served.get("/status"))["emergency"]

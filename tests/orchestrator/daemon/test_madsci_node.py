@@ -31,9 +31,15 @@ ARGS = {
 }
 
 
+def ordering(served: Served) -> Ordering:
+    return Ordering(served.daemon, served.supervisor.queue)
+
+
 @contextlib.asynccontextmanager
 async def node(served: Served, address: str = "127.0.0.1") -> AsyncIterator[httpx.AsyncClient]:
-    app = create_node(served.daemon, Ordering(served.daemon), MadsciSettings(allow=["127.0.0.0/8"]))
+    app = create_node(
+        served.supervisor, Ordering(served.daemon, served.supervisor.queue), MadsciSettings(allow=["127.0.0.0/8"])
+    )
     transport = httpx.ASGITransport(app=app, client=(address, 1))
     async with httpx.AsyncClient(transport=transport, base_url="http://node") as http:
         yield http
@@ -126,7 +132,7 @@ def test_an_action_whose_order_was_stored_when_the_daemon_was_killed_is_started(
             await served.post("/queue/pause")
             unsent = await created(http)
             key = await created(http)
-            await Ordering(served.daemon).pour(PourIn.model_validate({**ARGS, "id": key}), PERSON)
+            await ordering(served).pour(PourIn.model_validate({**ARGS, "id": key}), PERSON)
         async with serving(tmp_path, rigs=rigs_in(tmp_path)) as served, node(served) as http:
             found = (await http.get(f"/action/{unsent}/result")).json()
             assert found["status"] == "not_started"
@@ -205,7 +211,7 @@ def test_an_address_that_is_not_listed_reaches_nothing(tmp_path: Path) -> None:
             for path in ("/info", "/status"):
                 assert (await http.get(path)).status_code == 403
             assert (await http.post("/admin/safety_stop")).status_code == 403
-            assert served.daemon.emergency is None
+            assert served.supervisor.stops.of_all is None
 
     run(work())
 

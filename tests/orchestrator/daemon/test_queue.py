@@ -78,7 +78,7 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
             laboratory.bench.go.set()
             found = await served.until(key, "finished")
             assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
-            settings, item = served.daemon.settings, served.daemon.item(key)
+            settings, item = served.daemon.settings, served.supervisor.queue.item(key)
             plan = run_request(settings, item, settings.rig(item.rig)).campaign
             afresh = Pours().of(settings.runs / str(item.run), lambda: plan, live=False)
             assert found["pours_made"] == [pour.model_dump() for pour in afresh]
@@ -212,7 +212,7 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
         async with serving(tmp_path) as served:
             key = (await served.post("/campaigns", sent))["id"]
             found = await served.until(key, "finished")
-            plan = run_request(served.daemon.settings, served.daemon.item(key), Rig(NO_RIG)).campaign
+            plan = run_request(served.daemon.settings, served.supervisor.queue.item(key), Rig(NO_RIG)).campaign
             assert plan.parameters.friction == 0.21
             assert found["name"] == plan.name == "cup-plan"
             assert [scene.receiver.name for scene in plan.deployment.scenes] == ["bowl"]  # type: ignore[union-attr]

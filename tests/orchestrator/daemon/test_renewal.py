@@ -29,18 +29,18 @@ def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(
             keys = [await served.submit(), await served.submit()]
             laboratory = await served.pouring()
             monkeypatch.setattr(WarmSimulators, "lost", property(lambda self: lost[0]))
-            assert served.daemon.pouring
-            served.daemon.leave("raylet")
+            assert served.supervisor.pouring
+            served.supervisor.leave("raylet")
             told = await served.post("/queue/pause")
             told = await served.post(f"/campaigns/{keys[1]}/resume", status=409)
             assert "just beginning anew" in told["detail"]
             (problem,) = (await served.get("/status"))["problems"]
             assert "Ray has lost its raylet" in problem
             await asyncio.sleep(0.2)
-            assert not served.daemon.left.is_set()
+            assert not served.supervisor.left.is_set()
             assert laboratory.bench.aborted == []
             laboratory.bench.go.set()
-            await served.daemon.left.wait()
+            await served.supervisor.left.wait()
             found = await served.until(keys[0], "paused")
             assert [pour["state"] for pour in found["pours_made"]] == ["weighed"]
             await served.post("/queue/resume")
@@ -56,6 +56,7 @@ class Daemon:
     lost, pouring = "raylet", False
 
     def __init__(self) -> None:
+        self.shared = self.warm = self
         self.left: list[str] = []
         self.problems: list[str] = []
 

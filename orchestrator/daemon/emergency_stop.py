@@ -1,27 +1,33 @@
-"""The request of an emergency stop over HTTP. Nothing that comes with it prevents the stop.
+"""Emergency stops: their requests over HTTP, the stops of the arms, and what stays latched until it is cleared.
 
-Method, path and token suffice. What the rest of the request can't say is ignored, and a note reports it.
+Nothing that comes with a request prevents the stop. Method, path and token suffice. What the rest of the request can't
+say is ignored, and a note reports it.
 
+- `EmergencyStops` stops the arms of one rig or of all, latches the stop, and clears it.
 - `is_stop` recognises the paths that stop an arm; `StopProtocol` keeps uvicorn from refusing their malformed bodies.
 - `StopBody` reads a body for a limited time; `read_stop` finds reason and rig in its bytes.
 - `recorded_reason` shortens a reason for the records; `later_stop` merges the records of several stops.
-
-The arms are stopped by `supervisor`.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import re
+import sqlite3
 import time
-from collections.abc import Awaitable, Callable, MutableMapping
+from collections.abc import Awaitable, Callable, MutableMapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 from urllib.parse import parse_qs
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from orchestrator.daemon.daemon_store import DesiredState
+from orchestrator.daemon.rig_worker import RigWorker, SharedServices
+from orchestrator.learning.run_errors import RunError
 
 STOP_PATH = "/api/v1/emergency-stop"
 
@@ -42,10 +48,22 @@ LONGEST_REASON = 500
 
 ALL_STOPPED = ": every arm was stopped"
 
+EMERGENCY = "emergency"
+"""Flag of the emergency stop of all rigs; that of one rig has the rig's name after it."""
+
+UNSTORED = (RunError, OSError, sqlite3.Error)
+"""Errors of a store that can't be used: none of them prevents a stop."""
+
+LEAVING_STEPS = 4
+"""Turns of the event loop in which the orders to stop leave the process, before the disk is written."""
+
 REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
 
 _PATHS = re.compile(r"/+api/+v1/+(emergency-stop|campaigns/+[^/]+/+abort)/*", re.IGNORECASE)
 _NODE = re.compile(r"/+admin/+(?:\w+\.)?safety_stop/*", re.IGNORECASE)
+
+ArmStops = dict[str, asyncio.Task[None]]
+"""Stops that are under way, by rig."""
 
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 
@@ -230,3 +248,140 @@ def later_stop(latched: dict[str, Any] | None, by: str, reason: str, now: float)
     authors += [by] if by not in authors else []
     reasons += [reason] if reason and reason not in reasons else []
     return {"by": ", ".join(authors), "time": latched["time"], "reason": "; ".join(reasons)[:LONGEST_REASON]}
+
+
+class EmergencyStops:
+    """The emergency stops of a daemon: of all rigs, and of single ones. They persist until they are cleared.
+
+    Args:
+        shared: what the parts of the daemon share.
+    """
+
+    def __init__(self, shared: SharedServices) -> None:
+        self._shared, self._store = shared, shared.store
+        for worker in shared.workers.values():
+            worker.latched = self.holds(worker.rig.name)
+
+    @property
+    def of_all(self) -> dict[str, Any] | None:
+        """The active emergency stop of all rigs, with its fields by, time and reason; None if there is none."""
+        found: dict[str, Any] | None = self._store.flag(EMERGENCY)
+        return found
+
+    @property
+    def of_rigs(self) -> dict[str, dict[str, Any]]:
+        """Active emergency stops of single rigs, by the rig's name."""
+        stops = {rig.name: self._store.flag(f"{EMERGENCY} {rig.name}") for rig in self._shared.settings.rigs}
+        return {name: stop for name, stop in stops.items() if stop is not None}
+
+    @property
+    def active(self) -> bool:
+        """Whether any emergency stop is latched."""
+        return self.of_all is not None or bool(self.of_rigs)
+
+    def holds(self, rig: str) -> bool:
+        """Whether a rig may start nothing, because of its own emergency stop or that of all rigs."""
+        return bool(self.refusal(rig))
+
+    def refusal(self, rig: str = "") -> str:
+        """Return why a stop forbids new work, of one rig or of those that are stopped for all; '' if none does."""
+        if self.of_all is not None:
+            return "the emergency stop is latched; requests are accepted again after it is cleared"
+        if rig in self.of_rigs:
+            return f"the emergency stop of rig {rig} is latched; it accepts requests again after it is cleared"
+        return ""
+
+    async def stop_arms(self, rig: str, arms: ArmStops) -> None:
+        """Begin to stop the arm of a rig, or ('') every arm, and let nothing start there. Part of `stop`.
+
+        Args:
+            rig: an existing rig, or ''.
+            arms: stops that the same request has begun; each arm is stopped once. Those that begin are added.
+        """
+        for worker in self._affected(rig)[1]:
+            worker.latched = True
+            if worker.running is not None and worker.rig.name not in arms:
+                arms[worker.rig.name] = asyncio.create_task(worker.running.emergency())
+        for _ in range(LEAVING_STEPS):
+            await asyncio.sleep(0)
+
+    def latch(self, by: str, reason: str, rig: str = "") -> None:
+        """Store an emergency stop, so that it holds after a restart. Authors and reasons of several are kept."""
+        flag, workers = self._affected(rig)
+        with contextlib.suppress(*UNSTORED):
+            self._store.set_flag(flag, later_stop(self._store.flag(flag), by, reason, time.time()))
+            for worker in workers:
+                if worker.running is not None:
+                    self._store.change(worker.running.item.id, desired_state=str(DesiredState.ABORT))
+
+    async def stop(
+        self,
+        by: str,
+        reason: object = "",
+        rig: object = "",
+        *,
+        arms: ArmStops | None = None,
+        notes: Sequence[str] = (),
+    ) -> list[str]:
+        """Stop every arm, give all work up, and accept nothing new until `clear`. The arms are stopped first.
+
+        Args:
+            by: user who triggers the stop.
+            reason: reason, if given; its first 500 printable characters are recorded.
+            rig: stop only this rig; '' for all. The stop of all rigs and that of one are set and cleared separately.
+                A rig that does not exist stops all.
+            arms: stops that the same request has begun before; see `stop_arms`.
+            notes: what was changed or ignored in the request.
+
+        Returns:
+            These notes, and others on reason and rig. The audit entry has them, too.
+        """
+        affected, found = self.scope(rig)
+        arms = {} if arms is None else arms
+        await self.stop_arms(affected, arms)
+        text, changes = recorded_reason(reason)
+        self.latch(by, text, affected)
+        found = [*notes, *found, *changes]
+        with contextlib.suppress(*UNSTORED):
+            detail = ": ".join(filter(None, (f"rig {affected}" if affected else "", text)))
+            self._shared.note(
+                by, "emergency stop", detail=f"{detail} ({'; '.join(found)})".lstrip() if found else detail
+            )
+        await asyncio.gather(*arms.values(), return_exceptions=True)
+        return found
+
+    def scope(self, rig: object) -> tuple[str, list[str]]:
+        """Return the rig that a stop is for, '' for all, and a note if the wanted rig does not exist."""
+        if isinstance(rig, str) and (not rig or rig in self.rig_names):
+            return rig, []
+        return "", [unknown_rig(rig)]
+
+    @property
+    def rig_names(self) -> list[str]:
+        """Names of the rigs, in the order of the settings."""
+        return [rig.name for rig in self._shared.settings.rigs]
+
+    def clear(self, by: str, rig: str = "") -> None:
+        """Accept work again. Work that was given up rests until an operator resumes it.
+
+        Args:
+            by: user who clears the stop.
+            rig: rig whose own emergency stop is cleared; '' for that of all rigs.
+
+        Raises:
+            KeyError: the rig does not exist.
+        """
+        flag, workers = self._affected(rig)
+        self._store.set_flag(flag, None)
+        for worker in workers:
+            worker.latched = self.holds(worker.rig.name)
+        self._shared.note(by, "clear emergency stop", detail=f"rig {rig}" if rig else "")
+        self._shared.wake()
+
+    def _affected(self, rig: str) -> tuple[str, list[RigWorker]]:
+        """Return the flag of an emergency stop and the rig workers it affects. Raises KeyError."""
+        if not rig:
+            return EMERGENCY, list(self._shared.workers.values())
+        if rig not in self.rig_names:
+            raise KeyError(rig)
+        return f"{EMERGENCY} {rig}", [self._shared.workers[rig]]
