@@ -9,14 +9,14 @@ from __future__ import annotations
 import ipaddress
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from actors.arm.arm_geometry import RobotCell
-from actors.arm.arm_interface import ArmFigure
+from actors.arm.arm_interface import ArmFigure, PlannedPour
 from actors.arm.arm_settings import ArmDiagnostics, ArmEmulator, ArmKind
-from actors.arm.planned_pour import MotionPath, PourPath
+from actors.arm.planned_pour import MotionPath, PlaceWay, PourPath
 from actors.arm.simulated_arm import APPROACH_TIME, SimulatedArm, SimulatedArmSettings
 from actors.arm.ur.robot_models import MODELS, same_robot
 from actors.arm.ur_settings import UrArmSettings
@@ -27,9 +27,11 @@ from actors.grippers.gripper_interface import GripperEmulator
 from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import DeviceCheck
+from actors.places import PlaceSettings, Role
 from sim_engine.action import Action
 from sim_engine.scene import Scene
 from sim_engine.settings.model import Problems
+from sim_engine.vessel.vessel import Vessel
 
 
 class SimulatedArmKind(ArmKind[SimulatedArmSettings]):
@@ -59,7 +61,7 @@ class UrArmKind(ArmKind[UrArmSettings]):
     """A UR arm."""
 
     settings = UrArmSettings
-    doses = emulated = True
+    doses = carries = emulated = True
 
     def check_laboratory(self, problems: Problems, *, mode: str, cell: RobotCell | None) -> None:
         """See `ArmKind.check_laboratory`."""
@@ -110,6 +112,35 @@ class UrArmKind(ArmKind[UrArmSettings]):
         from actors.bench.pour_feasibility import plan_pour, vessel
 
         return plan_path(plan_pour(scene, action), self.spec, vessel(scene.pourer), vessel(scene.receiver))
+
+    def place_problems(
+        self, places: Sequence[PlaceSettings], vessels: Mapping[Role, Vessel]
+    ) -> Iterable[tuple[int, str]]:
+        """See `ArmKind.place_problems`."""
+        from actors.arm.planning.place_ways import place_problems
+
+        return place_problems(places, self.spec, vessels)
+
+    def way(
+        self,
+        place: PlaceSettings,
+        places: Sequence[PlaceSettings],
+        vessels: Mapping[Role, Vessel],
+        volume: float | None = None,
+    ) -> PlaceWay:
+        """See `ArmKind.way`."""
+        from actors.arm.planning.place_ways import way_to
+
+        return way_to(place, places, self.spec, vessels, volume)
+
+    def in_the_way(
+        self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[Role, Vessel]
+    ) -> list[str]:
+        """See `ArmKind.in_the_way`."""
+        from actors.arm.planning.place_ways import in_the_way
+
+        assert isinstance(path, PourPath)
+        return in_the_way(path, pourer, places, self.spec, vessels)
 
     def with_stored(self, folder: Path) -> UrArmSettings:
         """See `ArmKind.with_stored`: the calibration of `calibration_file`."""

@@ -34,6 +34,7 @@ from actors.interfaces import (
 )
 from actors.laboratory_settings import MODE_LABELS, LaboratorySettings, RaySettings
 from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
+from actors.places import PlaceRecord
 from actors.runtime.ray_cluster import JoinedCluster, check_cluster, versions
 from actors.runtime.ray_runtime import forget_ray_logs, open_ray, ray_lost, stop_ray, watch_ray
 from actors.runtime.remote_object import Device, LocalDevice, RayDevice
@@ -167,6 +168,7 @@ def open_laboratory(
     operator: Operator | None = None,
     kept: SimulatorPool | None = None,
     optimizer: Optimizer | None = None,
+    record: PlaceRecord | None = None,
 ) -> Laboratory:
     """Create a laboratory, to be entered with `async with`; nothing starts before that.
 
@@ -180,6 +182,7 @@ def open_laboratory(
         kept: simulators to use instead of its own (`WarmSimulators.share`); they stay open. If they are on the
             cluster that `spec` names, arm, balance and bench are on this machine.
         optimizer: an optimiser to use instead of its own; it is stateless.
+        record: account of what stands where, for a laboratory with places.
 
     Raises:
         LaboratoryError: a bench is needed and there is none, or it has no operator, or the mode is unknown.
@@ -198,7 +201,7 @@ def open_laboratory(
         kind = partial(InProcessLaboratory, processes=0 if spec.in_process else spec.simulator_count)
     else:
         kind = RayLaboratory
-    return kind(spec, make, need_bench=need_bench, operator=operator, kept=kept, optimizer=optimizer)
+    return kind(spec, make, need_bench=need_bench, operator=operator, kept=kept, optimizer=optimizer, record=record)
 
 
 class _OpenLaboratory:
@@ -210,6 +213,7 @@ class _OpenLaboratory:
         operator: a person who answers questions, if there is one.
         kept: simulators to use instead of its own; they stay open.
         optimizer: to use instead of its own; it stays open.
+        record: account of what stands where.
     """
 
     def __init__(
@@ -221,8 +225,9 @@ class _OpenLaboratory:
         operator: Operator | None = None,
         kept: SimulatorPool | None = None,
         optimizer: Optimizer | None = None,
+        record: PlaceRecord | None = None,
     ) -> None:
-        self._spec, self._make, self._operator = spec, make, operator
+        self._spec, self._make, self._operator, self._record = spec, make, operator, record
         self._pool, self._optimizer = kept, optimizer
         self._needs_bench = need_bench and spec.pours
         self._own_pools: list[WorkerPool] = []
@@ -292,7 +297,7 @@ class _OpenLaboratory:
         return DeviceOptimizer(proposer)
 
     async def _open_bench(self, make: MakeDevice, liquid: SimulatorPool | None) -> None:
-        self._opened = await open_bench(self._spec, make, liquid, self._operator, self._report)
+        self._opened = await open_bench(self._spec, make, liquid, self._operator, self._report, self._record)
         self._devices += self._opened.devices
 
     async def _close_all(self) -> None:

@@ -30,6 +30,7 @@ from actors.liquid_devices import (
     SpillSensorSettings,
     check_devices,
 )
+from actors.places import PlaceSettings, UnattendedSettings, check_places
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.settings.model import (
@@ -42,6 +43,7 @@ from sim_engine.settings.model import (
     Problems,
     Settings,
     Switch,
+    Text,
 )
 from sim_engine.settings.quantity import Quantity
 
@@ -198,6 +200,15 @@ class LaboratorySettings(Settings):
     gripper: Annotated[Annotated[GripperSettings, OneOf(lambda: GRIPPERS.all)] | None, NOT_IN_FINGERPRINT] = None
     """The gripper that holds the pourer; `kind` is one of the installed kinds. The operator works it unless given."""
 
+    places: Annotated[tuple[PlaceSettings, ...], NOT_IN_FINGERPRINT] = ()
+    """Places between which the arm carries the vessels, instead of the operator."""
+
+    safeguard: Annotated[Text, NOT_IN_FINGERPRINT] = ""
+    """What keeps people out while the arm moves without a person: fence, scanner, and the safety input that it is wired to. Needed for `unattended` pours."""  # noqa: E501
+
+    unattended: Annotated[UnattendedSettings | None, SET_BY_PROGRAM] = None
+    """What the campaign asks for."""
+
     balance: Annotated[BalanceSettings, OneOf(kinds)] | None = None
     """The balance next to the arm, or under the receiver of the pump."""
 
@@ -294,6 +305,8 @@ class LaboratorySettings(Settings):
             arm_kind(self.arm).check_laboratory(problems, mode=self.mode, cell=self.cell)
             if self.gripper is not None:
                 self.gripper.check_laboratory(problems.within("gripper"), mode=self.mode, arm=self.arm)
+            if self.places and problems.valid("places", "arm", "cell"):
+                self._check_places(problems)
             if self.balance is not None:
                 inner = problems.within("balance")
                 if self.balance.typed:
@@ -338,12 +351,26 @@ class LaboratorySettings(Settings):
         else:
             balance.check_laboratory(inner, mode=self.mode)
 
+    def _check_places(self, problems: Problems) -> None:
+        assert self.arm is not None
+        if self.gripper is None:
+            problems.add("vessels are carried between places by a gripper; add 'gripper: {model: …}'", "places")
+        balance = self.balance
+        if balance is not None and (balance.typed or balance.placement != "receiver" or balance.pourer != "here"):
+            problems.add("with places the balance stands under the receiver and is connected: 'placement: receiver'",
+                "balance")  # fmt: skip
+        check_places(problems, self.places, getattr(self.arm, "tool", None))
+        arm = self.arm.in_laboratory(self.cell, 1.0)
+        if problems.valid("places", "arm", "cell"):
+            for number, text in arm_kind(arm).place_problems(self.places, {}):
+                problems.add(text, "places", number, more=True)
+
     def _check_without_arm(self, problems: Problems) -> None:
-        for key in ("cell", "gripper", "balance", "operator", "source", "spill_sensor"):
+        for key in ("cell", "gripper", "places", "balance", "operator", "source", "spill_sensor"):
             if key in self.model_fields_set:
                 meant = (
                     "; a simulated bench has 'bench: {balance: …, operator_time: …}'"
-                    if key not in ("cell", "gripper")
+                    if key not in ("cell", "gripper", "places")
                     else ""
                 )
                 text = f"belongs to an arm, and there is none; add 'arm', or remove it{meant}"

@@ -35,6 +35,7 @@ from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import OperatorSettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
+from actors.places import PlaceSettings, UnattendedSettings
 from orchestrator.campaigns import campaign_file as campaign
 from orchestrator.campaigns import vessel_file as vessel
 from orchestrator.campaigns.pour_table import MASS_COLUMNS, SPLITS, column_name
@@ -103,6 +104,8 @@ SECTIONS: dict[str, type[Settings]] = {
     "arm": UrArmSettings,
     "limits": ArmLimits,
     "cell": RobotCell,
+    "places": PlaceSettings,
+    "unattended": UnattendedSettings,
     "gripper-robotiq": RobotiqSettings,
     "gripper-onrobot": OnRobotSettings,
     "gripper-digital": DigitalSettings,
@@ -149,6 +152,8 @@ OF_SECTIONS = {
     "DisplayBehaviour": "[display behaviour](#display-behaviour)",
     "PumpSettings": "[pump](#pump)",
     "GripperSettings": "[gripper](grippers.md)",
+    "PlaceSettings": "[place](places.md#settings)",
+    "UnattendedSettings": "[unattended](places.md#settings)",
     "EmulatedOnRobotSettings": "[gripper](grippers.md)",
     "EmulatedRobotiqSettings": "[gripper](grippers.md)",
     "SpillSensorSettings": "[spill sensor](#spill-sensor)",
@@ -715,6 +720,8 @@ def _default(key: str, info: FieldInfo, model: type[Settings]) -> str:
     quantity = next((m for m in info.metadata if isinstance(m, Quantity)), None)
     if quantity is not None and quantity.unit != "1":
         return f"{_shown(value, quantity)} {quantity.display}"
+    if isinstance(value, tuple):
+        return ", ".join(f"`{one}`" for one in value)
     return f"`{str(value).lower() if isinstance(value, bool) else value}`"
 
 
@@ -745,6 +752,8 @@ def _value(annotation: Any, metadata: Sequence[Any] = ()) -> str:
     if origin is tuple:
         inner = typing.get_args(annotation)
         if isinstance(inner[0], type) and issubclass(inner[0], Settings):
+            return f"list of: {_value(inner[0])}"
+        if typing.get_origin(inner[0]) is Literal:
             return f"list of: {_value(inner[0])}"
         if typing.get_args(inner[0])[-1:] == (...,):
             return "list of rows of numbers"

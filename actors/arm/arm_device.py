@@ -11,8 +11,9 @@ from collections.abc import AsyncIterator, Callable
 
 from actors.arm.arm_interface import ArmError, ArmFacts, ArmState, Executed, PlannedPour
 from actors.arm.arm_settings import ArmSettings
+from actors.arm.planned_pour import PlaceWay
 from actors.interfaces import LaboratoryError
-from actors.runtime.remote_object import Device
+from actors.runtime.remote_object import Device, DeviceLostError
 
 PATIENCE = 60.0
 """Longest wait for a call that moves nothing [s], such as a process start or controller queries."""
@@ -25,6 +26,9 @@ POWER_TIME = 180.0
 
 LOOK_INTERVAL = 0.1
 """Time between two readings of a moving arm's state [s]."""
+
+STUCK = (ArmError, DeviceLostError)
+"""Errors after which the operator has to check the arm."""
 
 Follow = Callable[[ArmState], None]
 
@@ -88,10 +92,19 @@ class DeviceArm:
         state: ArmState = await self.device.call("drive", speed, deadline=DRIVE_PATIENCE, urgent=True)
         return state
 
-    async def retreat(self, path: PlannedPour, follow: Follow = _ignore) -> None:
+    async def retreat(self, path: PlannedPour | PlaceWay, follow: Follow = _ignore) -> None:
         """Move home from any upright pose on the way to or from the pour; `follow` as in `move_to_start`."""
         async with self._followed(follow):
             await self.device.call("retreat", path, deadline=self._deadline(3.0 * path.retreat_time))
+
+    async def carry(self, way: PlaceWay, *, loaded: bool) -> None:
+        """Move from home to a place or back; see `actors.arm.arm_interface.CarryingArm`.
+
+        Args:
+            way: to the place.
+            loaded: whether a vessel is in the gripper, for arms that watch it.
+        """
+        await self.device.call("carry", way, deadline=self._deadline(way.approach_time))
 
     async def untilt(self, path: PlannedPour) -> None:
         """Bring the pourer slowly upright again after that pour was stopped."""

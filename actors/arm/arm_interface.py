@@ -37,7 +37,8 @@ class ArmState:
         stopped: `stop` is in force; nothing moves until `release`.
         time: bench time since the motion began [s].
         fraction: of the motion, 0 … 1.
-        phase: 'announced', 'approach', the pour's 'tilt', 'hold', 'return', then 'retreat'; 'untilt', 'jog'; 'idle'.
+        phase: 'announced', 'approach', the pour's 'tilt', 'hold', 'return', then 'retreat'; 'untilt', 'jog', 'carry';
+            'idle'.
         tilt: of the pourer [rad].
         joints: as last measured [rad]; empty if the arm does not report them.
         pourer: pose of the pourer in the world (x y z [m], qw qx qy qz), from an arm without joints; else empty.
@@ -319,6 +320,18 @@ class DosingArm(Protocol):
         ...
 
 
+class CarryingArm(Protocol):
+    """An `Arm` that also carries vessels between places."""
+
+    def carry(self, way: Any) -> None:
+        """Move from home to a place, or back; raises as `Arm.move_to_start`. The consent stays.
+
+        Args:
+            way: an `actors.arm.planned_pour.PlaceWay`; the arm stands at its begin, or at its end if it is homewards.
+        """
+        ...
+
+
 @dataclass(frozen=True)
 class Bar:
     """One link.
@@ -409,7 +422,8 @@ class ArmStoppedError(ArmError):
     Args:
         text: what happened, and what to do.
         kind: 'operator', 'protective stop', 'emergency stop', 'safeguard', 'safety', 'watchdog', 'program ended'.
-        phase: of the motion: 'announced', 'approach', 'tilt', 'hold', 'return', 'retreat', 'untilt', 'jog'.
+        phase: of the motion: 'announced', 'approach', 'tilt', 'hold', 'return', 'retreat', 'untilt', 'jog',
+            'carry'.
         time: since the motion's start [s of controller time].
         tilt: of the stopped pourer [rad].
         executed: the part of the motion that was executed; None if there is none.

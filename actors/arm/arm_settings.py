@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Protocol, Self, TypeVar
 
 from actors.arm.arm_geometry import RobotCell
-from actors.interfaces import DeviceCheck, LaboratoryError
+from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
+from actors.places import PlaceSettings, Role
 from sim_engine.action import Action
 from sim_engine.scene import Scene
 from sim_engine.settings.model import SET_BY_PROGRAM, Problems, Settings
@@ -25,6 +26,8 @@ from sim_engine.settings.plugin_registry import PluginRegistry
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import ArmFacts, ArmFigure, PlannedPour
+    from actors.arm.planned_pour import PlaceWay
+    from sim_engine.vessel.vessel import Vessel
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,9 @@ class ArmKind(ABC, Generic[S]):
     doses: ClassVar[bool] = False
     """Whether the driver pours wanted amounts, see `actors.arm.arm_interface.DosingArm`."""
 
+    carries: ClassVar[bool] = False
+    """Whether the driver carries vessels between places, see `actors.arm.arm_interface.CarryingArm`."""
+
     emulated: ClassVar[bool] = False
     """Whether a virtual bench emulates the arm, see `start_emulator`."""
 
@@ -240,6 +246,35 @@ class ArmKind(ABC, Generic[S]):
             mode: 'virtual' or 'hardware'.
             cell: the section `cell`; None if it is missing.
         """
+
+    def place_problems(
+        self, places: Sequence[PlaceSettings], vessels: Mapping[Role, Vessel]
+    ) -> Iterable[tuple[int, str]]:
+        """Problems of a laboratory's places, each with the number of its place.
+
+        Without vessels, only what does not depend on them is checked.
+        """
+        return [(0, f"an arm of the kind '{self.spec.kind}' carries no vessels between places; remove 'places'")]
+
+    def way(
+        self,
+        place: PlaceSettings,
+        places: Sequence[PlaceSettings],
+        vessels: Mapping[Role, Vessel],
+        volume: float | None = None,
+    ) -> PlaceWay:
+        """Plan the way from home to a place; `volume` is that of a carried liquid [m³], None for empty vessels.
+
+        Raises:
+            InvalidActionError: the way is impossible; the text lists all problems.
+        """
+        raise InvalidActionError(f"an arm of the kind '{self.spec.kind}' carries no vessels")
+
+    def in_the_way(
+        self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[Role, Vessel]
+    ) -> list[str]:
+        """Problems of a planned pour with the vessels that may stand at other places."""
+        return []
 
     def with_stored(self, folder: Path) -> S:
         """The settings with the contents of recordings that they name.

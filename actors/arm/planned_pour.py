@@ -124,6 +124,42 @@ class PourPath:
 
 
 @dataclass(frozen=True, eq=False)
+class PlaceWay:
+    """A way from home to a place where vessels stand, and back by the same points.
+
+    Attributes:
+        place: name of the place.
+        approach: from home to the place.
+        calibration: as in `PourPath`.
+        homewards: whether it is to be driven back home.
+    """
+
+    place: str
+    approach: JointPath
+    calibration: str | None = None
+    homewards: bool = False
+
+    @property
+    def retreat(self) -> JointPath:
+        """From the place to home."""
+        return JointPath(self.approach.times[-1] - self.approach.times[::-1], self.approach.joints[::-1])
+
+    @property
+    def approach_time(self) -> float:
+        """Duration of one way [s]."""
+        return self.approach.duration
+
+    @property
+    def retreat_time(self) -> float:
+        """Duration of one way [s]."""
+        return self.approach.duration
+
+    def slowed(self, factor: float) -> PlaceWay:
+        """The same way with all its times divided by a factor in (0, 1]."""
+        return replace(self, approach=JointPath(self.approach.times / factor, self.approach.joints))
+
+
+@dataclass(frozen=True, eq=False)
 class ExecutedPath:
     """The motion that an arm's own encoders measured.
 

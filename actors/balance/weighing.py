@@ -77,14 +77,20 @@ class Weighings:
         """All weighings so far, including valid ones of earlier pours."""
         return self._known | self._weighed
 
-    async def before(self) -> None:
+    async def before(self, given: Mapping[str, PourMasses] | None = None) -> None:
         """Carry out all steps before the pour.
+
+        Args:
+            given: weighings made otherwise; the steps up to the last of them are left out.
 
         Raises:
             BalanceError: an error that the operator could not fix, e.g. no connection.
             LaboratoryError: any error of `ask`.
         """
-        for step in self._steps[: self._pour]:
+        for key, weighed in (given or {}).items():
+            self._note(key, weighed)
+        first = max((i + 1 for i, step in enumerate(self._steps) if given and step.key in given), default=0)
+        for step in self._steps[first : self._pour]:
             await self._do(step)
 
     async def at_once(self) -> None:

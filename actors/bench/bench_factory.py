@@ -27,9 +27,11 @@ from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.held_vessel import HeldVessel, HoldingArm
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
+from actors.bench.night_consent import NightConsent
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.pump_bench import PumpBench
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
+from actors.bench.vessel_handling import VesselHandling
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
 from actors.dosing.dosing_settings import DosingSettings
 from actors.grippers.gripper_interface import GripperSettings
@@ -45,6 +47,7 @@ from actors.interfaces import (
 )
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from actors.liquid_devices import PumpSettings, SourceSettings, SpillSensorSettings
+from actors.places import PlaceRecord
 from actors.runtime.remote_object import Device
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
@@ -106,6 +109,10 @@ class PouringBench:
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)
+            if self._setup.handling is not None:
+                if dose is not None:
+                    raise InvalidActionError("wanted amounts are poured without places; remove 'places'")
+                await asyncio.to_thread(self._setup.handling.fit, self._arm_spec, scene, path)
 
             async def run() -> PourMeasurement:
                 return await self._run(scene, action, path, seed, progress, dose)
@@ -128,6 +135,12 @@ class PouringBench:
         )
         try:
             return await pour.run()
+        except BaseException as error:
+            if self._setup.handling is not None:
+                self._setup.handling.forget()
+            if self._setup.night is not None:
+                self._setup.night.end(str(error) or "the pour was given up")
+            raise
         finally:
             self._known[scene.pourer.name] = pour.lasting
 
@@ -263,6 +276,7 @@ async def open_bench(
     liquid: SimulatorPool | None,
     operator: Operator | None,
     tell: Callable[[Notice], None],
+    record: PlaceRecord | None = None,
 ) -> OpenBench:
     """Open the bench of a laboratory that pours.
 
@@ -272,6 +286,7 @@ async def open_bench(
         liquid: simulates the hidden liquid of a virtual bench.
         operator: the person who answers, if one does.
         tell: receives notices.
+        record: what stands where, for a laboratory with places.
 
     Raises:
         LaboratoryError: a device does not start, or the laboratory needs an operator and none is available.
@@ -290,7 +305,7 @@ async def open_bench(
             return _open_simulated(spec.bench, spec.dosing, opening, liquid)
         if spec.balance is None:
             raise LaboratoryError(f"laboratory {spec.name}: an arm that pours needs a balance; add a 'balance' to it")
-        return await _open_devices(spec, spec.arm, spec.balance, opening, liquid, operator, tell)
+        return await _open_devices(spec, spec.arm, spec.balance, opening, liquid, operator, tell, record)
     except BaseException:
         for device in reversed(opening.devices):
             with contextlib.suppress(LaboratoryError):
@@ -355,6 +370,7 @@ async def _open_devices(
     liquid: SimulatorPool | None,
     operator: Operator | None,
     tell: Callable[[Notice], None],
+    record: PlaceRecord | None,
 ) -> OpenBench:
     emulators: DeviceEmulators | None = None
     true_arm: ArmSettings | None = None
@@ -383,6 +399,17 @@ async def _open_devices(
     questions = OperatorQuestions(operator, spec.operator, tell, arm_spec.time_scale)
     supply = None if spec.source is None else opening.supply(spec.source, contents, arm_spec.time_scale, tell)
     watch = opening.watch(spec.spill_sensor, questions, tell)
+    handling = night = None
+    if spec.unattended is not None:
+        night = NightConsent(spec.unattended, spec.safeguard, arm_spec.title, spec.places, tell)
+    if spec.places:
+        assert held is not None
+        assert balance is not None
+        if record is None:
+            raise LaboratoryError(f"laboratory {spec.name} has places, and no account of what stands where was given")
+        handling = VesselHandling(
+            spec.places, arm, arm_spec, held, balance, balance_spec, record, supply, ground_truth, tell
+        )
     setup = Setup(
         spec.mode,
         arm_spec,
@@ -396,5 +423,7 @@ async def _open_devices(
         supply,
         watch,
         held,
+        handling,
+        night,
     )
     return OpenBench(PouringBench(setup, spec.dosing), opening.devices, emulators, operator)

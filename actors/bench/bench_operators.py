@@ -125,6 +125,8 @@ class BenchContents:
         placement: where the balance stands.
         on_balance: those of 'pourer', 'receiver', 'tray' that stand on it.
         in_pourer, in_receiver, on_tray: liquid [kg].
+        stands: names of the places where vessels stand that the arm carries.
+        spilt_back: liquid that misses the pourer the next time the receiver is poured back [kg].
     """
 
     placement: Placement
@@ -132,6 +134,21 @@ class BenchContents:
     in_pourer: float = 0.0
     in_receiver: float = 0.0
     on_tray: float = 0.0
+    stands: dict[str, str] = field(default_factory=dict)
+    spilt_back: float = 0.0
+
+    def move(self, vessel: str, place: str, *, on_balance: bool) -> None:
+        """Move a vessel to a place, or into the gripper ('')."""
+        self.stands[vessel] = place
+        (self.on_balance.add if on_balance else self.on_balance.discard)(vessel)
+
+    def pour_back(self, film: float) -> None:
+        """Pour the receiver back into the pourer; a film [kg] stays."""
+        left = max(self.in_receiver - film, 0.0)
+        spilt, self.spilt_back = min(self.spilt_back, left), 0.0
+        self.in_receiver -= left
+        self.in_pourer += left - spilt
+        self.on_tray += spilt
 
     def mass(self, name: str) -> float:
         """Mass of an object with its contents [kg]."""
@@ -166,6 +183,11 @@ class BenchContents:
         match about:
             case "tray_wiped":
                 self.on_tray, self.on_balance = 0.0, under
+            case "laid_out":
+                self.in_receiver = self.in_pourer = 0.0
+                self.on_balance = under
+            case "top_up":
+                self.in_pourer = fill
             case "dry_pourer" | "dry_pourer_after":
                 self.on_balance = {"dry pourer"}
             case "cleared" | "cleared_after":
@@ -265,6 +287,13 @@ class Hands:
     async def do(self, question: OperatorQuestion) -> None:
         """Carry out the step of a question."""
         self.contents.do(question.about, self._load + float(self._rng.normal(0.0, SCATTER)))
+        match question.about:
+            case "laid_out":
+                self.contents.stands = {"receiver": str(question.details["receiver"])}
+            case "grasp_failed":
+                self.contents.stands[str(question.details["role"])] = str(question.details["place"])
+            case "pourer_empty" | "pourer_full":
+                self.contents.stands["pourer"] = str(question.details.get("place", ""))
         if self._put is not None and question.wants == "done":
             await self._put(self.contents.carried)
         if self._hold is not None and question.about in ("grasp", "let_go", "open_gripper", "activate_gripper"):

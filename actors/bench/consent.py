@@ -13,18 +13,20 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from actors.arm.arm_device import DeviceArm
-from actors.arm.arm_interface import ArmError, PlannedPour
+from actors.arm.arm_device import STUCK, DeviceArm
+from actors.arm.arm_interface import PlannedPour
 from actors.arm.arm_settings import ArmSettings
+from actors.arm.planned_pour import PlaceWay
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.held_vessel import HeldVessel
 from actors.bench.liquid_supply import LiquidSupply, SpillWatch
+from actors.bench.night_consent import MOTIONS, NightConsent
+from actors.bench.vessel_handling import VesselHandling
 from actors.grippers.gripper_interface import VesselLostError
 from actors.interfaces import BenchLostError, LaboratoryError, Notice, OperatorQuestion
-from actors.runtime.remote_object import DeviceLostError
 
 
 def grams(mass: float) -> str:
@@ -113,10 +115,6 @@ def way_home_question(spec: ArmSettings) -> OperatorQuestion:
     )
 
 
-STUCK = (ArmError, DeviceLostError)
-"""Errors after which the operator has to check the arm."""
-
-
 class ConsentRefusedError(LaboratoryError):
     """The operator refused."""
 
@@ -137,6 +135,8 @@ class Setup:
     supply: LiquidSupply | None = None
     watch: SpillWatch | None = None
     held: HeldVessel | None = None
+    handling: VesselHandling | None = None
+    night: NightConsent | None = None
 
     @property
     def lost(self) -> bool:
@@ -160,10 +160,21 @@ class Consent:
 
         With a gripper, the pourer is gripped or let go before or after questions that need it.
         """
+        if self._setup.handling is not None:
+            return await self._setup.handling.around(question, self)
         held = self._setup.held
-        return await (self._ask(question) if held is None else held.around(question, self._ask))
+        return await (self.asked(question) if held is None else held.around(question, self.asked))
 
-    async def _ask(self, question: OperatorQuestion) -> str:
+    async def asked(self, question: OperatorQuestion) -> str:
+        """Ask the operator, after nothing can move if the question invites hands into the cell.
+
+        A consent for a night answers questions for a motion; it is asked for before the first of them.
+        """
+        night = self._setup.night
+        if night is not None and not night.asked and question.about in MOTIONS:
+            night.answered(await self._setup.questions.ask(night.question()))
+        if night is not None and night.agrees(question):
+            return "yes"
         if question.hands:
             await self.make_safe()
         return await self._setup.questions.ask(question)
@@ -210,19 +221,29 @@ class Consent:
 
     # ---- recovery after a stop
 
-    async def bring_upright(self, error: Exception) -> None:
-        """Bring the pourer upright after a stop in which it was tilted. Two confirmations precede the motion."""
+    async def bring_upright(self, error: Exception, path: PlannedPour | None = None) -> None:
+        """Bring the pourer upright after a stop in which it was tilted. Two confirmations precede the motion.
+
+        Args:
+            error: reported the stop.
+            path: that was being poured; that of the pour unless given.
+        """
         while True:
             await self._recover(error, begun=True)
             await self.given(upright_question(self._setup.spec))
             try:
-                await self._setup.arm.untilt(self._path)
+                await self._setup.arm.untilt(path or self._path)
                 return
             except STUCK as again:
                 error = again
 
-    async def bring_home(self, error: Exception, *, begun: bool) -> None:
+    async def bring_home(self, error: Exception, *, begun: bool, path: PlannedPour | PlaceWay | None = None) -> None:
         """Bring the arm home after a stop on the way to the pour, or on the way back from it.
+
+        Args:
+            error: reported the stop.
+            begun: whether liquid may have been poured.
+            path: way between places on which it stands; that of the pour unless given.
 
         Raises:
             VesselLostError: as given, once the arm is home: the pour is not what it was planned to be.
@@ -232,7 +253,7 @@ class Consent:
             await self._recover(error, begun=begun)
             await self.given(way_home_question(self._setup.spec))
             try:
-                await self._setup.arm.retreat(self._path)
+                await self._setup.arm.retreat(path or self._path)
             except STUCK as again:
                 error = again
                 continue

@@ -24,10 +24,11 @@ from typing import Any
 
 import numpy as np
 
+from actors.arm.arm_device import STUCK
 from actors.arm.arm_interface import ArmFacts, ArmState, Executed, PlannedPour
 from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing_plan import GRIP, Placement
-from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
+from actors.bench.consent import Consent, Setup, grams, start_question
 from actors.bench.pour_feasibility import vessel
 from actors.bench.pour_procedure import PourReport
 from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult

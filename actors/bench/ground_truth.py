@@ -19,6 +19,7 @@ import numpy as np
 from actors.arm.arm_interface import Executed, PlannedPour
 from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
+from actors.places import Role
 from sim_engine.action import Action
 from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
 from sim_engine.scene import PoseError, PourTask, Scene
@@ -216,6 +217,18 @@ class GroundTruth:
         Raises:
             LaboratoryError: the masses are unknown.
         """
+
+    async def between(self, vessel: Role, place: str, width: float) -> None:
+        """Called when open fingers stand around a place, before they close on a vessel of this width [m]."""
+
+    async def lifted(self, vessel: Role) -> None:
+        """Called when a gripped vessel leaves its place."""
+
+    async def placed(self, vessel: Role, place: str, *, on_balance: bool) -> None:
+        """Called when the fingers have let go of a vessel at a place."""
+
+    async def poured_back(self, seed: int) -> None:
+        """Called when the receiver was poured back into the pourer."""
 
     async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int) -> None:
         """Called before the operator prepares a dose.

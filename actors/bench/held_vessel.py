@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from actors.arm.arm_device import DeviceArm, Follow, _ignore
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError, Executed, PlannedPour
 from actors.arm.arm_settings import ArmSettings
+from actors.arm.planned_pour import PlaceWay
 from actors.balance.weighing_plan import GRIP
 from actors.grippers.gripper_interface import (
     SMALLEST_GAP,
@@ -105,8 +106,10 @@ class HeldVessel:
         weight: reads the balance that the pourer stood on [kg], if nothing else comes to stand on it; None otherwise.
 
     Attributes:
+        spec: settings of the gripper.
         holds: the grasp of the vessel was checked, and it was not lost or let go since.
         lost: why the vessel may have been lost; '' if it was not.
+        role: of the vessel, for messages.
     """
 
     def __init__(
@@ -117,11 +120,11 @@ class HeldVessel:
         tell: Callable[[Notice], None],
         weight: Callable[[], Awaitable[float]] | None = None,
     ) -> None:
-        self._device, self._spec, self._arm, self._tell, self._weight = device, spec, arm, tell, weight
+        self._device, self.spec, self._arm, self._tell, self._weight = device, spec, arm, tell, weight
         self._limits: GripLimits | None = None
         self._stood = 0.0
         self._blind = 0
-        self.holds, self.lost = False, ""
+        self.holds, self.lost, self.role = False, "", "pourer"
 
     # ---- the driver
 
@@ -140,7 +143,7 @@ class HeldVessel:
             GripperError: it does not answer.
             LaboratoryError: it cannot grip this vessel.
         """
-        self._limits = grip_limits(vessel, self._spec, self._arm)
+        self._limits = grip_limits(vessel, self.spec, self._arm)
         await self._device.revive()
         await self._call("connect")
         state = await self.state()
@@ -168,11 +171,39 @@ class HeldVessel:
             LaboratoryError: the gripper does not answer, or the operator gave up.
         """
         if question.about in TAKES and self.holds:
-            await self._let_go(ask)
+            await self.let_go(ask)
         answer = await ask(replace(question, text=question.text.replace(GRIP, "")))
         if not self.holds and question.about in GIVES:
             await self._take(ask)
         return answer
+
+    # ---- at a place, without hands
+
+    async def open_at(self, vessel: Vessel) -> None:
+        """Open the fingers around a vessel that stands between them, or let go of it. It stays where it is.
+
+        Raises:
+            GripperError: they do not open.
+        """
+        limits = grip_limits(vessel, self.spec, self._arm)
+        self.holds = False
+        await self._call("open", min(limits.width + self.spec.clearance, self.spec.widest))
+
+    async def grip_at(self, vessel: Vessel, role: str) -> None:
+        """Close the open fingers on a vessel that stands between them, and check the grasp.
+
+        Raises:
+            GripperError: it is no grasp of this vessel, or the gripper cannot tell.
+        """
+        limits = grip_limits(vessel, self.spec, self._arm)
+        state: GripperState = await self._call("grip", BELOW * limits.width, self.spec.applied)
+        problem = limits.problem(state)
+        if not problem and state.detected is None:
+            problem = "the gripper cannot tell whether it holds something"
+        if problem:
+            raise GripperError(problem)
+        self._limits, self.role = limits, role
+        self.holds, self.lost, self._blind = True, "", 0
 
     async def _take(self, ask: Ask) -> None:
         """Close the gripper on the pourer that the operator holds, until the grasp is checked."""
@@ -180,8 +211,8 @@ class HeldVessel:
         assert limits is not None
         while True:
             try:
-                await self._activated(ask)
-                opened = min(limits.width + self._spec.clearance, self._spec.widest)
+                await self.activated(ask)
+                opened = min(limits.width + self.spec.clearance, self.spec.widest)
                 await self._agreed(
                     ask,
                     "open_gripper",
@@ -193,10 +224,10 @@ class HeldVessel:
                     ask,
                     "grasp",
                     f"Hold '{limits.vessel}' upright between the open fingers, your own fingers away from them. The "
-                    f"gripper closes with {self._spec.applied:.0f} N at once when you say so. May it?",
+                    f"gripper closes with {self.spec.applied:.0f} N at once when you say so. May it?",
                     width_mm=1e3 * limits.width,
                 )
-                state: GripperState = await self._call("grip", BELOW * limits.width, self._spec.applied)
+                state: GripperState = await self._call("grip", BELOW * limits.width, self.spec.applied)
                 problem = limits.problem(state) or await self._still_standing()
                 if not problem and state.detected is None:
                     problem = await self._unconfirmed(ask)
@@ -204,10 +235,11 @@ class HeldVessel:
                 problem = str(error)
             if not problem:
                 break
-        self.holds, self.lost, self._blind = True, "", 0
+        self.holds, self.lost, self._blind, self.role = True, "", 0, "pourer"
         self._tell(Notice("note", f"'{limits.vessel}' is in the gripper: {state}"))
 
-    async def _activated(self, ask: Ask) -> None:
+    async def activated(self, ask: Ask) -> None:
+        """Make a gripper ready that is not, after a question."""
         if not (await self.state()).problem:
             return
         await self._agreed(
@@ -236,7 +268,7 @@ class HeldVessel:
         )
         return "" if _yes(await ask(question)) else "the operator says that the pourer is not held"
 
-    async def _let_go(self, ask: Ask) -> None:
+    async def let_go(self, ask: Ask) -> None:
         """Open the gripper while the operator holds the pourer."""
         limits = self._limits
         assert limits is not None
@@ -245,7 +277,7 @@ class HeldVessel:
             "let_go",
             f"Hold '{limits.vessel}' in the gripper. Its fingers open at once when you say so. May they?",
         )
-        await self._call("open", min(limits.width + self._spec.clearance, self._spec.widest))
+        await self._call("open", min(limits.width + self.spec.clearance, self.spec.widest))
         self.holds = False
 
     async def _agreed(self, ask: Ask, about: str, text: str, problem: str = "", **details: float) -> None:
@@ -313,7 +345,14 @@ class HoldingArm(DeviceArm):
         """See `DeviceArm.dose`."""
         return await self._holding(super().dose(path, longest))
 
-    async def retreat(self, path: PlannedPour, follow: Follow = _ignore) -> None:
+    async def carry(self, way: PlaceWay, *, loaded: bool) -> None:
+        """See `DeviceArm.carry`: with a vessel in the gripper, it is watched."""
+        if loaded and not self._held.holds:
+            raise ArmRefusedError("the gripper holds no vessel, as far as it is known; nothing has moved")
+        motion = super().carry(way, loaded=loaded)
+        await (self._holding(motion) if loaded else motion)
+
+    async def retreat(self, path: PlannedPour | PlaceWay, follow: Follow = _ignore) -> None:
         """See `DeviceArm.retreat`."""
         await self._holding(super().retreat(path, follow))
 
@@ -349,7 +388,8 @@ class HoldingArm(DeviceArm):
         return result
 
     async def _lost(self, loss: str, executed: Executed | None) -> VesselLostError:
-        text = f"the gripper may have lost the pourer: {loss}. The arm was stopped. Look for the pourer and the liquid"
+        role = self._held.role
+        text = f"the gripper may have lost the {role}: {loss}. The arm was stopped. Look for the {role} and the liquid"
         state = await self.state()
         return VesselLostError(text, "vessel lost", state.phase, state.time, state.tilt, executed)
 

@@ -163,6 +163,20 @@ class LiquidSupply:
         found = await self.weighed(source) or replace(source, deviation=deviation)
         return replace(found, fill=False, before=None)
 
+    async def top_up(self, mass: float, density: float, seed: int) -> bool:
+        """Add a mass [kg] to the pourer under the outlet. Returns whether there is a refill device for it.
+
+        Raises:
+            LaboratoryError: the device has failed.
+        """
+        if self._refill is None:
+            return False
+        await self._refill.connect()
+        moved = await self._refill.move(max(mass / density, self._refill.spec.smallest), (seed, 61))
+        if self._contents is not None:
+            self._contents.in_pourer += density * moved
+        return True
+
     async def interrupt(self) -> None:
         """Stop the refill device and end a weighing; errors are suppressed."""
         with contextlib.suppress(LaboratoryError):

@@ -17,6 +17,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
+from actors.arm.arm_device import STUCK
 from actors.arm.arm_interface import (
     FULL_SPEED,
     ArmFacts,
@@ -30,7 +31,7 @@ from actors.arm.arm_interface import (
 from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing import Weighings
 from actors.balance.weighing_plan import Placement, PourMasses
-from actors.bench.consent import STUCK, Consent, Setup, grams, start_question
+from actors.bench.consent import Consent, Setup, grams, start_question
 from actors.bench.ground_truth import PourAsk
 from actors.bench.pour_feasibility import vessel
 from actors.interfaces import (
@@ -190,7 +191,7 @@ class PourProcedure:
             setup.balance_spec, setup.balance, self._consent.ask, known, self._note_weight, nominal=scene.liquid.mass
         )
         self._report = PourReport(progress, _expected(setup, path), path.pour_time)
-        self._begun = False
+        self._begun = self._moves = False
         self._broken: Exception | None = None
         self._executed: Executed | None = None
         self._facts: ArmFacts | None = None
@@ -226,7 +227,7 @@ class PourProcedure:
             await self._consent.leave_safe()
             raise
         except LaboratoryError as error:
-            self._begun = self._begun or self._setup.lost
+            self._begun = self._begun or (self._moves and self._setup.lost)
             if self._begun and not isinstance(error, BalanceError):
                 await self._weigh_remaining()
             await self._consent.leave_safe()
@@ -250,12 +251,16 @@ class PourProcedure:
             await setup.balance.resume()
         show = self._report.pour if self._report.watched else None
         await setup.ground_truth.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
-        await self._weighings.before()
+        given: dict[str, PourMasses] = {}
+        if setup.handling is not None:
+            given = await setup.handling.prepare(self._consent, self._weighings.weighed.get("pourer_empty"), self._seed)
+        await self._weighings.before(given)
 
     async def _move(self) -> None:
         """Approach, pour and return home after one consent, unless a stop interrupts the motion."""
         setup, path = self._setup, self._path
         await self._consent.given(start_question(setup.spec, path))
+        self._moves = True
         async with self._setup.ground_truth.followed():
             await self._out_and_home()
 
@@ -312,6 +317,8 @@ class PourProcedure:
         await self._weighings.after()
         measured = self._weighings.measurement(self._scene.liquid.mass)
         self._report.enter("record", 1.0)
+        if self._setup.handling is not None:
+            self._setup.handling.poured(self._weighings.weighed)
         if self._broken is not None:
             raise self._broken
         return PourMeasurement(measured.loaded, measured.spilled, measured.retained, self._notes(measured))
@@ -363,6 +370,7 @@ class PourProcedure:
             "executed_s": float(executed.times[-1]),
             "largest_tilt_deg": _largest_tilt(executed),
             "executed": executed.record(),
+            **({} if self._setup.handling is None else {"cycle": self._setup.handling.cycle}),
             **self._signals(),
             "operator": self._setup.questions.take_log(),
         }

@@ -33,6 +33,7 @@ from actors.dosing.simulated_dose import true_cup
 from actors.grippers.gripper_interface import GripperEmulator, GripperSettings
 from actors.interfaces import DoseTarget, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
+from actors.places import Role
 from actors.runtime.remote_object import Device
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
@@ -56,6 +57,9 @@ UPRIGHT = math.radians(0.5)
 
 NOTING_INTERVAL = 40.0
 """Interval between two reads of the arm's history [s of controller time]; a virtual controller keeps two minutes."""
+
+FILM = 0.4e-3
+"""Liquid that stays in a receiver that was poured back [kg]; a tenth of it is random."""
 
 LONGEST_GAP = 0.1
 """Largest distance between two samples of a history without a gap [s of controller time]; the sampling rate is 125 Hz.
@@ -344,6 +348,26 @@ class VirtualBench(GroundTruth):
         self._pour = pour
         self._hands.prepare(pour.scene.liquid.mass, stream(pour.seed, "arm"))
         await self.emulators.prepare(stream(pour.seed, "balance"))
+        await self.emulators.put(self.contents.carried)
+
+    async def between(self, vessel: Role, place: str, width: float) -> None:
+        """See `GroundTruth.between`: the vessel is there only if it was put there."""
+        await self.emulators.hold(width if self.contents.stands.get(vessel) == place else None)
+
+    async def lifted(self, vessel: Role) -> None:
+        """See `GroundTruth.lifted`."""
+        self.contents.move(vessel, "", on_balance=False)
+        await self.emulators.put(self.contents.carried)
+
+    async def placed(self, vessel: Role, place: str, *, on_balance: bool) -> None:
+        """See `GroundTruth.placed`."""
+        self.contents.move(vessel, place, on_balance=on_balance)
+        await self.emulators.hold(None)
+        await self.emulators.put(self.contents.carried)
+
+    async def poured_back(self, seed: int) -> None:
+        """See `GroundTruth.poured_back`: all but a film arrives."""
+        self.contents.pour_back(FILM * (1.0 + 0.1 * float(np.random.default_rng((seed, 71)).standard_normal())))
         await self.emulators.put(self.contents.carried)
 
     @contextlib.asynccontextmanager

@@ -21,9 +21,11 @@ import numpy as np
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.bench.held_vessel import grip_limits
 from actors.bench.pour_feasibility import vessel as built
+from actors.bench.vessel_handling import check_handling, plan_back
 from actors.dosing.simulated_dose import check_straight
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import InvalidActionError, LaboratoryError, UnreachablePlaceError
+from actors.places import PlaceSettings
 from orchestrator.campaigns.yaml.file_access import why_not_writable
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Loc
@@ -227,6 +229,7 @@ class _Checker:
     source: Path
     arm: ArmSettings | None = None
     gripper: GripperSettings | None = None
+    places: tuple[PlaceSettings, ...] = ()
     document: Document | None = None
     warn: Callable[[Problem], None] = _ignore
     doing: Callable[[str], None] = _ignore
@@ -302,6 +305,7 @@ class _Checker:
         trials = actions_all_over(actions, plan.constraints, corners=CORNERS, drawn=DRAWN)
         if vessels is None or self._never_pours(scene, trials, vessels[0], role):
             return
+        self._carried(scene, role)
         first = beyond = ""
         barred: set[CheckedPlace] = set()
         for i, chosen in enumerate(trials, start=1):
@@ -343,6 +347,16 @@ class _Checker:
             self.add(places, str(error))
             return False
         return True
+
+    def _carried(self, scene: Scene, role: _Role) -> None:
+        """Whether the arm can carry the vessels between the places of the laboratory, and pour the receiver back."""
+        if not self.places or self.gripper is None or self.arm is None:
+            return
+        try:
+            check_handling(self.places, self.arm, self.gripper, scene)
+            plan_back(self.places, self.arm, scene)
+        except InvalidActionError as error:
+            self.add(role.places(("receiver",), ("pourer",)), f"{role.text}: {error}")
 
     def _payload(self, scene: Scene) -> None:
         """The configured payload of the arm can't be less than the mass of the liquid."""
@@ -486,7 +500,8 @@ def check_campaign(
         document = Document.read(plan.source) if as_written else None
     except ConfigError:
         document = None  # a plan without a file
-    checker = _Checker(plan.source, plan.laboratory.arm, plan.laboratory.gripper, document, warn, doing)
+    lab = plan.laboratory
+    checker = _Checker(plan.source, lab.arm, lab.gripper, lab.places, document, warn, doing)
     at: Loc
     if (problem := why_not_writable(plan.outputs.folder)) is not None:
         checker.add((("outputs", "directory"),), problem)
@@ -514,6 +529,8 @@ def check_campaign(
         for key, stage in (("calibration", plan.calibration), ("deployment", plan.deployment)):
             if stage is not None:
                 checker.add(((key,),), f"needs an arm; laboratory '{plan.laboratory.name}' doses with a pump")
+    if plan.dispense is not None and lab.places:
+        checker.add((("dispense",),), f"is poured without places; laboratory '{lab.name}' has some")
     if plan.dispense is not None:
         balance = plan.laboratory.balance
         if plan.laboratory.dispenses and (balance is None or balance.placement not in ("receiver", "everything")):

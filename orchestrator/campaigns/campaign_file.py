@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, create_model
 
 from actors.laboratory_settings import LaboratorySettings
+from actors.places import UnattendedSettings
 from orchestrator.campaigns.campaign_prior import AnyPrior
 from orchestrator.campaigns.search_ranges import Actions, Motion, Parameters
 from orchestrator.campaigns.vessel_file import VesselFile
@@ -390,6 +391,9 @@ class CampaignFile(Settings):
 
     on_unknown: Literal["ask", "repeat"] = "ask"
     """Treatment on resume of a pour that had started and has no outcome; 'repeat' on a virtual bench only."""
+
+    unattended: UnattendedSettings | None = None
+    """Pours without a person, after one consent; needs a laboratory with places and a safeguard."""
 
     parallel_simulations: Annotated[PositiveCount, Field(le=256)] = 2
     """Logical slots for parallel simulations, independent of the machine: the same seed gives the same requests on any

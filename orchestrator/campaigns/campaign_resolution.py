@@ -378,6 +378,12 @@ def resolve_campaign(
             root.at("on_unknown"),
             f"'repeat' needs a virtual bench, and laboratory '{laboratory.name}' has none; use 'ask'",
         )
+    if file.unattended is not None and laboratory is not None:
+        if not (laboratory.places and laboratory.safeguard):
+            missing = "'safeguard'" if laboratory.places else "'gripper' and 'places'"
+            text = f"pours without a person need {missing} in the file of laboratory '{laboratory.name}'"
+            report.add(root.at("unattended"), text)
+        laboratory = laboratory.with_values(unattended=file.unattended)
     if report.problems or laboratory is None:
         return None
     directory = file.outputs.folder if file.outputs.directory is None else root.directory / file.outputs.directory

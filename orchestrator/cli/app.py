@@ -263,6 +263,19 @@ _add(
     "decant robot home configs/laboratories/ur10-kern.yaml --enable-motion",
     to=_robot,
 )
+_add(
+    robot_commands.teach,
+    "decant robot teach my-lab.yaml pan --use balance     # after guiding the arm there by hand",
+    "decant robot teach my-lab.yaml left --use source",
+    to=_robot,
+)
+_add(
+    robot_commands.try_place,
+    "decant robot try configs/laboratories/night.yaml left             # practise without a robot",
+    "decant robot try my-lab.yaml left --enable-motion",
+    name="try",
+    to=_robot,
+)
 
 _balance = _group(
     "balance",
@@ -409,6 +422,7 @@ _add(
     to=_materials,
 )
 _add(materials_commands.history, "decant materials history virtual/beaker", to=_materials)
+_add(materials_commands.place, "decant materials place night/receiver right", to=_materials)
 _add(
     materials_commands.poured,
     "decant materials poured monday-1 --from beaker-1 --into vial-7 --weighed '30.2 g'",

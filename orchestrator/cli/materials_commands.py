@@ -89,9 +89,10 @@ def _of_campaign(vessel: str) -> str:
 
 
 def list_vessels(url: Url = None, state: State = None, as_json: Json = False) -> None:
-    """List vessels with what is left in each one, and its standard deviation.
+    """List vessels with what is left in each one, its standard deviation, and where it stands.
 
-    Vessels of the daemon have an id; the sources of `dispense` campaigns and of `decant dose` are LABORATORY/VESSEL.
+    Vessels of the daemon have an id. The sources of `dispense` campaigns and of `decant dose`, and the vessels that an
+    arm carries between places, are LABORATORY/VESSEL.
     """
     from orchestrator.materials.vessel_account import VesselAccount
 
@@ -100,9 +101,14 @@ def list_vessels(url: Url = None, state: State = None, as_json: Json = False) ->
         if not isinstance(where, VesselAccount):
             found = where.get("/materials")
             rows = [{"id": one["id"], "position": one["position"], **one["content"]} for one in found["vessels"]]
-            rows += [{"id": one["id"], "position": "", **one["content"]} for one in found["sources"]]
+            rows += [{"id": one["id"], "position": one["position"], **one["content"]} for one in found["sources"]]
         else:
-            rows = [{"id": one.vessel, "position": "", **one.json_content()} for one in where.all()]
+            places = where.places()
+            rows = [
+                {"id": one.vessel, "position": places[one.vessel].text if one.vessel in places else ""}
+                | one.json_content()
+                for one in where.all()
+            ]
     if as_json:
         print_json({"vessels": rows})
         return
@@ -194,3 +200,31 @@ def poured(
             names = _of_campaign(source), _of_campaign(receiver)
             where.transfer(f"by hand {key}", *names, Transfer(moved, moved), by=getpass.getuser(), note=note)
     print(f"{key}: {mass} from {source} into {receiver}")
+
+
+def place(
+    vessel: VesselName,
+    where: Annotated[
+        str,
+        typer.Argument(
+            metavar="PLACE",
+            help="Place of the laboratory, or position of the daemon; '' for nowhere.",
+            show_default=False,
+        ),
+    ],
+    note: Note = "",
+    url: Url = None,
+    state: State = None,
+) -> None:
+    """Correct where a vessel stands, for example after an interrupted motion has left it UNKNOWN."""
+    from orchestrator.materials.vessel_account import VesselAccount
+    from sim_engine.errors import InvalidArgumentError
+
+    with _opened(url, state) as account:
+        if not isinstance(account, VesselAccount):
+            account.post(f"/materials/vessels/{vessel}/place", {"position": where})
+        else:
+            name = _of_campaign(vessel)
+            with Refused(InvalidArgumentError):
+                account.put(name, where or None, by=getpass.getuser(), note=note or "corrected")
+    print(f"{vessel}: {where or 'UNKNOWN'}")

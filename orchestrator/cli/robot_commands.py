@@ -4,6 +4,7 @@
   tared only on request.
 - `archive` collects the recordings of a commissioning day in one file, and replays them.
 - `jog` moves the arm by typed steps, `home` brings it home; the session itself is in `motion_control`.
+- `teach` writes the arm's pose into the laboratory file as a place; `try` moves to one and back.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -23,11 +24,10 @@ from orchestrator.cli.command_options import EnableMotion, Json, Laboratory
 from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message
 
 if TYPE_CHECKING:
-    from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
+    from actors.arm.arm_interface import Arm
+    from actors.arm.arm_settings import ArmDiagnostics, ArmSettings, SafetyRecord
     from actors.interfaces import DeviceCheck
     from actors.laboratory_settings import LaboratorySettings
-    from orchestrator.cli.motion_control import Jogging
-
 
 _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
 
@@ -231,10 +231,12 @@ def jog(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     'j5 +2' turns joint 5 by 2 deg, 'z -5' moves the tool by 5 mm, 'home' goes home. The first step along an axis is
     confirmed with Enter; Ctrl-C stops the arm.
     """
+    from orchestrator.cli.motion_control import Jogging, typed_line
+
     with _session(
         laboratory, "jog", "one at a time, as typed: at most 10 deg at 5 deg/s, or 50 mm at 20 mm/s", enable_motion
-    ) as session:
-        session.run()
+    ) as (driver, _):
+        Jogging(driver, typed_line).run()
 
 
 def home(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
@@ -244,10 +246,11 @@ def home(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     has been typed. Obstacles are not checked: watch the arm. Ctrl-C stops it. Exit code 2 if nothing was moved.
     """
     from actors.interfaces import LaboratoryError
-    from orchestrator.cli.motion_control import JogError
+    from orchestrator.cli.motion_control import JogError, Jogging, typed_line
 
     lines = "all joints to 'home': steps of at most 10 deg at 5 deg/s; obstacles are not checked"
-    with _session(laboratory, "home", lines, enable_motion) as session:
+    with _session(laboratory, "home", lines, enable_motion) as (driver, _):
+        session = Jogging(driver, typed_line)
         session.where()
         with Refused(JogError, LaboratoryError, code=FAILED):
             confirmed = session.home()
@@ -255,9 +258,87 @@ def home(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
             raise RefusalError("not confirmed; nothing has moved", BAD_INPUT)
 
 
+PlaceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the place.", show_default=False)]
+
+TRIED = 0.25
+"""Fraction of its usual speed at which a way is tried."""
+
+
+def teach(
+    laboratory: Laboratory,
+    name: PlaceName,
+    use: Annotated[
+        Literal["stand", "balance", "source"] | None,
+        typer.Option(
+            help="'balance' under the receiver, 'source' under the outlet of the refill pump.", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Read where the arm stands and write it into the laboratory file as a place. Nothing moves.
+
+    Guide the arm by hand (free drive) until the fingers are at a vessel that stands there, then run this. The place is
+    checked: reach, limits, the way from home, distance from other places. Comments in the file are kept.
+    """
+    from actors.arm.arm_settings import arm_kind
+    from actors.interfaces import LaboratoryError
+    from actors.laboratory import reached
+    from actors.places import PlaceSettings
+    from orchestrator.campaigns.place_writing import PlaceWritingError, write_place
+    from orchestrator.cli.motion_control import connected
+    from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum
+
+    spec = read_laboratory(laboratory)
+    if spec.arm is None or (tool := getattr(spec.arm, "tool", None)) is None:
+        raise without_arm(laboratory, spec, "'decant robot teach' reads the pose of an arm's tool")
+    with Refused(SafetyRecordError):
+        accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
+    with Refused(LaboratoryError, code=FAILED), reached(spec) as ready, connected(ready, accepted) as (driver, facts):
+        pose = driver.where().tool
+        arm = (ready.arm or spec.arm).fitted_to(facts)
+    before = next((place for place in spec.places if place.name == name), None)
+    taught = {"pose": pose, "tool": tool, **({} if use is None else {"use": use})}
+    place = PlaceSettings(name=name, **taught) if before is None else before.with_values(**taught)
+    places = [*(other for other in spec.places if other.name != name), place]
+    problems = [text for number, text in arm_kind(arm).place_problems(places, {}) if number == len(places) - 1]
+    if problems:
+        raise RefusalError("nothing is written: " + "; ".join(problems), BAD_INPUT)
+    with Refused(PlaceWritingError, OSError):
+        write_place(laboratory, place)
+    x, y, z = (1e3 * value for value in pose.as_list[:3])
+    print_message(f"{laboratory}: place '{name}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm ({place.use})")
+
+
+def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMotion = False) -> None:
+    """Move the arm slowly from home to a place and back, with an empty, open gripper, after confirmations.
+
+    The way is the one on which vessels are carried later, at a quarter of its speed. Ctrl-C stops the arm; bring it
+    home with 'decant robot home' then.
+    """
+    from actors.arm.arm_settings import arm_kind
+    from actors.interfaces import LaboratoryError
+    from orchestrator.cli.motion_control import stoppable, typed_line
+
+    spec = read_laboratory(laboratory)
+    place = next((one for one in spec.places if one.name == name), None)
+    if place is None:
+        known = ", ".join(f"'{one.name}'" for one in spec.places) or "none"
+        raise RefusalError(f"{laboratory}: there is no place '{name}'; there are {known}", BAD_INPUT)
+    lines = f"from home to the place '{name}' and back, at a quarter of the usual speed"
+    with _session(laboratory, "try", lines, enable_motion) as (driver, arm), Refused(LaboratoryError, code=FAILED):
+        way = arm_kind(arm).way(place, spec.places, {}).slowed(TRIED)
+        print_message(f"{way.approach_time:.0f} s for each way. The fingers must be open, and hands out of the cell.")
+        for homewards, text in ((False, f"down to '{name}'"), (True, "back home")):
+            if typed_line(f"type 'yes' to move {text} > ").strip() != "yes":
+                raise RefusalError("not confirmed; the arm stays where it is", BAD_INPUT)
+            driver.release()
+            step = dataclasses.replace(way, homewards=homewards)
+            stoppable(driver, lambda step=step: driver.carry(step))  # type: ignore[misc, attr-defined]
+    print_message(f"place '{name}' was reached and left again")
+
+
 @contextlib.contextmanager
-def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Iterator[Jogging]:
-    """Connect the arm for motion by small steps, after the operator's approval.
+def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Iterator[tuple[Arm, ArmSettings]]:
+    """Connect the arm for motion, after the operator's approval. Yields its driver and settings.
 
     Args:
         laboratory: the laboratory's file.
@@ -270,7 +351,7 @@ def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Itera
     """
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
-    from orchestrator.cli.motion_control import WARNING_TIME, Jogging, confirm, connected, require_flag, typed_line
+    from orchestrator.cli.motion_control import WARNING_TIME, confirm, connected, require_flag
     from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum
 
     spec = read_laboratory(laboratory)
@@ -292,4 +373,5 @@ def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Itera
         soon = ready.with_values(arm=ready.arm.with_values(warning_time=WARNING_TIME))
         with connected(soon, accepted) as (driver, facts):
             print_message(f"{facts.model} {facts.serial}, {spec.mode}; nothing moves before you confirm it")
-            yield Jogging(driver, typed_line)
+            assert soon.arm is not None
+            yield driver, soon.arm.fitted_to(facts)

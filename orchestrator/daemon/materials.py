@@ -135,8 +135,17 @@ class Materials:
         if there:
             raise MaterialError(f"position {position} is taken by vessel {there[0]['id']}; move that one first")
 
-    def place(self, vessel: str, position: str) -> None:
-        """Record that a vessel was moved to a position; '' for none. Raises MaterialError."""
+    def place(self, vessel: str, position: str, by: str) -> None:
+        """Record that a vessel was moved to a position; '' for none. Raises MaterialError.
+
+        A vessel `LABORATORY/VESSEL` is moved to a place of its laboratory.
+        """
+        if "/" in vessel:
+            try:
+                self.account.put(vessel, position or None, by=by, note="corrected")
+            except InvalidArgumentError as error:
+                raise MaterialError(str(error)) from None
+            return
         found = self.vessel(vessel)
         position = str(self._row("position", position)["id"]) if position else ""
         self._require_free(position, found.id)
@@ -277,7 +286,11 @@ class Materials:
                     "promised_g": 1e3 * self.promised(row["id"]),
                 }
             )  # fmt: skip
-        sources = [{"id": name, "content": held.json_content()} for name, held in contents.items()]
+        places = self.account.places()
+        sources = [
+            {"id": name, "position": places[name].text if name in places else "", "content": held.json_content()}
+            for name, held in contents.items()
+        ]
         liquids = [
             {"id": row["id"], "code": row["code"] or "", "properties": json.loads(row["properties"])}
             for row in self._store.rows("select * from liquid order by id")

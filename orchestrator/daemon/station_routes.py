@@ -276,11 +276,11 @@ async def enter_pour_by_hand(daemon: Daemon, orders: Orders, person: Operator, b
     )
 
 
-@router.post("/materials/vessels/{key}/place", operation_id="place_vessel", response_model=MaterialsOut)
+@router.post("/materials/vessels/{key:path}/place", operation_id="place_vessel", response_model=MaterialsOut)
 async def place_vessel(daemon: Daemon, orders: Orders, person: Operator, key: str, body: PlaceIn) -> Any:
-    """Record that a vessel was moved to another position."""
+    """Record that a vessel was moved to another position, or to a place of its laboratory."""
     with _answering():
-        orders.materials.place(key, body.position)
+        orders.materials.place(key, body.position, person.name)
     return _changed(daemon, orders, person.name, "place vessel", f"{key}: {body.position or 'nowhere'}")
 
 

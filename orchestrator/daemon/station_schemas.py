@@ -318,6 +318,9 @@ class SourceOut(_Out):
     id: str
     """LABORATORY/VESSEL."""
 
+    position: str
+    """Place of the laboratory where it stands; UNKNOWN after an interrupted motion; '' without places."""
+
     content: ContentOut
 
 

@@ -24,10 +24,11 @@ import math
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from actors.interfaces import LaboratoryError
 from orchestrator.learning.campaign_plan import DispensePlan
 from orchestrator.learning.dispense import KnownSource, left_after
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured
@@ -49,11 +50,16 @@ create table if not exists entry (
     note text not null, weighed real, knowledge text check (knowledge is null or json_valid(knowledge))
 ) strict;
 create index if not exists entry_by_vessel on entry (vessel, id);
+create table if not exists stand (
+    id integer primary key, vessel text not null, t real not null, place text, by text not null, note text not null
+) strict;
 create trigger if not exists entry_is_never_changed before update on entry begin
     select raise(abort, 'account entries are append-only'); end;
 create trigger if not exists entry_is_never_deleted before delete on entry begin
     select raise(abort, 'account entries are append-only'); end;
 """
+
+LATEST = "id in (select max(id) from stand group by vessel)"
 
 PATIENCE = 1.0
 """Longest wait for another process that writes [s]."""
@@ -104,6 +110,30 @@ class VesselContent:
             **{name: content[name] for name in ("mass_g", "deviation_g", "liquid", "pour")},
             **{"by": self.by, "note": self.note},
         }
+
+
+@dataclass(frozen=True)
+class VesselPlace:
+    """Where a vessel stands after one entry of the account.
+
+    Attributes:
+        vessel: its name.
+        time: of the entry, seconds since 1970.
+        place: name of the place; None: UNKNOWN, since a motion with it has begun and not ended.
+        by: who made the entry; '' for a run.
+        note: for people, such as the motion that was under way.
+    """
+
+    vessel: str
+    time: float
+    place: str | None
+    by: str = ""
+    note: str = ""
+
+    @property
+    def text(self) -> str:
+        """For tables: the place, or that it is unknown, and since which motion."""
+        return self.place if self.place is not None else f"UNKNOWN ({self.note})" if self.note else "UNKNOWN"
 
 
 @dataclass(frozen=True)
@@ -237,6 +267,17 @@ class VesselAccount:
             )
             _write(connection, key or f"{kind} {vessel} {time.time_ns()}", entry)
 
+    def lose(self, vessel: str) -> None:
+        """The content of a vessel is unknown from now on: a pour from it or into it has begun.
+
+        Raises:
+            OSError: the file can't be written.
+        """
+        with self._writing() as connection:
+            before = _last(connection, vessel) or _empty(vessel)
+            entry = replace(before, time=time.time(), kind="unknown", mass=None, deviation=0.0, pour="", note="")
+            _write(connection, f"unknown {vessel} {time.time_ns()}", entry)
+
     def transfer(self, pour: str, source: str, receiver: str, moved: Transfer, *, by: str = "", note: str = "") -> None:
         """Enter a pour in the account of both vessels, once: a second call for the same pour changes nothing.
 
@@ -263,6 +304,48 @@ class VesselAccount:
                     before.knowledge,
                 )  # fmt: skip
                 _write(connection, f"{pour} {role}", entry)
+
+    # ---- places
+
+    def places(self) -> dict[str, VesselPlace]:
+        """Where vessels stand, by their names.
+
+        Raises:
+            OSError: the file can't be read.
+        """
+        if not self._path.is_file():
+            return {}
+        with self._connection() as connection:
+            if not connection.execute("select 1 from sqlite_master where name = 'stand'").fetchone():
+                return {}
+            rows = connection.execute(f"select vessel, t, place, by, note from stand where {LATEST}").fetchall()
+        return {str(row[0]): VesselPlace(*row) for row in rows}
+
+    def put(self, vessel: str, place: str | None, *, by: str = "", note: str = "") -> None:
+        """Enter where a vessel stands; None for UNKNOWN. The entry is on disk when this returns.
+
+        Args:
+            vessel: 'LABORATORY/VESSEL'; places belong to the laboratory.
+            place: name of the place.
+            by: who corrected it; '' for a run.
+            note: for people.
+
+        Raises:
+            InvalidArgumentError: another vessel of the laboratory stands there.
+            OSError: the file can't be written.
+        """
+        laboratory = vessel.partition("/")[0]
+        with self._writing() as connection:
+            rows = connection.execute(f"select vessel, place from stand where {LATEST} and vessel != ?", (vessel,))
+            for other, taken in rows.fetchall():
+                if place is not None and taken == place and str(other).partition("/")[0] == laboratory:
+                    raise InvalidArgumentError(
+                        f"{vessel}: {other} stands at '{place}' already; a place holds one vessel"
+                    )
+            connection.execute(
+                "insert into stand (vessel, t, place, by, note) values (?, ?, ?, ?, ?)",
+                (vessel, time.time(), place, by, note),
+            )
 
     # ---- entries of runs
 
@@ -345,6 +428,49 @@ class VesselAccount:
                 yield connection
         except sqlite3.Error as error:
             raise OSError(f"{self._path}: {error}") from error
+
+
+class LaboratoryPlaces:
+    """The account of one laboratory's vessels, for its bench; see `actors.places.PlaceRecord`.
+
+    Args:
+        account: the account.
+        laboratory: name of the laboratory.
+    """
+
+    def __init__(self, account: VesselAccount, laboratory: str) -> None:
+        self._account, self._prefix = account, f"{laboratory}/"
+
+    def stands(self) -> dict[str, str | None]:
+        """See `PlaceRecord.stands`."""
+        with _writable():
+            found = self._account.places()
+        return {
+            name.removeprefix(self._prefix): entry.place
+            for name, entry in found.items()
+            if name.startswith(self._prefix)
+        }
+
+    def put(self, vessel: str, place: str | None, note: str = "") -> None:
+        """See `PlaceRecord.put`."""
+        with _writable():
+            self._account.put(self._prefix + vessel, place, note=note)
+
+    def content(self, vessel: str, mass: float | None, deviation: float, liquid: str) -> None:
+        """See `PlaceRecord.content`."""
+        with _writable():
+            if mass is None:
+                self._account.lose(self._prefix + vessel)
+            else:
+                self._account.weigh(self._prefix + vessel, max(mass, 0.0), deviation, liquid=liquid)
+
+
+@contextlib.contextmanager
+def _writable() -> Iterator[None]:
+    try:
+        yield
+    except (OSError, InvalidArgumentError) as error:
+        raise LaboratoryError(f"the account of vessels: {error}") from error
 
 
 def _empty(vessel: str) -> VesselContent:

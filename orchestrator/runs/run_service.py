@@ -22,7 +22,7 @@ from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
 from actors.laboratory_settings import LaboratorySettings, RaySettings
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
-from orchestrator.materials.vessel_account import VesselAccount
+from orchestrator.materials.vessel_account import LaboratoryPlaces, VesselAccount
 from orchestrator.records.events import Event, Subscriber
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import check_journal, has_begun
@@ -237,6 +237,7 @@ class RunService:
                 operator=resources.operator,
                 kept=resources.simulators,
                 optimizer=resources.optimizer,
+                record=LaboratoryPlaces(VesselAccount.open(), spec.name) if spec.places and request.pours else None,
             )
         request = self.with_folder(request)
         assert request.folder is not None

@@ -176,6 +176,9 @@ class VesselGrip(Settings):
     tolerance: Annotated[float, Quantity("m", "2 mm", lower=1e-4, upper=0.05)] = 2e-3
     """Largest difference of the fingers from it in a good grasp."""
 
+    mass: Annotated[float, Quantity("kg", "312 g", lower=1e-3, upper=30.0)] | None = None
+    """Mass of the empty, dry vessel; needed if an arm carries it between places."""
+
 
 class VesselSpec(BaseModel):
     """A vessel by its name, the source of its shape, and how it is gripped."""

@@ -21,6 +21,7 @@ from actors.bench.virtual_bench import DeviceEmulators, FollowedBench, VirtualBe
 from actors.interfaces import Notice, OperatorQuestion, OperatorSettings
 from actors.laboratory import InProcessLaboratory
 from actors.laboratory_settings import LaboratorySettings
+from actors.places import PlaceRecord
 from orchestrator.campaigns.file_loading import load_laboratory
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
@@ -215,10 +216,11 @@ async def opened_stage(
     *,
     answers: Mapping[str, Sequence[str]] | None = None,
     late: Mapping[str, float] | None = None,
+    record: PlaceRecord | None = None,
     **changes: Any,
 ) -> AsyncIterator[Stage]:
     """A wired bench around the cheap liquid, with an operator that does as it is told."""
-    laboratory = InProcessLaboratory(spec or wired_spec(**changes), Trickle, need_bench=True)
+    laboratory = InProcessLaboratory(spec or wired_spec(**changes), Trickle, need_bench=True, record=record)
     stage = Stage(laboratory)
     laboratory.listen(stage.notices.append)
     async with laboratory:

@@ -118,8 +118,8 @@ def _pourer_error(sampled: SampledPath, pourer: Vessel) -> float:
     return SAME_PLACE + SAME_ANGLE * lever
 
 
-def nearest_links(sampled: SampledPath, receiver: Vessel) -> tuple[Nearest, Nearest]:
-    """Smallest distances of the arm's links from the table, and from the receiver as a cylinder."""
+def nearest_links(sampled: SampledPath, receiver: Vessel | None) -> tuple[Nearest, Nearest]:
+    """Smallest distances of the arm's links from the table, and from the receiver as a cylinder, if there is one."""
     points = sampled.links
     world = cell_transforms(sampled.spec).world.inverse
     table, cup = [], []
@@ -130,6 +130,9 @@ def nearest_links(sampled: SampledPath, receiver: Vessel) -> tuple[Nearest, Near
         line = a + (b - a) * along
         above = line[..., 2].min(axis=1) - radius - sampled.spec.cell.table
         table.append(Nearest(float(above.min()), int(np.argmin(above)), name))
+        if receiver is None:
+            cup.append(Nearest(np.inf, 0, name))
+            continue
         inside = world.apply(line.reshape(-1, 3)).reshape(line.shape)
         aside = np.hypot(inside[..., 0], inside[..., 1]) - receiver.outer_radius
         over = np.maximum(inside[..., 2] - receiver.rim_height, -inside[..., 2])

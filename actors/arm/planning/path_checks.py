@@ -173,6 +173,25 @@ def check_stretch(sampled: SampledPath, pourer: Vessel, receiver: Vessel) -> lis
     return [*_joint_speeds(sampled), *_speeds(sampled, points), *problems]
 
 
+def check_way_limits(sampled: SampledPath, points: FloatArray) -> list[str]:
+    """Problems of a way on which no liquid is poured: limits, table and speeds, without a receiver.
+
+    Args:
+        sampled: the way.
+        points: outermost points of the carried vessel, shape (V, 3) [m].
+    """
+    table, _ = nearest_links(sampled, None)
+    problems = [*_ranges(sampled), *_singular(sampled), *_tilts(sampled), *_places(sampled, points)]
+    if table.distance < 0.0:
+        problems.append(
+            f"the {table.name} would come {-1e3 * table.distance:.0f} mm too near to the table, "
+            f"{sampled.when(table.index)}"
+        )
+    if sampled.margins.min() >= THROUGH:
+        problems += [*_joint_speeds(sampled), *_speeds(sampled, points)]
+    return [text.replace("move the receiver", "teach another pose") for text in problems]
+
+
 def check_clearance(sampled: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> tuple[Nearest, list[str]]:
     """Smallest distance of the pourer from the receiver until a time [s], and the problems with it."""
     nearest = nearest_to_receiver(sampled, until, pourer, receiver)
@@ -372,12 +391,13 @@ def _speeds(s: SampledPath, points: FloatArray) -> Iterator[str]:
 def _tilts(s: SampledPath) -> Iterator[str]:
     worst = _first_worst(s.tilts)
     # on the approach the pourer is full, so a smaller limit holds than during a pour
-    most = UPRIGHT if s.name == "approach" else s.spec.limits.tilt
+    upright = s.name in ("approach", "way")
+    most = UPRIGHT if upright else s.spec.limits.tilt
     if s.tilts[worst] > most * (1.0 + SLACK):
         yield (
             f"the pourer would lean {math.degrees(s.tilts[worst]):.1f} deg, {s.when(worst)}; "
             f"{math.degrees(most):.1f} deg are allowed"
-            f"{' while it is full' if s.name == 'approach' else ': lower max_angle, or raise arm.limits.tilt'}"
+            f"{' while it is full' if upright else ': lower max_angle, or raise arm.limits.tilt'}"
         )
 
 

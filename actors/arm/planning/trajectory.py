@@ -363,7 +363,13 @@ def routes(start: FloatArray, end: FloatArray, over: float) -> list[list[FloatAr
     return [[start, end], [start, up, across, end]]
 
 
-def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSettings) -> JointPath:
+def travel(
+    knots: list[FloatArray],
+    near: FloatArray,
+    spec: UrArmSettings,
+    fastest: float = TOOL_SPEED,
+    hardest: float = TOOL_ACCELERATION,
+) -> JointPath:
     """Move along straight lines from knot to knot, at rest at each.
 
     The slowest of these limits sets the time of each line: approach speed and acceleration of the fastest joint; tool
@@ -373,6 +379,8 @@ def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSettings) -> Jo
         knots: poses of the pourer in the world, each of shape (7,).
         near: joints at the first knot [rad].
         spec: of the arm and its cell.
+        fastest: speed of the tool [m/s].
+        hardest: acceleration of the tool [m/s²].
 
     Raises:
         OutOfReachError: some pose cannot be reached.
@@ -383,7 +391,7 @@ def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSettings) -> Jo
         distance, angle = float(np.linalg.norm(b[:3] - a[:3])), _angle(a, b)
         if distance < 1e-6 and angle < 1e-6:
             continue
-        t, q = _line(a, b, distance, angle, joints[-1][-1], spec)
+        t, q = _line(a, b, distance, angle, joints[-1][-1], spec, fastest, hardest)
         times.append(times[-1][-1] + t[1:])
         joints.append(q[1:])
     path = np.concatenate(joints)
@@ -393,7 +401,14 @@ def travel(knots: list[FloatArray], near: FloatArray, spec: UrArmSettings) -> Jo
 
 
 def _line(
-    a: FloatArray, b: FloatArray, distance: float, angle: float, near: FloatArray, spec: UrArmSettings
+    a: FloatArray,
+    b: FloatArray,
+    distance: float,
+    angle: float,
+    near: FloatArray,
+    spec: UrArmSettings,
+    fastest: float,
+    hardest: float,
 ) -> tuple[FloatArray, FloatArray]:
     s = np.linspace(0.0, 1.0, max(math.ceil(distance / 0.005), math.ceil(angle / math.radians(1.0)), 8) + 1)
     joints = follow(_between(a, b, s), near, spec)
@@ -405,7 +420,7 @@ def _line(
     # half of the joints' acceleration is reserved for the curvature of the joint path at full speed
     half = 0.5 * spec.approach_acceleration
     speed = min(
-        min(spec.limits.tool_speed, TOOL_SPEED) / way,
+        min(spec.limits.tool_speed, fastest) / way,
         spec.approach_speed / max(first, 1e-9),
         math.sqrt(half / max(second, 1e-9)),
         0.5 * spec.limits.tilt_speed / max(angle, 1e-9),
@@ -413,7 +428,7 @@ def _line(
     if first > MOST_TURNS * 2.0 * math.pi and 1.0 / speed > LONGEST:
         heading = 2.0 * math.atan2(a[6], a[3])
         raise RacingJointError(int(np.argmax(rates)), math.remainder(heading, 2.0 * math.pi), angle, 1.0 / speed)
-    times, fraction = trapezoid(1.0, 0.98 * speed, min(TOOL_ACCELERATION / way, half / max(first, 1e-9)), STEP)
+    times, fraction = trapezoid(1.0, 0.98 * speed, min(hardest / way, half / max(first, 1e-9)), STEP)
     return times, follow(_between(a, b, fraction), near, spec)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from actors.arm.arm_geometry import JOINT_NAMES, Joints
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
-from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PourPath
+from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PlaceWay, PourPath
 from actors.arm.planning.kinematics import (
     cell_transforms,
     flange_transforms,
@@ -96,7 +96,7 @@ def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSettings) -> tupl
     return _paced(points, tilts, costs)
 
 
-def way_home(path: PourPath, joints: FloatArray, spec: UrArmSettings) -> JointPath:
+def way_home(path: PourPath | PlaceWay, joints: FloatArray, spec: UrArmSettings) -> JointPath:
     """From any upright point of the approach or the retreat to home.
 
     Args:

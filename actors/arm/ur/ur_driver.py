@@ -29,7 +29,7 @@ from actors.arm.arm_interface import (
     ArmStoppedError,
     NotAcceptedError,
 )
-from actors.arm.planned_pour import ExecutedPath, FloatArray, PourPath
+from actors.arm.planned_pour import ExecutedPath, FloatArray, PlaceWay, PourPath
 from actors.arm.planning.kinematics import cell_transforms, forward
 from actors.arm.planning.path_checks import recheck
 from actors.arm.ur.dashboard import DashboardError, stop_program
@@ -219,13 +219,19 @@ class UrArm:
         self._session.tilt(speed)
         return self.state()
 
-    def retreat(self, path: PourPath) -> None:
+    def retreat(self, path: PourPath | PlaceWay) -> None:
         """See `Arm.retreat`."""
         with self._at_work("retreating"):
             self._consent()
             way = way_home(path, np.array(self._joints()), self._spec)
             self._go(MotionSegment.of("retreat", way, self._spec))
             self.lock()
+
+    def carry(self, way: PlaceWay) -> None:
+        """See `CarryingArm.carry`."""
+        with self._at_work("carrying"):
+            self._check_calibration(way)
+            self._go(MotionSegment.of("carry", way.retreat if way.homewards else way.approach, self._spec), pours=True)
 
     def untilt(self, path: PourPath | None = None) -> None:
         """See `Arm.untilt`."""
@@ -329,7 +335,7 @@ class UrArm:
             raise ArmNotReleasedError("the arm is locked: an operator has to release it before it moves")
         return released
 
-    def _check_calibration(self, path: PourPath) -> None:
+    def _check_calibration(self, path: PourPath | PlaceWay) -> None:
         own = self._spec.robot.parameters.checksum
         if path.calibration not in (None, own):
             raise ArmRefusedError(

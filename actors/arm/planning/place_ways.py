@@ -1,0 +1,309 @@
+"""Ways from home to the places where vessels stand, and back: planned, checked, and slow enough for a full vessel.
+
+- `plan_way` plans one way. All ways begin and end at home, so that a laboratory of N places has N ways to check.
+- `full_acceleration` is the acceleration at which the liquid of a carried vessel stays below its rim.
+- `way_to` and `in_the_way` serve the ways and the pours of a laboratory.
+- `Standing` is a vessel that may stand at another place; `standing_problems` checks a path against it.
+- `place_problems` checks the places of a laboratory before anything starts.
+
+A vessel is carried upright, along straight lines: first to above the place, then straight down.
+
+Limitations: standing vessels count as cylinders, links of the arm as capsules with rough radii. The arm is not checked
+against itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.arm.planned_pour import JointPath, PlaceWay, PourPath
+from actors.arm.planning.collision_geometry import LINKS, hull
+from actors.arm.planning.kinematics import Transforms, beyond_reach, cell_transforms, posture, quaternions, transform_of
+from actors.arm.planning.path_checks import UPRIGHT, check_way_limits, outside
+from actors.arm.planning.trajectory import (
+    TOOL_ACCELERATION,
+    TOOL_SPEED,
+    OutOfReachError,
+    RacingJointError,
+    SampledPath,
+    home_pose,
+    routes,
+    travel,
+)
+from actors.arm.ur_settings import UrArmSettings
+from actors.interfaces import InvalidActionError
+from actors.places import PlaceSettings, Role
+from sim_engine.hydrostatics import level
+from sim_engine.vessel.vessel import Vessel
+
+FloatArray = NDArray[np.float64]
+
+FULL_SPEED = 0.15
+"""Speed at which a vessel with liquid is carried [m/s]; an empty gripper or vessel moves at `TOOL_SPEED`."""
+
+SWINGS = 4.0
+"""Largest amplification of the surface's lean while a vessel is carried along one straight line. The liquid counts as
+an undamped oscillator. Each of the four steps in acceleration (begin and end of speeding up and of braking) then adds
+at most the static lean a/g to its amplitude. Source: the equivalent pendulum of lateral sloshing, Ibrahim, Liquid
+Sloshing Dynamics, Cambridge 2005, chapter 5, without its damping."""
+
+LEAST_ACCELERATION = 0.05
+"""Acceleration below which a vessel is too full to be carried [m/s²]."""
+
+GRAVITY = 9.81
+
+OFF_CENTRE = 5e-3
+"""Largest distance of the place on the balance from `cell.receiver` [m]."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A vessel that may stand somewhere, as a cylinder.
+
+    Attributes:
+        place: name of the place.
+        foot: middle of its underside in the room's frame [m].
+        radius, height: [m]; 0 without a vessel.
+        clearance: gap to keep from it [m].
+    """
+
+    place: str
+    foot: tuple[float, float, float]
+    radius: float
+    height: float
+    clearance: float
+
+
+def full_acceleration(vessel: Vessel, volume: float) -> float:
+    """Acceleration at which a carried liquid stays below the rim [m/s²]: the surface rises by `SWINGS` · R · a / g.
+
+    Args:
+        vessel: that holds it.
+        volume: of the liquid [m³].
+    """
+    freeboard = max(-level(vessel, volume, 0.0), 0.0)
+    return min(TOOL_ACCELERATION, GRAVITY * freeboard / (SWINGS * vessel.opening_radius))
+
+
+def vessel_at(place: PlaceSettings, spec: UrArmSettings) -> Transforms:
+    """Frame of a vessel that stands at a place, in the room's frame."""
+    return cell_transforms(spec).base @ transform_of(place.pose) @ transform_of(spec.grip)
+
+
+def standing_at(place: PlaceSettings, vessels: Mapping[Role, Vessel], spec: UrArmSettings) -> Standing:
+    """The largest of the vessels that may stand at a place."""
+    found = [vessels[role] for role in place.holds if role in vessels]
+    x, y, z = map(float, vessel_at(place, spec).position)
+    radius, height = (max((getattr(v, name) for v in found), default=0.0) for name in ("outer_radius", "rim_height"))
+    return Standing(place.name, (x, y, z), radius, height, place.clearance)
+
+
+def plan_way(
+    place: PlaceSettings,
+    spec: UrArmSettings,
+    carried: Sequence[Vessel],
+    others: Sequence[Standing],
+    fastest: float = TOOL_SPEED,
+    hardest: float = TOOL_ACCELERATION,
+) -> PlaceWay:
+    """Plan and check the way from home to a place.
+
+    Args:
+        place: where it ends.
+        spec: of the arm and its cell.
+        carried: vessels that may be in the gripper on this way.
+        others: what may stand at other places.
+        fastest: speed of the tool [m/s].
+        hardest: its acceleration [m/s²].
+
+    Raises:
+        InvalidActionError: the way is forbidden or impossible; the text lists all problems of the best route.
+    """
+    at = cell_transforms(spec).world.inverse @ vessel_at(place, spec)
+    end = np.concatenate([at.position, quaternions(at.rotation[None])[0]])
+    start = home_pose(spec)
+    if float(np.dot(start[3:], end[3:])) < 0.0:  # the shorter turn
+        end[3:] *= -1.0
+    above = end.copy()
+    above[2] += place.approach
+    floor = spec.cell.receiver.vector[2]
+    over = max((each.foot[2] - floor + each.height + each.clearance for each in others), default=0.0) + 0.01
+    points = np.concatenate([hull(vessel) for vessel in carried]) if carried else np.zeros((1, 3))
+    best: tuple[JointPath, list[str]] | None = None
+    found: list[str] = []
+    for knots in routes(start, above, over):
+        try:
+            path = travel([*knots, end], np.array(spec.home.angles), spec, fastest, hardest)
+        except OutOfReachError as error:
+            found = [_unreached(error, spec)]
+            continue
+        except RacingJointError:
+            found = ["on a straight way from home two joints would turn about one axis and race; teach another pose"]
+            continue
+        sampled = SampledPath.of("way", path, spec)
+        found = [*check_way_limits(sampled, points), *standing_problems(sampled, points, others, own=place.name)]
+        if best is None or len(found) < len(best[1]):
+            best = (path, found)
+        if not found:
+            break
+    if best is None or best[1]:
+        problems = found if best is None else best[1]
+        raise InvalidActionError(f"place '{place.name}': " + "; ".join(problems))
+    return PlaceWay(place.name, best[0], spec.robot.parameters.checksum)
+
+
+def way_to(
+    place: PlaceSettings,
+    places: Sequence[PlaceSettings],
+    spec: UrArmSettings,
+    vessels: Mapping[Role, Vessel],
+    volume: float | None,
+) -> PlaceWay:
+    """The way to a place of a laboratory, among the vessels of a campaign.
+
+    Args:
+        place: where it ends.
+        places: all places.
+        spec: of the arm and its cell.
+        vessels: of the campaign.
+        volume: largest volume of liquid in a carried vessel [m³]; None for a way on which none is carried.
+
+    Raises:
+        InvalidActionError: as `plan_way`; or a vessel is too full to be carried.
+    """
+    carried = [vessels[role] for role in place.holds if role in vessels]
+    standing = [standing_at(each, vessels, spec) for each in places]
+    others = [each for each in standing if each.radius > 0.0]
+    if volume is None:
+        return plan_way(place, spec, carried, others)
+    hardest = TOOL_ACCELERATION
+    for vessel in carried:
+        allowed = 0.0 if volume > vessel.capacity else full_acceleration(vessel, volume)
+        hardest = min(hardest, allowed)
+        if hardest < LEAST_ACCELERATION:
+            raise InvalidActionError(
+                f"'{vessel.name}' would be too full to be carried: {1e6 * volume:.0f} ml could swing over its rim"
+            )
+    return plan_way(place, spec, carried, others, FULL_SPEED, hardest)
+
+
+def in_the_way(
+    path: PourPath, pourer: Vessel, places: Sequence[PlaceSettings], spec: UrArmSettings, vessels: Mapping[Role, Vessel]
+) -> list[str]:
+    """Problems of a pour over the balance with vessels that may stand at the other places.
+
+    Args:
+        path: of the pour.
+        pourer: vessel in the gripper.
+        places: all places.
+        spec: of the arm and its cell.
+        vessels: of the campaign.
+    """
+    others = [standing_at(each, vessels, spec) for each in places if each.use != "balance"]
+    points = hull(pourer)
+    parts = (("approach", path.approach, ()), ("pour", path.pour, path.phases))
+    return [
+        problem
+        for name, part, phases in parts
+        for problem in standing_problems(SampledPath.of(name, part, spec, phases), points, others)
+    ]
+
+
+def _unreached(error: OutOfReachError, spec: UrArmSettings) -> str:
+    flange = SampledPath.beyond("way", np.arange(float(len(error.poses))), error.poses, spec).unreached
+    assert flange is not None
+    beyond = beyond_reach(flange.rotation, flange.position, spec.robot)
+    apart = beyond[:, posture(np.array(spec.home.angles), spec.robot)]
+    worst = float(apart[int(np.argmax(np.abs(apart)))])
+    how = f"out of the arm's reach by {1e3 * worst:.0f} mm" if worst > 0.0 else "too near to the arm's base"
+    return f"{how}, on the way from home in the posture of home"
+
+
+def standing_problems(
+    sampled: SampledPath, points: FloatArray, others: Sequence[Standing], own: str = ""
+) -> Iterator[str]:
+    """Problems of a path with vessels that may stand at other places.
+
+    Args:
+        sampled: the path.
+        points: outermost points of the carried vessel, shape (V, 3) [m].
+        others: what may stand there.
+        own: place where the path ends. The gripper reaches around the vessel there, so that only the links count.
+    """
+    pose = sampled.pourer
+    world = np.einsum("nij,vj->nvi", pose.rotation, points) + pose.position[:, None]
+    along = np.linspace(0.0, 1.0, 13)[:, None]
+    for each in others:
+        if each.place != own:
+            apart = _distance(world, each).min(axis=1)
+            if apart.min() < each.clearance:
+                yield _too_near("the carried vessel", float(apart.min()), each, sampled.when(int(np.argmin(apart))))
+        for name, first, second, radius in LINKS:
+            if each.place == own and name in ("gripper", "wrist"):
+                continue
+            a, b = sampled.links[:, first, None], sampled.links[:, second, None]
+            apart = _distance(a + (b - a) * along, each).min(axis=1) - radius - sampled.link_error
+            if apart.min() < each.clearance:
+                yield _too_near(f"the {name}", float(apart.min()), each, sampled.when(int(np.argmin(apart))))
+                break
+
+
+def _distance(points: FloatArray, standing: Standing) -> FloatArray:
+    """Distance of points (N, V, 3) in the room from a cylinder, negative inside, shape (N, V) [m]."""
+    x, y, z = standing.foot
+    aside = np.hypot(points[..., 0] - x, points[..., 1] - y) - standing.radius
+    over = np.maximum(points[..., 2] - (z + standing.height), z - points[..., 2])
+    outer: FloatArray = np.hypot(np.maximum(aside, 0.0), np.maximum(over, 0.0))
+    return np.where(outer > 0.0, outer, np.maximum(aside, over))
+
+
+def _too_near(thing: str, apart: float, each: Standing, when: str) -> str:
+    how = f"come within {1e3 * apart:.0f} mm of" if apart > 0.0 else "run into"
+    return f"{thing} would {how} a vessel at '{each.place}', {when}; {1e3 * each.clearance:.0f} mm have to stay free"
+
+
+def place_problems(
+    places: Sequence[PlaceSettings], spec: UrArmSettings, vessels: Mapping[Role, Vessel]
+) -> Iterator[tuple[int, str]]:
+    """Problems of a laboratory's places: number of the place, and the message.
+
+    Args:
+        places: all places.
+        spec: of the arm and its cell.
+        vessels: of a campaign; without them, only what does not depend on them is checked.
+    """
+    standing = [standing_at(place, vessels, spec) for place in places]
+    for (_, one), (i, other) in combinations(enumerate(standing), 2):
+        apart = math.dist(one.foot[:2], other.foot[:2]) - one.radius - other.radius
+        if apart < max(one.clearance, other.clearance):
+            yield (
+                i,
+                f"places '{one.place}' and '{other.place}' overlap: what stands there is {1e3 * apart:.0f} mm apart, "
+                f"{1e3 * max(one.clearance, other.clearance):.0f} mm have to stay free",
+            )
+    for i, (place, foot) in enumerate(zip(places, standing, strict=True)):
+        axis = vessel_at(place, spec).rotation[:, 2]
+        lean = math.acos(float(np.clip(axis[2], -1.0, 1.0)))
+        if lean > UPRIGHT:
+            yield i, f"a vessel at '{place.name}' would lean by {math.degrees(lean):.1f} deg; teach it upright"
+            continue
+        if place.use == "balance" and (off := math.dist(foot.foot, spec.cell.receiver.vector)) > OFF_CENTRE:
+            yield (
+                i,
+                f"place '{place.name}' is on the balance, and {1e3 * off:.0f} mm away from cell.receiver, where pours "
+                "end; teach it again, or correct cell.receiver",
+            )
+        if texts := outside(np.array(foot.foot), spec):
+            yield i, f"the foot of a vessel at '{place.name}' is {', '.join(texts)}"
+            continue
+        carried = [vessels[role] for role in place.holds if role in vessels]
+        try:
+            plan_way(place, spec, carried, [each for each in standing if each.radius > 0.0])
+        except InvalidActionError as error:
+            yield i, str(error)

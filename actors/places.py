@@ -1,0 +1,140 @@
+"""Places of a laboratory where the arm puts vessels down and takes them from: settings, and what stands where.
+
+- `PlaceSettings` is one entry of a laboratory's section `places`; `Layout` names the places that a pour uses.
+- `PlaceRecord` is the account of what stands where. The orchestrator keeps it on disk
+  (`orchestrator.materials.vessel_account`), so that it outlasts the program.
+
+The ways to the places are planned in `actors.arm.planning.place_ways`, and driven in `actors.bench.vessel_handling`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, Protocol
+
+from pydantic import Field, Strict
+
+from actors.arm.arm_geometry import Pose
+from actors.interfaces import InvalidActionError
+from sim_engine.settings.model import Example, Name, PositiveCount, Problems, Settings
+from sim_engine.settings.quantity import Quantity
+
+Role = Literal["pourer", "receiver"]
+
+ROLES: tuple[Role, Role] = ("pourer", "receiver")
+"""Names of the vessels that the arm handles."""
+
+
+class PlaceSettings(Settings):
+    """A place where a vessel stands, taught by hand with 'decant robot teach'."""
+
+    name: Annotated[Name, Example("left")]
+    """Name of the place."""
+
+    pose: Annotated[Pose, Example("{x: 600 mm, y: -300 mm, z: 120 mm, rx: 1.571 rad}")]
+    """Tool centre point in the base's frame, with the fingers at a vessel that stands there."""
+
+    tool: Annotated[Pose, Example("{z: 170 mm}")]
+    """Tool centre point in the flange's frame when the pose was taught; it has to be that of the arm."""
+
+    use: Literal["stand", "balance", "source"] = "stand"
+    """'balance': on the balance, where the receiver stands in a pour. 'source': under the outlet of the refill pump. 'stand': any other."""  # noqa: E501
+
+    holds: tuple[Role, ...] = ROLES
+    """Vessels that may stand there."""
+
+    approach: Annotated[float, Quantity("m", "120 mm", 20e-3, 0.5)] = 0.12
+    """Height above the pose from which the tool comes straight down, and to which it rises again."""
+
+    clearance: Annotated[float, Quantity("m", "15 mm", 5e-3, 0.2)] = 15e-3
+    """Gap that arm, gripper and carried vessel keep from a vessel that stands there."""
+
+
+class UnattendedSettings(Settings):
+    """Pours without a person, after one consent."""
+
+    pours: Annotated[PositiveCount, Field(le=10_000)] = 200
+    """Largest number of pours of one consent."""
+
+    until: Annotated[str, Strict(), Field(pattern=r"^([01]\d|2[0-3]):[0-5]\d$")] = "07:00"
+    """Local time at which the consent ends, at the latest a day after it was given."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The places of a laboratory, as pours use them.
+
+    Attributes:
+        balance: where the receiver stands in a pour.
+        rest: place of each vessel while the other one stands on the balance.
+    """
+
+    balance: PlaceSettings
+    rest: Mapping[Role, PlaceSettings]
+
+    @classmethod
+    def of(cls, places: Sequence[PlaceSettings]) -> Layout:
+        """The layout of a laboratory's places.
+
+        Raises:
+            InvalidActionError: they do not suffice for a pour.
+        """
+        balance = [place for place in places if place.use == "balance" and set(ROLES) <= set(place.holds)]
+        others = [place for place in places if place.use != "balance"]
+        # the pourer stands where it can be filled up; the receiver anywhere else
+        pourer = next((p for p in sorted(others, key=lambda p: p.use != "source") if "pourer" in p.holds), None)
+        receiver = next((p for p in others if "receiver" in p.holds and p is not pourer), None)
+        if len(balance) == 1 and pourer is not None and receiver is not None:
+            return cls(balance[0], {"pourer": pourer, "receiver": receiver})
+        raise InvalidActionError(
+            "these places do not suffice for a pour: it needs one with 'use: balance' for both vessels, one more for "
+            "the pourer, and another one for the receiver"
+        )
+
+
+def check_places(problems: Problems, places: Sequence[PlaceSettings], tool: Pose | None) -> None:
+    """Add a problem for each place that does not fit the others or the arm.
+
+    Args:
+        problems: of the laboratory, whose key `places` is.
+        places: all places.
+        tool: tool centre point of the arm; None if the arm has none.
+    """
+    names: set[str] = set()
+    for number, place in enumerate(places):
+        if place.name in names:
+            problems.add(f"two places are named '{place.name}'", "places", number, "name")
+        names.add(place.name)
+        if tool is not None and _differ(place.tool, tool):
+            problems.add(
+                f"place '{place.name}' was taught with another tool than the arm's: teach it again with 'decant robot "
+                f"teach {place.name}'",
+                "places",
+                number,
+                "tool",
+            )
+
+
+def _differ(one: Pose, other: Pose) -> bool:
+    return any(abs(a - b) > 1e-4 for a, b in zip(one.as_list, other.as_list, strict=True))
+
+
+class PlaceRecord(Protocol):
+    """What stands where, kept on disk before anything moves."""
+
+    def stands(self) -> dict[str, str | None]:
+        """The place of every vessel that was entered: its name; None if it is UNKNOWN."""
+        ...
+
+    def put(self, vessel: str, place: str | None, note: str = "") -> None:
+        """Enter the place of a vessel; None before it is moved: it is UNKNOWN until it has arrived.
+
+        Raises:
+            LaboratoryError: another vessel stands there, or it can't be written.
+        """
+        ...
+
+    def content(self, vessel: str, mass: float | None, deviation: float, liquid: str) -> None:
+        """Enter the weighed content of a vessel [kg]; None: unknown until it is weighed again."""
+        ...
