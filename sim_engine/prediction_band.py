@@ -25,7 +25,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any
 
 from sim_engine.outcome import PourOutcome, normalised_spillage
 
@@ -70,19 +69,6 @@ class PredictionInterval:
     def percent(self, decimals: int = 1) -> str:
         """As text: '1.2 … 6.0 %'."""
         return f"{100 * self.low:.{decimals}f} … {100 * self.high:.{decimals}f} %"
-
-    def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping."""
-        return {
-            "low": self.low,
-            "high": self.high,
-            "level": self.level,
-            "deviations": {
-                "simulations": self.simulations,
-                "discrepancy": self.discrepancy,
-                "resolution": self.resolution,
-            },
-        }
 
 
 def resolution_shift(particles: int) -> float:
@@ -216,10 +202,6 @@ class SampleStatistics:
         if len(values) == 1:
             return cls(mean, None, 1)
         return cls(mean, math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1)), len(values))
-
-    def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping."""
-        return {"mean": self.mean, "deviation": self.deviation, "count": self.count}
 
     def percent(self, decimals: int = 1) -> str:
         """A fraction as text: '3.1 ± 0.4 %'; of a single seed '3.1 %'."""

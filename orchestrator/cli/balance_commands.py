@@ -8,7 +8,6 @@ dialects in `actors.balance.line_explanation`.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import sys
 import time
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from actors.balance.line_recording import Capture, Recorder
     from actors.balance.scale_model import Load
     from actors.interfaces import DeviceCheck
+    from orchestrator.cli.command_results import ExplainedDialectOutput
 
 CHECK_SCALE = 4.0
 """Bench seconds per second of the clock while a virtual balance is checked: its lag must stay longer than this
@@ -93,8 +93,9 @@ def check(
             driver.close()
     failed = [one for one in checks if one.state == "fail"]
     if as_json:
-        table = [dataclasses.asdict(one) for one in checks]
-        print_json({"balance": balance, "ready": not failed, "checks": table})
+        from orchestrator.cli.command_results import BalanceCheckOutput
+
+        print_json(BalanceCheckOutput(balance=balance, ready=not failed, checks=checks))
     if failed:
         raise RefusalError(f"{len(failed)} of {len(checks)} checks fail")
     print_message("ready" if all(one.state == "ok" for one in checks) else "ready, with warnings")
@@ -173,15 +174,17 @@ def explain(
     fits = explain_lines(capture.lines)
     best = best_fits(fits)
     if as_json:
+        from orchestrator.cli.command_results import BalanceExplainOutput
+
         print_json(
-            {
-                "file": file,
-                "lines": len(capture.lines),
-                "recorded": capture.about,
-                "notes": capture.notes,
-                "best": [fit.dialect.name for fit in best],
-                "dialects": [_fit_in_json(fit) for fit in fits],
-            }
+            BalanceExplainOutput(
+                file=file,
+                lines=len(capture.lines),
+                recorded=dict(capture.about),
+                notes=list(capture.notes),
+                best=[fit.dialect.name for fit in best],
+                dialects=[_explained(fit) for fit in fits],
+            )
         )
     else:
         _print_fits(file, capture, fits)
@@ -257,23 +260,24 @@ def _print_settings(capture: Capture, best: Sequence[DialectFit]) -> None:
         print("  weight: net   # or gross; it sends both")
 
 
-def _fit_in_json(fit: DialectFit) -> dict[str, Any]:
+def _explained(fit: DialectFit) -> ExplainedDialectOutput:
     from actors.balance.line_explanation import shown_bytes
+    from orchestrator.cli.command_results import ExplainedDialectOutput, RefusedLinesOutput
 
-    return {
-        "dialect": fit.dialect.name,
-        "title": fit.dialect.title,
-        "understood": fit.understood,
-        "weights": fit.weights,
-        "reads": fit.reads,
-        "marks": sorted(fit.marks),
-        "states": dict(fit.states),
-        "others": dict(fit.others),
-        "refused": [
-            {"line": shown_bytes(line), "count": count, "reason": reason}
+    return ExplainedDialectOutput(
+        dialect=fit.dialect.name,
+        title=fit.dialect.title,
+        understood=fit.understood,
+        weights=fit.weights,
+        reads=list(fit.reads),
+        marks=sorted(fit.marks),
+        states=dict(fit.states),
+        others=dict(fit.others),
+        refused=[
+            RefusedLinesOutput(line=shown_bytes(line), count=count, reason=reason)
             for line, (reason, count) in fit.refused.items()
         ],
-    }
+    )
 
 
 def _put(emulator: BalanceEmulator, load: Load) -> None:

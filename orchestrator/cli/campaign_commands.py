@@ -29,6 +29,7 @@ from orchestrator.cli.command_options import (
 from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_note
 
 if TYPE_CHECKING:
+    from orchestrator.cli.command_results import CalibrateOutput
     from orchestrator.learning.campaign_plan import CampaignPlan
     from orchestrator.records.run_record import CampaignResult
     from orchestrator.reports.publishing import Published
@@ -86,9 +87,11 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         if published.theta is not None:
             print_note(f"the parameters to use are in {published.theta}; give them with --parameters")
         if as_json and task == "calibrate":
-            print_json(calibration_json(result, published))
+            print_json(calibration_output(result, published))
         elif as_json:
-            print_json({"run": result.directory.name, "report": published.report, **summary_json(published.summary)})
+            from orchestrator.cli.json_output import RunOutput
+
+            print_json(RunOutput.model_validate({"report": published.report, **summary_json(published.summary)}))
 
     work.__name__, work.__doc__ = task, text
     return work
@@ -111,9 +114,10 @@ The recommended θ is written to runs/ID/theta.json in SI units (cohesion in N/m
 )
 
 
-def calibration_json(result: CampaignResult, published: Published) -> dict[str, Any]:
+def calibration_output(result: CampaignResult, published: Published) -> CalibrateOutput:
     """The recommended θ, θ*, and mean |r − c_s| by split: that of θ*, that of its rivals: see
     `CalibrationEvaluation`."""
+    from orchestrator.cli.command_results import CalibrateOutput
     from orchestrator.learning.calibration.calibration_base import Calibrated
     from orchestrator.learning.calibration.calibration_scores import CALIBRATED, Scores
     from orchestrator.records.codec import result_of
@@ -125,25 +129,27 @@ def calibration_json(result: CampaignResult, published: Published) -> dict[str, 
     evaluation = result_of(results, EVALUATION, Scores)
     ours = evaluation.discrepancy[CALIBRATED]
     rivals = rival_scores(evaluation)
-    data: dict[str, Any] = {
-        "theta": deployed_theta(results).model_dump(),
-        "calibrated_theta": theta.model_dump(),
-        "calibration_gain": None if evaluation.gain is None else evaluation.gain.model_dump(mode="json"),
+    others = {
+        f"{split}_discrepancy_{name}": values.get(split)
+        for split in ("test", "transfer")
+        for name, values in rivals.items()
     }
-    for split in ("train", "test", "transfer"):
-        data[f"{split}_discrepancy"] = ours.get(split)
-        if split != "train":
-            data |= {f"{split}_discrepancy_{name}": values.get(split) for name, values in rivals.items()}
-    return {
-        **data,
-        "simulations": result.simulations,
-        "calibration_simulations": calibration.simulations,
-        "cpu_s": result.cpu_s,
-        "run": str(result.directory),
-        "figures": published.figures,
-        "recording": published.recording,
-        "report": published.report,
-    }
+    return CalibrateOutput(
+        theta=deployed_theta(results),
+        calibrated_theta=theta,
+        calibration_gain=None if evaluation.gain is None else evaluation.gain.model_dump(mode="json"),
+        train_discrepancy=ours.get("train"),
+        test_discrepancy=ours.get("test"),
+        transfer_discrepancy=ours.get("transfer"),
+        simulations=result.simulations,
+        calibration_simulations=calibration.simulations,
+        cpu_s=result.cpu_s,
+        run=str(result.directory),
+        figures=dict(published.figures),
+        recording=published.recording,
+        report=published.report,
+        **others,
+    )
 
 
 def plan(
@@ -221,11 +227,12 @@ def plan(
                 **told.model_dump(mode="json", include=set(PLANNED)),
             }
         )
-    theta = chosen.parameters.model_dump()
     if as_json:
+        from orchestrator.cli.json_output import PlanOutput
+
         totals = {"simulations": run_result.simulations, "cpu_s": run_result.cpu_s, "run": str(run_result.directory)}
-        first = answers[0]
-        print_json({**first, "theta": theta, **totals, **({"plans": answers} if len(answers) > 1 else {})})
+        several = answers if len(answers) > 1 else []
+        print_json(PlanOutput.model_validate({**answers[0], "theta": chosen.parameters, **totals, "plans": several}))
 
 
 def planning_request(

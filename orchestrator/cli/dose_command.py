@@ -163,7 +163,9 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
         if not as_json:
             print(forecast_text(planned, source, found))
     if as_json:
-        print_json({"doses": rows})
+        from orchestrator.cli.command_results import DosePredictionOutput
+
+        print_json(DosePredictionOutput.model_validate({"doses": rows}))
     elif len(rows) > 1:
         times = "once" if filled == 1 else f"{filled} times"
         print(f"{len(rows)} doses: {total:.0f} s of pouring and weighing; sources filled {times}")
@@ -256,8 +258,10 @@ def pour_doses(request: RunRequest, *, in_process: bool, as_json: bool, again: s
     directory = finished.directory
     result: Dispensed = result_of(finished.results, DOSES, Dispensed)
     if as_json:
-        doses = [one.model_dump(mode="json", exclude={"signals"}) for one in result.doses]
-        print_json({"run": str(directory), "doses": doses})
+        from orchestrator.cli.json_output import DoseOutput
+
+        doses = [one.model_dump(exclude={"signals"}) for one in result.doses]
+        print_json(DoseOutput(run=str(directory), doses=doses))
     else:
         for one in result.doses:
             print(dose_text(one))

@@ -131,11 +131,10 @@ def plugins(as_json: Json = False) -> None:
 
     found, unusable = installed(), broken()
     if as_json:
+        from orchestrator.cli.command_results import PluginsOutput
+
         print_json(
-            {
-                "plugins": [dataclasses.asdict(plugin) for plugin in found],
-                "broken": [dataclasses.asdict(one) for one in unusable],
-            }
+            PluginsOutput(plugins=[*map(dataclasses.asdict, found)], broken=[*map(dataclasses.asdict, unusable)])
         )
     else:
         width = [max(len(row) for row in column) for column in zip(*((p.group, p.name) for p in found), strict=True)]

@@ -108,7 +108,9 @@ def first_day(
         (folder / PAGE).write_text(_page(folder, found, replays, words), encoding="utf-8")
     print_message(f"page: {folder / PAGE}")
     if as_json:
-        print_json(document)
+        from orchestrator.cli.command_results import FirstDayOutput
+
+        print_json(FirstDayOutput(**document))
 
 
 def _day_of(folder: Path) -> list[PourRecording]:

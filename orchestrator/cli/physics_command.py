@@ -132,7 +132,9 @@ def validate_solver(
         print_message(f"page: {page}")
     rows = [(record["title"], m) for record in records.values() for m in record["measurements"]]
     if as_json:
-        print_json({"solver": fingerprint, "full": full, "cases": records})
+        from orchestrator.cli.command_results import ValidateSolverOutput
+
+        print_json(ValidateSolverOutput(solver=fingerprint, full=full, cases=records))
     else:
         console = Console()
         console = console if console.is_terminal else Console(width=PLAIN_WIDTH + 40)

@@ -9,7 +9,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -34,7 +34,7 @@ from orchestrator.cli.console import (
 )
 
 if TYPE_CHECKING:
-    from actors.arm.arm_interface import Executed, PathReport, PlannedPour
+    from actors.arm.arm_interface import Executed, PlannedPour
     from orchestrator.learning.campaign_plan import CampaignPlan
     from orchestrator.learning.single_action import WeighedPour
     from sim_engine.action import Action
@@ -164,11 +164,6 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     return Chosen(plan, scene, action, planned)
 
 
-def report_json(report: PathReport) -> dict[str, Any]:
-    """SI units."""
-    return dataclasses.asdict(report)
-
-
 def _draw(chosen: Chosen, png: Path) -> None:
     from actors.arm.planned_pour import PourPath
     from actors.arm.ur_settings import UrArmSettings
@@ -200,15 +195,11 @@ def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
     print_note(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
     home = _stands_at_home(chosen) if connect else None
     if as_json:
-        print_json(
-            {
-                "mode": laboratory.mode,
-                "action": chosen.action.values(),
-                "report": report_json(planned.report),
-                "phases": [{"name": n, "start": a, "end": b} for n, a, b in planned.phases],
-                "at_home": home,
-            }
-        )
+        from orchestrator.cli.command_results import DryRunOutput
+
+        phases = [{"name": n, "start": a, "end": b} for n, a, b in planned.phases]
+        action, report = chosen.action.values(), planned.report
+        print_json(DryRunOutput(mode=laboratory.mode, action=action, report=report, phases=phases, at_home=home))
     else:
         for line in [*report_lines(planned.report), *_way_lines(planned)]:
             print(line)
@@ -272,8 +263,10 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool)
     if result.weighed is None:
         raise RefusalError(result.failed or "nothing was poured", FAILED)
     if as_json:
+        from orchestrator.cli.json_output import PourOutput
+
         about = {"run": str(finished.directory), "mode": chosen.plan.laboratory.mode, "action": chosen.action.values()}
-        print_json({**about, **result.weighed.model_dump()})
+        print_json(PourOutput.model_validate({**about, **result.weighed.model_dump()}))
     else:
         print(told(result.weighed))
     return finished.directory
@@ -352,7 +345,9 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
     }
     (directory / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     if as_json:
-        print_json({"run": str(directory), **record})
+        from orchestrator.cli.command_results import EmptyPourOutput
+
+        print_json(EmptyPourOutput.model_validate({"run": str(directory), **record}))
     else:
         print(_told(executed))
     print_message(f"record: {directory / RECORD}")

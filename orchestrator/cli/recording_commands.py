@@ -54,6 +54,7 @@ def export(
     Files that exist are kept. To write them at the end of every run, set 'outputs: {pour_recordings: true}' in the
     campaign.
     """
+    from orchestrator.cli.command_results import RecordingExportOutput
     from orchestrator.learning.run_errors import RunError
     from orchestrator.records.journal import JOURNAL_NAME
     from orchestrator.reports.recording_export import export_recordings
@@ -68,7 +69,7 @@ def export(
     for path in written:
         print(path)
     if as_json:
-        print_json({"recordings": written, "left_out": left_out})
+        print_json(RecordingExportOutput(recordings=written, left_out=left_out))
     if not written:
         raise RefusalError(f"{folder}: no pour of this run can be exported", FAILED)
 
@@ -128,7 +129,9 @@ def replay(
         if simulator is not None:
             simulator.close()
     if as_json:
-        print_json({"replays": documents})
+        from orchestrator.cli.command_results import RecordingReplaysOutput
+
+        print_json(RecordingReplaysOutput.model_validate({"replays": documents}))
 
 
 def fit(
@@ -181,7 +184,9 @@ def fit(
         with Refused(OSError, at="--output: "):
             output.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     if as_json:
-        print_json(document)
+        from orchestrator.cli.command_results import RecordingFitOutput
+
+        print_json(RecordingFitOutput(**document))
 
 
 def _loaded(paths: Sequence[Path]) -> list[PourRecording]:

@@ -58,7 +58,9 @@ def report(
         raise RefusalError(_nothing_there(folder), BAD_INPUT)
     print_note(f"report  {page}")
     if as_json:
-        print_json({"report": page, "figures": figures})
+        from orchestrator.cli.command_results import ReportOutput
+
+        print_json(ReportOutput(report=page, figures=figures))
 
 
 def _nothing_there(folder: Path) -> str:

@@ -64,6 +64,7 @@ def check(
     """
     from actors.interfaces import LaboratoryError
     from actors.laboratory import check_bench_packages
+    from orchestrator.cli.command_results import CheckOutput
     from orchestrator.cli.commissioning_archive import ArchiveError, write_robot_check
     from orchestrator.runs.bench_check import check_bench
     from orchestrator.runs.motion_approval import SafetyRecordError, read_record
@@ -102,7 +103,7 @@ def check(
     with Refused(LaboratoryError, code=FAILED):
         report = check_bench(spec, laboratory, record, tare=tare, read=read)
     if as_json:
-        print_json(report.document())
+        print_json(CheckOutput(**report.document()))
     else:
         print_table(report.checks)
     if report.failed:
@@ -127,6 +128,7 @@ def archive(
     stable weights of the balance, the weighed pours of runs. Exit code 1 if this version of Decant reads one of them
     differently. Nothing is connected.
     """
+    from orchestrator.cli.command_results import ArchiveOutput
     from orchestrator.cli.commissioning_archive import ArchiveError, CommissioningArchive
 
     with Refused(ArchiveError, OSError):
@@ -138,8 +140,7 @@ def archive(
     checks = list(kept.replay())
     failed = [one for one in checks if one.state == "fail"]
     if as_json:
-        table = [dataclasses.asdict(one) for one in checks]
-        print_json({"archive": str(archive), "ready": not failed, "checks": table})
+        print_json(ArchiveOutput(archive=str(archive), ready=not failed, checks=checks))
     else:
         print_table(checks)
     if failed:

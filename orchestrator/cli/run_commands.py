@@ -304,15 +304,10 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
     with _refusing():
         found = check_journal(folder / JOURNAL_NAME)
     if as_json:
-        print_json(
-            {
-                "run": folder,
-                "complete": not found.problems,
-                "problems": found.problems,
-                "entries": found.entries,
-                "pours": found.pours,
-            }
-        )
+        from orchestrator.cli.command_results import RunCheckOutput
+
+        problems, entries, pours = list(found.problems), found.entries, list(found.pours)
+        print_json(RunCheckOutput(run=folder, complete=not problems, problems=problems, entries=entries, pours=pours))
     else:
         print(f"{folder}: {found.verdict}")
         for pour in found.pours:

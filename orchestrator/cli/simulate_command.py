@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -38,13 +38,14 @@ from orchestrator.cli.console import (
 
 if TYPE_CHECKING:
     from orchestrator.campaigns.pour_table import RecordTable
+    from orchestrator.cli.command_results import IntervalOutput, ScoredPourOutput
     from orchestrator.learning.campaign_plan import CampaignPlan, RecordedPour, RecordSet
     from orchestrator.reports.prediction_scores import ScoredRow
     from sim_engine.action import Action
     from sim_engine.liquids import SimulationParameters
     from sim_engine.model_validity import ModelValidity
     from sim_engine.outcome import PourOutcome, SimulatedPour
-    from sim_engine.prediction_band import SampleStatistics
+    from sim_engine.prediction_band import PredictionInterval, SampleStatistics
     from sim_engine.scene import PourTask, Scene
     from sim_engine.search_space import Space
     from sim_engine.simulator import PourSimulator
@@ -159,24 +160,22 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     received = over_seeds.get("received")
     delivered = None if received is None else received.mean * scene.liquid.mass
     if options.as_json:
-        prediction = {name: spread.as_json() for name, spread in over_seeds.items()}
+        from orchestrator.cli.command_results import PredictionOutput, SimulateOutput
+
+        seeds = [task.seed for task in tasks]
         print_json(
-            {
+            SimulateOutput(
                 **outcomes[0].as_json(),
-                "action": action.values(),
-                "theta": known.theta.model_dump(),
-                "thetas": len(known.drawn),
-                "scene": scene.name,
-                "delivered_g": None if delivered is None else 1e3 * delivered,
-                "delivered_ml": None if delivered is None else scene.liquid.millilitres(delivered),
-                "prediction": {
-                    **prediction,
-                    "band": None if where is None else where.as_json(),
-                    "seeds": [task.seed for task in tasks],
-                },
-                "regimes": None if regime is None else regime.as_json(),
-                "not_covered": [] if regime is None else [one.as_json() for one in regime.not_covered],
-            }
+                action=action.values(),
+                theta=known.theta,
+                thetas=len(known.drawn),
+                scene=scene.name,
+                delivered_g=None if delivered is None else 1e3 * delivered,
+                delivered_ml=None if delivered is None else scene.liquid.millilitres(delivered),
+                prediction=PredictionOutput.model_validate({"band": _interval(where), "seeds": seeds, **over_seeds}),
+                regimes=None if regime is None else regime.as_json(),
+                not_covered=[] if regime is None else [one.as_json() for one in regime.not_covered],
+            )
         )
     else:
         print_note(f"{scene.name}: {action.display()}")
@@ -330,19 +329,23 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
         title = f"{scene.pourer.name} into {scene.receiver.name}, {len(rows)} weighed pours"
         print_note(f"picture: {figure_style.save(draw_scored(rows, title=title, note=said), options.png)}")
     if options.as_json:
+        from orchestrator.cli.command_results import ScoresOutput, SimulateTableOutput
+        from sim_engine.prediction_band import resolution_shift
+
+        shift = resolution_shift(known.theta.particles)
         print_json(
-            {
-                "scene": scene.name,
-                "from": source,
-                "scores": {split: one.as_json() for split, one in found.items()},
-                "level": LEVEL,
-                "theta": known.theta.model_dump(),
-                "thetas": len(known.thetas),
-                "simulations": sum(map(len, outcomes)),
-                "cpu_s": sum(outcome.cpu_s for some in outcomes for outcome in some),
-                "bands": known.as_json(),
-                "pours": [_row_json(row, dimensions) for row in rows],
-            }
+            SimulateTableOutput(
+                scene=scene.name,
+                from_=source,
+                scores={split: ScoresOutput(**one.as_json()) for split, one in found.items()},
+                level=LEVEL,
+                theta=known.theta,
+                thetas=len(known.thetas),
+                simulations=sum(map(len, outcomes)),
+                cpu_s=sum(outcome.cpu_s for some in outcomes for outcome in some),
+                bands={"discrepancy_shift": known.discrepancy, "resolution_shift": shift},
+                pours=[_scored(row, dimensions) for row in rows],
+            )
         )
     else:
         for split, one in found.items():
@@ -480,16 +483,27 @@ def _row(line: int, pour: RecordedPour, outcomes: Sequence[PourOutcome], discrep
     )
 
 
-def _row_json(row: ScoredRow, dimensions: Sequence[str]) -> dict[str, object]:
-    return {
-        "line": row.line,
-        "split": row.split,
-        "action": {name: getattr(row.action, name) for name in dimensions},
-        "measured": row.measured,
-        "predicted": None if row.predicted is None else row.predicted.as_json(),
-        "band": None if row.band is None else row.band.as_json(),
-        "inside": row.held,
-    }
+def _interval(band: PredictionInterval | None) -> IntervalOutput | None:
+    from orchestrator.cli.command_results import IntervalOutput
+
+    if band is None:
+        return None
+    deviations = {name: getattr(band, name) for name in ("simulations", "discrepancy", "resolution")}
+    return IntervalOutput(low=band.low, high=band.high, level=band.level, deviations=deviations)
+
+
+def _scored(row: ScoredRow, dimensions: Sequence[str]) -> ScoredPourOutput:
+    from orchestrator.cli.command_results import ScoredPourOutput
+
+    return ScoredPourOutput(
+        line=row.line,
+        split=row.split,
+        action={name: getattr(row.action, name) for name in dimensions},
+        measured=row.measured,
+        predicted=row.predicted,
+        band=_interval(row.band),
+        inside=row.held,
+    )
 
 
 @dataclass(frozen=True)
@@ -538,12 +552,6 @@ class PredictionInputs:
             parts.append("the residual of calibration")
             return f"intervals from {', '.join(parts[:-1])} and {parts[-1]}"
         return f"intervals from {', '.join(parts[:-1])} and {parts[-1]} alone (the residual of calibration is unknown)"
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the shifts in the prediction intervals, JSON-ready."""
-        from sim_engine.prediction_band import resolution_shift
-
-        return {"discrepancy_shift": self.discrepancy, "resolution_shift": resolution_shift(self.theta.particles)}
 
 
 def prediction_inputs(plan: CampaignPlan, parameters: Path | None, thetas: int | None, seeds: int) -> PredictionInputs:

@@ -121,7 +121,9 @@ def report_study(file: StudyPath, as_json: Json = False) -> None:
 
 
 def _print_result(plan: StudyPlan, folder: Path, page: Path, cells: int, finished: int | None) -> None:
-    print_json({"study": plan.name, "folder": folder, "page": page, "cells": cells, "finished": finished})
+    from orchestrator.cli.command_results import StudyOutput
+
+    print_json(StudyOutput(study=plan.name, folder=folder, page=page, cells=cells, finished=finished))
 
 
 def read_study(path: Path) -> StudyPlan:
@@ -147,6 +149,7 @@ def read_study(path: Path) -> StudyPlan:
 
 
 def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: bool) -> None:
+    from orchestrator.cli.command_results import StudyCostOutput
     from orchestrator.study.study_folder import is_finished
     from orchestrator.study.study_plan import estimated_seconds
 
@@ -154,14 +157,11 @@ def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: boo
     simulations, pours = sum(cell.simulations for cell in left), sum(cell.pours for cell in left)
     hours = sum(estimated_seconds(plan, cell) for cell in left) / 3600
     if as_json:
+        names = [cell.id for cell in cells]
         print_json(
-            {
-                "cells": [cell.id for cell in cells],
-                "left": len(left),
-                "simulations": simulations,
-                "pours": pours,
-                "cpu_hours": round(hours, 3),
-            }
+            StudyCostOutput(
+                cells=names, left=len(left), simulations=simulations, pours=pours, cpu_hours=round(hours, 3)
+            )
         )
         return
     groups: dict[str, list[StudyCell]] = {}

@@ -291,7 +291,7 @@ def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
         print_warning(doubt)
     print_note(f"{out} holds {1e6 * found.capacity:.0f} ± {1e6 * found.deviation:.1f} mL; its picture: {found.picture}")
     if vessel.as_json:
-        from orchestrator.cli.json_output import VesselOutput
+        from orchestrator.cli.command_results import VesselOutput
 
         print_json(
             VesselOutput(

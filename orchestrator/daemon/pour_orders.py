@@ -54,8 +54,7 @@ from orchestrator.learning.single_action import OnePour, RepeatedSimulation
 from orchestrator.materials.vessel_account import MIXTURE, Transfer
 from orchestrator.records.run_record import RunPour, read_record
 from orchestrator.runs.run_service import RunRequest
-from orchestrator.runs.run_tasks import POUR
-from orchestrator.runs.stages import StageDefinition
+from orchestrator.runs.run_tasks import POUR, single_task
 from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import plan_motion
@@ -248,8 +247,8 @@ class PlannedOrder:
 
     def request(self) -> RunRequest:
         """The run of the order."""
-        stage = StageDefinition(POUR, self.strategy, pours=True)
-        return RunRequest(self.plan, [stage], problems=self.problems, as_written=False)
+        made = single_task(self.plan, POUR, self.strategy, pours=True)
+        return replace(made, problems=self.problems, as_written=False)
 
     @property
     def target(self) -> DoseTarget | None:
@@ -261,7 +260,7 @@ class PlannedOrder:
         )
         return DoseTarget(self.order.amount, self.order.tolerance, source=source)
 
-    def strategy(self, results: object, seed: int) -> Dispense | OnePour:
+    def strategy(self, seed: int) -> Dispense | OnePour:
         """Build the strategy."""
         if self.target is None:
             return OnePour(self.scene, self.action, seed)

@@ -1,7 +1,8 @@
 """The tasks: one function for each gives the `RunRequest` of a campaign.
 
 `run_task`, `calibrate_task` and `plan_task` need a campaign alone; `TASKS` has them by name. `pour_task` is one pour
-with a given action, `dose_task` a series of amounts. The task of an order is in `orchestrator.daemon.pour_orders`.
+with a given action, `dose_task` a series of amounts. Orders of the daemon and cells of a study also are `single_task`
+and `deploy_task`. Which stages a task has is decided here alone.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from orchestrator.runs.stages import (
 )
 
 if TYPE_CHECKING:
+    from orchestrator.learning.strategy import Strategy
     from sim_engine.action import Action
     from sim_engine.liquids import SimulationParameters
     from sim_engine.scene import Scene
@@ -164,6 +166,24 @@ TASKS: dict[Task, Callable[[CampaignPlan], RunRequest]] = {
 """Tasks that need a campaign alone."""
 
 
+def deploy_task(plan: CampaignPlan) -> RunRequest:
+    """The campaign's deployment alone; its plan has what a calibration has found."""
+    assert plan.deployment is not None
+    return RunRequest(replace(plan, calibration=None), deployment_stages(plan, plan.deployment))
+
+
+def single_task(plan: CampaignPlan, stage: str, build: Callable[[int], Strategy], *, pours: bool = False) -> RunRequest:
+    """One strategy alone.
+
+    Args:
+        plan: of the campaign.
+        stage: name of its stage.
+        build: makes the strategy from a seed.
+        pours: whether it pours.
+    """
+    return RunRequest(plan, [StageDefinition(stage, lambda results, seed: build(seed), pours=pours)])
+
+
 def pour_task(plan: CampaignPlan, scene: Scene, action: Action) -> RunRequest:
     """One pour with a given action, without the parts of the campaign that it does not need.
 
@@ -177,8 +197,8 @@ def pour_task(plan: CampaignPlan, scene: Scene, action: Action) -> RunRequest:
         deployment = replace(plan.deployment.with_settings(pours=1), scenes=(scene,))
         small = replace(plan, calibration=None, deployment=deployment)
     outputs = plan.outputs.model_copy(update={"figures": False})
-    stage = StageDefinition(POUR, lambda results, seed: OnePour(scene, action, seed), pours=True)
-    return RunRequest(replace(small, name=f"{plan.name}-pour", outputs=outputs), [stage])
+    small = replace(small, name=f"{plan.name}-pour", outputs=outputs)
+    return single_task(small, POUR, lambda seed: OnePour(scene, action, seed), pours=True)
 
 
 def dose_scenes(plan: CampaignPlan) -> list[Scene]:

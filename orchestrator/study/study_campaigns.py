@@ -1,7 +1,7 @@
 """Conversion of a study's cell to a campaign.
 
-`campaign_of` copies the plan of the base campaign with the cell's pours, budget, θ, bench and seed, and builds its
-stages. It runs nothing.
+`campaign_of` copies the plan of the base campaign with the cell's pours, budget, θ, bench and seed, and makes its task.
+It runs nothing.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from orchestrator.learning.study_strategies import AnsweredByTable, FinalPour, S
 from orchestrator.records.codec import Results, result_of
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.run_record import answers
+from orchestrator.runs.run_service import RunRequest
+from orchestrator.runs.run_tasks import calibrate_task, deploy_task, single_task
 from orchestrator.runs.stages import (
     CALIBRATION,
     EVALUATION,
     POURS,
     StageDefinition,
-    calibration_stages,
     deployed_theta,
-    deployment_stages,
     known_simulations,
     measured_pours,
     stage_seed,
@@ -49,22 +49,19 @@ Load = Callable[[str], Results]
 """Loads the stage results of a finished cell by its id."""
 
 
-def campaign_of(
-    study: StudyPlan, cell: StudyCell, load: Load, directory: Path
-) -> tuple[CampaignPlan, list[StageDefinition]]:
-    """Campaign of a cell, with its stages.
+def campaign_of(study: StudyPlan, cell: StudyCell, load: Load, directory: Path) -> RunRequest:
+    """The task of a cell.
 
     Args:
         load: loads the results of the cells that this cell needs.
         directory: directory of its run.
     """
-    plan, stages = _planned(study, cell, load, directory)
-    return replace(plan, resolved=record_of(study.base.resolved, plan)), stages
+    request = _task(study, cell, load, directory)
+    plan = replace(request.campaign, resolved=record_of(study.base.resolved, request.campaign))
+    return replace(request, campaign=plan, folder=directory, resume="if begun")
 
 
-def _planned(
-    study: StudyPlan, cell: StudyCell, load: Load, directory: Path
-) -> tuple[CampaignPlan, list[StageDefinition]]:
+def _task(study: StudyPlan, cell: StudyCell, load: Load, directory: Path) -> RunRequest:
     base = study.base
     bench = base.laboratory.bench if not cell.level else study.level(cell.level).bench
     plan = replace(
@@ -87,14 +84,14 @@ def _planned(
             plan = replace(plan, calibration=designed)
     match cell.kind:
         case "grid":
-            return plan, [StageDefinition(GRID, lambda results, seed: _table(study, seed))]
+            return single_task(plan, GRID, lambda seed: _table(study, seed))
         case "pours":
-            return plan, [StageDefinition(POURS, lambda results, seed: _pours(study, plan, cell, seed), pours=True)]
+            return single_task(plan, POURS, lambda seed: _pours(study, plan, cell, seed), pours=True)
         case "calibration":
             return _calibration(study, cell, plan, load, directory)
         case "uncalibrated":
             plan = _with_pours(study, cell, plan, load, directory)
-            return plan, [StageDefinition(EVALUATION, lambda results, seed: _score_of_default(plan, seed))]
+            return single_task(plan, EVALUATION, lambda seed: _score_of_default(plan, seed))
         case "deployment":
             return _deployment(study, cell, plan, cell.needs, load)
         case "final":
@@ -160,24 +157,18 @@ def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Loa
     return replace(plan, calibration=replace(calibration, records=records))
 
 
-def _calibration(
-    study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path
-) -> tuple[CampaignPlan, list[StageDefinition]]:
-    plan = _with_pours(study, cell, plan, load, directory)
-    assert plan.calibration is not None
-    stages = calibration_stages(plan.calibration)
+def _calibration(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path) -> RunRequest:
+    request = calibrate_task(_with_pours(study, cell, plan, load, directory))
     if cell.arm != "C1":
-        return plan, stages
+        return request
     found = answers(directory.parent / GRID, Simulate)
     table = [(one.request, one.outcome) for one in found if isinstance(one.request, Simulate)]
 
     def answered(stage: StageDefinition) -> StageDefinition:
-        def build(results: Results, seed: int) -> Strategy:
-            return AnsweredByTable(stage.build(results, seed), table)
+        return replace(stage, build=lambda results, seed: AnsweredByTable(stage.build(results, seed), table))
 
-        return replace(stage, build=build)
-
-    return plan, [answered(stage) if stage.name == CALIBRATION else stage for stage in stages]
+    stages = [answered(stage) if stage.name == CALIBRATION else stage for stage in request.stages]
+    return replace(request, stages=stages)
 
 
 def _score_of_default(plan: CampaignPlan, seed: int) -> Strategy:
@@ -188,26 +179,24 @@ def _score_of_default(plan: CampaignPlan, seed: int) -> Strategy:
 
 def _deployment(
     study: StudyPlan, cell: StudyCell, plan: CampaignPlan, calibrations: Sequence[str], load: Load
-) -> tuple[CampaignPlan, list[StageDefinition]]:
+) -> RunRequest:
     arm = study.deployment(cell.arm).plan
     deployment = replace(arm, scenes=tuple(scene for scene in arm.scenes if scene.name == cell.receiver))
     for calibration in calibrations:
         found = load(calibration)
         deployment = with_posterior(deployment, found)
         plan = replace(plan, parameters=deployed_theta(found))
-    plan = replace(plan, calibration=None, deployment=deployment)
-    return plan, deployment_stages(plan, deployment)
+    return deploy_task(replace(plan, deployment=deployment))
 
 
-def _final(
-    study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load
-) -> tuple[CampaignPlan, list[StageDefinition]]:
-    """Stage for one pour of the recommended action, in the deployment's laboratory and with its loss."""
+def _final(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load) -> RunRequest:
+    """One pour of the recommended action, in the deployment's laboratory and with its loss."""
     deployed, *calibrations = cell.needs
-    plan, stages = _deployment(study, cell, plan, calibrations, load)
+    request = _deployment(study, cell, plan, calibrations, load)
+    plan = request.campaign
     assert plan.deployment is not None
-    recommended = result_of(load(deployed), stages[0].name, Deployed).recommended
+    recommended = result_of(load(deployed), request.stages[0].name, Deployed).recommended
     scene = plan.deployment.scenes[0]
     action = None if recommended is None else scene.action(dict(recommended.action_si))
     costing = Costing.of(plan.deployment, scene, plan.parameters)
-    return plan, [StageDefinition(FINAL, lambda results, seed: FinalPour(costing, action, seed), pours=True)]
+    return single_task(plan, FINAL, lambda seed: FinalPour(costing, action, seed), pours=True)

@@ -30,7 +30,7 @@ from actors.runtime.child_process import ChildProcess, python_module
 from actors.simulators.local_worker import thread_pool
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.run_record import read_record
-from orchestrator.runs.run_service import RunRequest, RunResources, RunService
+from orchestrator.runs.run_service import RunResources, RunService
 from orchestrator.runs.stages import CALIBRATION
 from orchestrator.study.study_campaigns import campaign_of
 from orchestrator.study.study_file import load_study
@@ -288,9 +288,9 @@ def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, resources: RunReso
         LaboratoryError: its laboratory can't be opened.
     """
     directory = run_folder(folder, cell.id)
-    plan, stages = campaign_of(study, cell, lambda other: read_result(folder, other).results, directory)
+    request = campaign_of(study, cell, lambda other: read_result(folder, other).results, directory)
     directory.mkdir(parents=True, exist_ok=True)
-    handle = RunService().start(RunRequest(plan, stages, directory, "if begun"), resources)
+    handle = RunService().start(request, resources)
     result = asyncio.run(handle.wait())
     kept = CellResult(
         results=dict(result.results),

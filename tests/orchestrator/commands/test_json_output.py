@@ -1,9 +1,8 @@
-"""The output of commands with --json agrees with its documented schema."""
+"""Commands with --json print their models; catalogue and daemon return what their documented schema says."""
 
 from __future__ import annotations
 
 import shlex
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,8 @@ from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
 from orchestrator.cli.json_output import OUTPUTS
-from orchestrator.study.study_folder import run_folder, write_result
-from orchestrator.study.study_plan import cells_of
-from tests.orchestrator.study.test_study_report import made_up
 from tests.orchestrator.test_catalogue import made
-from tests.support import small_campaign, study_files
+from tests.support import small_campaign
 from tests.support.cli_inputs import CSV, ROOT, process
 from tests.support.daemon_thread import Real
 from tests.support.output_schema import validated
@@ -88,41 +84,6 @@ def test_queries_of_the_catalogue_print_what_is_documented(tmp_path: Path, monke
         name = f"runs {command.partition(' ')[0]}"
         validated(name, said(f"runs {command} --json" + (" --format csv" if "export" in name else "")))
     validated("report", said(f"report {run} --json"))
-
-
-@pytest.mark.slow
-def test_a_study_prints_what_is_documented(tmp_path: Path) -> None:
-    plan = study_files.small(tmp_path)
-    file = tmp_path / "study.yaml"
-    assert validated("study run", said(f"study run {file} --dry-run --json"))["left"] == len(cells_of(plan))
-    for cell in cells_of(plan):
-        run_folder(plan.folder, cell.id).mkdir(parents=True)
-        write_result(plan.folder, cell.id, made_up(cell))
-    assert validated("study run", said(f"study run {file} --json"))["finished"] == len(cells_of(plan))
-    validated("study report", said(f"study report {file} --json"))
-
-
-def test_vessels_plugins_and_checks_print_what_is_documented(tmp_path: Path) -> None:
-    sizes = "--height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'"
-    validated("vessel profile", said(f"vessel profile {tmp_path / 'cup.yaml'} {sizes} --json"))
-    validated("plugins", said("plugins --json"))
-    lines = tmp_path / "lines.txt"
-    lines.write_bytes(b"N     +    90.00 g  \r\nT     +    12.00 g  \r\nnothing\r\n")
-    validated("balance explain", said(f"balance explain {lines} --json"))
-
-
-@pytest.mark.slow
-@pytest.mark.realtime
-def test_checks_and_paths_of_the_virtual_arm_print_what_is_documented(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(ROOT / "configs", tmp_path / "configs")
-    monkeypatch.chdir(tmp_path)
-    laboratory = "configs/laboratories/virtual.yaml"
-    assert validated("robot check", said(f"robot check {laboratory} --json"))["checks"]
-    pour = "pour configs/campaigns/quickstart.yaml --set angular_velocity=100 --set x_offset=90"
-    assert validated("pour", said(f"{pour} --dry-run --json"))["phases"]
-    assert validated("pour", said(f"{pour} --empty --json"))["tracking"]
 
 
 def test_queries_of_a_daemon_print_what_is_documented(tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ def test_cells_of_a_study_are_kept_in_the_language_of_campaigns(name: str, tmp_p
         kinds.add((cell.kind, cell.arm))
         stage = f"deployment:{cell.receiver.removeprefix('deployment-')}"
         needed = {"calibration": plans.calibrated(theta), stage: Deployed.model_construct(recommended=None)}
-        plan, _ = campaign_of(study, cell, lambda other, needed=needed: needed, tmp_path / cell.id)  # type: ignore[misc]
+        plan = campaign_of(study, cell, lambda other, needed=needed: needed, tmp_path / cell.id).campaign  # type: ignore[misc]
         assert reloaded(plan, tmp_path) == plan, cell.id
     assert len(kinds) > 4
 

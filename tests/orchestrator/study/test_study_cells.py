@@ -44,8 +44,8 @@ def test_the_uncalibrated_baseline_plans_with_the_defaults_and_needs_no_calibrat
     assert cells["D1-2"].needs == ("calibration.large.C4.01",)
     assert cells["D1-uncalibrated"].needs == ()
     assert cells["D1-2"].seed == cells["D1-uncalibrated"].seed, "they differ in θ alone"
-    plan, _ = campaign_of(study, cells["D1-uncalibrated"], lambda _: pytest.fail("it loads no results"), tmp_path)
-    assert plan.parameters == study.base.parameters
+    request = campaign_of(study, cells["D1-uncalibrated"], lambda _: pytest.fail("it loads no results"), tmp_path)
+    assert request.campaign.parameters == study.base.parameters
     without_c4 = {key: value for key, value in read("quick").items() if key != "calibration"}
     alone = load_study(written(tmp_path / "alone", {**without_c4, "deployment": {"D1_uncalibrated": arm}}))
     assert {cell.kind for cell in cells_of(alone)} == {"deployment", "final"}
@@ -148,8 +148,8 @@ def test_risk_of_the_campaign_is_that_of_d1_and_what_simulates_draws_from_the_po
     made = {}
     for cell in cells_of(study):
         if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":
-            plan, stages = campaign_of(study, cell, lambda name: known, tmp_path)
-            made[cell.arm] = stages[0].build({}, 1)
+            request = campaign_of(study, cell, lambda name: known, tmp_path)
+            made[cell.arm], plan = request.stages[0].build({}, 1), request.campaign
             assert plan.deployment is not None
             drawn = [one.cohesion for one in plan.deployment.thetas]
             assert drawn == ([] if cell.arm == "D2" else [0.0, 0.01, 0.02])  # D2 simulates nothing

@@ -1,0 +1,515 @@
+"""What commands return, as models that `--json` prints; the documentation and the schema are made from them.
+
+Quantities are in SI units unless a name has a unit: `spilled_g`, `capacity_mL`. Models with parts of runs, of the
+catalogue or of the daemon's API are in `json_output`, whose import takes longer.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from actors.arm.arm_interface import PathReport
+from actors.interfaces import DeviceCheck
+from sim_engine.liquids import SimulationParameters
+from sim_engine.prediction_band import SampleStatistics
+
+
+class CommandOutput(BaseModel):
+    """Base of what commands print with `--json`. A model is built when the first one is printed."""
+
+    model_config = ConfigDict(
+        extra="forbid",
+        use_attribute_docstrings=True,
+        arbitrary_types_allowed=True,
+        defer_build=True,
+    )
+
+
+class CalibrateOutput(BaseModel):
+    """Result of a calibration. Further keys are `test_discrepancy_NAME` and `transfer_discrepancy_NAME` of other θ."""
+
+    model_config = ConfigDict(extra="allow", use_attribute_docstrings=True, defer_build=True)
+
+    theta: SimulationParameters
+    """θ to simulate with: θ*, or the uncalibrated θ if the weighed pours do not justify θ*."""
+
+    calibrated_theta: SimulationParameters
+    """θ*."""
+
+    calibration_gain: dict[str, Any] | None
+    """Whether the weighed pours justify θ*; null if θ* was not compared with the uncalibrated θ."""
+
+    train_discrepancy: float | None
+    """Mean |r − c_s| of θ* on the pours of the calibration."""
+
+    test_discrepancy: float | None
+    """The same on pours that were kept for testing."""
+
+    transfer_discrepancy: float | None
+    """The same on pours into another receiver."""
+
+    simulations: int
+    calibration_simulations: int
+    """Simulations without those of the evaluation."""
+
+    cpu_s: float
+    run: str
+    """Folder of the run."""
+
+    figures: dict[str, Path]
+    recording: Path | None
+    report: Path | None
+
+
+class IntervalOutput(CommandOutput):
+    """Prediction interval of r = spilled / poured for a single pour."""
+
+    low: float
+    high: float
+    level: float
+    """Probability, such as 0.9."""
+
+    deviations: dict[str, float | None]
+    """Standard deviations by source: simulations, discrepancy, resolution."""
+
+
+class PredictionOutput(BaseModel):
+    """Prediction over seeds: `SampleStatistics` by quantity, such as received, spilled, retained and spillage."""
+
+    model_config = ConfigDict(extra="allow", use_attribute_docstrings=True, defer_build=True)
+
+    band: IntervalOutput | None
+    seeds: list[int]
+    __pydantic_extra__: dict[str, SampleStatistics]
+
+
+class SimulateOutput(CommandOutput):
+    """A simulated pour. Fractions are of the load: received + spilled + retained + in_flight + escaped = 1."""
+
+    received: float
+    spilled: float
+    retained: float
+    in_flight: float
+    """Fraction in the air at the end."""
+
+    escaped: float
+    """Fraction that left the simulated box."""
+
+    dribbled: float
+    """Fraction that ran down the outside of the pourer; part of received and spilled."""
+
+    particles: int
+    spacing_mm: float
+    density_error: float
+    simulated_time_s: float
+    steps: int
+    cpu_s: float
+    seed: int
+    curve: dict[str, list[float]]
+    """Poured and spilled fractions over time: `time_s`, `poured`, `spilled`."""
+
+    invalid: str | None
+    """Why the outcome must not be used; null if it is valid."""
+
+    action: dict[str, float | None]
+    theta: SimulationParameters
+    thetas: int
+    """Number of posterior draws of θ."""
+
+    scene: str
+    delivered_g: float | None
+    """Mean mass in the receiver."""
+
+    delivered_ml: float | None
+    prediction: PredictionOutput
+    regimes: dict[str, Any] | None
+    """Flow at the lip and in the stream: Reynolds, Weber and Bond numbers, thickness, velocity."""
+
+    not_covered: list[dict[str, Any]]
+    """Effects of this pour that are not simulated: `kind`, `share`, `text`."""
+
+
+class ScoredPourOutput(CommandOutput):
+    """A weighed pour of the table with its prediction."""
+
+    line: int
+    """Line in the table."""
+
+    split: str
+    action: dict[str, float | None]
+    measured: float | None
+    """r = spilled / poured as weighed; null if it is undefined."""
+
+    predicted: SampleStatistics | None
+    band: IntervalOutput | None
+    inside: bool | None
+    """Whether the measured value is inside the interval."""
+
+
+class ScoresOutput(CommandOutput):
+    """Agreement of predictions and weighed pours."""
+
+    pours: int
+    mean_error: float | None
+    """Mean absolute difference of r."""
+
+    spearman: float | None
+    """Rank correlation."""
+
+    held: int
+    """Number of pours inside their interval."""
+
+    share_held: float | None
+
+
+class SimulateTableOutput(CommandOutput):
+    """Predictions for a table of weighed pours (`--from`)."""
+
+    scene: str
+    from_: Path = Field(serialization_alias="from")
+    scores: dict[str, ScoresOutput]
+    """By split, and for all."""
+
+    level: float
+    """Level of the intervals."""
+
+    theta: SimulationParameters
+    thetas: int
+    simulations: int
+    cpu_s: float
+    bands: dict[str, float | None]
+    """Standard deviations of the shifts in the intervals."""
+
+    pours: list[ScoredPourOutput]
+
+
+class DryRunOutput(CommandOutput):
+    """A planned pour (`--dry-run`)."""
+
+    mode: str
+    action: dict[str, float | None]
+    report: PathReport
+    phases: list[dict[str, Any]]
+    """Phases of the tilt: `name`, `start` and `end` [s]."""
+
+    at_home: bool | None
+    """Whether the arm stands at home; null without `--connect`."""
+
+
+class EmptyPourOutput(CommandOutput):
+    """A cycle with an empty pourer (`--empty`), as in pour.json."""
+
+    run: str
+    mode: str
+    laboratory: str
+    date: str
+    robot: dict[str, str]
+    action: dict[str, float | None]
+    slow: float
+    planned: PathReport
+    tracking: dict[str, float]
+    """Deviations of the executed motion from the planned one."""
+
+    executed_s: float
+    """Duration of the pour."""
+
+
+class ReportOutput(CommandOutput):
+    """A written report."""
+
+    report: Path
+    figures: list[Path]
+
+
+class CheckOutput(CommandOutput):
+    """Checks of a laboratory."""
+
+    laboratory: str
+    mode: str
+    ready: bool
+    """Whether no check fails."""
+
+    checks: list[DeviceCheck]
+
+
+class BalanceCheckOutput(CommandOutput):
+    """Checks of a balance."""
+
+    balance: str
+    """The balance as it was named on the command line."""
+
+    ready: bool
+    """Whether no check fails."""
+
+    checks: list[DeviceCheck]
+
+
+class RefusedLinesOutput(CommandOutput):
+    """A line that a dialect does not understand."""
+
+    line: str
+    """Its bytes, with escapes for those that are no text."""
+
+    count: int
+    reason: str
+
+
+class ExplainedDialectOutput(CommandOutput):
+    """What one dialect reads in the lines of a balance."""
+
+    dialect: str
+    title: str
+    understood: int
+    """Lines that it understands."""
+
+    weights: int
+    """Lines that it reads as a weight."""
+
+    reads: list[str]
+    """The stable weights as read, without repetition."""
+
+    marks: list[str]
+    """Marks of the weights: net, gross."""
+
+    states: dict[str, int]
+    """A state without a weight (an overload), or a number that is no mass (`12 pcs`), and its lines."""
+
+    others: dict[str, int]
+    """Another quantity than the weight, such as a tare, and its lines."""
+
+    refused: list[RefusedLinesOutput]
+
+
+class BalanceExplainOutput(CommandOutput):
+    """The lines of a balance as the dialects read them."""
+
+    file: Path
+    lines: int
+    recorded: dict[str, Any]
+    """What the recording says of itself; empty for a plain file of lines."""
+
+    notes: list[str]
+    best: list[str]
+    """Dialects that read most weights."""
+
+    dialects: list[ExplainedDialectOutput]
+
+
+class ArchiveOutput(CommandOutput):
+    """Replay of the recordings of a commissioning day."""
+
+    archive: str
+    ready: bool
+    """Whether all recordings are read as on the day."""
+
+    checks: list[DeviceCheck]
+
+
+class ValidateSolverOutput(CommandOutput):
+    """Results of the solver's validation cases."""
+
+    solver: str
+    """Fingerprint of the solver's source."""
+
+    full: bool
+    cases: dict[str, dict[str, Any]]
+    """By case: title, cpu_s, figure, and measurements with value, bounds and whether they passed."""
+
+
+class VesselOutput(CommandOutput):
+    """A vessel file that was made."""
+
+    file: Path
+    picture: Path
+    capacity_mL: float  # noqa: N815
+    capacity_deviation_mL: float  # noqa: N815
+    radius_deviation_mm: float | None
+    notes: list[str]
+    doubts: list[str]
+    """Checks that failed."""
+
+
+class PluginsOutput(CommandOutput):
+    """Plug-ins of installed packages."""
+
+    plugins: list[dict[str, str]]
+    """`group`, `name` and `package`."""
+
+    broken: list[dict[str, str]]
+    """Plug-ins that can't be used, with the reason."""
+
+
+class StudyOutput(CommandOutput):
+    """A study that was run or reported."""
+
+    study: str
+    folder: Path
+    page: Path
+    cells: int
+    finished: int | None
+    """Number of finished cells; null for a report."""
+
+
+class StudyCostOutput(CommandOutput):
+    """Unfinished work of a study (`--dry-run`)."""
+
+    cells: list[str]
+    left: int
+    simulations: int
+    pours: int
+    cpu_hours: float
+
+
+class RunCheckOutput(CommandOutput):
+    """Check of a run's records."""
+
+    run: Path
+    complete: bool
+    """Whether the check found no problem."""
+
+    problems: list[str]
+    entries: int
+
+    pours: list[str]
+
+
+class ExportOutput(CommandOutput):
+    """Exported tables."""
+
+    files: list[str]
+    runs: int
+    pours: int
+
+
+class PredictedDoseOutput(CommandOutput):
+    """One dose, predicted."""
+
+    number: int
+    wanted_g: float
+    position: str
+    source: str
+    filled: bool
+    """Whether the source is filled before."""
+
+    expected_g: float
+    interval_g: tuple[float, float]
+    """The expected amount lies in it with a probability of 90 %."""
+
+    duration_s: float
+    longest_s: float
+    """Duration that 95 % of the doses do not exceed."""
+
+    enough: float
+    """Probability that the source holds the amount."""
+
+    fine_flow_g_s: float
+    """Flow at the end of the dose."""
+
+    clean_flow_g_s: float
+    """Smallest flow that leaves the lip cleanly; a slower one may run down the outside."""
+
+    left_g: float
+    """Expected content of the source after the dose."""
+
+    reachable_tolerance_g: float
+    """Half of the 90 % interval of the dose as weighed with this balance."""
+
+    ends: dict[str, int]
+    """Number of predicted doses by their end."""
+
+
+class DosePredictionOutput(CommandOutput):
+    """Doses that were predicted (`--dry-run`)."""
+
+    doses: list[PredictedDoseOutput]
+
+
+class RecordingExportOutput(CommandOutput):
+    """Result of the export of a run's pours."""
+
+    recordings: list[Path]
+    """Files of the recorded pours (YAML), each with a CSV file of the same name."""
+
+    left_out: list[str]
+    """Reasons why pours could not be exported."""
+
+
+class RecordingReplayOutput(CommandOutput):
+    """The replay of a recorded pour. Masses are without the receiver."""
+
+    recording: Path
+    readings: int
+    measured_g: float
+    """Mass at the end."""
+
+    onset: dict[str, float] | None
+    """Time [s] and recorded tilt [deg] at which the readings have risen; null if nothing flowed."""
+
+    arrivals: dict[str, float]
+    """How readings arrived: interval, longest gap, step, and number of readings that repeat while the mass rises."""
+
+    fitted: dict[str, Any]
+    """Values that differ from the file's, and the recordings that they were fitted on."""
+
+    simulation: dict[str, Any] | None
+    """Particle simulation of the recorded tilt: mass at the end, RMS of the readings, onset; null without it."""
+
+    estimator: dict[str, Any]
+    """Estimator of doses over the readings: mass and lag with 90 % intervals, innovation, coverage."""
+
+    warnings: list[str]
+
+
+class RecordingReplaysOutput(CommandOutput):
+    """Replays of recorded pours."""
+
+    replays: list[RecordingReplayOutput]
+
+
+class RecordingFitOutput(CommandOutput):
+    """Quantities that were fitted to recorded pours, and predictions of readings that were not."""
+
+    fitted: dict[str, dict[str, Any]]
+    """Value, 90 % interval and unit of each quantity, and whether the readings identify it."""
+
+    fitted_on: list[str]
+    """Names of the recordings."""
+
+    until_s: float | None
+    """Readings after this time were not fitted."""
+
+    rms_g: list[float]
+    """RMS of the residuals of each recording."""
+
+    held_readings: list[float] | None
+    """Share of the readings that repeat the one before while the mass rises, with its 90 % interval."""
+
+    judged: list[dict[str, Any]]
+    """Predicted and measured mass, RMS and coverage of each judged recording."""
+
+
+class FirstDayOutput(CommandOutput):
+    """What the recordings of a first day show."""
+
+    main: str | None
+    """Quantity that explains the pours best; null if none does better than the tolerances of a rig in order."""
+
+    describes: bool
+    """Whether half of the doses or more are as predicted from the pours."""
+
+    explanations: list[dict[str, Any]]
+    """Name, evidence and value of each quantity; empty if fewer than four pours have readings while they flow."""
+
+    doses: list[dict[str, Any]]
+    """Predicted mass with its 90 % interval, weighed and wanted mass of each dose."""
+
+    missed_g: float | None
+    """Mass in the receiver after the deliberate miss."""
+
+    dose_error_g: list[float] | None
+    """Mean and largest distance of the weighed from the wanted amount."""
+
+    replays: list[RecordingReplayOutput]
