@@ -321,7 +321,7 @@ class InProcessLaboratory(_OpenLaboratory):
 
     For fast tests and single commands.
 
-    Without separate processes the hidden liquid uses the pool's only simulator, since a process has one Taichi: no
+    Without separate processes the ground truth uses the pool's only simulator, since a process has one Taichi: no
     other simulation runs while the bench computes its liquid. Outcomes equal those of `RayLaboratory`.
     """
 
@@ -386,7 +386,7 @@ class RayLaboratory(_OpenLaboratory):
             return
         node = None if self._cluster is None else self._cluster.bench or here
         if self._spec.bench is not None:
-            # The hidden liquid's simulator, on the arm's machine. It reserves no core: the pool's size is the
+            # The ground truth's simulator, on the arm's machine. It reserves no core: the pool's size is the
             # campaign's choice, and a pour must never wait for it.
             placement = None if node is None else node.options
             self._liquid = self._open_pool(ray_pool(1, self._make, cpus=0.0, placement=placement))

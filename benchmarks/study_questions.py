@@ -1,10 +1,11 @@
-"""Answer the six questions of the study of hidden benches (docs/evidence/study-questions.md) from its finished cells.
+"""Answer the six questions of the study of ten worlds (docs/evidence/study-questions.md) from its finished cells.
 
     python benchmarks/study_questions.py [runs/study-benches] [--write] [--intervals]
 
-Each value belongs to a bench: the mean over its repetitions (and receivers) of differences paired by repetition. The
-mean over the benches has a 95 % t interval. `--write` puts the table into docs/evidence/results.md. `--intervals` only
-counts the pours of D3 in their 90 % intervals; with `--write` it stores this table in docs/data/results.json.
+Each value belongs to a world, a virtual bench with its ground truth: the mean over its repetitions (and receivers) of
+differences paired by repetition. The mean over the worlds has a 95 % t interval. `--write` puts the table into
+docs/evidence/results.md. `--intervals` only counts the pours of D3 in their 90 % intervals; with `--write` it stores
+this table in docs/data/results.json.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ from orchestrator.study.study_statistics import (
 from sim_engine.prediction_band import LEVEL as INTERVAL
 
 PAGE = ROOT / "docs" / "evidence" / "results.md"
-BEGIN, END = "<!-- measured: hidden benches -->\n", "<!-- end of measured -->"
+BEGIN, END = "<!-- measured: worlds -->\n", "<!-- end of measured -->"
 STUDY = ROOT / "configs" / "studies" / "benches.yaml"
 COMMAND = "python benchmarks/study_questions.py"
 NEAR = 0.005
 """'Within half a point', and the largest excess error allowed for six active pours compared with twelve."""
 
-ByBench = dict[str, float]
+ByWorld = dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -52,50 +53,50 @@ class Answer:
     """One question with its answer."""
 
     question: str
-    by_bench: ByBench
-    yes: Callable[[Estimate, ByBench], bool]
+    by_world: ByWorld
+    yes: Callable[[Estimate, ByWorld], bool]
     unit: str = "points"
 
     def row(self) -> str:
         """Return the row of the table."""
-        found = estimate(list(self.by_bench.values()))
+        found = estimate(list(self.by_world.values()))
         factor = 100.0 if self.unit == "points" else 1.0
-        better = sum(value < 0.0 for value in self.by_bench.values())
+        better = sum(value < 0.0 for value in self.by_world.values())
         shown = f"{factor * found.mean:.2f} ({factor * found.low:.2f} … {factor * found.high:.2f}) {self.unit}"
-        said = "yes" if self.yes(found, self.by_bench) else "no"
+        said = "yes" if self.yes(found, self.by_world) else "no"
         return f"| {self.question} | {shown} | {better} of {found.count} | {said} |"
 
 
-def calibrated(found: Gathered, levels: list[str], first: str, second: str) -> ByBench:
+def calibrated(found: Gathered, levels: list[str], first: str, second: str) -> ByWorld:
     """Return the test discrepancy of one calibration minus that of another."""
     a, b = tests_of(found, first), tests_of(found, second)
-    return _by_bench(levels, {number: a[number] - b[number] for number in a.keys() & b.keys()})
+    return _by_world(levels, {number: a[number] - b[number] for number in a.keys() & b.keys()})
 
 
-def _by_bench(levels: list[str], differences: Mapping[int, float]) -> ByBench:
+def _by_world(levels: list[str], differences: Mapping[int, float]) -> ByWorld:
     grouped = {level: [d for n, d in differences.items() if n // LEVEL == i] for i, level in enumerate(levels)}
     return {level: mean(values) for level, values in grouped.items() if values}
 
 
 def deployed(
     found: Gathered, levels: list[str], receivers: list[str], value: Callable[[Key], dict[int, float]]
-) -> ByBench:
+) -> ByWorld:
     """Return a deployment's value for D3 minus that for D2, by bench."""
-    by_bench: ByBench = {}
+    by_world: ByWorld = {}
     for level in levels:
         differences = []
         for receiver in receivers:
             ours, theirs = (value(Key(level, receiver, arm)) for arm in ("D3", "D2"))
             differences += [ours[n] - theirs[n] for n in ours.keys() & theirs.keys()]
         if differences:
-            by_bench[level] = mean(differences)
-    return by_bench
+            by_world[level] = mean(differences)
+    return by_world
 
 
 def answers(found: Gathered, levels: list[str], receivers: list[str]) -> list[Answer]:
     """Return the answers to all six questions."""
 
-    def below_zero(one: Estimate, _: ByBench) -> bool:
+    def below_zero(one: Estimate, _: ByWorld) -> bool:
         return one.high < 0.0
 
     def losses(key: Key) -> dict[int, float]:
@@ -136,7 +137,7 @@ def answers(found: Gathered, levels: list[str], receivers: list[str]) -> list[An
 
 def table(found: Gathered, levels: list[str], receivers: list[str]) -> str:
     """Return Markdown: one row per question, and the description of the runs."""
-    rows = ["| question | difference, 95 % interval over benches | first better on | |", "|---|---|---|---|"]
+    rows = ["| question | difference, 95 % interval over worlds | first better on | |", "|---|---|---|---|"]
     rows += [one.row() for one in answers(found, levels, receivers)]
     shares = {name: 100.0 * mean(list(tests_of(found, name).values())) for name in found.calibrated}
     means = ", ".join(f"{name} {share:.1f}" for name, share in shares.items())

@@ -21,7 +21,7 @@ from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel
-from tests.support.measured_vessel import FOCAL, Bench, vessel
+from tests.support.measured_vessel import FOCAL, MeasuredVessel, vessel
 
 PAGE = Path("docs/evidence/results.md")
 PARTICLES = 600
@@ -48,7 +48,7 @@ class Row:
     spillage: tuple[float, float]
 
 
-def vessel_sources(of: Bench, folder: Path) -> dict[str, dict[str, Any]]:
+def vessel_sources(of: MeasuredVessel, folder: Path) -> dict[str, dict[str, Any]]:
     """Return the arguments of `decant vessel` by source."""
     tall, wall, floor = f"{of.height} m", f"{of.shape.wall} m", f"{of.shape.floor} m"
     outside = f"{of.height + of.shape.floor} m"
@@ -103,7 +103,7 @@ def measure(seeds: int) -> list[Row]:
     """Measure all vessels from all sources."""
     rows, simulator = [], PourSimulator()
     for name in OFFSETS:
-        of = Bench(load_vessel(Path(f"configs/vessels/{name}.yaml")))
+        of = MeasuredVessel(load_vessel(Path(f"configs/vessels/{name}.yaml")))
         z = np.linspace(0.02, 0.99, 200) * of.height
         true = of.radius(z)
         right = spillages(of.spec, name, simulator, range(4 * seeds))

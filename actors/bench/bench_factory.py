@@ -283,7 +283,7 @@ async def open_bench(
     Args:
         spec: settings of the laboratory.
         make: creates devices on the bench's machine.
-        liquid: simulates the hidden liquid of a virtual bench.
+        liquid: simulates the ground truth of a virtual bench.
         operator: the person who answers, if one does.
         tell: receives notices.
         record: what stands where, for a laboratory with places.

@@ -1,7 +1,7 @@
 """The ground truth of a bench: what truly happens to the liquid, which calibration sees only through the balance.
 
 - `GroundTruth` has the hooks that a pour calls. On hardware they do nothing; virtual benches override them.
-- `hidden_pour` and `hidden_spill` simulate one pour of a virtual bench's 'real' liquid, which has hidden parameters and
+- `true_pour` and `true_spill` simulate one pour of a virtual bench's ground truth, which has hidden parameters and
   is poured with hidden pose errors. `Spill` holds the resulting masses. The simulations run in a simulator pool of
   their own, so that they never occupy a simulator of the calibration.
 """
@@ -27,7 +27,7 @@ from sim_engine.scene import PoseError, PourTask, Scene
 T = TypeVar("T")
 
 WATCHED_RATE = 10.0
-"""Frame rate of the hidden liquid's particles for the live view [1/s]."""
+"""Frame rate of the ground truth's particles for the live view [1/s]."""
 
 ATTEMPTS = 3
 """Number of initial particle positions to try before the simulation of the liquid fails."""
@@ -90,12 +90,12 @@ class Spill:
     frames: RecordedFrames | None = None
 
 
-async def hidden_pour(spec: BenchSettings, simulators: SimulatorPool, task: PourTask, seed: int) -> SimulatedPour:
+async def true_pour(spec: BenchSettings, simulators: SimulatorPool, task: PourTask, seed: int) -> SimulatedPour:
     """Simulate the 'real' liquid in one pour; the same seed gives the same result.
 
     Args:
         spec: of the bench, with the hidden θ.
-        simulators: a separate pool for the hidden liquid.
+        simulators: a separate pool for the ground truth.
         task: scene and motion of the pour; θ and seed are filled in here.
         seed: of the pour.
 
@@ -115,7 +115,7 @@ async def hidden_pour(spec: BenchSettings, simulators: SimulatorPool, task: Pour
     raise LaboratoryError(f"the virtual bench's liquid could not be simulated: {reason}")
 
 
-async def hidden_spill(
+async def true_spill(
     spec: BenchSettings,
     simulators: SimulatorPool,
     scene: Scene,
@@ -124,18 +124,18 @@ async def hidden_spill(
     frame_rate: float = 0.0,
 ) -> Spill:
     """Simulate the liquid for an arm that executes the commanded action with this pour's errors; raises like
-    `hidden_pour`.
+    `true_pour`.
 
     Args:
         spec: of the bench, with the hidden θ and errors.
-        simulators: a separate pool for the hidden liquid.
+        simulators: a separate pool for the ground truth.
         scene: the intended scene.
         action: the commanded action.
         seed: of the pour.
         frame_rate: rate of the recorded particle frames for the live view [1/s].
     """
     task = PourTask(scene, action, spec.theta, 0, frame_rate=frame_rate, pose_error=draw_pose_error(spec, seed))
-    simulated = await hidden_pour(spec, simulators, task, seed)
+    simulated = await true_pour(spec, simulators, task, seed)
     return replace(spill_of(simulated.outcome, scene.liquid.mass), frames=simulated.frames)
 
 
@@ -174,7 +174,7 @@ class PourAsk:
 
     @property
     def frame_rate(self) -> float:
-        """Frame rate of the hidden liquid's particles [1/s]; 0 without a live view. The simulation is unaffected."""
+        """Frame rate of the ground truth's particles [1/s]; 0 without a live view. The simulation is unaffected."""
         return 0.0 if self.show is None else WATCHED_RATE
 
     def shown(self, frames: RecordedFrames | None) -> None:

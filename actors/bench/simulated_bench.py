@@ -1,4 +1,4 @@
-"""The simulated bench: arm and balance are simulated in the driver, and the hidden liquid is poured before the arm
+"""The simulated bench: arm and balance are simulated in the driver, and the ground truth is poured before the arm
 moves.
 
 The same seed and action give the same measurement bit for bit, independent of earlier pours and of the clock: bench
@@ -18,7 +18,7 @@ from actors.balance.balance_device import DeviceBalance
 from actors.balance.scale_model import Load
 from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
-from actors.bench.ground_truth import GroundTruth, PourAsk, Spill, TouchingError, draw_pose_error, hidden_spill, stream
+from actors.bench.ground_truth import GroundTruth, PourAsk, Spill, TouchingError, draw_pose_error, stream, true_spill
 from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSettings, PourFailedError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
 
@@ -41,8 +41,8 @@ class SimulatedBench(GroundTruth):
     """The ground truth of a simulated bench.
 
     Args:
-        spec: hidden liquid, errors, time scale.
-        simulators: a separate pool for the hidden liquid.
+        spec: ground truth, errors, time scale.
+        simulators: a separate pool for the ground truth.
         arm: the simulated arm.
         balance: the simulated balance; bench time passes on it.
     """
@@ -61,7 +61,7 @@ class SimulatedBench(GroundTruth):
         """See `GroundTruth.prepare`; starts the simulation of the liquid."""
         self._pour = pour
         self._liquid = asyncio.create_task(
-            hidden_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed, pour.frame_rate)
+            true_spill(self._spec, self._simulators, pour.scene, pour.action, pour.seed, pour.frame_rate)
         )
         await self._balance.prepare(stream(pour.seed, "balance"))
         error = draw_pose_error(self._spec, pour.seed)

@@ -27,7 +27,7 @@ from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, ba
 from actors.balance.scale_model import Load
 from actors.bench.bench_operators import Hands
 from actors.bench.flowing_liquid import FlowEnd, FlowingLiquid, FlowOrder
-from actors.bench.ground_truth import GroundTruth, PourAsk, draw_pose_error, hidden_pour, spill_of, stream
+from actors.bench.ground_truth import GroundTruth, PourAsk, draw_pose_error, spill_of, stream, true_pour
 from actors.dosing.dose_series import source_of
 from actors.dosing.simulated_dose import true_cup
 from actors.grippers.gripper_interface import GripperEmulator, GripperSettings
@@ -322,11 +322,11 @@ class VirtualBench(GroundTruth):
     """A bench without hardware whose liquid follows the poses that the arm read back.
 
     Args:
-        spec: the hidden liquid and errors.
+        spec: the ground truth and errors.
         time_scale: bench seconds per second of the clock.
         emulators: the emulators of arm and balance.
         hands: fill the pourer and hold the bench contents.
-        simulators: a separate pool for the hidden liquid.
+        simulators: a separate pool for the ground truth.
     """
 
     def __init__(
@@ -409,7 +409,7 @@ class VirtualBench(GroundTruth):
         shift = PoseError(x=error.x, y=error.y, z=error.z)
         task = PourTask(scene, pour.action, SimulationParameters(), 0, pose_error=shift, motion=motion)
         task = replace(task, frame_rate=pour.frame_rate)
-        simulated = await hidden_pour(self._spec, self._simulators, task, pour.seed)
+        simulated = await true_pour(self._spec, self._simulators, task, pour.seed)
         pour.shown(simulated.frames)
         spill = spill_of(simulated.outcome, mass)
         return spill.spilled, spill.retained

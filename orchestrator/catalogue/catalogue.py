@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self
 from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, annotate
 from orchestrator.catalogue.export import write_tables
 from orchestrator.catalogue.queries import condition_sql, differing_settings, outcomes
-from orchestrator.catalogue.run_reading import TABLES, UNREADABLE, Column, RunRead, read_run, unreadable
+from orchestrator.catalogue.run_reading import TABLES, UNREADABLE, Column, RunRows, read_run, unreadable
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import has_begun
@@ -289,7 +289,7 @@ class Catalogue:
             problem = f"{path}: its journal has values that can't be entered ({error}); see `decant runs check`"
             self._enter(path, stamp, unreadable(Path(path), problem, read.annotations))
 
-    def _enter(self, path: str, stamp: str, read: RunRead) -> None:
+    def _enter(self, path: str, stamp: str, read: RunRows) -> None:
         """Replace the rows of a run. The previous folder of a moved run, with the same name and start, is removed."""
         run, annotations = read.run, read.annotations
         with _transaction(self._connection):

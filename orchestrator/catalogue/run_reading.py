@@ -166,7 +166,7 @@ UNREADABLE = "unreadable"
 
 
 @dataclass(frozen=True)
-class RunRead:
+class RunRows:
     """The catalogue's content of a run: rows by the names of the columns, its posterior (JSON; '' without one), and its
     tags and notes."""
 
@@ -176,12 +176,12 @@ class RunRead:
     annotations: Annotations = field(default_factory=Annotations)
 
 
-def read_run(directory: Path) -> RunRead:
+def read_run(directory: Path) -> RunRows:
     """Read a run, also while it is being written. A run that can't be read is `UNREADABLE`; nothing is raised."""
     annotations = Annotations()
     try:
         annotations = read_annotations(directory)
-        return RunRead(*_rows(directory), annotations=annotations)
+        return RunRows(*_rows(directory), annotations=annotations)
     except (RunError, CodecError, AnnotationsError, OSError) as error:
         return unreadable(directory, str(error), annotations)
     except Exception as error:  # damaged content can cause any error, and must not hide other runs
@@ -190,12 +190,12 @@ def read_run(directory: Path) -> RunRead:
         )
 
 
-def unreadable(directory: Path, problem: str, annotations: Annotations) -> RunRead:
+def unreadable(directory: Path, problem: str, annotations: Annotations) -> RunRows:
     """An unreadable run: its folder, the time of its last change, and the reason."""
     row: Row = {"run": directory.name, "path": str(directory), "state": UNREADABLE, "reason": problem}
     with contextlib.suppress(OSError):
         row["begun"] = row["ended"] = directory.stat().st_mtime
-    return RunRead(row, annotations=annotations)
+    return RunRows(row, annotations=annotations)
 
 
 def _rows(directory: Path) -> tuple[Row, list[Row], str]:

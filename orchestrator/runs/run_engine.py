@@ -81,7 +81,7 @@ async def run_campaign(
             a pour's records (NoSpaceError), or the laboratory or a strategy fails.
         LaboratoryError: the laboratory can't be opened.
     """
-    run = _Run(
+    run = _RunEngine(
         plan,
         laboratory,
         run_directory,
@@ -106,7 +106,7 @@ def _default_deadlines(plan: CampaignPlan) -> Deadlines:
 
 
 @dataclass
-class _Run:
+class _RunEngine:
     """One process's part of a campaign's run."""
 
     _plan: CampaignPlan

@@ -16,7 +16,7 @@ import numpy as np
 
 from actors.dosing.dose_estimator import calibrated_knowledge
 from actors.interfaces import DoseKnowledge
-from orchestrator.learning.calibration.action_prior import Contexts, drawn_benches
+from orchestrator.learning.calibration.action_prior import Contexts, drawn_worlds
 from orchestrator.learning.calibration.active_design import ActivePours
 from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.learning.calibration.calibration_scores import (
@@ -373,8 +373,8 @@ def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationPar
         posterior = [SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in rows]
     if not posterior:
         return deployment
-    benches = drawn_benches(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
-    return replace(deployment, bench=tuple(displacement(best, bench, deployment.actions) for bench in benches))
+    worlds = drawn_worlds(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
+    return replace(deployment, bench=tuple(displacement(best, world, deployment.actions) for world in worlds))
 
 
 def by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:

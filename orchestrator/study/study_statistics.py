@@ -36,7 +36,7 @@ RANDOM = "random θ"
 """Label of the random θ of a study, which count as one strategy."""
 
 LEVEL = 100_000
-"""Offset between the repetition numbers of different benches, if calibrations are compared on all of them."""
+"""Offset between the repetition numbers of different worlds, if calibrations are compared on all of them."""
 
 
 @dataclass
@@ -132,7 +132,7 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
         found.cpu_s += data.cpu_s
         found.seconds += data.seconds
         if cell.kind in ("calibration", "uncalibrated") and study.compares(cell.level):
-            # repetitions on different benches count separately: each has its own number
+            # repetitions in different worlds count separately: each has its own number
             number = cell.repetition + LEVEL * levels.index(cell.level)
             if _differences(data, "test", random=True):
                 _add(found.calibrated.setdefault(RANDOM, Found()), number, data, random=True)

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from orchestrator.catalogue import catalogue as index
 from orchestrator.catalogue.catalogue import INDEX_NAME, Catalogue
 from orchestrator.catalogue.queries import moment
-from orchestrator.catalogue.run_reading import POURS, RUNS, RunRead, read_run
+from orchestrator.catalogue.run_reading import POURS, RUNS, RunRows, read_run
 from orchestrator.cli import console
 from orchestrator.cli.app import app
 from orchestrator.records import run_registry as registry
@@ -131,7 +131,7 @@ def test_a_query_does_not_wait_for_another_process_that_reads_runs(
     names = {made(tmp_path).name, made(tmp_path).name}
     found: list[set[str]] = []
 
-    def read_slowly(directory: Path) -> RunRead:
+    def read_slowly(directory: Path) -> RunRows:
         monkeypatch.setattr(index, "read_run", read_run)
         found.append({run["run"] for run in asked()})  # another process, while this one reads a journal
         return read_run(directory)

@@ -35,7 +35,7 @@ def vessel(out: Path, **options: Any) -> None:
 
 
 @dataclass
-class Bench:
+class MeasuredVessel:
     """Somebody with tools beside a vessel."""
 
     spec: VesselSpec

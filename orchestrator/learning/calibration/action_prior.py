@@ -1,10 +1,10 @@
-"""Actions of calibration pours: the prior g over them, the surrogate's contexts, and draws of θ for uncertain benches.
+"""Actions of calibration pours: the prior g over them, the surrogate's contexts, and draws of θ for uncertain worlds.
 
 - `actions_of_prior` draws actions from g: a scrambled Sobol sequence, restricted by the constraints. g is uniform,
   except along dimensions with a normal prior.
 - `actions_all_over` selects actions from the whole space for checks.
 - `Contexts` maps actions in several scenes to points of one context space, and back.
-- `drawn_benches` draws complete θ with nuisances, from a calibration's posterior or from declared tolerances.
+- `drawn_worlds` draws complete θ with nuisances, from a calibration's posterior or from declared tolerances.
 
 The module is loaded whenever a campaign file is read. It therefore imports scipy only inside the functions that draw.
 """
@@ -114,7 +114,7 @@ FARTHEST = 3.0
 """Limit of drawn nuisances, in standard deviations."""
 
 
-def drawn_benches(
+def drawn_worlds(
     best: SimulationParameters,
     count: int,
     seed: int,
@@ -151,14 +151,14 @@ def drawn_benches(
     sampler = qmc.Sobol(len(nuisances), scramble=True, rng=np.random.default_rng([seed % 2**64, *b"bench"]))
     uniform = sampler.random_base2(math.ceil(math.log2(count)) if count > 1 else 0)[:count]
     z = np.clip(ndtri(uniform), -FARTHEST, FARTHEST)
-    benches = []
+    worlds = []
     for row, theta in zip(z, rows, strict=True):
         moved = {
             info.name: min(max(getattr(theta, info.name) + info.tolerance * float(u), info.lower), info.upper)
             for info, u in zip(nuisances, row, strict=True)
         }
-        benches.append(theta.model_copy(update=moved))
-    return tuple(benches)
+        worlds.append(theta.model_copy(update=moved))
+    return tuple(worlds)
 
 
 class Contexts:

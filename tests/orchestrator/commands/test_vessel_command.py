@@ -16,13 +16,13 @@ from orchestrator.cli.console import RefusalError
 from orchestrator.cli.vessel_tables import read_fill_table, read_photograph
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
-from tests.support.measured_vessel import FOCAL, Bench, vessel
+from tests.support.measured_vessel import FOCAL, MeasuredVessel, vessel
 
 VESSELS = Path("configs/vessels")
 
 
-def bench(name: str) -> Bench:
-    return Bench(load_vessel(VESSELS / f"{name}.yaml"))
+def measured(name: str) -> MeasuredVessel:
+    return MeasuredVessel(load_vessel(VESSELS / f"{name}.yaml"))
 
 
 def made(tmp_path: Path, sources: dict[str, Any]) -> float:
@@ -33,37 +33,37 @@ def made(tmp_path: Path, sources: dict[str, Any]) -> float:
     return build_vessel(load_vessel(out), use_cache=False).capacity
 
 
-Door = Callable[[Bench, Path], dict[str, Any]]
+Door = Callable[[MeasuredVessel, Path], dict[str, Any]]
 
 
-def callipers(of: Bench, folder: Path) -> dict[str, Any]:
+def callipers(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return {"height": f"{of.height} m", "diameters": of.diameters(), "wall": f"{of.shape.wall} m"}
 
 
-def fill(of: Bench, folder: Path) -> dict[str, Any]:
+def fill(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return {"height": f"{of.height} m", "fill": of.fill(folder / "fill.csv"), "wall": "3 mm"}
 
 
-def tilt(of: Bench, folder: Path) -> dict[str, Any]:
+def tilt(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return {"height": f"{of.height} m", "tilt": of.tilt(folder / "tilt.csv"), "wall": "3 mm"}
 
 
-def photo(of: Bench, folder: Path) -> dict[str, Any]:
+def photo(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     tall = of.height + of.shape.floor
     wall, floor = f"{of.shape.wall} m", f"{of.shape.floor} m"
     return {"photo": of.photo(folder / "side.png"), "known_height": f"{tall} m", "wall": wall, "floor": floor}
 
 
-def points(of: Bench, folder: Path) -> dict[str, Any]:
+def points(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return {"points": of.save_cloud(folder / "cloud.csv"), "unit": "mm", "floor": f"{of.shape.floor} m"}
 
 
-def depth(of: Bench, folder: Path) -> dict[str, Any]:
+def depth(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     wall, floor = f"{of.shape.wall} m", f"{of.shape.floor} m"
     return {"depth": of.depth(folder / "depth.png"), "focal": FOCAL, "wall": wall, "floor": floor}
 
 
-def mesh(of: Bench, folder: Path) -> dict[str, Any]:
+def mesh(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     of.solid().export(folder / "scan.stl")
     return {"mesh": folder / "scan.stl"}
 
@@ -75,14 +75,14 @@ def mesh(of: Bench, folder: Path) -> dict[str, Any]:
     [callipers, fill, tilt, photo, *(pytest.param(each, marks=pytest.mark.slow) for each in (points, depth, mesh))],
 )
 def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
-    of, within = bench(name), 0.03 if door is depth else 0.015  # a pixel of the camera is 1.4 mm on the cup
+    of, within = measured(name), 0.03 if door is depth else 0.015  # a pixel of the camera is 1.4 mm on the cup
     assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=within)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_photograph_is_measured_as_it_is_shown_however_the_camera_was_held(tmp_path: Path, orientation: int) -> None:
     """A camera stores what its sensor saw, and in EXIF how that has to be turned or mirrored."""
-    of = bench("tumbler")
+    of = measured("tumbler")
     shown = Image.open(of.photo(tmp_path / "shown.png"))
     stored = shown if (turn := AS_STORED[orientation]) is None else shown.transpose(turn)
     exif = Image.Exif()
@@ -106,7 +106,7 @@ AS_STORED = {
 
 @pytest.mark.slow
 def test_a_cup_photographed_upright_by_a_camera_on_its_side_comes_out_as_it_is(tmp_path: Path) -> None:
-    of = bench("tumbler")
+    of = measured("tumbler")
     sources = photo(of, tmp_path)
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
@@ -116,7 +116,7 @@ def test_a_cup_photographed_upright_by_a_camera_on_its_side_comes_out_as_it_is(t
 
 @pytest.mark.slow
 def test_a_bowl_wider_than_high_comes_out_as_it_is_from_a_photograph_out_of_level(tmp_path: Path) -> None:
-    of = bench("bowl")
+    of = measured("bowl")
     assert made(tmp_path, photo(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
@@ -124,7 +124,7 @@ def test_a_bowl_wider_than_high_comes_out_as_it_is_from_a_photograph_out_of_leve
 def test_a_large_photograph_with_little_room_beside_the_vessel_will_do(tmp_path: Path) -> None:
     from PIL import Image, ImageChops
 
-    of = bench("tumbler")
+    of = measured("tumbler")
     sources = photo(of, tmp_path)
     with Image.open(sources["photo"]) as whole:
         seen = ImageChops.difference(whole, Image.new(whole.mode, whole.size, whole.getpixel((0, 0))))
@@ -140,7 +140,7 @@ def test_a_large_photograph_with_little_room_beside_the_vessel_will_do(tmp_path:
 def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import json
 
-    of, deviations = bench("bowl"), []
+    of, deviations = measured("bowl"), []
     for number, sources in enumerate(
         (
             fill(of, tmp_path),
@@ -164,7 +164,7 @@ def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsy
 @pytest.mark.slow
 @pytest.mark.parametrize("door", [callipers, fill, pytest.param(photo, marks=pytest.mark.slow)])
 def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) -> None:
-    made(tmp_path, door(bench("cone"), tmp_path))
+    made(tmp_path, door(measured("cone"), tmp_path))
     told = float((tmp_path / "made.yaml").read_text().partition("±")[2].split()[0])
     found = load_vessel(tmp_path / "made.yaml")
     capacities = [volume(np.array(found.drawn(seed).shape.outline().inner)) for seed in range(200)]  # type: ignore[attr-defined]
@@ -172,7 +172,7 @@ def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) 
 
 
 def test_a_brimful_cup_that_weighs_otherwise_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    of = bench("tumbler")
+    of = measured("tumbler")
     sources = callipers(of, tmp_path)
     vessel(tmp_path / "right.yaml", **(sources | {"brimful": "321 g"}))
     assert "warning" not in capsys.readouterr().err
@@ -183,7 +183,7 @@ def test_a_brimful_cup_that_weighs_otherwise_is_told(tmp_path: Path, capsys: pyt
 
 @pytest.mark.slow
 def test_a_sheet_is_thickened_and_holes_are_closed(tmp_path: Path) -> None:
-    of = bench("bowl")
+    of = measured("bowl")
     sheet = trimesh.creation.revolve(1e3 * of.inner, sections=64)
     sheet.update_faces(sheet.nondegenerate_faces())
     keep = np.ones(len(sheet.faces), bool)
@@ -198,7 +198,7 @@ def test_a_sheet_is_thickened_and_holes_are_closed(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_vessel_that_is_not_round_becomes_a_mesh(tmp_path: Path) -> None:
-    of = bench("tumbler")
+    of = measured("tumbler")
     oval = of.cloud(noise=1e-4) * [1.0, 0.8, 1.0]
     np.savetxt(tmp_path / "oval.csv", 1e3 * oval, delimiter=",", header="x,y,z", comments="")
     capacity = made(tmp_path, {"points": tmp_path / "oval.csv", "unit": "mm", "floor": "4 mm"})
@@ -206,23 +206,23 @@ def test_a_vessel_that_is_not_round_becomes_a_mesh(tmp_path: Path) -> None:
     assert capacity == pytest.approx(0.8 * of.vessel.capacity, rel=0.04)
 
 
-def two_cups(of: Bench, folder: Path) -> dict[str, Any]:
+def two_cups(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     other = of.solid().apply_translation([300.0, 0.0, 0.0])
     trimesh.util.concatenate([of.solid(), other]).export(folder / "two.stl")
     return {"mesh": folder / "two.stl", "unit": "mm"}
 
 
-def tiny(of: Bench, folder: Path) -> dict[str, Any]:
+def tiny(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     of.solid().apply_scale(1e-6).export(folder / "tiny.stl")
     return {"mesh": folder / "tiny.stl"}
 
 
-def steep(of: Bench, folder: Path) -> dict[str, Any]:
+def steep(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return depth(of, folder) | {"depth": of.depth(folder / "steep.png", down=0.7)}
 
 
 def written(text: str) -> Door:
-    def door(of: Bench, folder: Path) -> dict[str, Any]:
+    def door(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
         (folder / "fill.csv").write_text(text)
         return {"height": "100 mm", "fill": folder / "fill.csv", "wall": "3 mm"}
 
@@ -283,7 +283,7 @@ def written(text: str) -> Door:
 )
 def test_what_makes_no_vessel_is_refused_and_nothing_is_written(tmp_path: Path, door: Door, said: str) -> None:
     with pytest.raises(RefusalError, match=said) as refused:
-        vessel(tmp_path / "cup.yaml", **door(bench("tumbler"), tmp_path))
+        vessel(tmp_path / "cup.yaml", **door(measured("tumbler"), tmp_path))
     assert refused.value.code == 2
     assert not (tmp_path / "cup.yaml").exists()
     assert not (tmp_path / "cup.stl").exists()
@@ -298,7 +298,7 @@ def test_no_file_is_written_over(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["12", "no"])
 def test_a_file_that_is_called_a_number_can_be_read(tmp_path: Path, name: str) -> None:
     out = tmp_path / f"{name}.yaml"
-    vessel(out, **callipers(bench("tumbler"), tmp_path))
+    vessel(out, **callipers(measured("tumbler"), tmp_path))
     assert load_vessel(out).name == name
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from orchestrator.campaigns.file_loading import load_campaign, load_parameters, load_posterior
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.learning.calibration.action_prior import drawn_benches
+from orchestrator.learning.calibration.action_prior import drawn_worlds
 from orchestrator.learning.calibration.calibration_base import described
 from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.learning.campaign_plan import MeasuredPour, NormalPrior
@@ -80,13 +80,13 @@ def test_the_theta_file_carries_nuisances_to_whoever_plans_with_it(found: Any, t
 @pytest.mark.slow
 def test_benches_are_drawn_from_the_posterior_and_what_it_leaves_unsaid_from_tolerances(found: Any) -> None:
     complete = [SimulationParameters.from_values({**found.theta.model_dump(), **row}) for row in found.posterior.thetas]
-    benches = drawn_benches(found.theta, 256, 3, posterior=complete, known=SEARCHED.names)
-    assert benches == drawn_benches(found.theta, 256, 3, posterior=complete, known=SEARCHED.names)
+    benches = drawn_worlds(found.theta, 256, 3, posterior=complete, known=SEARCHED.names)
+    assert benches == drawn_worlds(found.theta, 256, 3, posterior=complete, known=SEARCHED.names)
     assert {bench.receiver_x for bench in benches} <= {theta.receiver_x for theta in complete}
     sides = np.array([bench.receiver_y for bench in benches])
     assert abs(sides.mean()) < 0.0003
     assert sides.std() == pytest.approx(0.003, rel=0.1)
-    alone = drawn_benches(SimulationParameters(receiver_x=0.03), 64, 0)
+    alone = drawn_worlds(SimulationParameters(receiver_x=0.03), 64, 0)
     assert max(bench.receiver_x for bench in alone) == 0.03  # not beyond the bounds
     assert {bench.friction for bench in alone} == {0.0}
 
