@@ -17,7 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from orchestrator.daemon.daemon_client import Client, DaemonError
+from orchestrator.daemon.daemon_client import Client, DaemonError, order_body
+from orchestrator.daemon.pour_request import PourIn
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.resources import require
 
@@ -170,10 +171,12 @@ class Station:
         Raises:
             DecantError: the order is invalid or refused, or the daemon can't be reached; the text gives the reason.
         """
-        body = {
-            **{"id": id, "source": source, "receiver": receiver, "amount": amount, "tolerance": tolerance},
-            **{"action": dict(action or {}), "liquid": liquid, "rig": rig, "dry_run": dry_run},
-        }
+        body = order_body(
+            lambda: PourIn(
+                id=id, source=source, receiver=receiver, amount=amount, tolerance=tolerance, action=dict(action or {}),
+                liquid=liquid, rig=rig, dry_run=dry_run,
+            )
+        )  # fmt: skip
         placed = _pour(self._posted("/pours", body))
         return placed if dry_run or wait <= 0.0 else self.wait(id, wait)
 

@@ -40,11 +40,15 @@ def order(
                 f"--set: {text!r} should be name=value, for example angular_velocity='60 deg/s'", BAD_INPUT
             )
         action[name] = value
-    body = {
-        **{"id": key, "source": source, "receiver": receiver, "amount": amount, "tolerance": tolerance},
-        **{"action": action, "dry_run": dry_run},
-    }
     with connected_client(url, state) as client:
+        from orchestrator.daemon.daemon_client import order_body
+
+        body = order_body(
+            lambda: PourIn(
+                id=key, source=source, receiver=receiver, amount=amount, tolerance=tolerance, action=action,
+                dry_run=dry_run,
+            )
+        )  # fmt: skip
         found = client.post(f"/pours?wait={wait:g}", body)
     if as_json:
         print_json(found)

@@ -11,7 +11,7 @@ import os
 import ssl
 import time
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -19,9 +19,11 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import httpx
+from pydantic import ValidationError
 
 from orchestrator.daemon import PHYSICAL, PORT
 from orchestrator.daemon.access_tokens import Role, token_of
+from orchestrator.daemon.pour_request import PourIn, problems_text
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.run_registry import state_directory
 
@@ -56,6 +58,22 @@ class ServerReply:
     id: int
     type: str
     data: dict[str, Any]
+
+
+def order_body(make: Callable[[], PourIn]) -> dict[str, Any]:
+    """The body of `POST /pours`.
+
+    Args:
+        make: the order.
+
+    Raises:
+        DaemonError: it is invalid, in the words of the daemon.
+    """
+    try:
+        body: dict[str, Any] = make().model_dump(exclude_unset=True)
+    except ValidationError as error:
+        raise DaemonError(problems_text(error.errors()), 2) from None
+    return body
 
 
 class Client:
@@ -205,7 +223,7 @@ def _check(answer: httpx.Response) -> None:
     except (ValueError, KeyError, TypeError):
         detail = answer.text[:500] or answer.reason_phrase
     if isinstance(detail, list):  # validation errors of FastAPI
-        detail = "; ".join(f"{'.'.join(map(str, one['loc'][1:]))}: {one['msg']}" for one in detail)
+        detail = problems_text(detail, 1)
     code = 2 if answer.status_code in (400, 404, 413, 422) else 1
     raise DaemonError(str(detail), code)
 

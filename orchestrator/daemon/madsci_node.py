@@ -32,7 +32,7 @@ from pydantic import BaseModel, ValidationError, WithJsonSchema
 from orchestrator.daemon.daemon_settings import MadsciSettings, networks
 from orchestrator.daemon.daemon_store import ENDED, DesiredState, QueueItem
 from orchestrator.daemon.ordering import Ordering
-from orchestrator.daemon.pour_request import PourIn, described
+from orchestrator.daemon.pour_request import PourIn, described, problems_text
 from orchestrator.daemon.submissions import Submission, prepare
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.learning.run_errors import RunError
@@ -268,8 +268,7 @@ class MadsciNode:
             found = await self._ordering.pour(request, PERSON)
             predicted = found if dry else None
         except ValidationError as problem:
-            told = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in problem.errors())
-            error = f"args: {told}"
+            error = f"args: {problems_text(problem.errors())}"
         except RunError as problem:
             error = str(problem)
         kept = None if predicted is None else json.dumps(predicted)

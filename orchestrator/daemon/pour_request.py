@@ -1,12 +1,13 @@
 """The parameters of one ordered pour: the request of the HTTP API, from which the other interfaces take theirs.
 
-The options of `decant queue pour` and the arguments of the MADSci node have the descriptions of these fields. The
-module imports pydantic alone, so that the command line starts fast.
+`decant queue pour`, `decant.Station.pour`, the SiLA 2 server and the MADSci node make this model of their parameters;
+help texts and arguments have its descriptions. The module imports pydantic alone, so that the command line starts fast.
 """
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -84,6 +85,11 @@ class PourIn(RequestModel):
 
     predict: bool = True
     """Predict the pour before it is queued. An action is predicted by simulations, which takes seconds."""
+
+
+def problems_text(errors: Iterable[Mapping[str, Any]], begin: int = 0) -> str:
+    """Errors of validation in one line, each with its place from a part of it on."""
+    return "; ".join(f"{'.'.join(map(str, one['loc'][begin:]))}: {one['msg']}" for one in errors)
 
 
 def described(name: str) -> str:

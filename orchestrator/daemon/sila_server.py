@@ -31,7 +31,8 @@ from urllib.parse import quote
 from sila import UndefinedExecutionError, ValidationError
 from unitelabs.cdk import Connector, ConnectorBaseConfig, Logger, SiLAServerConfig, run, sila
 
-from orchestrator.daemon.daemon_client import Client, DaemonError
+from orchestrator.daemon.daemon_client import Client, DaemonError, order_body
+from orchestrator.daemon.pour_request import PourIn
 from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
@@ -476,11 +477,17 @@ def _order(
     rig: str,
 ) -> dict[str, Any]:
     """The body of `POST /pours`. Equal arguments give an equal body, which makes a repeated order the same order."""
-    return {
-        **{"id": order_id, "source": source, "receiver": receiver, "liquid": liquid, "rig": rig},
-        **{"amount": f"{amount!r} g" if amount else None, "tolerance": f"{tolerance!r} g"},
-        "action": {one.dimension: one.value for one in action},
-    }
+    wanted = f"{amount!r} g" if amount else None
+    motion = {one.dimension: one.value for one in action}
+    try:
+        return order_body(
+            lambda: PourIn(
+                id=order_id, source=source, receiver=receiver, liquid=liquid, rig=rig, amount=wanted,
+                tolerance=f"{tolerance!r} g", action=motion,
+            )
+        )  # fmt: skip
+    except DaemonError as error:
+        _refuse(error)
 
 
 def _refuse(error: DaemonError) -> NoReturn:
