@@ -213,7 +213,7 @@ def plan(
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
         repeated = result_of(run_result.results, PREDICTION + receiver_name, PredictedPour).over_seeds
         spillage = repeated.get("spillage")
-        told = published.summary.receivers[result.scene]
+        told = published.summary.outcome.receivers[result.scene]
         answers.append(
             {
                 "receiver": receiver_name,

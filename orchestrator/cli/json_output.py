@@ -99,8 +99,8 @@ PlanOutput = create_model(
 RunOutput = create_model(
     "RunOutput",
     __base__=CommandOutput,
-    __doc__="Summary of a run: `summary.json` without results, decisions and notes.",
-    **_part(RunSummary, [name for name in RunSummary.model_fields if name not in ("results", "decisions", "notes")]),
+    __doc__="Summary of a run: `summary.json` without results and log.",
+    **_part(RunSummary, [name for name in RunSummary.model_fields if name not in ("results", "log")]),
     report=(Path | None, Field(description="The report, report.html.")),
 )
 

@@ -22,21 +22,22 @@ def summary_table(summary: RunSummary) -> RenderableType:
     from rich.text import Text
 
     parts: list[RenderableType] = [Text(f"\n{summary.campaign}  seed {summary.seed}", style="bold")]
-    if summary.calibrated_theta is not None:
-        parts.append(Text(f"θ*  {style.display_values(summary.calibrated_theta.model_dump())}"))
-        parts += [Text(f"  {line}", style="dim") for line in summary.theta_sentences]
-    parts += [_table(table) for table in (score_table(summary), receiver_table(summary)) if table.rows]
-    for one in summary.advice:
+    learning, outcome, files = summary.learning, summary.outcome, summary.files
+    if learning.calibrated_theta is not None:
+        parts.append(Text(f"θ*  {style.display_values(learning.calibrated_theta.model_dump())}"))
+        parts += [Text(f"  {line}", style="dim") for line in learning.theta_sentences]
+    parts += [_table(table) for table in (score_table(learning), receiver_table(outcome)) if table.rows]
+    for one in outcome.advice:
         parts += _advice(one)
     pools = {stage.rpartition(":")[2]: use.text for stage, use in summary.occupancy.items() if use.text}
     parts += [Text(f"  {stage}: pool {text}", style="dim") for stage, text in pools.items()]
-    files = [*summary.figures.items(), *([("recording", summary.recording)] if summary.recording else [])]
-    if files:
-        width = max(len(name) for name, _ in files)
+    paths = [*files.figures.items(), *([("recording", files.recording)] if files.recording else [])]
+    if paths:
+        width = max(len(name) for name, _ in paths)
         # Each path ends its line without a line break, so that it can be clicked and copied.
-        parts.append(Text("\n".join(f"  {name:<{width}}  {path}" for name, path in files), overflow="fold"))
-    if summary.dropped_events:
-        parts.append(Text(f"  the recording lacks {summary.dropped_events} events: it could not keep up", "yellow"))
+        parts.append(Text("\n".join(f"  {name:<{width}}  {path}" for name, path in paths), overflow="fold"))
+    if files.dropped_events:
+        parts.append(Text(f"  the recording lacks {files.dropped_events} events: it could not keep up", "yellow"))
     return Group(*parts)
 
 

@@ -102,7 +102,7 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
     Raises:
         OSError: a figure can't be read.
     """
-    pictures = {name: _picture(name, path) for name, path in summary.figures.items() if path.is_file()}
+    pictures = {name: _picture(name, path) for name, path in summary.files.figures.items() if path.is_file()}
     seed = "" if summary.seed is None else f" Seed {summary.seed}."
     # The paths of the machine are left out.
     kept = {key: value for key, value in (resolved or {}).items() if key != "outputs"}
@@ -116,19 +116,19 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         finished=summary.state == State.FINISHED,
         lead=f"Begun {_date(summary.began_at)}, last entry {_date(summary.ended_at)}.{seed}",
         run=summary,
-        stages=wording.stage_table(summary),
+        stages=wording.stage_table(summary.outcome),
         cost=wording.cost_table(summary),
-        questions=wording.question_table(summary),
-        theta=wording.theta_table(summary) if summary.parameters else None,
-        theta_fixed=wording.fixed_parameters(summary),
-        scores=wording.score_table(summary),
+        questions=wording.question_table(summary.outcome),
+        theta=wording.theta_table(summary.learning) if summary.learning.parameters else None,
+        theta_fixed=wording.fixed_parameters(summary.learning),
+        scores=wording.score_table(summary.learning),
         theta_figures=[one for name, one in pictures.items() if name.startswith(_THETA_FIGURES)],
-        receivers=wording.receiver_table(summary),
+        receivers=wording.receiver_table(summary.outcome),
         first=[one for start in _FIRST_FIGURES for name, one in pictures.items() if name.startswith(start)],
         figures=[one for name, one in pictures.items() if not name.startswith((*_THETA_FIGURES, *_FIRST_FIGURES))],
         pours=wording.pour_tables(summary),
-        not_simulated=wording.validity_table(summary),
-        notes=[(_date(one.time), one.text) for one in summary.notes],
+        not_simulated=wording.validity_table(summary.outcome),
+        notes=[(_date(one.time), one.text) for one in summary.log.notes],
         resolved=json.dumps(kept, indent=2, ensure_ascii=False) if kept else "",
         footer="Made by Decant from the run's journal.",
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -26,7 +26,7 @@ from orchestrator.reports import validity_warnings as regimes
 from orchestrator.reports.html_report import REPORT_NAME, run_page
 from orchestrator.reports.recording_export import export_recordings
 from orchestrator.reports.run_figures import draw_figures
-from orchestrator.reports.run_summary import SUMMARY_NAME, RunSummary, Totals, write_summary
+from orchestrator.reports.run_summary import SUMMARY_NAME, RunFiles, RunSummary, Totals, write_summary
 from orchestrator.reports.stage_views import evaluation_of, theta_of
 from orchestrator.reports.summarise import pool_use, summarise, summarise_record
 from orchestrator.runs.run_folder import FIGURES, read_versions
@@ -83,7 +83,7 @@ def publish(
     if plan.outputs.pour_recordings:
         for reason in export_recordings(directory, plan=plan)[1]:
             _log.warning("not recorded: %s", reason)
-    summary = summary_of(plan, result, figures, recording=recording, dropped_events=dropped_events)
+    summary = summary_of(plan, result, RunFiles(figures=figures, recording=recording, dropped_events=dropped_events))
     write_summary(directory, summary)
     found = theta_of(result.results)
     theta = None if found is None else directory / THETA_FILE
@@ -96,7 +96,7 @@ def publish(
     except Exception as error:  # days of pouring don't end in a traceback about a page
         _log.warning("the report was not written: %s: %s", type(error).__name__, error)
         report = None
-    return Published(summary, figures, summary.recording, theta, report)
+    return Published(summary, figures, summary.files.recording, theta, report)
 
 
 def publish_run(handle: RunHandle) -> Published:
@@ -145,22 +145,11 @@ def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
     return True
 
 
-def summary_of(
-    plan: CampaignPlan,
-    result: CampaignResult,
-    figures: Mapping[str, Path] | None = None,
-    *,
-    recording: Path | None = None,
-    dropped_events: int = 0,
-    live: bool = False,
-) -> RunSummary:
+def summary_of(plan: CampaignPlan, result: CampaignResult, files: RunFiles | None = None) -> RunSummary:
     """The result document of a run as its folder holds it, of one that is not finished too.
 
     Args:
-        figures: name → file.
-        recording: its file; by default the one in the run's folder, if there is one.
-        dropped_events: missing in the recording.
-        live: whether the run is in progress.
+        files: its figures and its recording; by default the recording in the run's folder, if there is one.
 
     Raises:
         OSError: a file can't be read.
@@ -168,18 +157,17 @@ def summary_of(
     """
     directory = result.directory
     record = read_record(directory, slots=plan.parallel_simulations)
-    beside = directory / RECORDING
+    files, beside = files or RunFiles(), directory / RECORDING
+    if files.recording is None and beside.is_file():
+        files = files.model_copy(update={"recording": beside})
     return summarise(
         plan,
         result.results,
         record=record,
         run=directory.name,
-        live=live,
         versions=read_versions(directory),
         check=check_journal(directory / JOURNAL_NAME),
-        figures=figures,
-        recording=recording or (beside if beside.is_file() else None),
-        dropped_events=dropped_events,
+        files=files,
         not_covered=worked_out(lambda: regimes.campaign_warnings(plan)),
         best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
         totals=Totals(
@@ -213,7 +201,7 @@ def report_on(
         RunError: the journal can't be read.
     """
     figures = draw_figures(result.directory / FIGURES, plan, result.results, formats) if draw else {}
-    page = run_page(summary_of(plan, result, figures), plan.resolved)
+    page = run_page(summary_of(plan, result, RunFiles(figures=figures)), plan.resolved)
     return _write_page(path or result.directory / REPORT_NAME, page), figures
 
 
@@ -229,6 +217,7 @@ def write_reduced_report(path: Path, directory: Path, reason: str) -> Path:
         OSError: it can't be written, or a figure can't be read.
         RunError: the journal can't be read.
     """
+    figures = {file.stem.replace("-", " "): file for file in sorted((directory / FIGURES).glob("*.png"))}
     summary = summarise_record(
         read_record(directory),
         directory.name,
@@ -236,7 +225,7 @@ def write_reduced_report(path: Path, directory: Path, reason: str) -> Path:
         catalogued=read_run(directory).run,
         versions=read_versions(directory),
         check=check_journal(directory / JOURNAL_NAME),
-        figures={file.stem.replace("-", " "): file for file in sorted((directory / FIGURES).glob("*.png"))},
+        files=RunFiles(figures=figures),
     )
     return _write_page(path, run_page(summary))
 

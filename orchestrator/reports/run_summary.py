@@ -289,26 +289,12 @@ PLANNED = (
 """Fields of a receiver's summary that a plan for it gives beside the action."""
 
 
-class RunSummary(Totals):
-    """Summary of a run; missing parts are null or empty."""
+class RunOutcome(ResultPart):
+    """Pours of a run, and the actions that it recommends."""
 
-    campaign: str
-    seed: int | None = None
-    run: str = ""
-    """Name of its folder."""
-
-    state: str = "queued"
-    """State of the run when the summary was made."""
-
-    began_at: float | None = None
-    """Seconds since 1970."""
-
-    ended_at: float | None = None
-    """When the last entry of the journal was written."""
-
-    standing: tuple[str, ...] = ()
-    """State of an unfinished run and the next steps, and damage of its records."""
-
+    stages: tuple[StageSummary, ...] = ()
+    pours_made: tuple[PourSummary, ...] = ()
+    questions: tuple[QuestionSummary, ...] = ()
     advice: tuple[Advice, ...] = ()
     """For each receiver."""
 
@@ -318,21 +304,21 @@ class RunSummary(Totals):
     open_questions: tuple[str, ...] = ()
     """Open questions that do not depend on the receiver."""
 
-    asked: dict[str, str] = Field(default_factory=dict)
-    """The campaign's settings for readers who have not seen its file."""
+    loss: str | None = None
+    """Name of the loss that deployments minimise."""
 
-    cost: dict[str, str] = Field(default_factory=dict)
-    """Pours, liquid, time and simulations."""
+    loss_label: str = ""
+    """Its meaning and unit."""
 
-    settings: dict[str, str] = Field(default_factory=dict)
-    """Laboratory, versions, and the check of the records."""
+    receivers: dict[str, ReceiverSummary] = Field(default_factory=dict)
+    """By scene."""
 
-    stages: tuple[StageSummary, ...] = ()
-    pours_made: tuple[PourSummary, ...] = ()
-    questions: tuple[QuestionSummary, ...] = ()
-    notes: tuple[LogEntry, ...] = ()
-    decisions: tuple[LogEntry, ...] = ()
-    """The most recent ones."""
+    not_covered: dict[str, tuple[NotSimulated, ...]] = Field(default_factory=dict)
+    """Effects that are not simulated in the action spaces, by scene."""
+
+
+class RunLearning(ResultPart):
+    """Knowledge of θ; null or empty without a calibration."""
 
     theta: SimulationParameters | None = None
     """θ to simulate with: θ*, or the uncalibrated θ if the weighed pours do not justify θ*."""
@@ -357,23 +343,57 @@ class RunSummary(Totals):
     discrepancy: dict[str, dict[str, float | None]] = Field(default_factory=dict)
     """Mean |r − c_s| by split and predictor, as fractions of the poured liquid."""
 
-    loss: str | None = None
-    """Name of the loss that deployments minimise."""
 
-    loss_label: str = ""
-    """Its meaning and unit."""
+class RunLog(ResultPart):
+    """What was written for the operator."""
 
-    receivers: dict[str, ReceiverSummary] = Field(default_factory=dict)
-    """By scene."""
+    notes: tuple[LogEntry, ...] = ()
+    decisions: tuple[LogEntry, ...] = ()
+    """The most recent ones."""
 
-    not_covered: dict[str, tuple[NotSimulated, ...]] = Field(default_factory=dict)
-    """Effects that are not simulated in the action spaces, by scene."""
+
+class RunFiles(ResultPart):
+    """Files of a run, besides its records."""
 
     figures: dict[str, Path] = Field(default_factory=dict)
     recording: Path | None = None
     dropped_events: int = 0
     """Number of events missing in the recording."""
 
+
+class RunSummary(Totals):
+    """Summary of a run; missing parts are null or empty."""
+
+    campaign: str
+    seed: int | None = None
+    run: str = ""
+    """Name of its folder."""
+
+    state: str = "queued"
+    """State of the run when the summary was made."""
+
+    began_at: float | None = None
+    """Seconds since 1970."""
+
+    ended_at: float | None = None
+    """When the last entry of the journal was written."""
+
+    standing: tuple[str, ...] = ()
+    """State of an unfinished run and the next steps, and damage of its records."""
+
+    asked: dict[str, str] = Field(default_factory=dict)
+    """The campaign's settings for readers who have not seen its file."""
+
+    cost: dict[str, str] = Field(default_factory=dict)
+    """Pours, liquid, time and simulations."""
+
+    settings: dict[str, str] = Field(default_factory=dict)
+    """Laboratory, versions, and the check of the records."""
+
+    outcome: RunOutcome = Field(default_factory=RunOutcome)
+    learning: RunLearning = Field(default_factory=RunLearning)
+    log: RunLog = Field(default_factory=RunLog)
+    files: RunFiles = Field(default_factory=RunFiles)
     results: dict[str, SerializeAsAny[StageResult]] = Field(default_factory=dict)
     """Results of the stages, in order."""
 
@@ -406,5 +426,5 @@ def write_summary(directory: Path, summary: RunSummary) -> Path:
 
 
 def summary_json(summary: RunSummary) -> dict[str, Any]:
-    """JSON of a summary for commands: without results, decisions and notes, which are in its file."""
-    return summary.model_dump(mode="json", exclude={"results", "decisions", "notes"})
+    """JSON of a summary for commands: without results and log, which are in its file."""
+    return summary.model_dump(mode="json", exclude={"results", "log"})

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.learning.calibration.calibration_base import CalibratedTheta
 from orchestrator.learning.calibration.calibration_scores import Scores
+from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.single_action import Confirmed, PredictedPour
@@ -36,6 +37,10 @@ from orchestrator.reports.run_summary import (
     PourSummary,
     QuestionSummary,
     ReceiverSummary,
+    RunFiles,
+    RunLearning,
+    RunLog,
+    RunOutcome,
     RunSummary,
     StageSummary,
     Totals,
@@ -61,18 +66,18 @@ MOST_DECISIONS = 300
 """Largest number of decisions in a summary, the most recent ones."""
 
 
+NO_ADVICE = "This run recommends no action that can be read here."
+
+
 def summarise(
     plan: CampaignPlan,
     results: Results,
     *,
     record: RunState | None = None,
     run: str = "",
-    live: bool = False,
     versions: Mapping[str, Any] | None = None,
     check: JournalCheck | None = None,
-    figures: Mapping[str, Path] | None = None,
-    recording: Path | None = None,
-    dropped_events: int = 0,
+    files: RunFiles | None = None,
     not_covered: Mapping[str, Sequence[NotSimulated]] | None = None,
     best_not_covered: Mapping[str, Sequence[NotCovered]] | None = None,
     totals: Totals | None = None,
@@ -84,64 +89,39 @@ def summarise(
         results: results of the stages.
         record: content of the run's journal.
         run: name of the run's folder.
-        live: whether the run is in progress, so that a pour without outcome is under way.
         versions: content of `versions.json`.
         check: check of the journal.
-        figures: name → file.
-        recording: path of the `.rrd`.
-        dropped_events: number of events missing in the recording.
+        files: figures and recording.
         not_covered: effects that are not simulated in the action spaces, by scene.
         best_not_covered: the same for the recommended actions.
         totals: costs of the run.
     """
-    record = record or RunState(Header(plan.name, {}))
-    found, evaluation, gain = theta_of(results), evaluation_of(results), gain_of(results)
-    calibration = calibration_of(results)
-    posterior = None if found is None or found.posterior is None else found.posterior.summary()
-    space = None if plan.calibration is None else plan.calibration.parameters
-    liquid = None if plan.calibration is None else plan.calibration.scene.liquid
-    expected = None if found is None else found.predicted_discrepancy
-    deviation = None if found is None else found.predicted_deviation
-    ended = None if calibration is None else calibration.ended
-    discrepancy = _discrepancies(evaluation)
-    receivers = _receivers(plan, results, best_not_covered or {})
+    record, totals, files = record or RunState(Header(plan.name, {})), totals or Totals(), files or RunFiles()
+    learning = _learning(plan, results)
+    calibrated, receivers = learning.calibrated_theta is not None, _receivers(plan, results, best_not_covered or {})
     advised = wording.advice(plan, receivers)
-    totals = totals or Totals()
-    open_theta = [] if found is None else wording.about_theta(gain, posterior, discrepancy)
-    return RunSummary(
-        **dict(totals),
-        **_of_record(plan, record, run, live, check),
-        campaign=plan.name,
-        seed=plan.seed,
+    outcome = _outcome(
+        plan,
+        record,
         advice=advised,
-        without_advice=() if advised else tuple(wording.without_advice(plan, record, calibrated=found is not None)),
-        open_questions=tuple(
-            wording.open_questions(
-                plan, record, open_theta, calibrated=found is not None, dropped_events=dropped_events
-            )
-        ),
-        asked=wording.what_was_asked(plan, record),
-        cost=wording.cost(record, totals.occupancy, _time_scale(plan)),
-        settings=_settings(plan, versions or {}, recording, check, figures=bool(figures)),
-        theta=recommended_theta_of(results),
-        calibrated_theta=None if found is None else found.theta,
-        calibration_gain=gain,
-        predicted_discrepancy=expected,
-        predicted_deviation=deviation,
-        posterior=posterior,
-        parameters=() if found is None else _parameters(plan.calibration, found),
-        theta_sentences=(
-            *wording.memory_sentences(plan.memory, None if calibration is None else calibration.memory),
-            *wording.theta_sentences(expected, deviation, posterior, space, gain, liquid, ended),
-        ),
-        discrepancy=discrepancy,
+        without_advice=() if advised else tuple(wording.without_advice(plan, record, calibrated=calibrated)),
+        open_questions=tuple(wording.open_questions(plan, record, learning, files.dropped_events)),
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,
         receivers=receivers,
         not_covered={scene: tuple(several) for scene, several in (not_covered or {}).items()},
-        figures=dict(figures or {}),
-        recording=recording,
-        dropped_events=dropped_events,
+    )
+    return RunSummary(
+        **dict(totals),
+        **_of_record(record, run, check),
+        campaign=plan.name,
+        seed=plan.seed,
+        asked=wording.what_was_asked(plan, record),
+        cost=wording.cost(record, totals.occupancy, _time_scale(plan)),
+        settings=_settings(plan, versions or {}, files.recording, check, figures=bool(files.figures)),
+        outcome=outcome,
+        learning=learning,
+        files=files,
         results=dict(results),
     )
 
@@ -154,7 +134,7 @@ def summarise_record(
     catalogued: Mapping[str, Any],
     versions: Mapping[str, Any],
     check: JournalCheck,
-    figures: Mapping[str, Path],
+    files: RunFiles,
 ) -> RunSummary:
     """The result document of a run whose campaign or results can't be read, for example because a plug-in is missing.
 
@@ -165,7 +145,7 @@ def summarise_record(
         catalogued: the run's row of the catalogue: mode, seed, θ*, recommended actions.
         versions: content of `versions.json`.
         check: check of the journal.
-        figures: name → file.
+        files: figures.
     """
     about = [
         f"Recommended for {receiver} by {one['strategy']} (degrees, millimetres, seconds): {_plain(one['action'])}."
@@ -173,14 +153,14 @@ def summarise_record(
     ]
     if theta := catalogued.get("theta"):
         about.append(f"θ* (SI units): {_plain(theta)}.")
-    known = _of_record(None, record, run, False, check)
+    known = _of_record(record, run, check)
     known["standing"] = (f"This report is reduced to what the journal has. {reason}", *known["standing"])
     return RunSummary(
         **known,
         campaign=record.header.name,
         seed=catalogued.get("seed"),
         mode=catalogued.get("mode") or "none",
-        without_advice=tuple(about) or ("This run recommends no action that can be read here.",),
+        outcome=_outcome(None, record, without_advice=about or [NO_ADVICE]),
         asked={"campaign": record.header.name},
         cost=wording.cost(record, {}),
         settings={
@@ -189,7 +169,7 @@ def summarise_record(
             **_programs(versions),
             "records": check.verdict,
         },
-        figures=dict(figures),
+        files=files,
     )
 
 
@@ -197,37 +177,41 @@ def _plain(values: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {value:.4g}" for name, value in values.items() if value is not None)
 
 
-def _of_record(
-    plan: CampaignPlan | None, record: RunState, run: str, live: bool, check: JournalCheck | None
-) -> dict[str, Any]:
-    """The fields that come from the journal."""
+def _of_record(record: RunState, run: str, check: JournalCheck | None) -> dict[str, Any]:
+    """The fields of a summary that come from the journal."""
     standing = wording.standing(record, run) if run else []
+    decisions = record.decisions[-MOST_DECISIONS:]
     return {
         "run": run,
         "state": str(record.state),
         "began_at": record.header.created or None,
         "ended_at": record.ended or None,
         "standing": (*(() if check is None else _damage(check)), *standing),
-        "stages": tuple(
-            StageSummary(
-                stage=one.name,
-                state="open" if one.closed_at is None else "closed",
-                pours=one.pours,
-                simulations=one.simulations,
-                unusable_simulations=one.failed_simulations,
-            )
-            for one in record.stages.values()
-        ),
-        "pours_made": tuple(pour_summaries(plan, record, live=live)),
-        "questions": tuple(
-            QuestionSummary(time=one.time, stage=one.stage, question=one.text, answer=one.answer)
-            for one in record.questions
-        ),
-        "notes": tuple(LogEntry(time=when, stage="", text=text) for when, text in record.notes),
-        "decisions": tuple(
-            LogEntry(time=one.time, stage=one.stage, text=one.text) for one in record.decisions[-MOST_DECISIONS:]
+        "log": RunLog(
+            notes=tuple(LogEntry(time=when, stage="", text=text) for when, text in record.notes),
+            decisions=tuple(LogEntry(time=one.time, stage=one.stage, text=one.text) for one in decisions),
         ),
     }
+
+
+def _outcome(plan: CampaignPlan | None, record: RunState, **others: Any) -> RunOutcome:
+    """The outcome, with the fields that come from the journal."""
+    stages = (
+        StageSummary(
+            stage=one.name,
+            state="open" if one.closed_at is None else "closed",
+            pours=one.pours,
+            simulations=one.simulations,
+            unusable_simulations=one.failed_simulations,
+        )
+        for one in record.stages.values()
+    )
+    questions = (
+        QuestionSummary(time=one.time, stage=one.stage, question=one.text, answer=one.answer)
+        for one in record.questions
+    )
+    pours = pour_summaries(plan, record)
+    return RunOutcome(stages=tuple(stages), pours_made=tuple(pours), questions=tuple(questions), **others)
 
 
 def _damage(check: JournalCheck) -> list[str]:
@@ -315,39 +299,57 @@ def _remark(state: str, pour: RunPour) -> str:
 # ---- θ and receivers
 
 
+def _learning(plan: CampaignPlan, results: Results) -> RunLearning:
+    evaluation, calibration, found = evaluation_of(results), calibration_of(results), theta_of(results)
+    memory = wording.memory_sentences(plan.memory, None if calibration is None else calibration.memory)
+    learning = RunLearning(
+        calibration_gain=gain_of(results), discrepancy=_discrepancies(evaluation), theta_sentences=tuple(memory)
+    )
+    if calibration is None or found is None:
+        return learning
+    posterior = None if found.posterior is None else found.posterior.summary()
+    learning = learning.model_copy(
+        update={
+            "theta": recommended_theta_of(results),
+            "calibrated_theta": found.theta,
+            "predicted_discrepancy": found.predicted_discrepancy,
+            "predicted_deviation": found.predicted_deviation,
+            "posterior": posterior,
+            "parameters": tuple(_parameters(plan.calibration, found, posterior)),
+        }
+    )
+    said = wording.theta_sentences(learning, plan.calibration, calibration.ended)
+    return learning.model_copy(update={"theta_sentences": (*memory, *said)})
+
+
 def _discrepancies(evaluation: Scores | None) -> dict[str, dict[str, float | None]]:
     label = None if evaluation is None else calibrated_label(evaluation)
     if evaluation is None or label is None:
         return {}
-    table: dict[str, dict[str, float | None]] = {}
-    for split in SPLITS:
-        if split in evaluation.discrepancy[label]:
-            table[split] = {"calibrated": evaluation.discrepancy[label][split]}
-            table[split] |= {
-                name: scores[split] for name, scores in rival_scores(evaluation).items() if split in scores
-            }
-    return table
+    ours, rivals = evaluation.discrepancy[label], rival_scores(evaluation)
+    return {
+        split: {"calibrated": ours[split], **{name: of[split] for name, of in rivals.items() if split in of}}
+        for split in SPLITS
+        if split in ours
+    }
 
 
-def _parameters(calibration: CalibrationPlan | None, found: CalibratedTheta) -> tuple[ParameterSummary, ...]:
+def _parameters(
+    calibration: CalibrationPlan | None, found: CalibratedTheta, posterior: PosteriorSummary | None
+) -> Iterator[ParameterSummary]:
     axes = {} if calibration is None else {axis.name: axis for axis in calibration.parameters.axes}
-    posterior = None if found.posterior is None else found.posterior.summary()
-    rows = []
     for name, value in found.theta.model_dump().items():
         axis, region = axes.get(name), "—"
         if posterior is not None and name in posterior.region:
             low, high = posterior.region[name]
             open_end = ", not determined" if name in posterior.open else ""
             region = style.display_interval(name, low, high) + open_end
-        rows.append(
-            ParameterSummary(
-                name=style.PARAMETER_NAMES.get(name, name.replace("_", " ")),
-                value=style.display_value(name, value),
-                region=region,
-                searched=NOT_SEARCHED if axis is None else style.display_interval(name, axis.lower, axis.upper),
-            )
+        yield ParameterSummary(
+            name=style.PARAMETER_NAMES.get(name, name.replace("_", " ")),
+            value=style.display_value(name, value),
+            region=region,
+            searched=NOT_SEARCHED if axis is None else style.display_interval(name, axis.lower, axis.upper),
         )
-    return tuple(rows)
 
 
 def _receivers(

@@ -11,10 +11,9 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from orchestrator.learning.calibration.calibration_scores import CalibrationGain
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, MemoryFound
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
-from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.learning.deployment.deployment_result import ParetoAction, RiskFound
 from orchestrator.learning.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
@@ -30,7 +29,16 @@ from orchestrator.reports.loss_units import (
     deployment_unit,
     minimised_loss,
 )
-from orchestrator.reports.run_summary import NOT_SEARCHED, Advice, PoolUse, PourSummary, ReceiverSummary, RunSummary
+from orchestrator.reports.run_summary import (
+    NOT_SEARCHED,
+    Advice,
+    PoolUse,
+    PourSummary,
+    ReceiverSummary,
+    RunLearning,
+    RunOutcome,
+    RunSummary,
+)
 from orchestrator.reports.stage_views import SPLITS
 from sim_engine.liquids import Liquid
 from sim_engine.prediction_band import PredictionInterval
@@ -242,14 +250,10 @@ def _poured_again(row: ReceiverSummary) -> list[str]:
     return [f"Its loss is known from {pours}; this is too few to estimate how much pours differ."]
 
 
-def open_questions(
-    plan: CampaignPlan, record: RunState, theta: Sequence[str], *, calibrated: bool, dropped_events: int
-) -> list[str]:
+def open_questions(plan: CampaignPlan, record: RunState, learning: RunLearning, dropped_events: int) -> list[str]:
     """Open questions after a run that do not depend on the receiver.
 
     Args:
-        theta: open questions about θ*, see `about_theta`.
-        calibrated: whether θ* was found.
         dropped_events: number of events missing in the recording.
     """
     said = []
@@ -258,8 +262,9 @@ def open_questions(
             "The bench was VIRTUAL: no robot moved and no liquid was weighed. Its hidden liquid "
             "is simulated, too; a real cup may behave differently."
         )
-    said += theta
-    if not calibrated and plan.calibration is None:
+    if learning.calibrated_theta is not None:
+        said += _about_theta(learning)
+    elif plan.calibration is None:
         said.append("The simulator was not calibrated in this run: its parameters are those of the campaign.")
     liquids = {scene.liquid.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
     if liquids:
@@ -272,18 +277,9 @@ def open_questions(
     return said
 
 
-def about_theta(
-    gain: CalibrationGain | None,
-    posterior: PosteriorSummary | None,
-    discrepancy: Mapping[str, Mapping[str, float | None]],
-) -> list[str]:
-    """Open questions about θ*.
-
-    Args:
-        gain: whether the weighed pours justify θ*.
-        posterior: θ that fit as well.
-        discrepancy: mean |Δ| by split and predictor.
-    """
+def _about_theta(learning: RunLearning) -> list[str]:
+    """Open questions about θ*."""
+    gain, posterior = learning.calibration_gain, learning.posterior
     said, used = [], "calibrated"
     if gain is not None and gain.recommended != used:
         said, used = [_sentence(gain.text)], gain.recommended
@@ -294,7 +290,7 @@ def about_theta(
         said.append(f"The pours do not determine {names}: nearly the whole searched range fits them as well as θ*.")
     unseen = [
         f"{DISCREPANCY.text(own)} on {SPLITS[split]}"
-        for split, row in discrepancy.items()
+        for split, row in learning.discrepancy.items()
         if split != "train" and (own := row.get(used)) is not None
     ]
     if unseen:
@@ -302,7 +298,7 @@ def about_theta(
             f"On pours that calibration did not see, the simulator's spillage was off by {' and '.join(unseen)} in the "
             "mean."
         )
-    elif discrepancy:
+    elif learning.discrepancy:
         said.append("The simulator was not scored on pours that calibration did not see.")
     return said
 
@@ -314,28 +310,20 @@ def memory_sentences(memory: CampaignMemory | None, found: MemoryFound | None) -
     return [_sentence(part) for part in (memory.lines if found is None else [found.text, *memory.lines[1:]])]
 
 
-def theta_sentences(
-    expected: float | None,
-    deviation: float | None,
-    posterior: PosteriorSummary | None,
-    space: Space | None,
-    gain: CalibrationGain | None,
-    liquid: Liquid | None = None,
-    ended: str | None = None,
-) -> list[str]:
+def theta_sentences(learning: RunLearning, calibration: CalibrationPlan | None, ended: str | None) -> list[str]:
     """The knowledge of θ*: its expected discrepancy, its posterior over the searched space, whether it is justified.
 
     Args:
+        calibration: its plan, for the searched space and the liquid.
         ended: reason of the end of an automatic calibration.
-        liquid: of the pours, as declared; its viscosity is stated if the pours determine it.
     """
-    said = []
-    if expected is not None:
-        said.append(f"Expected {DISCREPANCY.meaning} of θ*: {DISCREPANCY.text(expected, deviation or 0.0)}.")
-    if posterior is not None and space is not None:
-        said += map(_sentence, posterior_lines(posterior, space))
-        if liquid is not None and liquid.is_thick:
-            said += _identified_viscosity(posterior, liquid)
+    said, gain, posterior = [], learning.calibration_gain, learning.posterior
+    if learning.predicted_discrepancy is not None:
+        expected = DISCREPANCY.text(learning.predicted_discrepancy, learning.predicted_deviation or 0.0)
+        said.append(f"Expected {DISCREPANCY.meaning} of θ*: {expected}.")
+    if posterior is not None and calibration is not None:
+        said += map(_sentence, posterior_lines(posterior, calibration.parameters))
+        said += identified_viscosity(posterior, calibration.scene.liquid)
     if ended is not None:
         said.append(f"The calibration ended because {ended}.")
     if gain is not None:
@@ -351,9 +339,9 @@ POSTERIOR_ADVICE = (
 )
 
 
-def _identified_viscosity(posterior: PosteriorSummary, liquid: Liquid) -> list[str]:
-    """The posterior of the viscosity itself; nothing if it was not searched or the pours do not determine it."""
-    if "viscosity_factor" not in posterior.region or "viscosity_factor" in posterior.open:
+def identified_viscosity(posterior: PosteriorSummary, liquid: Liquid) -> list[str]:
+    """The posterior of a thick liquid's viscosity; nothing if it was not searched or the pours do not determine it."""
+    if not liquid.is_thick or "viscosity_factor" not in posterior.region or "viscosity_factor" in posterior.open:
         return []
     declared = 1e3 * liquid.dynamic_viscosity
     low, high = (f"{declared * factor:.3g}" for factor in posterior.region["viscosity_factor"])
@@ -593,13 +581,13 @@ class ResultTable:
         return ResultTable(self.caption, [self.header[i] for i in kept], rows, numbers)
 
 
-def stage_table(summary: RunSummary) -> ResultTable:
+def stage_table(outcome: RunOutcome) -> ResultTable:
     """Progress of each stage."""
     rows = [
         ResultRow(
             [one.stage, one.state, *(str(n or "") for n in (one.pours, one.simulations, one.unusable_simulations))]
         )
-        for one in summary.stages
+        for one in outcome.stages
     ]
     header = ["stage", "state", "pours", "simulations", "of them unusable"]
     return ResultTable("Stages, in the order in which they ran", header, rows, frozenset({2, 3, 4})).filled()
@@ -610,7 +598,7 @@ def cost_table(summary: RunSummary) -> ResultTable:
     return ResultTable("Cost", ["what", "how much"], [ResultRow(pair) for pair in summary.cost.items()])
 
 
-def question_table(summary: RunSummary) -> ResultTable:
+def question_table(outcome: RunOutcome) -> ResultTable:
     """Questions to the operator and their answers."""
     rows = [
         ResultRow(
@@ -622,25 +610,25 @@ def question_table(summary: RunSummary) -> ResultTable:
             ],
             "bad" if one.answer is None else "",
         )
-        for one in summary.questions
+        for one in outcome.questions
     ]
     return ResultTable("Questions to the operator", ["when", "stage", "question", "answer"], rows)
 
 
-def theta_table(summary: RunSummary) -> ResultTable:
+def theta_table(learning: RunLearning) -> ResultTable:
     """θ* with its region: the searched parameters."""
-    level = "region" if summary.posterior is None else f"{100 * summary.posterior.level:.0f} % of the θ that fit"
-    searched = [one for one in summary.parameters if one.searched != NOT_SEARCHED]
+    level = "region" if learning.posterior is None else f"{100 * learning.posterior.level:.0f} % of the θ that fit"
+    searched = [one for one in learning.parameters if one.searched != NOT_SEARCHED]
     rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in searched]
     return ResultTable("θ* with its region", ["parameter", "θ*", level, "searched"], rows).filled()
 
 
-def fixed_parameters(summary: RunSummary) -> str:
+def fixed_parameters(learning: RunLearning) -> str:
     """The parameters that were not searched, with their values; empty if all were."""
-    return ", ".join(f"{one.name} {one.value}" for one in summary.parameters if one.searched == NOT_SEARCHED)
+    return ", ".join(f"{one.name} {one.value}" for one in learning.parameters if one.searched == NOT_SEARCHED)
 
 
-def score_table(summary: RunSummary) -> ResultTable:
+def score_table(learning: RunLearning) -> ResultTable:
     """Mean |Δ| of θ* and its rivals by set of pours."""
     columns = {
         "calibrated": "θ*",
@@ -652,18 +640,18 @@ def score_table(summary: RunSummary) -> ResultTable:
     }
     rows = [
         ResultRow([SPLITS[split], *("—" if (v := row.get(name)) is None else f"{100 * v:.2f}" for name in columns)])
-        for split, row in summary.discrepancy.items()
+        for split, row in learning.discrepancy.items()
         if any(value is not None for value in row.values())
     ]
     caption = "Mean |measured − predicted| spillage [% of the poured liquid]; smaller is better"
     return ResultTable(caption, ["pours", *columns.values()], rows, frozenset(range(1, len(columns) + 1))).filled()
 
 
-def receiver_table(summary: RunSummary) -> ResultTable:
+def receiver_table(outcome: RunOutcome) -> ResultTable:
     """Comparison of the receivers; those without a result are left out."""
     shown = [
         row
-        for row in summary.receivers.values()
+        for row in outcome.receivers.values()
         if row.recommended is not None or any(one is not None and one.loss is not None for one in (row.first, row.best))
     ]
     heads = list(dict.fromkeys(head for row in shown for head in row.texts))
@@ -671,16 +659,16 @@ def receiver_table(summary: RunSummary) -> ResultTable:
         ResultRow([row.receiver, row.strategy, *(row.texts.get(head, "") or "—" for head in heads)]) for row in shown
     ]
     header = ["receiver", "strategy", *heads]
-    return ResultTable(summary.loss_label, header, rows, frozenset(range(2, len(header)))).filled()
+    return ResultTable(outcome.loss_label, header, rows, frozenset(range(2, len(header)))).filled()
 
 
 def pour_tables(summary: RunSummary) -> list[ResultTable]:
     """Every requested pour, one table for each stage."""
-    stages = dict.fromkeys(pour.stage for pour in summary.pours_made)
+    stages = dict.fromkeys(pour.stage for pour in summary.outcome.pours_made)
     return [
         _dose_table(stage, doses)
         if isinstance(doses := summary.results.get(stage), Dispensed)
-        else _pour_table(stage, [pour for pour in summary.pours_made if pour.stage == stage])
+        else _pour_table(stage, [pour for pour in summary.outcome.pours_made if pour.stage == stage])
         for stage in stages
     ]
 
@@ -730,11 +718,11 @@ def _bare(name: str, value: float | None) -> str:
     return style.display_value(name, value).removesuffix(style.display_unit(name)).rstrip()
 
 
-def validity_table(summary: RunSummary) -> ResultTable:
+def validity_table(outcome: RunOutcome) -> ResultTable:
     """Effects that are not simulated in the action spaces."""
     rows = [
         ResultRow([one.receiver, one.kind.replace("_", " "), f"{one.hit} of {one.tried}", one.text])
-        for several in summary.not_covered.values()
+        for several in outcome.not_covered.values()
         for one in several
     ]
     return ResultTable("At the middle and the corners of the ranges", ["into", "what", "actions", "meaning"], rows)

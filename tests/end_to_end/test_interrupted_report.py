@@ -42,7 +42,7 @@ def test_a_run_interrupted_before_its_report_is_published_by_decant_report(tmp_p
 
         place.finish(*command)
         summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-        assert json.loads((run / "theta.json").read_text(encoding="utf-8"))["theta"] == summary["theta"]
+        assert json.loads((run / "theta.json").read_text(encoding="utf-8"))["theta"] == summary["learning"]["theta"]
         assert "finished" in (run / "report.html").read_text(encoding="utf-8")
         assert list((run / "figures").iterdir())
     finally:

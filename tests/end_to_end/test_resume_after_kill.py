@@ -80,25 +80,25 @@ def test_a_campaign_learns_from_calibration_to_its_last_pour(undisturbed: Finish
     assert sum(r["type"] == "Simulate" for r in asked) == 6
 
     summary = json.loads((undisturbed.directory / "summary.json").read_text(encoding="utf-8"))
-    (narrow,) = summary["receivers"].values()
+    (narrow,) = summary["outcome"]["receivers"].values()
     assert 0.0 <= narrow["best"]["spillage"] <= 1.0
     assert narrow["best"]["loss"] <= narrow["first"]["loss"]
-    assert 0.0 <= summary["theta"]["cohesion"] <= 0.1
+    assert 0.0 <= summary["learning"]["theta"]["cohesion"] <= 0.1
     learnt = summary.pop("results")
-    del summary["decisions"], summary["notes"]
+    del summary["log"]
     assert {"calibration", "deployment:narrow"} <= learnt.keys()
     told = dict(undisturbed.summary)
     assert Path(told.pop("report")).read_text(encoding="utf-8").lower().startswith("<!doctype html>")
     assert {**told, "run": None} == {**summary, "run": None}
-    assert json.loads((undisturbed.directory / "theta.json").read_text())["theta"] == summary["theta"]
-    for figure in summary["figures"].values():
+    assert json.loads((undisturbed.directory / "theta.json").read_text())["theta"] == summary["learning"]["theta"]
+    for figure in summary["files"]["figures"].values():
         assert Path(figure).read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
 @pytest.mark.realtime
 def test_its_recording_can_be_read_and_shows_vessels_liquid_and_every_pour(undisturbed: Finished) -> None:
-    rows = recording(Path(undisturbed.summary["recording"]))
+    rows = recording(Path(undisturbed.summary["files"]["recording"]))
     assert rows["/cell/pourer/mesh"] >= 1
     assert rows["/cell/receiver/mesh"] >= 1
     assert rows["/cell/liquid"] > 5
@@ -147,8 +147,8 @@ def test_killed_in_a_pour_in_calibration_and_in_deployment_it_ends_as_if_undistu
     assert_same_run(workplace, undisturbed)
     attempts = [e.body["attempt"] for e in workplace.entries() if e.kind == Kind.POUR_STARTED]
     assert attempts == [1, 1, 2, 1, 1, 2, 1]
-    assert result["receivers"] == undisturbed.summary["receivers"]
-    assert recording(Path(result["recording"]))["/learning/deployment-narrow/loss/measured"] >= 2
+    assert result["outcome"]["receivers"] == undisturbed.summary["outcome"]["receivers"]
+    assert recording(Path(result["files"]["recording"]))["/learning/deployment-narrow/loss/measured"] >= 2
     workplace.assert_nothing_is_left()
 
 
@@ -191,7 +191,7 @@ def test_ctrl_c_finishes_the_pour_says_how_to_go_on_and_that_works(workplace: Wo
     command = advice.rpartition("Continue with: decant ")[2].split()
     result = workplace.finish(*command)
     assert_same_run(workplace, undisturbed)
-    assert result["receivers"] == undisturbed.summary["receivers"]
+    assert result["outcome"]["receivers"] == undisturbed.summary["outcome"]["receivers"]
 
 
 @pytest.mark.realtime
@@ -210,7 +210,7 @@ def test_a_simulator_killed_under_way_is_replaced_and_nobody_notices(
         output, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, errors
     (line,) = output.splitlines()
-    assert json.loads(line)["receivers"] == undisturbed.summary["receivers"]
+    assert json.loads(line)["outcome"]["receivers"] == undisturbed.summary["outcome"]["receivers"]
     assert_same_run(workplace, undisturbed)
     workplace.assert_nothing_is_left()
 

@@ -146,12 +146,12 @@ def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path
     assert found["spillage"].count == 3
     assert found["spillage"].deviation > 0.0
     summary = summarise(plan, result.results)
-    assert summary.receivers["cup"].prediction == found
+    assert summary.outcome.receivers["cup"].prediction == found
     text = " ".join(shown(summary_table(summary)).split())
     mean, deviation = (100 * getattr(found["spillage"], name) for name in ("mean", "deviation"))
     assert f"Simulated again with 3 new seeds: spilled / poured {mean:.2f} ± {deviation:.2f} %" in text
     assert "(mean ± standard deviation)" in text
-    band = summary.receivers["cup"].prediction_interval
+    band = summary.outcome.receivers["cup"].prediction_interval
     assert band is not None
     assert band.low < found["spillage"].mean < band.high
     assert f"Nine single pours in ten spill {band.percent(2)} of what is poured" in text
@@ -189,7 +189,7 @@ def test_a_planned_action_at_the_edge_of_the_box_is_said_to_be(tmp_path: Path) -
         summary = summarise(plan, {"deployment:cup": changed_result})
         text = " ".join(shown(summary_table(summary)).split())
         assert text.count("Better actions may lie outside the searched range: ") == said
-        assert len(summary.receivers["cup"].at_bounds) == said
+        assert len(summary.outcome.receivers["cup"].at_bounds) == said
 
 
 @pytest.mark.parametrize(("name", "strategy"), [("D3", Hybrid), ("D1", OneShotPlanning)])

@@ -70,13 +70,13 @@ def test_publishing_names_the_recording_and_can_be_done_again(tmp_path: Path, re
     recording = tmp_path / "campaign.rrd"
     result = replace(asyncio.run(run_toy(tmp_path / "run")), results=results)
     published = publish(example_run.campaign(), result, recording, 3)
-    assert published.recording == published.summary.recording == recording
-    assert published.summary.dropped_events == 3
+    assert published.recording == published.summary.files.recording == recording
+    assert published.summary.files.dropped_events == 3
     assert published.theta is not None
     assert json.loads(published.theta.read_text())["theta"] == results["calibration"].found.theta.model_dump()
     assert all(path.is_file() for path in published.figures.values())
     summary = (tmp_path / "run" / "summary.json").read_text()
-    assert json.loads(summary)["theta"] == results["calibration"].found.theta.model_dump()
+    assert json.loads(summary)["learning"]["theta"] == results["calibration"].found.theta.model_dump()
     publish(example_run.campaign(), result, recording, 3)
     assert (tmp_path / "run" / "summary.json").read_text() == summary
 

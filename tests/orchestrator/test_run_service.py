@@ -255,7 +255,7 @@ def test_recorder_and_subscribers_get_every_event_and_the_run_is_published(tmp_p
     assert made.events == heard
     assert any(isinstance(event, CampaignOpened) for event in heard)
     published = publish_run(handle)
-    assert (published.recording, published.summary.dropped_events) == (made.path, 3)
+    assert (published.recording, published.summary.files.dropped_events) == (made.path, 3)
     assert published.summary.pours == result.pours == 5
     assert published.theta is not None
 

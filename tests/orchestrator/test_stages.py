@@ -145,7 +145,7 @@ def test_a_theta_that_the_pours_do_not_justify_is_not_deployed_and_everything_pu
     } == {plain}
     found = result.results["calibration"].found
     published = publish(plan, result)
-    assert (published.summary.theta, published.summary.calibrated_theta) == (plain, found.theta)
+    assert (published.summary.learning.theta, published.summary.learning.calibrated_theta) == (plain, found.theta)
     assert gain.text[1:] in " ".join(shown(summary_table(published.summary), width=400).split())
     assert published.theta is not None
     assert published.report is not None
@@ -153,7 +153,9 @@ def test_a_theta_that_the_pours_do_not_justify_is_not_deployed_and_everything_pu
     assert (written["theta"], written["why"]) == (plain.model_dump(), gain.text)
     assert written["calibrated"] == found.theta.model_dump()
     assert not predicts_with_posterior(published.theta)
-    assert json.loads((tmp_path / "run" / "summary.json").read_text())["calibration_gain"]["text"] == gain.text
+    assert (
+        json.loads((tmp_path / "run" / "summary.json").read_text())["learning"]["calibration_gain"]["text"] == gain.text
+    )
     page = html.unescape(published.report.read_text())
     assert gain.text[1:] in page
     with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
@@ -192,7 +194,7 @@ def test_what_is_recommended_is_poured_again_after_each_deployment(tmp_path: Pat
         confirmed = result.results[f"confirmation:{scene.name}"]
         assert (confirmed.scene, confirmed.loss.count) == (scene.name, 2)
     summary = summarise(plan, result.results)
-    found = summary.receivers[SCENE.name].confirmed
+    found = summary.outcome.receivers[SCENE.name].confirmed
     assert found is not None
     text = " ".join(shown(summary_table(summary)).split())
     assert "poured again" in text

@@ -33,7 +33,7 @@ def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path
             found = await served.until(second, "finished")
             assert found["summary"]["pours"] == 3
             assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
-            assert found["pours_made"] == found["summary"]["pours_made"]
+            assert found["pours_made"] == found["summary"]["outcome"]["pours_made"]
             before = await served.get(f"/campaigns/{first}")
             assert before["state"] == "finished"
             assert before["ended"] <= found["begun"]
@@ -216,7 +216,7 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
             assert plan.parameters.friction == 0.21
             assert found["name"] == plan.name == "cup-plan"
             assert [scene.receiver.name for scene in plan.deployment.scenes] == ["bowl"]  # type: ignore[union-attr]
-            assert len(found["summary"]["receivers"]) == 1
+            assert len(found["summary"]["outcome"]["receivers"]) == 1
 
     run(work())
 

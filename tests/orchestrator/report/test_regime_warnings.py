@@ -104,9 +104,12 @@ def test_the_summary_has_them_for_people_and_for_programs(results: dict[str, Any
     deployed = {"narrow cup": results["narrow cup"]}
     best = {"narrow cup": [NotCovered(one.kind, one.share, one.text) for one in spaces["narrow cup"]]}
     summary = summarise(plan, deployed, not_covered=spaces, best_not_covered=best)
-    written = summary.model_dump(mode="json")
+    written = summary.model_dump(mode="json")["outcome"]
     assert [one["kind"] for one in written["not_covered"]["narrow cup"]] == ["dribbling", "wetting"]
-    assert [one["kind"] for one in written["receivers"]["narrow cup"]["not_covered"]] == ["dribbling", "wetting"]
+    assert [one["kind"] for one in written["receivers"]["narrow cup"]["not_covered"]] == [
+        "dribbling",
+        "wetting",
+    ]
     text = " ".join(shown(summary_table(summary)).split())
     assert "Not simulated at this action, dribbling: " in text
     assert "at this action, dribbling" not in shown(summary_table(summarise(plan, deployed)))

@@ -136,7 +136,7 @@ def test_expected_losses_below_zero_are_shown_as_zero_and_stored_as_they_are(
         map=changed(learnt.map, mean=(np.array(learnt.map.mean) - 0.5).tolist()),
     )
     summary = summarise(plan, {"narrow cup": deployed})
-    recommended = summary.receivers["narrow cup"].recommended
+    recommended = summary.outcome.receivers["narrow cup"].recommended
     assert recommended is not None
     assert recommended.predicted_loss == -0.013
     assert "0.00 ± 1.40 %" in shown(summary_table(summary))

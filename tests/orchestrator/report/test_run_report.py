@@ -28,7 +28,7 @@ from orchestrator.reports import figure_style as style
 from orchestrator.reports.console_view import summary_table
 from orchestrator.reports.html_report import run_page
 from orchestrator.reports.publishing import Published, publish
-from orchestrator.reports.run_summary import summary_json
+from orchestrator.reports.run_summary import RunFiles, summary_json
 from orchestrator.reports.summarise import summarise
 from orchestrator.runs.request_executor import FILM_RATE
 from orchestrator.runs.run_engine import run_campaign
@@ -125,7 +125,7 @@ def test_the_same_figure_is_the_same_file(tmp_path: Path) -> None:
 
 
 def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> None:
-    said, row = texts(made.page), next(iter(made.published.summary.receivers.values()))
+    said, row = texts(made.page), next(iter(made.published.summary.outcome.receivers.values()))
     assert row.recommended is not None
     assert f"{row.recommended.action_si['x_offset'] * 1e3:.3g} mm" in said
     assert "To pour 100 g of water from beaker into narrow, use the recommended action." in said
@@ -137,7 +137,7 @@ def test_it_says_what_to_do_what_to_expect_and_what_nobody_knows(made: Made) -> 
 
 
 def test_ranges_of_theta_have_the_unit_of_their_value(made: Made) -> None:
-    searched = [one for one in made.published.summary.parameters if one.searched != "not searched"]
+    searched = [one for one in made.published.summary.learning.parameters if one.searched != "not searched"]
     assert searched
     for one in searched:
         _, _, unit = one.value.partition(" ")
@@ -154,7 +154,11 @@ def test_pictures_come_first_and_parameters_that_were_not_searched_in_one_line(m
     shown = texts(made.page)
     table = shown[shown.index("θ* with its region") : shown.index("Not searched: ")]
     assert "not searched" not in table
-    fixed = [f"{one.name} {one.value}" for one in made.published.summary.parameters if one.searched == "not searched"]
+    fixed = [
+        f"{one.name} {one.value}"
+        for one in made.published.summary.learning.parameters
+        if one.searched == "not searched"
+    ]
     assert fixed
     assert f"Not searched: {', '.join(fixed)}." in shown
 
@@ -188,7 +192,7 @@ def test_names_and_reasons_that_are_html_stay_text(made: Made) -> None:
         made.result.results,
         record=record,
         run=SCRIPT,
-        figures={f"loss map {SCRIPT}": made.published.figures["discrepancy map"]},
+        files=RunFiles(figures={f"loss map {SCRIPT}": made.published.figures["discrepancy map"]}),
         versions={"campaign": SCRIPT, "packages": {SCRIPT: SCRIPT}},
         check=JournalCheck(Path(SCRIPT), problems=(SCRIPT,)),
     )
@@ -329,17 +333,18 @@ def test_console_page_json_and_library_show_one_text_for_each_result(made: Made)
     console = " ".join(shown(summary_table(made.published.summary), width=400).split())
     page = " ".join(texts(made.page).split())
     data = json.loads(json.dumps(summary_json(library.open_run(made.result.directory).summary)))
-    (receiver,) = data["receivers"].values()
-    (advice,) = data["advice"]
+    outcome = data["outcome"]
+    (receiver,) = outcome["receivers"].values()
+    (advice,) = outcome["advice"]
     everywhere = [*filter(None, receiver["texts"].values()), *advice["sentences"], advice["window"], *advice["open"]]
-    everywhere += data["theta_sentences"]
+    everywhere += data["learning"]["theta_sentences"]
     assert len(everywhere) > 10
     for text in everywhere:
         assert text in console
         assert html.unescape(text) in page
-    for pour in data["pours_made"]:
+    for pour in outcome["pours_made"]:
         assert pour["predicted"] in page
         assert pour["calibration"] or pour["measured"] in page
         assert f"{pour['spilled_g']:.1f}" in page
     assert all(use["text"] in console and use["text"] in page for use in data["occupancy"].values())
-    assert all(text in page for text in (*data["cost"].values(), *data["open_questions"], *data["asked"].values()))
+    assert all(text in page for text in (*data["cost"].values(), *outcome["open_questions"], *data["asked"].values()))

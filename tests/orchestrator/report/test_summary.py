@@ -15,7 +15,15 @@ from orchestrator.learning.single_action import PredictedPour
 from orchestrator.records.codec import decode_result
 from orchestrator.reports.console_view import print_summary, summary_table
 from orchestrator.reports.figure_style import display_value, display_values
-from orchestrator.reports.run_summary import NotSimulated, PoolUse, RunSummary, Totals, summary_schema, write_summary
+from orchestrator.reports.run_summary import (
+    NotSimulated,
+    PoolUse,
+    RunFiles,
+    RunSummary,
+    Totals,
+    summary_schema,
+    write_summary,
+)
 from orchestrator.reports.summarise import summarise
 from orchestrator.reports.wording import pool_line
 from sim_engine.prediction_band import SampleStatistics
@@ -38,23 +46,22 @@ def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dic
     summary = summarise(
         plan,
         results,
-        figures=figures,
-        recording=tmp_path / "campaign.rrd",
+        files=RunFiles(figures=figures, recording=tmp_path / "campaign.rrd"),
         totals=Totals(simulations=60),
     )
     deployed = results["narrow cup"]
     losses = [pour.loss for pour in deployed.pours]
-    receiver = summary.receivers["narrow cup"]
-    assert summary.theta == results["calibration"].found.theta
+    receiver = summary.outcome.receivers["narrow cup"]
+    assert summary.learning.theta == results["calibration"].found.theta
     assert summary.simulations == 60
-    assert summary.discrepancy["test"]["calibrated"] == results["evaluation"].discrepancy["calibrated"]["test"]
-    assert summary.discrepancy["test"]["random_theta"] == results["evaluation"].random_median["test"]
+    assert summary.learning.discrepancy["test"]["calibrated"] == results["evaluation"].discrepancy["calibrated"]["test"]
+    assert summary.learning.discrepancy["test"]["random_theta"] == results["evaluation"].random_median["test"]
     assert (receiver.first.loss, receiver.best.loss) == (losses[0], min(losses))
     assert receiver.best.number == 1 + losses.index(min(losses))
     assert receiver.recommended == deployed.recommended
 
     text = shown(summary_table(summary))
-    assert display_value("particles", summary.theta.particles) in text
+    assert display_value("particles", summary.learning.theta.particles) in text
     assert "12.34" in text
     assert f"{100 * min(losses):.2f} % (pour {receiver.best.number})" in text
     assert display_values(deployed.recommended.action_si) in text
@@ -78,8 +85,9 @@ def test_summary_file_is_what_its_schema_says(results: dict[str, Any], tmp_path:
     warning = NotSimulated(
         receiver="cup", kind="wetting", share=0.1, text="", action_si={"x_offset": 0.1}, hit=1, tried=5
     )
-    summary = summarise(plan, results, totals=Totals(occupancy={"narrow cup": BUSY}))
-    written = json.loads(write_summary(tmp_path, changed(summary, not_covered={"cup": (warning,)})).read_text())
+    busy = Totals(occupancy={"narrow cup": BUSY})
+    summary = summarise(plan, results, totals=busy, not_covered={"cup": (warning,)})
+    written = json.loads(write_summary(tmp_path, summary).read_text())
     validator = jsonschema.Draft202012Validator(summary_schema())
     validator.validate(written)
     kinds = {one["kind"] for one in written["results"].values()}
@@ -97,7 +105,7 @@ def test_summary_warns_of_an_untrustworthy_simulator_failed_pours_and_dropped_ev
         pours[index] = changed(pours[index], status="failed", reason=why)
     poured = changed(results["narrow cup"], failed_pours=2, model_check=trust, pours=tuple(pours))
     plan = example_run.campaign()
-    text = shown(summary_table(summarise(plan, {"narrow cup": poured}, dropped_events=12)))
+    text = shown(summary_table(summarise(plan, {"narrow cup": poured}, files=RunFiles(dropped_events=12))))
     assert "the simulator may not fit this vessel" in text
     assert (
         "2 pours failed: pour 2: pour_failed: the gripper slipped; pour 3: pour_unknown: declared lost by the operator"
@@ -121,7 +129,7 @@ def test_what_pours_say_of_the_simulator_is_known_where_it_is_borne_out_and_open
     )
     plan = example_run.campaign()
     poured = changed(results["narrow cup"], model_check=trust)
-    (said,) = summarise(plan, {"narrow cup": poured}).advice
+    (said,) = summarise(plan, {"narrow cup": poured}).outcome.advice
     assert ("The simulator is as it is." in said.sentences) == known
     assert ("The simulator is as it is." in said.open) != known
 
@@ -144,7 +152,7 @@ def test_what_was_delivered_stands_in_table_and_file_in_grams_and_millilitres(re
         over_seeds={"received": SampleStatistics(0.9, 0.01, 2), "spilled": SampleStatistics(0.1, 0.01, 2)},
     )
     summary = summarise(plan, {"narrow cup": deployed, "prediction:narrow cup": foreseen})
-    receiver = summary.receivers["narrow cup"]
+    receiver = summary.outcome.receivers["narrow cup"]
     assert receiver.best == best
     assert receiver.predicted_delivered_g == pytest.approx(900.0 * liquid.mass)
     assert receiver.predicted_delivered_ml == pytest.approx(900.0 * liquid.mass / liquid.density * 1e3)
@@ -173,7 +181,7 @@ def test_table_in_a_log_file_breaks_neither_paths_nor_rows(
     monkeypatch.setenv("COLUMNS", "60")
     plan = example_run.campaign()
     recording = Path("/laboratory") / "a-folder-with-a-rather-long-name" / ("x" * 120) / "campaign.rrd"
-    summary = summarise(plan, {"narrow cup": results["narrow cup"]}, recording=recording)
+    summary = summarise(plan, {"narrow cup": results["narrow cup"]}, files=RunFiles(recording=recording))
     print_summary(summary)
     lines = capsys.readouterr().err.splitlines()
     assert any(line.endswith(str(recording)) for line in lines)
@@ -193,5 +201,5 @@ def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results:
 def test_run_that_was_stopped_at_once_has_a_summary_too() -> None:
     plan = example_run.campaign()
     summary = summarise(plan, {})
-    assert (summary.theta, summary.receivers) == (None, {})
+    assert (summary.learning.theta, summary.outcome.receivers) == (None, {})
     assert "narrow-cup" in shown(summary_table(summary))

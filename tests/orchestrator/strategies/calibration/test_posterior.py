@@ -29,7 +29,7 @@ from orchestrator.learning.single_action import RepeatedSimulation
 from orchestrator.reports.figure_style import save
 from orchestrator.reports.publishing import theta_file
 from orchestrator.reports.surrogate_figures import draw_posterior
-from orchestrator.reports.wording import posterior_lines, theta_sentences
+from orchestrator.reports.wording import identified_viscosity, posterior_lines
 from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS, PARAMETERS, SCENE, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -183,14 +183,13 @@ def test_people_read_the_viscosity_that_the_pours_mean() -> None:
         remaining_discrepancy=RemainingDiscrepancy(low=0.0, median=0.0, high=0.0),
         effective=100.0,
     )
-    space = Space((Axis("viscosity_factor", 0.1, 10.0, "log"),))
     shampoo = Liquid(name="shampoo", mass=0.18, density=1000.0, dynamic_viscosity=0.15)
     wanted = "Viscosity of shampoo, by these pours: 75 … 120 mPa*s (90 %; declared 150 mPa*s)."
-    assert wanted in theta_sentences(None, None, said, space, None, shampoo)
+    assert identified_viscosity(said, shampoo) == [wanted]
     undetermined = said.model_copy(update={"open": ("viscosity_factor",)})
     water = Liquid(mass=0.18)  # simulated without its viscosity
     for posterior, liquid in ((undetermined, shampoo), (said, water)):
-        assert not any("by these pours" in one for one in theta_sentences(None, None, posterior, space, None, liquid))
+        assert identified_viscosity(posterior, liquid) == []
 
 
 @pytest.mark.slow

@@ -249,7 +249,7 @@ def test_people_read_the_front_at_the_end_with_what_it_costs_and_how_it_is_poure
     )
     plan = toy_plan(tmp_path, deployment=deployment)
     summary = summarise(plan, {"deployment:cup": found.result()})
-    assert summary.loss == "objectives"
+    assert summary.outcome.loss == "objectives"
     console = Console(width=200)
     with console.capture() as capture:
         console.print(summary_table(summary))
