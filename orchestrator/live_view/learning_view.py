@@ -26,7 +26,7 @@ from orchestrator.learning.calibration.calibration_base import Calibrated, Calib
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import Believed
-from orchestrator.learning.requests import Pour, Poured, Suggest, Suggested
+from orchestrator.learning.requests import Suggest, Suggested
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
@@ -39,13 +39,14 @@ from orchestrator.reports.loss_units import (
     LossUnit,
     at_least_nothing,
     deployment_unit,
-    is_calibration,
     loss_of_pour,
     unit_of_pour,
 )
+from orchestrator.reports.progress_state import Best
 from orchestrator.reports.stage_views import receiver_names
 from orchestrator.reports.summarise import pour_summary
 from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.outcome import PourMeasurement
 from sim_engine.prediction_band import LEVEL
 
 if TYPE_CHECKING:
@@ -85,7 +86,6 @@ class LearningStage:
         self._scene_of_stage: dict[str, str] = {}
         self._drawn: dict[str, float] = {}
         self._waiting: dict[str, Callable[[], bytes]] = {}
-        self._least: dict[str, float] = {}
         self.trust = ""
         """Result of the model check, as text."""
 
@@ -111,15 +111,13 @@ class LearningStage:
         """Associate a stage with a scene."""
         self._scene_of_stage[stage] = scene
 
-    def poured(self, stage: str, request: Pour, outcome: Poured) -> str:
-        """Log a weighed pour; return a description."""
-        measured, unit = outcome.measurement, unit_of_pour(self._plan, request)
-        said = pour_summary(self._plan, RunPour(stage, 0, request, "weighed", outcome)).line
+    def poured(self, pour: RunPour, measured: PourMeasurement, best: Best | None) -> str:
+        """Log a weighed pour and the best one into its receiver; return a description."""
+        request, unit, told = pour.request, unit_of_pour(self._plan, pour.request), pour_summary(self._plan, pour)
         value = loss_of_pour(self._plan, request, measured)
         if value is None:
-            return said
-        calibrating = is_calibration(self._plan, request)
-        place = f"{PLACE}/{CALIBRATION if calibrating else safe_name(request.scene)}/loss"
+            return told.line
+        place = f"{PLACE}/{CALIBRATION if told.calibration else safe_name(request.scene)}/loss"
         shown = unit.factor * value
         self._number(f"{place}/measured", shown, f"measured [{unit.unit}]", style.MEASURED, marker=9.0)
         if request.predicted is not None:
@@ -128,10 +126,9 @@ class LearningStage:
             for name, end in zip(("low", "high"), request.predicted.of_a_pour(), strict=True):
                 label = f"{100 * LEVEL:.0f} % interval, {'upper' if name == 'high' else 'lower'} end [{unit.unit}]"
                 self._number(f"{place}/predicted_{name}", unit.factor * end, label, "#f0c27a", width=1.5)
-        if not calibrating:
-            self._least[request.scene] = least = min(shown, self._least.get(request.scene, shown))
-            self._number(f"{place}/best", least, f"best so far [{unit.unit}]", style.GOOD)
-        return said
+        if best is not None and not told.calibration:
+            self._number(f"{place}/best", unit.factor * best.loss, f"best so far [{unit.unit}]", style.GOOD)
+        return told.line
 
     def suggested(self, event: RequestFinished, request: Suggest, outcome: Suggested) -> None:
         """Draw the surrogate of a suggestion, unless it was drawn recently."""

@@ -166,10 +166,9 @@ class CampaignRecording:
     def _follow(self, request: Request) -> None:
         """Select the layout for a request."""
         if isinstance(request, Simulate | Pour) and self._moment != "replaying":
-            deployed = self._plan.deployment is not None and request.scene in {
-                scene.name for scene in self._plan.deployment.scenes
-            }
-            self._show("deploying" if deployed and request.purpose != "calibration" else "calibrating")
+            deployed = [scene.name for scene in self._plan.deployment.scenes] if self._plan.deployment else []
+            calibrates = request.calibrates(deployed) if isinstance(request, Pour) else request.scene not in deployed
+            self._show("calibrating" if calibrates else "deploying")
 
     def _started(self, event: RequestStarted) -> None:
         self._follow(event.request)
@@ -205,10 +204,12 @@ class CampaignRecording:
             case Simulate() as request, Simulated() as outcome:
                 self._learning.about(event.stage, request.scene)
                 self._simulation(event, request, outcome)
-            case Pour() as request, Poured() as outcome:
+            case Pour() as request, Poured(measured):
                 self._learning.about(event.stage, request.scene)
-                self._say(self._learning.poured(event.stage, request, outcome), source=event.stage)
-                measured, shown = outcome.measurement, self._balance.finish(outcome.measurement)
+                pour = next(one for one in self._progress.run.pours if one.id == event.id)
+                best = self._progress.best.get(request.scene)
+                self._say(self._learning.poured(pour, measured, best), source=event.stage)
+                shown = self._balance.finish(measured)
                 self._cell.finish(
                     self._scenes[request.scene],
                     measured,

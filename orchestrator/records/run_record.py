@@ -56,6 +56,10 @@ POOL_RESTS = "pool_rests"
 """Key in a decision's values with which a strategy reports that no simulation is worthwhile now."""
 
 
+NOT_REPORTED = Progress()
+"""Progress of a stage whose strategy has not reported any."""
+
+
 @dataclass
 class RunPour:
     """A requested pour and its outcome.
@@ -206,7 +210,7 @@ class RecordedStage:
     pours: int = 0
     simulations_asked: int = 0
     pours_asked: int = 0
-    progress: Progress = field(default_factory=Progress)
+    progress: Progress = NOT_REPORTED
     opened_at: float | None = None
     closed_at: float | None = None
 

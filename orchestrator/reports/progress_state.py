@@ -55,7 +55,7 @@ class ProgressState:
     def __init__(self, plan: CampaignPlan) -> None:
         self.plan = plan
         self.run = RunState(Header(plan.name, {}), plan.parallel_simulations)
-        self.forecast = Forecast(plan.parallel_simulations, particles_of(plan))
+        self.forecast = Forecast(self.run, particles_of(plan))
         self._timed: list[float] = []
         self._busy_seconds, self._load_to = 0.0, 0.0
         self._load_from: float | None = None
@@ -66,10 +66,10 @@ class ProgressState:
             self._pass_time(event.time)
             if isinstance(event, RequestFinished) and isinstance(event.outcome, Simulated) and event.seconds > 0.0:
                 self._timed.append(event.seconds)
+        self.run.take(event)
         self.forecast(event)
         if isinstance(event, CampaignOpened):
-            self.forecast.begin(event.simulators, work_of(self.plan, event.stages))
-        self.run.take(event)
+            self.forecast.begin(work_of(self.plan, event.stages))
 
     @property
     def best(self) -> dict[str, Best]:

@@ -1,6 +1,6 @@
 """Estimate of a campaign's remaining time.
 
-`work_of` derives the expected work of each stage (`WorkEstimate`) from the plan. `Forecast` follows the events and
+`work_of` derives the expected work of each stage (`WorkEstimate`) from the plan. `Forecast` reads the `RunState`, and
 combines this work with measured durations.
 
 - Pours and simulations are estimated separately. Before the first measurement, a pour takes the planned times of
@@ -27,14 +27,8 @@ from orchestrator.learning.calibration.calibration_scores import DRAWS
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.learning.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.learning.strategy import Progress
-from orchestrator.records.events import (
-    Event,
-    RequestFinished,
-    RequestStarted,
-    StageClosed,
-    StageOpened,
-    StrategyProgressed,
-)
+from orchestrator.records.events import Event, RequestFinished, RequestStarted, StageClosed, StageOpened
+from orchestrator.records.run_record import NOT_REPORTED, RecordedStage, RunState
 from orchestrator.runs.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, DOSES, EVALUATION, POURS
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.scene import Scene
@@ -90,14 +84,19 @@ class _Stage:
     """
 
     work: WorkEstimate
-    progress: Progress
-    closed: bool = False
+    recorded: RecordedStage
     waits: list[float] = field(default_factory=list)
     particles: list[int] = field(default_factory=list)
     made_before: int = 0
     answered: float = 0.0
     cycles: list[float] = field(default_factory=list)
     cycle_from: float | None = None
+
+    @property
+    def progress(self) -> Progress:
+        """Last reported by the strategy; the expected work before."""
+        known = self.recorded.progress
+        return Progress(0, self.work.simulations, 0, self.work.pours) if known is NOT_REPORTED else known
 
     @property
     def simulations_alone(self) -> int:
@@ -111,41 +110,36 @@ class _Stage:
 
 
 class Forecast:
-    """Counts a campaign's events and estimates the remaining time.
+    """Measures durations of a campaign's requests and estimates the remaining time.
 
     Args:
-        slots: maximum number of simulations at a time.
+        run: state of the run, which takes each event before the forecast.
         particles: particles of θ before anything is calibrated.
     """
 
-    def __init__(self, slots: int, particles: float) -> None:
-        self._slots = max(slots, 1)
-        self._particles = particles
+    def __init__(self, run: RunState, particles: float) -> None:
+        self._run, self._particles = run, particles
         self._stages: dict[str, _Stage] = {}
         self._current: _Stage | None = None
         self._pours: list[float] = []
 
-    def begin(self, simulators: int, works: Mapping[str, WorkEstimate]) -> None:
-        """Begin a run with this number of simulators and the expected work of each stage."""
-        self._slots = max(min(self._slots, simulators), 1)
-        self._stages = {name: _Stage(work, _all_of(work)) for name, work in works.items()}
+    def begin(self, works: Mapping[str, WorkEstimate]) -> None:
+        """Begin a run with the expected work of each stage."""
+        self._stages = {name: _Stage(work, self._run.stages[name]) for name, work in works.items()}
 
     def __call__(self, event: Event) -> None:
-        """Count an event."""
-        if event.replayed:
-            if isinstance(event, StrategyProgressed) and event.stage in self._stages:
-                self._stages[event.stage].progress = event.progress
-            elif isinstance(event, StageClosed) and event.stage in self._stages:
-                self._close(event)
-            return
+        """Measure an event."""
         match event:
+            case StageClosed() if event.stage in self._stages:
+                self._current = None
+                found = getattr(event.result, "found", None)
+                if (theta := getattr(found, "theta", None)) is not None:
+                    self._particles = theta.particles
+            case _ if event.replayed:
+                return
             case StageOpened() if event.stage in self._stages:
                 self._current = self._stages[event.stage]
                 self._current.answered = event.time
-            case StageClosed() if event.stage in self._stages:
-                self._close(event)
-            case StrategyProgressed() if event.stage in self._stages:
-                self._stages[event.stage].progress = event.progress
             case RequestStarted(request=Pour()) if self._current is not None:
                 if self._current.cycle_from is None:
                     self._current.cycle_from = event.time
@@ -169,19 +163,12 @@ class Forecast:
                     stage.particles.append(request.parameters.particles)
                 stage.answered = event.time
 
-    def _close(self, event: StageClosed) -> None:
-        self._stages[event.stage].closed = True
-        self._current = None
-        found = getattr(event.result, "found", None)
-        if (theta := getattr(found, "theta", None)) is not None:
-            self._particles = theta.particles
-
     def stage_left(self, name: str, now: float) -> float | None:
         """Seconds to the end of a stage; None for an unknown stage."""
         stage = self._stages.get(name)
         if stage is None:
             return None
-        if stage.closed:
+        if stage.recorded.closed_at is not None:
             return 0.0
         pours = stage.progress.pours_left
         left = stage.simulations_alone * self._price(stage) + pours * self._cycle(stage)
@@ -210,7 +197,7 @@ class Forecast:
         particles = stage.work.particles or self._particles
         others = [other for other in self._stages.values() if other is not stage and len(other.waits) >= ENOUGH]
         if not others:
-            return PRICE / self._slots * particles
+            return PRICE / max(min(self._run.slots, self._run.simulators), 1) * particles
         return _usual(others[-1].waits) / _mean(others[-1].particles) * particles
 
     def _cycle(self, stage: _Stage) -> float:
@@ -227,10 +214,6 @@ class Forecast:
 def _made_before(event: RequestFinished) -> bool:
     """Whether a simulation ran while the arm poured; its duration then does not predict the next one."""
     return isinstance(event.outcome, Simulated) and event.seconds < 0.1 * event.outcome.outcome.cpu_s
-
-
-def _all_of(work: WorkEstimate) -> Progress:
-    return Progress(0, work.simulations, 0, work.pours)
 
 
 def _mean(values: Sequence[float]) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -12,6 +13,7 @@ from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from orchestrator.learning.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.learning.strategy import Progress
 from orchestrator.records.events import (
+    CampaignOpened,
     Event,
     RequestFinished,
     RequestStarted,
@@ -19,6 +21,8 @@ from orchestrator.records.events import (
     StageOpened,
     StrategyProgressed,
 )
+from orchestrator.records.journal_file import Header
+from orchestrator.records.run_record import RunState
 from orchestrator.reports.time_estimate import PRICE, Forecast, WorkEstimate, pour_time, work_of
 from sim_engine.liquids import SimulationParameters
 from tests.support import example_run
@@ -84,10 +88,25 @@ class Timeline:
         yield from self.stage("deployment", PRIOR, CYCLES, beside=4)
 
 
-def begun() -> Forecast:
-    forecast = Forecast(slots=2, particles=900.0)
-    forecast.begin(2, WORK)
-    return forecast
+class Followed(Forecast):
+    """A forecast whose run takes the events, too."""
+
+    def __init__(self, slots: int, particles: float, works: dict[str, WorkEstimate]) -> None:
+        super().__init__(RunState(Header("", {}), slots), particles)
+        self._run.take(
+            CampaignOpened(
+                name="", run_directory=Path(), stages=tuple(works), mode="virtual", simulators=slots, time=0.0
+            )
+        )
+        self.begin(works)
+
+    def __call__(self, event: Event) -> None:
+        self._run.take(event)
+        super().__call__(event)
+
+
+def begun() -> Followed:
+    return Followed(2, 900.0, WORK)
 
 
 def test_the_end_that_is_foretold_comes_true_within_a_fifth_from_the_beginning_on() -> None:
@@ -107,8 +126,7 @@ def test_the_end_that_is_foretold_comes_true_within_a_fifth_from_the_beginning_o
 
 def test_first_pours_that_start_a_bench_and_what_is_made_beside_them_say_nothing_of_the_next_ones() -> None:
     """Seen: 171 s were told after the second pour where 88 were left, 119 a moment before."""
-    timeline, forecast = Timeline(), Forecast(slots=2, particles=1000.0)
-    forecast.begin(2, {"pours": WorkEstimate(pours=10, pour_time=8.5)})
+    timeline, forecast = Timeline(), Followed(2, 1000.0, {"pours": WorkEstimate(pours=10, pour_time=8.5)})
     lefts = []
     for event in timeline.stage("pours", pours=(33.6, 22.7, 6.5, 4.3, *(4.0,) * 6)):
         forecast(event)
@@ -120,8 +138,8 @@ def test_first_pours_that_start_a_bench_and_what_is_made_beside_them_say_nothing
 @pytest.mark.parametrize("last", [True, False])
 def test_simulations_made_while_the_arm_pours_are_not_waited_for(made: bool, last: bool) -> None:
     """Unless they weren't: then the forecast is right again once that is seen."""
-    forecast, timeline = Forecast(slots=2, particles=0.6 * 2 / PRICE), Timeline()
-    forecast.begin(2, {"pours": WorkEstimate(pours=4, pour_time=8.0), "evaluation": WorkEstimate(35, ahead=25)})
+    works = {"pours": WorkEstimate(pours=4, pour_time=8.0), "evaluation": WorkEstimate(35, ahead=25)}
+    forecast, timeline = Followed(2, 0.6 * 2 / PRICE, works), Timeline()
     assert forecast.left(timeline.now) == pytest.approx(4 * 8.2 + 10 * 0.6)
     answered = (*(0.6 for _ in range(10)), *((0.0 if made else 0.6) for _ in range(25)))
     for event in timeline.stage("pours", pours=(8.0,) * 4):
@@ -146,12 +164,9 @@ def test_the_time_left_falls_while_a_pour_or_a_simulation_takes_its_time() -> No
 
 
 def test_simulations_beside_a_pour_cost_time_only_where_they_outlast_it() -> None:
-    one = Forecast(slots=1, particles=1000.0)
-    one.begin(1, {"deployment": WorkEstimate(0, 10, beside=0, pour_time=90.0)})
-    few = Forecast(slots=1, particles=1000.0)
-    few.begin(1, {"deployment": WorkEstimate(200, 10, beside=20, pour_time=90.0)})
-    many = Forecast(slots=1, particles=1000.0)
-    many.begin(1, {"deployment": WorkEstimate(2000, 10, beside=200, pour_time=90.0)})
+    one = Followed(1, 1000.0, {"deployment": WorkEstimate(0, 10, beside=0, pour_time=90.0)})
+    few = Followed(1, 1000.0, {"deployment": WorkEstimate(200, 10, beside=20, pour_time=90.0)})
+    many = Followed(1, 1000.0, {"deployment": WorkEstimate(2000, 10, beside=200, pour_time=90.0)})
     assert few.left(0.0) == one.left(0.0) == pytest.approx(902.0)
     assert (many.left(0.0) or 0.0) > 1.5 * 902.0
 
