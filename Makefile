@@ -1,4 +1,4 @@
-# Everything that a fresh machine needs is Python 3.11 to 3.13, git and make.
+# Everything that a fresh machine needs is Python 3.11 to 3.14, git and make.
 #   make install   sets up, and nothing else
 #   make demo      sets up and runs the quickstart campaign on the virtual bench
 #   make test      sets up and runs all checks and the quick tests
@@ -18,7 +18,7 @@ READY := $(VENV)/.ready
 .DEFAULT_GOAL := demo
 
 $(READY): requirements.lock pyproject.toml
-	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 14) else "Decant needs Python 3.11, 3.12 or 3.13; this is %d.%d. Name another: make PYTHON=python3.12" % v)'
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 15) else "Decant needs Python 3.11 to 3.14; this is %d.%d. Name another: make PYTHON=python3.12" % v)'
 	@echo "setting up $(VENV) (about 2.1 GB, once; a few minutes)"
 	$(PYTHON) -m venv $(VENV)
 # The lock names every package, so pip resolves nothing: older ones would take a newer release for a package with extras.
