@@ -17,7 +17,6 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from actors.arm.arm_device import DeviceArm, Follow, _ignore
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError, Executed, PlannedPour
@@ -70,6 +69,8 @@ def grip_height(spec: GripperSettings, arm: ArmSettings) -> float:
     if grip is None:
         raise LaboratoryError("the arm does not state where it holds the pourer; add 'height' to the gripper")
     x, y, z, *turn = grip.as_list
+    from scipy.spatial.transform import Rotation  # slow import, not needed to check files
+
     return float((Rotation.from_rotvec(turn).inv().apply(-np.array([x, y, z])))[2])
 
 

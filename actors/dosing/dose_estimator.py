@@ -35,7 +35,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from actors.balance.step_response import FILTERS, LAGS, step_response
 from actors.dosing.cup_flow import CupFlow
@@ -574,6 +573,8 @@ def calibrated_knowledge(tilt_zeros: Sequence[float]) -> DoseKnowledge:
 
 def _normal(values: Floats) -> Floats:
     """Standard normal distribution function."""
+    from scipy.special import ndtr  # slow import, not needed to check files
+
     return np.asarray(ndtr(values), dtype=float)
 
 
