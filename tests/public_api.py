@@ -11,7 +11,8 @@ import inspect
 import tomllib
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Union, get_origin
 
 import decant
 from decant import plugins
@@ -44,7 +45,8 @@ def _lines(name: str, value: Any) -> list[str]:
         return [_class_line(name, value), *_members(name, value)]
     if inspect.isfunction(value):
         return [f"{name}{inspect.signature(value)}"]
-    return [f"{name}: {type(value).__name__}"]
+    kind = "UnionType" if get_origin(value) in (Union, UnionType) else type(value).__name__
+    return [f"{name}: {kind}"]
 
 
 def _class_line(name: str, cls: type) -> str:

@@ -45,6 +45,7 @@ from actors.optimizer.questions import (
 from actors.optimizer.suggest import propose
 from orchestrator.records.codec import to_json
 from sim_engine.action import DEG, Action
+from sim_engine.engine_package import engine_version
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.prediction_band import spreads
 from sim_engine.scene import PourTask, Scene
@@ -71,7 +72,8 @@ def machine() -> dict[str, str]:
         else []
     )
     features = os.environ.get("OPENBLAS_CORETYPE", "") + os.environ.get("NPY_DISABLE_CPU_FEATURES", "")
-    packages = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "scikit-learn", "taichi")}
+    packages = {name: importlib.metadata.version(name) for name in ("numpy", "scipy", "scikit-learn")}
+    packages["taichi"] = engine_version().removeprefix("taichi ")
     digest = hashlib.sha256("".join([*flags[:1], features]).encode()).hexdigest()[:16]
     return {"platform": platform.machine(), "instructions": digest, **packages}
 
