@@ -264,8 +264,8 @@ def engines(record: Record) -> str:
     gpu = prose(
         """**GPU.** The solver as it was before commit ea810740, with CUDA on an NVIDIA H200 (driver 580.159.04, Taichi
         1.7.4, 500 particles, 60 °/s to 85°, seeds 0 to 8191): the pourer keeps 15.44 ± 0.22 % in 8,192 pours side by
-        side, and 15.37 ± 0.12 % in 8 on the CPU of that machine; Quadrants 1.4.0 gives the same. One scene is one thread
-        there. A pour takes 8.4 s (0.4 s on the CPU), 512 take 70 s, 2,048 take 102 s, and 8,192 take 215 s: 38 a
+        side, and 15.37 ± 0.12 % in 8 on the CPU of that machine; Quadrants 1.4.0 gives the same. One scene is one
+        thread there. A pour takes 8.4 s (0.4 s on the CPU), 512 take 70 s, 2,048 take 102 s, and 8,192 take 215 s: 38 a
         second, where the 16 cores beside the card make 43. Many threads for one scene would be another solver."""
     )
     return f"## {title}\n\n{about}\n\n{table(head, rows, 'lrrlrrrr')}\n{settings([record])}\n{gpu}\n"

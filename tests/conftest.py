@@ -48,6 +48,8 @@ Their files alternate: many tests of the first wait for devices, and those of th
 REALTIME = (Path(__file__).parent / "end_to_end", Path(__file__).parent / "reliability")
 """Folders whose tests watch other processes: each is `realtime`."""
 
+WITHOUT_ARM = client_missing() is not None
+
 WITH_PROCESSES = tuple(
     Path(__file__).parent / name for name in ("actors", "plugins", "orchestrator/commands", "orchestrator/daemon")
 )
@@ -101,11 +103,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
     """Without `ur-rtde`, of which the newest Pythons have no wheel, a test that needs an arm is left out."""
     report = yield
-    if (
-        client_missing() is not None
-        and report.failed
-        and re.search(r"ur-rtde|rtde_(control|receive)", str(report.longrepr))
-    ):
+    if WITHOUT_ARM and report.failed and re.search(r"ur-rtde|rtde_(control|receive)", str(report.longrepr)):
         report.outcome, report.longrepr = "skipped", (str(item.path), None, "ur-rtde is not installed")
     return report
 
