@@ -1,8 +1,8 @@
 """Settings of a laboratory: the pool of simulators, the Ray cluster, arm, balance and operator, and the virtual bench.
 
 `LaboratorySettings` is the whole file. `RaySettings` and `BenchSettings` are sections of it; the settings of arm,
-balance and operator are in their own modules. The hidden θ of a virtual bench is part of the file; calibration never
-reads it.
+balance and operator are in their own modules. The ground truth of a virtual bench is part of the file; calibration
+never reads it.
 """
 
 from __future__ import annotations
@@ -95,11 +95,11 @@ class BenchBalance(Settings):
     """Time constant until a reading is stable."""
 
 
-class HiddenLiquidBase(Settings):
-    """θ of the 'real' liquid of the virtual bench. Hidden: calibration never reads it."""
+class TrueLiquidBase(Settings):
+    """The ground truth: θ of the virtual bench's liquid, which calibration never reads."""
 
     def parameters(self) -> SimulationParameters:
-        """The hidden θ."""
+        """θ of the ground truth."""
         return SimulationParameters.from_values(self.model_dump())
 
     def free_fields(self) -> frozenset[str]:
@@ -107,7 +107,7 @@ class HiddenLiquidBase(Settings):
         return self.parameters().free_fields()
 
 
-def _hidden_liquid() -> type[HiddenLiquidBase]:
+def _true_liquid() -> type[TrueLiquidBase]:
     """The settings with one key per parameter of the solver; the nuisances of a bench are its `pose_error`."""
     fields: Any = {
         name: (
@@ -117,25 +117,25 @@ def _hidden_liquid() -> type[HiddenLiquidBase]:
         for name, info in SimulationParameters.info().items()
         if not info.nuisance
     }
-    model: type[HiddenLiquidBase] = create_model(
-        "HiddenLiquid",
-        __base__=HiddenLiquidBase,
-        __doc__=HiddenLiquidBase.__doc__,
+    model: type[TrueLiquidBase] = create_model(
+        "TrueLiquid",
+        __base__=TrueLiquidBase,
+        __doc__=TrueLiquidBase.__doc__,
         __module__=__name__,
         **fields,
     )
     return model
 
 
-HiddenLiquid: Any = _hidden_liquid()
+TrueLiquid: Any = _true_liquid()
 
 
 class BenchSettings(Settings):
     """Ground truth of a virtual bench: a liquid that differs from the simulator's, execution errors, and the speed of
     time."""
 
-    liquid: Annotated[HiddenLiquid, Example("{particles: 4000, cohesion: 0.05 N/m}")]
-    """Hidden θ of the 'real' liquid; calibration never reads it."""
+    liquid: Annotated[TrueLiquid, Example("{particles: 4000, cohesion: 0.05 N/m}")]
+    """Ground truth: θ of the bench's liquid, which calibration never reads."""
 
     pose_error: PoseErrorSettings = PoseErrorSettings()
     """Systematic error of grip and placement."""
@@ -156,11 +156,11 @@ class BenchSettings(Settings):
     @classmethod
     def _from_parameters(cls, value: Any) -> Any:
         """A program may also give the θ itself."""
-        return HiddenLiquid(**value.of_the_solver()) if isinstance(value, SimulationParameters) else value
+        return TrueLiquid(**value.of_the_solver()) if isinstance(value, SimulationParameters) else value
 
     @property
     def theta(self) -> SimulationParameters:
-        """The hidden θ."""
+        """θ of the ground truth."""
         found: SimulationParameters = self.liquid.parameters()
         return found
 

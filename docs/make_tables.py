@@ -158,7 +158,7 @@ OF_SECTIONS = {
     "EmulatedRobotiqSettings": "[gripper](grippers.md)",
     "SpillSensorSettings": "[spill sensor](#spill-sensor)",
     "OperatorSettings": "[operator](#operator)",
-    "HiddenLiquid": "[parameters](#simulator), one value each",
+    "TrueLiquid": "[parameters](#simulator), one value each",
     "PoseErrorSettings": "[pose error](#pose-error)",
     "PoseNoise": "standard deviations of the [pose error](#pose-error)",
     "TransferSettings": "[transfer](#transfer)",

@@ -91,10 +91,10 @@ class Spill:
 
 
 async def true_pour(spec: BenchSettings, simulators: SimulatorPool, task: PourTask, seed: int) -> SimulatedPour:
-    """Simulate the 'real' liquid in one pour; the same seed gives the same result.
+    """Simulate the ground truth in one pour; the same seed gives the same result.
 
     Args:
-        spec: of the bench, with the hidden θ.
+        spec: of the bench, with the ground truth.
         simulators: a separate pool for the ground truth.
         task: scene and motion of the pour; θ and seed are filled in here.
         seed: of the pour.
@@ -127,7 +127,7 @@ async def true_spill(
     `true_pour`.
 
     Args:
-        spec: of the bench, with the hidden θ and errors.
+        spec: of the bench, with the ground truth and errors.
         simulators: a separate pool for the ground truth.
         scene: the intended scene.
         action: the commanded action.

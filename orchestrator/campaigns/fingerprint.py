@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from actors.balance.scale_model import ScaleSettings
 from actors.balance.simulated_balance import SimulatedBalanceSettings
-from actors.laboratory_settings import HiddenLiquidBase
+from actors.laboratory_settings import TrueLiquidBase
 from actors.optimizer.questions import WRITTEN_IF_SET
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.records.codec import to_json
@@ -25,7 +25,7 @@ from sim_engine.settings.model import BY_CONTENT, NOT_IN_FINGERPRINT, SET_BY_PRO
 from sim_engine.vessel.shapes import ProfileShape, Shape
 
 WITH_FREE_FIELDS = (
-    HiddenLiquidBase,
+    TrueLiquidBase,
     Liquid,
     ProfileShape,
     ScaleSettings,

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
-from actors.laboratory_settings import BenchSettings, HiddenLiquid, LaboratorySettings
+from actors.laboratory_settings import BenchSettings, LaboratorySettings, TrueLiquid
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.search_ranges import Parameters, ParametersBase
@@ -199,8 +199,8 @@ class LevelSettings(Settings):
     name: Annotated[Name, Example("moderate")]
     """Name of the level in figures and folders."""
 
-    liquid: Annotated[HiddenLiquid, Example("{particles: 4000, cohesion: 0.05 N/m}")]
-    """Hidden θ of the 'real' liquid; calibration never reads it."""
+    liquid: Annotated[TrueLiquid, Example("{particles: 4000, cohesion: 0.05 N/m}")]
+    """Ground truth: θ of the bench's liquid, which calibration never reads."""
 
     pose_error: PoseErrorSettings = PoseErrorSettings()
     """Systematic error of grip and placement."""

@@ -36,7 +36,7 @@ class Level:
 
     Attributes:
         name: name for display and folders.
-        bench: the bench with the hidden θ, the errors of grip and placement, and their scatter.
+        bench: the bench with the ground truth, the errors of grip and placement, and their scatter.
     """
 
     name: str

@@ -13,7 +13,7 @@ import pytest
 
 from actors.interfaces import LaboratoryError
 from actors.laboratory import check_laboratory, open_laboratory
-from actors.laboratory_settings import HiddenLiquid, LaboratorySettings
+from actors.laboratory_settings import LaboratorySettings, TrueLiquid
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.campaigns.file_loading import load_laboratory
@@ -99,7 +99,7 @@ def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running,
 def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_liquid(
     ray_running, bench_spec, scene, action
 ):
-    bench = bench_spec.with_values(liquid=HiddenLiquid(particles=400))
+    bench = bench_spec.with_values(liquid=TrueLiquid(particles=400))
     coarse = SimulationParameters(particles=300)
 
     async def play(in_process):
