@@ -50,8 +50,8 @@ from orchestrator.cli.app import main
 try:
     main()
 finally:
-    heavy = {"scipy.special", "scipy.spatial", "scipy.ndimage", "scipy.stats", "trimesh", "sklearn", "pandas", "ray", "taichi", "rerun",
-             "matplotlib"}
+    heavy = {"scipy.special", "scipy.spatial", "scipy.ndimage", "scipy.stats", "trimesh", "sklearn", "pandas", "ray",
+             "taichi", "rerun", "matplotlib"}
     print("loaded:", *sorted(heavy & set(sys.modules)), file=sys.stderr)
 """
 
