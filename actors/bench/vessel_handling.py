@@ -47,6 +47,9 @@ from sim_engine.vessel.vessel import Vessel
 FILMED = 5e-3
 """A vessel that holds less liquid than this is carried as an empty one [kg]."""
 
+WRONG = 5e-3
+"""Difference of an empty vessel from the mass that its file states [kg], above which it may be another one."""
+
 REFILLS = 2
 """Largest number of fillings by the refill device for one pour."""
 
@@ -353,11 +356,12 @@ class VesselHandling:
         await consent.asked(question)
         self._at, self._mass, self._dry, self._gross = {"receiver": rest}, {}, None, None
         self._poured = self._pending = None
-        for place in self._record.stands():  # frees the places before they are filled
-            self._record.put(place, None, "laid out again")
+        for name in self._record.stands():  # frees the places before they are filled
+            self._record.put(name, None, "laid out again")
         self._record.put("receiver", rest, "laid out by the operator")
         self._record.put("pourer", None, "with the operator")
         self._enter("receiver", 0.0, 0.0)
+        self._enter("pourer", None, 0.0)
 
     async def around(self, question: OperatorQuestion, consent: MotionConsent) -> str:
         """Carry out the step of a weighing with the arm; other questions go to the operator."""
@@ -400,7 +404,9 @@ class VesselHandling:
 
     async def _account(self, gross: PourMasses, consent: MotionConsent) -> None:
         """Compare the masses of a whole cycle; ask a person if they do not close."""
-        if self._dry is not None:
+        if self._dry is None:
+            await self._right_vessel(gross, consent)
+        else:
             self._cycle["film_g"] = 1e3 * (gross.mass - self._dry.mass)
         if self._pending is None:
             return
@@ -429,8 +435,28 @@ class VesselHandling:
             about="mass",
             details={"missing_g": 1e3 * missing, "uncertainty_g": 1e3 * sigma},
         )
+        await self._go_on(question, consent)
+
+    async def _right_vessel(self, gross: PourMasses, consent: MotionConsent) -> None:
+        """Ask a person if the dry receiver on the balance does not weigh what its file states."""
+        grip = self._vessel("receiver").spec.grip
+        assert grip is not None
+        assert grip.mass is not None
+        if abs(gross.mass - grip.mass) <= WRONG:
+            return
+        question = OperatorQuestion(
+            f"The empty receiver on the balance weighs {1e3 * gross.mass:.1f} g, and its file states "
+            f"{1e3 * grip.mass:.1f} g. Is it the right vessel, empty and dry? Shall it go on?",
+            "yes or no",
+            about="mass",
+            details={"missing_g": 1e3 * (grip.mass - gross.mass)},
+        )
+        await self._go_on(question, consent)
+
+    async def _go_on(self, question: OperatorQuestion, consent: MotionConsent) -> None:
+        """Ask a person about masses, and then for the rest of the sequence."""
         if (await consent.asked(question)).strip().lower() not in ("yes", "y"):
-            raise LaboratoryError("the masses of the cycle do not close")
+            raise LaboratoryError("the masses are not what they should be, and the operator ended the cycle")
         await consent.given(move_question("take the pourer"))
 
     def poured(self, weighed: Mapping[str, PourMasses]) -> None:
@@ -554,8 +580,10 @@ class VesselHandling:
 
     async def _drive(self, place: str, *, full: bool, homewards: bool) -> None:
         way = replace(self._ways[place, full], homewards=homewards)
-        self._way, self._away = way, True
-        await self._truth.lasting(self._arm.carry(way, loaded=self._held.holds), way.approach_time)
+        if not self._away:  # an arm that was left away from home has to return by the way that it came
+            self._way, self._away = way, True
+        loaded = IN_GRIPPER in self._at.values()
+        await self._truth.lasting(self._arm.carry(way, loaded=loaded), way.approach_time)
         self._away = not homewards
 
     def _vessel(self, role: Role) -> Any:

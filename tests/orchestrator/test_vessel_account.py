@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from actors.interfaces import ProgressCallback
+from actors.interfaces import LaboratoryError, ProgressCallback
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
-from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, Transfer, VesselAccount
+from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, LaboratoryPlaces, Transfer, VesselAccount
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement
@@ -87,6 +87,25 @@ def test_a_series_takes_the_content_of_its_liquid_only_and_that_of_the_station_i
     assert account.known(replace(series(), vessels={"beaker": "4001"}))["beaker"].mass == 0.1
 
 
+def test_where_a_vessel_stands_outlasts_the_program_and_a_place_holds_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path))
+    cell = LaboratoryPlaces(VesselAccount.open(), "night")
+    cell.content("receiver", 0.0, 0.0, "water")
+    cell.put("receiver", "right")
+    cell.put("pourer", None, "the arm began to take it from 'left'")
+    assert LaboratoryPlaces(VesselAccount.open(), "night").stands() == {"receiver": "right", "pourer": None}
+    with pytest.raises(LaboratoryError, match="night/receiver stands at 'right' already"):
+        cell.put("pourer", "right")
+    LaboratoryPlaces(VesselAccount.open(), "day").put("pourer", "right")  # the places of another laboratory
+    assert "right" in invoke("materials list").stdout
+    refused = invoke("materials place night/pourer right")
+    assert (refused.exit_code, "a place holds one vessel" in refused.stderr) == (2, True)
+    assert invoke("materials place night/pourer left").exit_code == 0
+    assert cell.stands() == {"receiver": "right", "pourer": "left"}
+
+
 class DosingBench(HeldBench):
     """Pours 30.2 g of a dose and estimates what is left."""
 
@@ -127,7 +146,10 @@ def test_a_campaign_of_the_daemon_pours_out_of_a_vessel_of_the_station(
             kinds = [one["kind"] for one in await served.get("/materials/account", vessel="beaker")]
             assert kinds == ["weighed", "weighed", "begun", "poured", "poured"]
             await served.post("/materials/vessels/jar/cup/weighed", {"mass": "9 g"})
-            assert (await served.get("/materials"))["sources"][0]["content"]["mass_g"] == pytest.approx(9.0)
+            found = (await served.get("/materials"))["sources"][0]
+            assert (found["content"]["mass_g"], found["position"]) == (pytest.approx(9.0), "")
+            await served.post("/materials/vessels/jar/cup/place", {"position": "shelf"})
+            assert (await served.get("/materials"))["sources"][0]["position"] == "shelf"
 
     run(work())
 

@@ -87,7 +87,9 @@ def full_acceleration(vessel: Vessel, volume: float) -> float:
         vessel: that holds it.
         volume: of the liquid [m³].
     """
-    freeboard = max(-level(vessel, volume, 0.0), 0.0)
+    # `level` counts points, so that near the rim the free volume over the opening is more exact
+    free = (vessel.capacity - volume) / (math.pi * vessel.opening_radius**2)
+    freeboard = max(min(-level(vessel, volume, 0.0), free), 0.0)
     return min(TOOL_ACCELERATION, GRAVITY * freeboard / (SWINGS * vessel.opening_radius))
 
 

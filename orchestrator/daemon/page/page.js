@@ -3,6 +3,7 @@
 import { Refused, call, knownToken, listen, reach, saveReport, useToken } from "./talk.js";
 import {
   button, cellLine, clock, draw, el, endedList, previousRuns, modeBadge, poursTable, questionCard, queueList, rigCard, stopCard,
+  vesselsTable,
 } from "./show.js";
 
 const $ = (id) => document.getElementById(id);
@@ -10,7 +11,7 @@ const RUNNING = ["preparing", "running", "pausing", "waiting for operator", "sto
 const BEAT = 2000, SILENCE = 6000;
 /* How often the daemon is called [ms], and after which silence the page no longer relies on it. */
 const PHYSICAL = "press the physical emergency stop: the red mushroom button on the teach pendant";
-const now = { status: null, campaigns: [], questions: [], pours: [], seen: 0, heard: 0, up: null, clearing: null };
+const now = { status: null, campaigns: [], questions: [], pours: [], vessels: [], seen: 0, heard: 0, up: null, clearing: null };
 let wanted = 0, busy = false, begun = false, joined = false;
 
 // ---- what is known
@@ -26,7 +27,9 @@ async function refresh() {
     const running = campaigns.filter((one) => RUNNING.includes(one.state) && one.run);
     const shown = running.length ? running : campaigns.filter((one) => one.run).slice(0, 1);
     const details = await Promise.all(shown.map((one) => call(`campaigns/${encodeURIComponent(one.id)}`)));
+    const stored = await call("materials").catch(() => ({ sources: now.vessels })); // of less weight than the rest
     if (away()) return;
+    now.vessels = stored.sources.filter((one) => one.position);
     now.pours = details.flatMap((one) => one.pours_made.map((pour) => ({ ...pour, campaign: one.name })))
       .filter((pour) => pour.state !== "asked").sort((one, other) => other.time - one.time).slice(0, 8);
     show();
@@ -135,6 +138,8 @@ function show() {
     rigs.map(([rig, campaign]) => rigCard(rig, campaign, acts)),
   ]);
   draw(body("pours"), now.pours, poursTable);
+  $("vessels").hidden = !now.vessels.length;
+  draw(body("vessels"), now.vessels, vesselsTable);
   const queued = campaigns.filter((one) => one.state === "queued");
   draw(body("queue"), [queued, status.queue_paused], ([items, paused]) => queueList(items, paused, acts));
   const ended = campaigns.filter((one) => one.state !== "queued" && !RUNNING.includes(one.state)).slice(0, 8);
@@ -307,7 +312,7 @@ function leave(why = "") {
   $("stop-all").disabled = true;
   document.title = "Decant";
   document.body.classList.remove("real", "stale");
-  Object.assign(now, { status: null, campaigns: [], questions: [], pours: [], up: null, clearing: null });
+  Object.assign(now, { status: null, campaigns: [], questions: [], pours: [], vessels: [], up: null, clearing: null });
   latched = "";
   $("link").textContent = "not signed in";
   $("token").focus({ preventScroll: true });

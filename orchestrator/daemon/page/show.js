@@ -191,6 +191,14 @@ export function poursTable(pours) {
       cell(SPILLED, pour.spillage === null ? "—" : percent(pour.spillage))))));
 }
 
+/** Where the vessels stand that an arm carries, and what they hold. */
+export function vesselsTable(vessels) {
+  return el("table", {},
+    el("thead", {}, el("tr", {}, ["Vessel", "Stands", "Holds"].map((head) => el("th", { scope: "col" }, head)))),
+    el("tbody", {}, vessels.map(({ id, position, content }) => el("tr", {}, cell("Vessel", id), cell("Stands", position),
+      cell("Holds", content.mass_g === null ? "unknown" : `${content.mass_g.toFixed(1)} g ${content.liquid}`)))));
+}
+
 const SPILLED = "Spilled / loaded";
 
 /** A cell; `meaning` says what its value is. */

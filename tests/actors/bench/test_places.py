@@ -13,6 +13,7 @@ import pytest
 
 from actors.arm.arm_geometry import Pose
 from actors.balance.weighing_plan import Placement
+from actors.bench.bench_operators import BenchContents
 from actors.grippers.gripper_interface import GRIPPERS
 from actors.interfaces import NotPouredError
 from actors.laboratory_settings import LaboratorySettings
@@ -58,9 +59,22 @@ class Watched(LaboratoryPlaces):
         super().__init__(account(folder), "virtual")
         self.once: dict[str, Callable[[], Awaitable[Any]]] = {}
         self.tasks: list[asyncio.Future[Any]] = []
+        self.truth: BenchContents | None = None
+
+    def follow(self, truth: BenchContents) -> None:
+        """Compare with the true places whenever one of them changes: then a killed program leaves a true account."""
+        move, self.truth = truth.move, truth
+
+        def moved(vessel: str, place: str, *, on_balance: bool) -> None:
+            assert self.stands()[vessel] is None, f"{vessel} moves, and is not UNKNOWN"
+            move(vessel, place, on_balance=on_balance)
+
+        truth.move = moved  # type: ignore[method-assign]
 
     def put(self, vessel: str, place: str | None, note: str = "") -> None:
         super().put(vessel, place, note)
+        if place is not None and self.truth is not None:
+            assert self.truth.stands.get(vessel) == place, f"{vessel} is not at '{place}'"
         if (hook := self.once.pop(f"{vessel}: {note}", None)) is not None:
             self.tasks.append(asyncio.ensure_future(hook()))
 
@@ -79,6 +93,7 @@ def played(
     async def run() -> tuple[Any, Stage]:
         record = Watched(folder)
         async with open_stage(spec=placed_spec(**changes), record=record) as stage:
+            record.follow(stage.contents)
             return await play(stage, record), stage
 
     return asyncio.run(run())
@@ -98,6 +113,7 @@ NIGHT: dict[str, Any] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_the_arm_does_what_the_operator_did_between_two_pours(open_stage: OpenStage, tmp_path: Path) -> None:
     async def play(stage: Stage, record: Watched) -> list[Any]:
@@ -171,6 +187,7 @@ def test_a_vessel_lost_on_its_way_is_unknown_and_ends_the_consent(open_stage: Op
     assert stage.unsafe == []
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_masses_that_do_not_close_are_asked_about(open_stage: OpenStage, tmp_path: Path) -> None:
     async def play(stage: Stage, record: Watched) -> Any:
@@ -185,6 +202,7 @@ def test_masses_that_do_not_close_are_asked_about(open_stage: OpenStage, tmp_pat
     assert stage.heard[stage.heard.index("mass") :] == ["mass", "move", "start", "move", "move"]
 
 
+@pytest.mark.slow
 @pytest.mark.realtime
 def test_a_vessel_that_is_not_grasped_is_put_right_by_a_person(open_stage: OpenStage, tmp_path: Path) -> None:
     async def play(stage: Stage, record: Watched) -> Any:
