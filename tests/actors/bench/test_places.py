@@ -222,3 +222,63 @@ def test_a_vessel_that_is_not_grasped_is_put_right_by_a_person(open_stage: OpenS
         one.problem for one in stage.operator.heard if one.about == "grasp_failed"
     )
     assert measured.loaded == pytest.approx(0.2, abs=5e-3)
+
+
+async def protective_stop(stage: Stage) -> None:
+    await stage.site.fault("protective_stop")
+
+
+async def lost(stage: Stage) -> None:
+    await stage.site.gripper_fault("lost")
+
+
+async def spilt(stage: Stage) -> None:
+    stage.contents.spilt_back = 5e-3
+
+
+FAULTS: dict[int, tuple[str, Callable[[Stage], Awaitable[None]], str]] = {
+    2: ("receiver: the arm began to take it from 'right'", spilt, "mass"),
+    3: ("pourer: the arm began to carry it to 'left'", protective_stop, "recover"),
+    4: ("receiver: the arm began to carry it to 'right'", lost, "recover"),
+    5: ("receiver: the arm began to take it from 'right'", protective_stop, "recover"),
+}
+"""Number of a pour, the motion at whose begin something fails, the failure, and what a person is asked first."""
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_a_virtual_night_with_faults_ends_each_in_a_safe_state_and_a_person_continues_it(
+    open_stage: OpenStage, tmp_path: Path
+) -> None:
+    async def play(stage: Stage, record: Watched) -> dict[int, list[str]]:
+        asked: dict[int, list[str]] = {}
+        measured: list[Any] = []
+
+        for number in range(1, 7):
+            begun = len(stage.heard)
+            if number in FAULTS:
+                where, fault, _ = FAULTS[number]
+                record.once[where] = lambda fault=fault: fault(stage)  # type: ignore[misc]
+            try:
+                measured.append(await pour(stage))
+            except NotPouredError:
+                measured.append(await pour(stage))  # the campaign is resumed
+            asked[number] = stage.heard[begun:]
+            assert record.once == {}
+        assert len(measured) == 6
+        for one in measured:
+            assert one.loaded == pytest.approx(0.2, abs=5e-3)
+            missing = one.notes["cycle"].get("missing_g", 0.0)
+            assert abs(missing) < 0.5 or missing == pytest.approx(5.0, abs=0.5)
+        return asked
+
+    places = (PLACES[0], PLACES[1].with_values(use="source"), PLACES[2])
+    asked, stage = played(open_stage, tmp_path, play, **NIGHT, places=places)
+    assert asked[1] == [*PREPARED, "unattended"]
+    for number, (_, _, first) in FAULTS.items():
+        motions = {"move", "start"}
+        assert next(one for one in asked[number] if one not in motions) == first, asked[number]
+    assert stage.heard.count("unattended") == 1
+    assert stage.unsafe == []
+    assert stage.said("warning").count("unattended: the consent has ended") == 1
+    assert standing(tmp_path) == {"pourer": "pan", "receiver": "right"}
