@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +153,7 @@ def warm(client: Client, sent: tuple[str, Files]) -> float:
     raise AssertionError("unreachable")
 
 
-def measured(folder: Path, times: int, chosen: Sequence[str]) -> dict[str, Any]:
+def measured(folder: Path, times: int) -> dict[str, Any]:
     """Run all measurements [ms]; include the machine's load average before them."""
     found: dict[str, Any] = {
         "cores": os.cpu_count(),
@@ -166,8 +166,8 @@ def measured(folder: Path, times: int, chosen: Sequence[str]) -> dict[str, Any]:
         token = next(line.split()[2] for line in (folder / "state/tokens").read_text().splitlines() if "viewer" in line)
         found["first simulation of a plan"] = [round(1e3 * warm(client, sent["numbers"])) for _ in range(3)]
         print("first simulation [ms]", found["first simulation of a plan"], file=sys.stderr, flush=True)
-        for load in chosen:
-            with beside(client, token, **LOADS[load]):
+        for load, others in LOADS.items():
+            with beside(client, token, **others):
                 for bench, text in sent.items():
                     for grade in GRADES if bench == "numbers" else GRADES[2:]:
                         taken = [1e3 * once(client, text, grade) for _ in range(times)]
@@ -182,11 +182,10 @@ def main() -> None:
     """Measure, and write the figures and their table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=10)
-    parser.add_argument("--loads", nargs="+", choices=list(LOADS), default=list(LOADS))
     arguments = parser.parse_args()
     end_in_order()
     with tempfile.TemporaryDirectory() as name:
-        keep("stops", measured(Path(name), arguments.times, arguments.loads))
+        keep("stops", measured(Path(name), arguments.times))
 
 
 if __name__ == "__main__":

@@ -21,21 +21,10 @@ from typing import Any
 import peer
 from machine import describe, pin, say, show
 from peer import PeerRun
-from standard_pour import (
-    END,
-    SCENE,
-    TIMES,
-    Measured,
-    check_particles,
-    measure,
-    short_task,
-    standard_action,
-)
+from standard_pour import END, TIMES, Measured, check_particles, measure, short_task
 
 from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import PourSimulator
-
-__all__ = ["SCENE", "main", "standard_action"]
 
 
 def turns(ours: int, theirs: int) -> Iterator[str]:
