@@ -85,6 +85,9 @@ def consent_to_motion(request: RunRequest, count: str = "", path: PathReport | N
     if not request.pours or laboratory.mode != "hardware":
         return ""
     lines = [count or f"pours          up to {pour_count(plan, request.stages)}"]
+    if laboratory.places:
+        names = ", ".join(place.name for place in laboratory.places)
+        lines.append(f"vessels        carried between {names}; the gripper opens and closes")
     if laboratory.arm is None:
         confirm(laboratory, lines)
         return ""
