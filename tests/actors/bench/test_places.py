@@ -139,6 +139,7 @@ def test_the_arm_does_what_the_operator_did_between_two_pours(open_stage: OpenSt
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 def test_one_consent_lasts_for_a_night_of_pours_and_every_gram_is_accounted(
     open_stage: OpenStage, tmp_path: Path
 ) -> None:
