@@ -390,6 +390,7 @@ MEASURED = (
         "convergence",
         "quickstart-coverage",
         "quickstart-fits",
+        "memory",
     ),
     *(
         "cliffs",

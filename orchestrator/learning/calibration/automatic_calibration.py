@@ -19,7 +19,7 @@ from actors.optimizer.questions import (
 )
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.calibration_base import THETA_MAP_RESOLUTION, Calibrated
-from orchestrator.learning.calibration.campaign_memory import log_memory, remembered_point
+from orchestrator.learning.calibration.campaign_memory import CONTRADICTED, log_memory, remembered_point
 from orchestrator.learning.calibration.pointwise_calibration import DiscrepancyOverPours, discrepancies
 from orchestrator.learning.calibration.posterior_summary import (
     left_open,
@@ -72,6 +72,7 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     describes them worse than the uncalibrated θ, if that lies in the searched box: the evaluation repeats the same
     simulations. With a memory, half of the space-filling θ lie where it expects them, and θ* has the highest posterior
     density. The uncalibrated θ is then the expected one, which has the highest prior density, so that the same holds.
+    A memory that the pours contradict does not count for θ*.
 
     Source: candidates from the posterior on a surrogate: Wang & Li, Adaptive Gaussian process approximation for
     Bayesian inference with expensive likelihood functions, 2018.
@@ -206,11 +207,12 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     def _merit(self, trial: Trial, score: float) -> float:
         """The mean |r_i − c_s(a_i, θ)|; with a memory, minus the logarithm of the posterior density.
 
-        The likelihood is that of independent errors of an unknown common scale.
+        The likelihood is that of independent errors of an unknown common scale. For θ*, groups that the pours contradict
+        do not count: the density at a remembered place is high, however improbable the memory as a whole has become.
         """
-        if self._memory is None:
-            return score
-        return len(self._usable) * math.log(WEIGHED + score) - log_memory(trial.point, self._memory)
+        held = () if self._posterior is None or self._ended is None else self._posterior.held or ()
+        kept = [one for i, one in enumerate(self._memory or ()) if i >= len(held) or held[i] >= CONTRADICTED]
+        return len(self._usable) * math.log(WEIGHED + score) - log_memory(trial.point, kept) if kept else score
 
     def _discrepancy(self, request: Simulate, simulated: float) -> float:
         """r_i − c_s(a_i, θ), with its sign."""

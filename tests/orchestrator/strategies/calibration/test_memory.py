@@ -118,8 +118,9 @@ def test_a_memory_that_is_right_keeps_its_weight_and_names_its_run() -> None:
     assert abs(found.alone["receiver_x"].mean - 0.008) < 0.004  # later campaigns get what these pours alone tell
 
 
-def test_a_memory_that_the_pours_contradict_loses_its_weight_and_the_run_says_so() -> None:
-    strategy = calibrated(-0.012)
+@pytest.mark.parametrize(("remembered", "pours"), [(-0.012, 3), (0.015, 2)])
+def test_a_memory_that_the_pours_contradict_loses_its_weight_and_the_run_says_so(remembered: float, pours: int) -> None:
+    strategy = calibrated(remembered, pours)
     (group,) = strategy.result().memory.groups
     assert group.contradicted
     assert any(
