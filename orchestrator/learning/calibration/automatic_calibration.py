@@ -207,8 +207,8 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     def _merit(self, trial: Trial, score: float) -> float:
         """The mean |r_i − c_s(a_i, θ)|; with a memory, minus the logarithm of the posterior density.
 
-        The likelihood is that of independent errors of an unknown common scale. For θ*, groups that the pours contradict
-        do not count: the density at a remembered place is high, however improbable the memory as a whole has become.
+        The likelihood is that of independent errors of an unknown common scale. For θ*, groups that the pours
+        contradict do not count: the density at a remembered place is high, however improbable the memory has become.
         """
         held = () if self._posterior is None or self._ended is None else self._posterior.held or ()
         kept = [one for i, one in enumerate(self._memory or ()) if i >= len(held) or held[i] >= CONTRADICTED]
