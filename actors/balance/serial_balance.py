@@ -294,6 +294,7 @@ OFF_TIME = 3.0
 server or a USB adapter does not notice that. Longer than a busy balance or a stalled computer needs."""
 
 
+# More than 25 methods: the whole balance interface, and each check of a reading by name.
 class SerialBalance:
     """Driver of a serial balance; see the module docstring.
 

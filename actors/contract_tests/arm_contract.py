@@ -112,6 +112,7 @@ class ArmBench:
     stops_within: float = AT_ONCE
 
 
+# More than 25 methods: one test for each promise of an arm.
 class ArmContract:
     """Derive a test class from this, with a name that begins with Test and a fixture `bench`."""
 

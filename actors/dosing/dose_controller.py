@@ -181,6 +181,7 @@ class TiltCommand:
     finished: bool = False
 
 
+# More than 25 methods: one method for each phase of a dose and each reason to stop.
 class DoseController:
     """The controller of one dose.
 

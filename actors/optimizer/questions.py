@@ -550,6 +550,7 @@ class SurrogateMap:
         return {name: value for name, value in space.decode(self.at).items() if name not in shown} if self.at else {}
 
 
+# More than 20 fields: one answer for all kinds of questions; fields that a question does not need are absent.
 @dataclass(frozen=True)
 class Suggestion:
     """An answer.

@@ -230,6 +230,7 @@ class _Member:
             self.overdue = None
 
 
+# More than 25 methods: its queue, waits and losses share one state.
 class WorkerPool:
     """A `SimulatorPool` of workers. Jobs begin in their order of arrival, as far as turns and deaths allow.
 

@@ -86,6 +86,7 @@ class PredictionOutput(BaseModel):
     __pydantic_extra__: dict[str, SampleStatistics]
 
 
+# More than 20 fields: a flat JSON object that programs read.
 class SimulateOutput(CommandOutput):
     """A simulated pour. Fractions are of the load: received + spilled + retained + in_flight + escaped = 1."""
 

@@ -56,7 +56,8 @@ class CampaignQueue:
         added = []
         with self._store.together():
             for at, item in enumerate(items):
-                added.append(replace(item, rank=self._store.last_rank() + 1.0, created=time.time()))
+                last = self._store.rows("select coalesce(max(rank), 0) as rank from campaign")[0]["rank"]
+                added.append(replace(item, rank=float(last) + 1.0, created=time.time()))
                 self._store.add(added[-1])
                 enter(at)
         for item in added:

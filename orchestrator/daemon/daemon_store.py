@@ -13,7 +13,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
@@ -236,24 +236,16 @@ class Store:
         self._lock.write(str(os.getpid()))
         self._lock.flush()
         try:
-            self._open()
-        except StoreError:
-            self._lock.close()
-            raise
+            with ExitStack() as failed:
+                failed.callback(self._lock.close)
+                self._db = sqlite3.connect(path, isolation_level=None, timeout=10.0)
+                failed.callback(self._db.close)
+                self._prepare()
+                failed.pop_all()
         except sqlite3.OperationalError as error:  # the disk, the folder or their permissions, rather than the content
-            self._lock.close()
             raise StoreError(f"{path}: can't be opened for writing ({error}); --state names another folder") from error
         except sqlite3.DatabaseError as error:
-            self._lock.close()
             raise StoreError(f"{path}: not the daemon's memory, or damaged ({error})") from error
-
-    def _open(self) -> None:
-        self._db = sqlite3.connect(self.path, isolation_level=None, timeout=10.0)
-        try:
-            self._prepare()
-        except BaseException:
-            self._db.close()
-            raise
 
     def _prepare(self) -> None:
         version = self._db.execute("pragma user_version").fetchone()[0]
@@ -279,12 +271,12 @@ class Store:
         """Add a submitted campaign."""
         values = {f.name: _written(f.name, getattr(item, f.name)) for f in fields(QueueItem)}
         names = ", ".join(values)
-        self._write(f"insert into campaign ({names}) values ({', '.join('?' * len(values))})", *values.values())
+        self.write(f"insert into campaign ({names}) values ({', '.join('?' * len(values))})", *values.values())
 
     def change(self, key: str, **values: Any) -> None:
         """Set fields of a campaign in one transaction."""
         names = ", ".join(f"{name} = ?" for name in values)
-        self._write(f"update campaign set {names} where id = ?", *(_written(n, v) for n, v in values.items()), key)
+        self.write(f"update campaign set {names} where id = ?", *(_written(n, v) for n, v in values.items()), key)
 
     def item(self, key: str) -> QueueItem | None:
         """Return a campaign, or None if the id is unknown."""
@@ -309,10 +301,6 @@ class Store:
         )
         return [_item(row) for row in rows]
 
-    def ids(self) -> set[str]:
-        """Return the ids of all campaigns."""
-        return {row["id"] for row in self.rows("select id from campaign")}
-
     def active(self) -> list[QueueItem]:
         """Return the campaigns that are in no state of rest."""
         return [
@@ -333,10 +321,6 @@ class Store:
         """Return the campaigns of a batch, in the order in which they were submitted."""
         rows = self._db.execute("select * from campaign where batch = ? order by rowid", [batch])
         return [_item(row) for row in rows]
-
-    def last_rank(self) -> float:
-        """Return the largest rank so far; 0 before the first campaign."""
-        return float(self._db.execute("select coalesce(max(rank), 0) from campaign").fetchone()[0])
 
     def counts(self) -> dict[str, int]:
         """Return the number of campaigns in each state."""
@@ -365,21 +349,21 @@ class Store:
         values["asked"] = time.time()
         names = ", ".join(values)
         written = [_written(n, v) for n, v in values.items()]
-        key = self._write(f"insert into question ({names}) values ({', '.join('?' * len(values))})", *written)
+        key = self.write(f"insert into question ({names}) values ({', '.join('?' * len(values))})", *written)
         found = self.question(key)
         assert found is not None
         return found
 
     def answer(self, key: int, answer: str, by: str) -> None:
         """Store an answer, before anything acts on it."""
-        self._write(
+        self.write(
             "update question set answer = ?, by = ?, answered = ?, closed = 'answered' where id = ? and closed is null",
             *(answer, by, time.time(), key),
         )
 
     def close_question(self, key: int, reason: str) -> None:
         """Close a question that needs no answer any more."""
-        self._write("update question set closed = ? where id = ? and closed is null", reason, key)
+        self.write("update question set closed = ? where id = ? and closed is null", reason, key)
 
     def question(self, key: int) -> StoredQuestion | None:
         """Return a question, or None if the id is unknown."""
@@ -409,14 +393,14 @@ class Store:
     def set_flag(self, name: str, value: Any) -> None:
         """Set a flag; None removes it."""
         if value is None:
-            self._write("delete from flag where name = ?", name)
+            self.write("delete from flag where name = ?", name)
         else:
-            self._write("insert into flag values (?, ?) on conflict do update set value = excluded.value",
+            self.write("insert into flag values (?, ?) on conflict do update set value = excluded.value",
                         name, json.dumps(value))  # fmt: skip
 
     def note(self, by: str, what: str, campaign: str = "", detail: str = "") -> None:
         """Append an audit entry: who did what."""
-        self._write("insert into audit (t, by, what, campaign, detail) values (?, ?, ?, ?, ?)",
+        self.write("insert into audit (t, by, what, campaign, detail) values (?, ?, ?, ?, ?)",
                     time.time(), by, what, campaign, detail)  # fmt: skip
 
     def audit(self, campaign: str | None = None, limit: int = 200) -> list[dict[str, Any]]:
@@ -450,9 +434,6 @@ class Store:
             StoreError: the disk is full or can't be written.
             sqlite3.IntegrityError: a constraint is violated.
         """
-        return self._write(statement, *arguments)
-
-    def _write(self, statement: str, *arguments: Any) -> int:
         try:
             return int(self._db.execute(statement, arguments).lastrowid or 0)
         except sqlite3.OperationalError as error:

@@ -118,6 +118,7 @@ class ProgressOut(_Out):
     seconds_left: float | None
 
 
+# More than 20 fields: a flat JSON object that programs read.
 class CampaignOut(_Out):
     """A submitted campaign."""
 

@@ -47,7 +47,8 @@ class Supervisor:
     async def start(self) -> None:
         """Recover the stored state and start all tasks."""
         shared = self.shared
-        await asyncio.to_thread(self._remove_unacknowledged, shared.store.ids())
+        known = {row["id"] for row in shared.store.rows("select id from campaign")}
+        await asyncio.to_thread(self._remove_unacknowledged, known)
         for item in shared.store.active():
             found = f"found {item.state} after the daemon had ended without a word"
             # without a run nothing has begun: it is in the queue again

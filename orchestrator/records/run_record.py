@@ -236,6 +236,7 @@ class RecordedDecision:
     simulations_asked: int
 
 
+# More than 20 fields: the one count of a run for all readers.
 @dataclass
 class RunState:
     """What a run has done, and what it is doing: all counting of its events, read from its journal or as they happen.

@@ -225,6 +225,7 @@ class NotSimulated(ResultPart):
     tried: int
 
 
+# More than 20 fields: a flat JSON object that programs read.
 class ReceiverSummary(ResultPart):
     """Result of a deployment in one scene. Losses are in the loss's own unit, r = spilled / poured."""
 

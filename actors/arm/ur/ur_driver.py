@@ -83,6 +83,7 @@ _numbers = itertools.count(os.getpid() % 4096 * 65536 + 1)
 """Numbers of motions, different from any that another process may have left in the controller's registers."""
 
 
+# More than 25 methods: the whole arm interface, and what each of its motions checks before and after.
 class UrArm:
     """A UR arm.
 

@@ -43,6 +43,7 @@ Watcher = Callable[[], bool]
 """Called each cycle until it returns True."""
 
 
+# More than 25 methods: one method for each command of the controller's interfaces.
 class Controller:
     """One robot with its controller. It uses no sockets; servers read and write it between ticks.
 

@@ -24,6 +24,7 @@ class FaultError(Exception):
     """The fault is unknown, or its arguments are invalid."""
 
 
+# More than 25 methods: one method for each fault.
 class ControllerFaults:
     """All faults of one host, by name. Times are controller times [s] unless wall time is named.
 

@@ -116,6 +116,7 @@ class SimulatedAction(ResultPart):
     """Mean over its simulations, in the unit of the loss."""
 
 
+# More than 20 fields: its JSON is in journals, and keeps its form.
 class Deployed(StageResult):
     """Result of a deployment in one scene."""
 

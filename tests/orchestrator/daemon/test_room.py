@@ -51,7 +51,7 @@ def test_a_command_that_a_full_disk_can_not_keep_is_refused_with_the_reason(
     async def work() -> None:
         async with serving(tmp_path) as served:
             with monkeypatch.context() as disk:
-                disk.setattr(served.daemon.store, "_write", full)
+                disk.setattr(served.daemon.store, "write", full)
                 refused = await served.post("/queue/pause", status=507)
             assert "is it full? Make room, then repeat the call" in refused["detail"]
             assert str(tmp_path) not in refused["detail"]

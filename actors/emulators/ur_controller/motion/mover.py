@@ -52,6 +52,7 @@ class ControlledElsewhereError(Exception):
     """Two threads of a program move the arm at once."""
 
 
+# More than 25 methods: one method for each motion command of URScript, on the same joints.
 class Mover:
     """Targets of the six joints.
 

@@ -55,6 +55,7 @@ def split(data: bytes) -> list[tuple[int, bytes]]:
     return found
 
 
+# More than 20 fields: the fields of UR's message.
 @dataclass(frozen=True)
 class PrimaryState:
     """The values of a robot state, in SI units.
