@@ -103,7 +103,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
     """Without `ur-rtde`, of which the newest Pythons have no wheel, a test that needs an arm is left out."""
     report = yield
-    if WITHOUT_ARM and report.failed and re.search(r"ur-rtde|rtde_(control|receive)", str(report.longrepr)):
+    said = f"{report.longrepr}{report.capstderr}" if WITHOUT_ARM and report.failed else ""
+    if re.search(r"ur-rtde|rtde_(control|receive)", said):
         report.outcome, report.longrepr = "skipped", (str(item.path), None, "ur-rtde is not installed")
     return report
 

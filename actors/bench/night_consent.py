@@ -7,6 +7,7 @@ not stored: a restarted program asks for a new one.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
 
@@ -27,6 +28,7 @@ class NightConsent:
         places: between which vessels are carried.
         tell: receives notices.
         now: the local time.
+        elapsed: seconds that no change of the clock affects. A clock that is set back does not lengthen the consent.
     """
 
     def __init__(
@@ -37,10 +39,11 @@ class NightConsent:
         places: Sequence[PlaceSettings],
         tell: Callable[[Notice], None],
         now: Callable[[], datetime] = datetime.now,
+        elapsed: Callable[[], float] = time.monotonic,
     ) -> None:
         self._spec, self._safeguard, self._arm, self._places = spec, safeguard, arm, places
-        self._tell, self._now = tell, now
-        self._left = 0
+        self._tell, self._now, self._elapsed = tell, now, elapsed
+        self._left, self._end_elapsed = 0, 0.0
         self._until: datetime | None = None
         self.asked = False
         """Whether it was asked for; it is asked for once."""
@@ -74,6 +77,7 @@ class NightConsent:
         hour, minute = map(int, self._spec.until.split(":"))
         until = now.replace(hour=hour, minute=minute, second=0, microsecond=0)
         self._until = until if until > now else until + timedelta(days=1)
+        self._end_elapsed = self._elapsed() + (self._until - now).total_seconds()
         self._left = self._spec.pours
         self._tell(Notice("info", f"unattended: agreed, up to {self._left} pours until {self._until:%Y-%m-%d %H:%M}"))
 
@@ -83,7 +87,7 @@ class NightConsent:
             return False
         if question.about not in MOTIONS:
             self.end(f"a question: {question.problem or question.text}")
-        elif self._now() >= self._until:
+        elif self._now() >= self._until or self._elapsed() >= self._end_elapsed:
             self.end(f"it is {self._spec.until}")
         elif question.about == "start" and self._left == 0:
             self.end(f"{self._spec.pours} pours were made")

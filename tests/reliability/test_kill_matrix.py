@@ -78,14 +78,15 @@ def test_every_combination_is_tried_or_has_a_reason_why_not() -> None:
         assert reason
 
 
-STAMPED = ("line_recording.py", "liquid_devices.py", "liquid_device_contracts.py")
-"""Files that record the time of day of raw lines and of events."""
+STAMPED = ("line_recording.py", "liquid_devices.py", "liquid_device_contracts.py", "night_consent.py")
+"""Files that record the time of day of raw lines and of events, and the one with the end of a consent."""
 
 
 def test_what_has_no_clock_reads_none() -> None:
     """The reason why clocks that jump are not tried on arm, balance, simulators and optimiser.
 
     A spill sensor stamps its events with the time of day, which is recorded; nothing is decided by it.
+    A consent for a night ends at a time of day; a clock that is set back does not lengthen it (`test_places`).
     """
     clock = re.compile(r"\btime\.time\(|datetime|time_ns\(|localtime|gmtime")
     files = [path for floor in ("actors", "sim_engine") for path in (ROOT / floor).rglob("*.py")]

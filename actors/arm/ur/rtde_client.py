@@ -44,7 +44,7 @@ def client_missing() -> str | None:
         return None
     return (
         "the arm needs the package ur-rtde, which is not installed: pip install 'decant-pouring[lab]' "
-        "(it has no wheel for Python 3.13 and later)"
+        "(Python 3.13 and later build it from its source: see docs/laboratory/connect-an-arm.md)"
     )
 
 

@@ -6,6 +6,7 @@ import asyncio
 import math
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ import pytest
 from actors.arm.arm_geometry import Pose
 from actors.balance.weighing_plan import Placement
 from actors.bench.bench_operators import BenchContents
+from actors.bench.night_consent import NightConsent
 from actors.grippers.gripper_interface import GRIPPERS
-from actors.interfaces import NotPouredError
+from actors.interfaces import Notice, NotPouredError, OperatorQuestion
 from actors.laboratory_settings import LaboratorySettings
 from actors.liquid_devices import PUMPS, SourceSettings
 from actors.places import PlaceSettings, UnattendedSettings
@@ -283,3 +285,36 @@ def test_a_virtual_night_with_faults_ends_each_in_a_safe_state_and_a_person_cont
     assert stage.unsafe == []
     assert stage.said("warning").count("unattended: the consent has ended") == 1
     assert standing(tmp_path) == {"pourer": "pan", "receiver": "right"}
+
+
+@pytest.mark.parametrize(
+    ("wall", "elapsed", "asked", "said"),
+    [
+        (8.9, 8.9, "move", ""),
+        (9.0, 9.0, "move", "it is 07:00"),
+        (-50.0, 9.0, "move", "it is 07:00"),  # the clock was set back meanwhile
+        (9.0, 0.1, "move", "it is 07:00"),
+        (1.0, 1.0, "refill", "a question: is it full"),
+    ],
+)
+def test_a_consent_ends_in_the_morning_or_with_a_question_and_never_returns(
+    wall: float, elapsed: float, asked: str, said: str
+) -> None:
+    evening, notices = datetime(2026, 11, 26, 22), list[Notice]()
+    hours = [0.0, 0.0]
+    consent = NightConsent(
+        UnattendedSettings(pours=3, until="07:00"),
+        "a fence",
+        "ur10",
+        PLACES,
+        notices.append,
+        now=lambda: evening + timedelta(hours=hours[0]),
+        elapsed=lambda: 3600.0 * hours[1],
+    )
+    consent.answered("yes")
+    assert consent.agrees(OperatorQuestion("pour?", "yes or no", about="start"))
+    hours[:] = wall, elapsed
+    assert consent.agrees(OperatorQuestion("is it full", "yes or no", about=asked)) == (not said)
+    assert said in notices[-1].text
+    hours[:] = 0.0, 0.0
+    assert consent.agrees(OperatorQuestion("carry?", "yes or no", about="move")) == (not said)

@@ -100,8 +100,8 @@ def test_quiet_leaves_notes_out_and_nothing_else(campaign: Path) -> None:
     assert loud.stderr.startswith("warning: far.yaml:27:64: ")
     assert (quiet.stderr, quiet.stdout) == (loud.stderr, loud.stdout)
     bowl = "--height '50 mm' --diameters '1 mm: 100 mm, 50 mm: 160 mm' --wall '0.4 mm'"
-    assert "too thin" in invoke(f"vessel bowl.yaml {bowl}").stderr
-    assert invoke(f"vessel --quiet bowl-2.yaml {bowl}").stderr == ""
+    assert "too thin" in invoke(f"vessel profile bowl.yaml {bowl}").stderr
+    assert invoke(f"vessel profile --quiet bowl-2.yaml {bowl}").stderr == ""
     write(campaign, "bad.yaml", small_campaign.CAMPAIGN.replace("pours: 2", "pour: 2"))
     assert "did you mean 'pours'?" in invoke("validate -q bad.yaml").stderr
     assert invoke("validate far.yaml").stderr == loud.stderr, "the next command is as loud as before"
