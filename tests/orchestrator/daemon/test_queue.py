@@ -43,14 +43,18 @@ def test_submitted_campaigns_run_to_their_end_one_after_the_other(tmp_path: Path
 
 
 def test_nothing_of_a_campaign_stays_in_memory_when_the_next_one_has_begun(tmp_path: Path) -> None:
+    def handles() -> list[RunHandle]:
+        return [one for one in gc.get_objects() if isinstance(one, RunHandle)]
+
     async def work() -> None:
         async with serving(tmp_path) as served:
             for key in [await served.submit() for _ in range(3)]:
                 await served.until(key, "finished")
             # the last one; a reader may hold another one a moment longer
-            await wait_async(lambda: sum(isinstance(one, RunHandle) for one in gc.get_objects()) <= 1, "released")
+            await wait_async(lambda: len(handles()) <= len(of_other_tests) + 1, "released")
 
     gc.collect()
+    of_other_tests = handles()
     gc.disable()  # Python itself would collect cycles much later
     try:
         run(work())
