@@ -259,7 +259,7 @@ def open_questions(plan: CampaignPlan, record: RunState, learning: RunLearning, 
     said = []
     if plan.laboratory.mode == "virtual" and (record.pours or plan.laboratory.pours):
         said.append(
-            "The bench was VIRTUAL: no robot moved and no liquid was weighed. Its hidden liquid "
+            "The bench was VIRTUAL: no robot moved and no liquid was weighed. Its true liquid "
             "is simulated, too; a real cup may behave differently."
         )
     if learning.calibrated_theta is not None:

@@ -436,7 +436,7 @@ def _level(level: Level) -> str:
     off = ", ".join(f"{1e3 * value:g}" for value in (error.x, error.y, error.z))
     scatter = ", ".join(f"{1e3 * value:g}" for value in (noise.x, noise.y, noise.z))
     return (
-        f"Mismatch '{level.name}': hidden θ {liquid}; receiver off by {off} mm (x, y, height), tilt by "
+        f"Mismatch '{level.name}': true θ {liquid}; receiver off by {off} mm (x, y, height), tilt by "
         f"{error.tilt:.3g} rad, speed × {error.speed_factor:g}; from pour to pour ± {scatter} mm, "
         f"{noise.tilt:.3g} rad, × {noise.speed_factor:g}."
     )

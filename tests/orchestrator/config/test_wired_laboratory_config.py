@@ -93,7 +93,7 @@ CASES = {
     "scaled time on hardware": (HARDWARE + BENCH, r"bench: is what a virtual bench hides, and how fast its time runs"),
     "hardware without an arm": (without(without(without(without(HARDWARE, "arm"), "cell"), "balance"), "operator"),
                                 r"a laboratory of hardware needs its arm"),
-    "virtual arm without a hidden liquid": (without(VIRTUAL, "bench"), r"a virtual arm pours a hidden liquid"),
+    "virtual arm without a hidden liquid": (without(VIRTUAL, "bench"), r"a virtual arm needs the true parameters"),
     "arm without a balance": (without(VIRTUAL, "balance"), r"an arm that pours needs a balance"),
     "arm without a cell": (without(VIRTUAL, "cell"), r"add 'cell:"),
     "an arm that is faster than it is told": (
