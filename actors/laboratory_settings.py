@@ -383,7 +383,9 @@ class LaboratorySettings(Settings):
         if self.mode == "hardware":
             return
         if self.bench is None:
-            text = "a virtual arm needs the true parameters of its liquid: add 'bench: {liquid: {…}}', or 'mode: hardware'"
+            text = (
+                "a virtual arm needs the true parameters of its liquid: add 'bench: {liquid: {…}}', or 'mode: hardware'"
+            )
             problems.add(text, of="bench")
             return
         bench, inner = self.bench, problems.within("bench")
