@@ -9,11 +9,13 @@ The ways to the places are planned in `actors.arm.planning.place_ways`, and driv
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
-from pydantic import Field, Strict
+from pydantic import AfterValidator, Field, Strict
+from pydantic_core import PydanticCustomError
 
 from actors.arm.arm_geometry import Pose
 from actors.interfaces import InvalidActionError
@@ -51,13 +53,25 @@ class PlaceSettings(Settings):
     """Gap that arm, gripper and carried vessel keep from a vessel that stands there."""
 
 
+TIME_OF_DAY = r"^([01]\d|2[0-3]):[0-5]\d$"
+
+
+def _time_of_day(value: str) -> str:
+    if not re.fullmatch(TIME_OF_DAY, value):
+        text = f"{value!r} should be a time of day from 00:00 to 23:59, such as '07:00'"
+        raise PydanticCustomError("time_of_day", "{text}", {"text": text})
+    return value
+
+
 class UnattendedSettings(Settings):
     """Pours without a person, after one consent."""
 
     pours: Annotated[PositiveCount, Field(le=10_000)] = 200
     """Largest number of pours of one consent."""
 
-    until: Annotated[str, Strict(), Field(pattern=r"^([01]\d|2[0-3]):[0-5]\d$")] = "07:00"
+    until: Annotated[str, Strict(), AfterValidator(_time_of_day), Field(json_schema_extra={"pattern": TIME_OF_DAY})] = (
+        "07:00"
+    )
     """Local time at which the consent ends, at the latest a day after it was given."""
 
 
@@ -109,7 +123,7 @@ def check_places(problems: Problems, places: Sequence[PlaceSettings], tool: Pose
         if tool is not None and _differ(place.tool, tool):
             problems.add(
                 f"place '{place.name}' was taught with another tool than the arm's: teach it again with 'decant robot "
-                f"teach {place.name}'",
+                f"teach FILE {place.name}', where FILE is this file",
                 "places",
                 number,
                 "tool",

@@ -21,7 +21,7 @@ import math
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, Protocol
+from typing import Protocol
 
 from actors.arm.arm_device import STUCK, DeviceArm
 from actors.arm.arm_interface import ArmRefusedError, PlannedPour
@@ -586,7 +586,7 @@ class VesselHandling:
         await self._truth.lasting(self._arm.carry(way, loaded=loaded), way.approach_time)
         self._away = not homewards
 
-    def _vessel(self, role: Role) -> Any:
+    def _vessel(self, role: Role) -> Vessel:
         assert self._scene is not None
         return _vessels(self._scene)[role]
 

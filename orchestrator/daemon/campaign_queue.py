@@ -85,6 +85,12 @@ class CampaignQueue:
             raise KeyError(key)
         return found
 
+    def _queued(self, key: str, what: str) -> QueueItem:
+        item = self.item(key)
+        if item.state != "queued":
+            raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign {what}")
+        return item
+
     def move(self, key: str, by: str, *, before: str | None = None, priority: int | None = None) -> QueueItem:
         """Move a queued campaign in front of another one or to the head (''), or change its priority.
 
@@ -92,9 +98,7 @@ class CampaignQueue:
             KeyError: the campaign does not exist.
             RequestRefusedError: it is not queued.
         """
-        item = self.item(key)
-        if item.state != "queued":
-            raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign has a place in the queue")
+        item = self._queued(key, "has a place in the queue")
         if priority is not None:
             self._store.change(item.id, priority=priority)
         if before is not None:
@@ -194,9 +198,7 @@ class CampaignQueue:
             KeyError: the campaign does not exist.
             RequestRefusedError: it is not queued.
         """
-        item = self.item(key)
-        if item.state != "queued":
-            raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign can be held or postponed")
+        item = self._queued(key, "can be held or postponed")
         if hold is not None:
             self._store.change(item.id, held=hold)
         if not_before is not None:

@@ -39,7 +39,7 @@ from actors.arm.planning.trajectory import (
 from actors.arm.ur_settings import UrArmSettings
 from actors.interfaces import InvalidActionError
 from actors.places import PlaceSettings, Role
-from sim_engine.hydrostatics import level
+from sim_engine.hydrostatics import GRAVITY, level
 from sim_engine.vessel.vessel import Vessel
 
 FloatArray = NDArray[np.float64]
@@ -55,8 +55,6 @@ Sloshing Dynamics, Cambridge 2005, chapter 5, without its damping."""
 
 LEAST_ACCELERATION = 0.05
 """Acceleration below which a vessel is too full to be carried [m/s²]."""
-
-GRAVITY = 9.81
 
 OFF_CENTRE = 5e-3
 """Largest distance of the place on the balance from `cell.receiver` [m]."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from actors.arm.arm_geometry import Pose
@@ -19,6 +20,7 @@ from actors.bench.pour_feasibility import vessel
 from actors.bench.vessel_handling import check_handling, plan_back
 from actors.grippers.gripper_interface import GRIPPERS
 from actors.interfaces import InvalidActionError
+from actors.places import UnattendedSettings
 from orchestrator.campaigns.campaign_checks import check_campaign
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.campaigns.place_writing import write_place
@@ -141,3 +143,8 @@ def test_the_shipped_night_can_be_poured() -> None:
     lonely = replace(plan.calibration.scene, receiver=cylinder("tumbler", inner_radius=0.032, inner_height=0.1))
     with pytest.raises(InvalidActionError, match="its vessel file needs its empty mass"):
         check_handling(lab.places, lab.arm, gripper, lonely)
+
+
+def test_the_end_of_a_night_is_a_time_of_day() -> None:
+    with pytest.raises(ValidationError, match=r"'25:00' should be a time of day from 00:00 to 23:59, such as '07:00'"):
+        UnattendedSettings(until="25:00")
