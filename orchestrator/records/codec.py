@@ -1,8 +1,8 @@
 """Exact conversion of values to JSON and back: requests, outcomes and plans, and the results of stages.
 
-`to_json` and `from_json` follow the type annotations of the values, so a new field needs no code here. Floats are
-preserved bit for bit (shortest round-trip notation). Numbers that are not finite are written as {"$float": "nan"},
-because JSON cannot represent them.
+`to_json` and `from_json` follow the type annotations of the values, by cattrs, so a new field needs no code here.
+Floats are preserved bit for bit (shortest round-trip notation). Numbers that are not finite are written as
+{"$float": "nan"}, because JSON cannot represent them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import hashlib
 import json
 import math
 import types
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
@@ -92,41 +92,7 @@ def to_json(value: Any, hint: Any = Any) -> Any:
     Raises:
         CodecError: the value does not have that type, or contains something that JSON can't represent.
     """
-    if hint is Any or hint is object:
-        return _plain(value)
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        return _union_to_json(value, get_args(hint))
-    if origin is Literal:
-        return value
-    if origin is tuple:
-        return [to_json(v, h) for v, h in zip(value, _element_hints(hint, len(value)), strict=True)]
-    if origin in (list, dict):
-        arguments = get_args(hint)
-        if origin is list:
-            return [to_json(v, arguments[0]) for v in value]
-        return {_key(k): to_json(v, arguments[1]) for k, v in value.items()}
-    if not isinstance(hint, type):
-        raise CodecError(f"no rule to write a value annotated {hint!r}")
-    if hint is float:
-        return _float_to_json(float(value))
-    if hint in (int, bool, str):
-        return hint(value)
-    if not isinstance(value, hint):
-        raise CodecError(f"expected {hint.__name__}, got {type(value).__name__}")
-    if issubclass(hint, Path | StrEnum):
-        return str(value)
-    if issubclass(hint, StageResult):
-        return encode_result(cast(StageResult, value))
-    if issubclass(hint, BaseModel):
-        return cast(BaseModel, value).model_dump(mode="json")
-    if dataclasses.is_dataclass(hint):
-        values = {name: (getattr(value, name), h) for name, h in written_fields(hint).items()}
-        absent = {name for name in _written_if_set(hint) if values[name][0] is None}
-        return {name: to_json(one, h) for name, (one, h) in values.items() if name not in absent}
-    if dataclasses.is_dataclass(value):  # only a base class is annotated
-        return {_TYPE: type(value).__name__, **to_json(value, type(value))}
-    raise CodecError(f"no rule to write a {hint.__name__}")
+    return _converter().unstructure(value, unstructure_as=hint)
 
 
 def from_json(data: Any, hint: Any = Any) -> Any:
@@ -135,93 +101,134 @@ def from_json(data: Any, hint: Any = Any) -> Any:
     Raises:
         CodecError: the data don't fit the type; the text names the place.
     """
-    if hint is Any or hint is object:
-        return _unplain(data)
-    origin = get_origin(hint)
-    if origin in (Union, types.UnionType):
-        return _union_from_json(data, get_args(hint))
-    if origin is Literal:
-        if data not in get_args(hint):
-            raise CodecError(f"expected one of {', '.join(map(repr, get_args(hint)))}, got {data!r}")
-        return data
-    if origin is tuple:
-        _expect(data, list)
-        if get_args(hint) == (float, Ellipsis) and all(type(v) is float for v in data):  # most of what a journal has
-            return tuple(data)
-        return tuple(from_json(v, h) for v, h in zip(data, _element_hints(hint, len(data)), strict=True))
-    if origin is list:
-        _expect(data, list)
-        return [from_json(v, get_args(hint)[0]) for v in data]
-    if origin is dict:
-        _expect(data, dict)
-        return {k: from_json(v, get_args(hint)[1]) for k, v in data.items()}
-    if hint is float:
-        return _float_from_json(data)
-    if hint in (int, bool, str):
-        _expect(data, hint)
-        return data
-    if isinstance(hint, type) and issubclass(hint, Path):
-        return hint(data)
-    if isinstance(hint, type) and issubclass(hint, StrEnum):
-        _expect(data, str)
-        return hint(data)
-    if isinstance(hint, type) and issubclass(hint, BaseModel):
-        return hint.model_validate(data)
-    if dataclasses.is_dataclass(hint):
-        return _dataclass_from_json(data, cast("type[Any]", hint))
-    raise CodecError(f"no rule to read a value annotated {hint!r}")
-
-
-def _dataclass_from_json(data: Any, hint: type[Any]) -> Any:
-    _expect(data, dict)
-    hints = written_fields(cast(Hashable, hint))
-    if unknown := set(data) - set(hints) - {_TYPE}:
-        raise CodecError(
-            f"{hint.__name__} has no field {', '.join(sorted(unknown))}; was it written by a newer version?"
-        )
-    defaults = {field.name for field in dataclasses.fields(hint) if field.default is not dataclasses.MISSING}
-    if missing := hints.keys() - data.keys() - defaults:  # a field of a later version has its default
-        raise CodecError(f"{hint.__name__} lacks {', '.join(sorted(missing))}; was it written by an older version?")
-    values = {}
-    for name in (name for name in hints if name in data):
-        try:
-            values[name] = from_json(data[name], hints[name])
-        except (CodecError, ValueError, TypeError) as error:
-            raise CodecError(f"{hint.__name__}.{name}: {error}") from error
     try:
-        return hint(**values)
-    except TypeError as error:
-        raise CodecError(f"{hint.__name__}: {error}") from error
+        return _converter().structure(data, hint)
+    except (ValueError, TypeError, ExceptionGroup) as error:
+        raise CodecError(_message(error)) from error
 
 
-def _union_to_json(value: Any, arguments: tuple[Any, ...]) -> Any:
-    if value is None and type(None) in arguments:
-        return None
-    members = [a for a in arguments if a is not type(None)]
-    if len(members) == 1:
-        return to_json(value, members[0])
-    for member in members:
-        if isinstance(member, type) and type(value) is member:
-            written = to_json(value, member)
-            return {_TYPE: member.__name__, **written} if dataclasses.is_dataclass(member) else written
-    raise CodecError(f"expected one of {', '.join(_name(m) for m in members)}, got {type(value).__name__}")
+@functools.cache
+def _converter() -> Any:
+    """The converter with our rules: tagged unions, strict values, and numbers that JSON lacks."""
+    from cattrs import Converter
+    from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn, override
+
+    def no_rule_to_write(hint: Any) -> Any:
+        def write(value: Any) -> dict[str, Any]:
+            if isinstance(value, hint) and dataclasses.is_dataclass(value):  # only a base class is annotated
+                return {_TYPE: type(value).__name__, **c.unstructure(value)}
+            raise CodecError(f"no rule to write a {type(value).__name__} as {_name(hint)}")
+
+        return write
+
+    def no_rule_to_read(hint: Any) -> Any:
+        raise CodecError(f"no rule to read a value annotated {hint!r}")
+
+    def is_literal(hint: Any) -> bool:
+        return get_origin(hint) is Literal
+
+    c = Converter(
+        forbid_extra_keys=True,
+        unstruct_collection_overrides={tuple: list},
+        unstructure_fallback_factory=no_rule_to_write,
+        structure_fallback_factory=no_rule_to_read,
+    )
+    c.register_unstructure_hook(float, lambda value: _float_to_json(float(value)))
+    c.register_structure_hook(float, lambda data, _: _float_from_json(data))
+    for kind in (int, bool, str):
+        c.register_unstructure_hook(kind, kind)
+        c.register_structure_hook(kind, _expect)
+    c.register_unstructure_hook_func(lambda hint: hint is Any or hint is object, _plain)
+    c.register_structure_hook_func(lambda hint: hint is Any or hint is object, lambda data, _: _unplain(data))
+    c.register_unstructure_hook_func(is_literal, lambda value: value)
+    c.register_structure_hook_func(is_literal, _one_of)
+    c.register_unstructure_hook(Path, str)
+    c.register_structure_hook(Path, lambda data, hint: hint(data))
+    c.register_unstructure_hook(StrEnum, str)
+    c.register_structure_hook(StrEnum, lambda data, hint: hint(_expect(data, str)))
+    c.register_unstructure_hook(BaseModel, lambda value: value.model_dump(mode="json"))
+    c.register_structure_hook(BaseModel, lambda data, hint: hint.model_validate(data))
+    c.register_unstructure_hook(StageResult, encode_result)
+
+    def choices(cls: Any) -> dict[str, Any]:
+        written, if_set = written_fields(cls), _written_if_set(cls)
+        return {
+            field.name: override(omit=field.name not in written, omit_if_default=field.name in if_set)
+            for field in dataclasses.fields(cls)
+        }
+
+    @c.register_unstructure_hook_factory(dataclasses.is_dataclass)
+    def write_dataclass(cls: Any) -> Any:
+        own = make_dict_unstructure_fn(cls, c, **choices(cls))
+
+        def write(value: Any) -> dict[str, Any]:
+            if not isinstance(value, cls):
+                raise CodecError(f"expected {cls.__name__}, got {type(value).__name__}")
+            return own(value)
+
+        return write
+
+    @c.register_structure_hook_factory(dataclasses.is_dataclass)
+    def read_dataclass(cls: Any) -> Any:
+        own = make_dict_structure_fn(cls, c, **choices(cls))
+
+        def read(data: Any, _: Any) -> Any:
+            return own({key: value for key, value in _expect(data, dict).items() if key != _TYPE}, cls)
+
+        return read
+
+    def is_union(hint: Any) -> bool:
+        return get_origin(hint) in (Union, types.UnionType) and len(set(get_args(hint)) - {types.NoneType}) > 1
+
+    @c.register_unstructure_hook_factory(is_union)
+    def write_union(hint: Any) -> Any:
+        members = {member: c.get_unstructure_hook(member) for member in get_args(hint)}
+
+        def write(value: Any) -> Any:
+            cls = type(value)
+            if cls not in members:
+                raise CodecError(f"expected one of {_names(hint)}, got {cls.__name__}")
+            written = members[cls](value)
+            return {_TYPE: cls.__name__, **written} if dataclasses.is_dataclass(cls) else written
+
+        return write
+
+    @c.register_structure_hook_factory(is_union)
+    def read_union(hint: Any) -> Any:
+        tagged: dict[Any, Any] = {_name(member): member for member in get_args(hint)}
+
+        def read(data: Any, _: Any) -> Any:
+            found = tagged.get(data[_TYPE]) if isinstance(data, Mapping) and _TYPE in data else type(data)
+            if found not in get_args(hint):
+                shown = repr(data[_TYPE]) if isinstance(data, Mapping) and _TYPE in data else _short(data)
+                raise CodecError(f"expected one of {_names(hint)}, got {shown}")
+            return None if data is None else c.structure(data, cast("type[Any]", found))
+
+        return read
+
+    return c
 
 
-def _union_from_json(data: Any, arguments: tuple[Any, ...]) -> Any:
-    if data is None and type(None) in arguments:
-        return None
-    members = [a for a in arguments if a is not type(None)]
-    if len(members) == 1:
-        return from_json(data, members[0])
-    if isinstance(data, Mapping) and _TYPE in data:
-        for member in members:
-            if dataclasses.is_dataclass(member) and _name(member) == data[_TYPE]:
-                return from_json(data, member)
-        raise CodecError(f"expected one of {', '.join(_name(m) for m in members)}, got {data[_TYPE]!r}")
-    for member in members:
-        if isinstance(member, type) and type(data) is member:
-            return from_json(data, member)
-    raise CodecError(f"expected one of {', '.join(_name(m) for m in members)}, got {_short(data)}")
+def _message(error: BaseException) -> str:
+    """The first of the errors of a conversion, with its place."""
+    from cattrs.errors import AttributeValidationNote, ClassValidationError, ForbiddenExtraKeysError
+
+    if not isinstance(error, ExceptionGroup):
+        return str(error)
+    if not isinstance(error, ClassValidationError):
+        return _message(error.exceptions[0])
+    name = error.cl.__name__
+    if unknown := [key for e in error.exceptions if isinstance(e, ForbiddenExtraKeysError) for key in e.extra_fields]:
+        return f"{name} has no field {', '.join(sorted(unknown))}; was it written by a newer version?"
+    if missing := [e.args[0] for e in error.exceptions if isinstance(e, KeyError)]:  # a later field has a default
+        return f"{name} lacks {', '.join(sorted(missing))}; was it written by an older version?"
+    first = error.exceptions[0]
+    places = [note.name for note in getattr(first, "__notes__", ()) if isinstance(note, AttributeValidationNote)]
+    return f"{'.'.join([name, *places])}: {_message(first)}"
+
+
+def _names(hint: Any) -> str:
+    return ", ".join(_name(member) for member in get_args(hint) if member is not types.NoneType)
 
 
 @functools.cache
@@ -235,15 +242,6 @@ def written_fields(cls: Any) -> dict[str, Any]:
 @functools.cache
 def _written_if_set(cls: Any) -> frozenset[str]:
     return frozenset(field.name for field in dataclasses.fields(cls) if field.metadata == WRITTEN_IF_SET)
-
-
-def _element_hints(hint: Any, count: int) -> tuple[Any, ...]:
-    arguments = get_args(hint)
-    if len(arguments) == 2 and arguments[1] is Ellipsis:
-        return (arguments[0],) * count
-    if len(arguments) != count:
-        raise CodecError(f"expected {len(arguments)} elements, got {count}")
-    return arguments
 
 
 def _plain(value: Any) -> Any:
@@ -289,9 +287,16 @@ def _key(key: Any) -> str:
     return key
 
 
-def _expect(data: Any, kind: type[Any]) -> None:
+def _expect(data: Any, kind: type[Any]) -> Any:
     if not isinstance(data, kind) or (kind is int and isinstance(data, bool)):
         raise CodecError(f"expected {kind.__name__}, got {_short(data)}")
+    return data
+
+
+def _one_of(data: Any, hint: Any) -> Any:
+    if data not in get_args(hint):
+        raise CodecError(f"expected one of {', '.join(map(repr, get_args(hint)))}, got {data!r}")
+    return data
 
 
 def _name(hint: Any) -> str:

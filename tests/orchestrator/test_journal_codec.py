@@ -195,6 +195,14 @@ def test_entries_of_a_newer_version_are_refused_by_name() -> None:
         decode_outcome({**written, "type": "Exploded"})
     with pytest.raises(CodecError, match=r"Failed\.kind: expected str, got 3"):
         decode_outcome({**written, "kind": 3})
+    with pytest.raises(CodecError, match="Failed lacks kind; was it written by an older version"):
+        decode_outcome({key: value for key, value in written.items() if key != "kind"})
+    asked = encode_request(Suggest(MinimumQuery(space, Data(((0.1, 0.2),), (1.0,)))))
+    asked["query"]["data"]["costs"] = ["much"]
+    with pytest.raises(
+        CodecError, match=r"^Suggest\.query: MinimumQuery\.data: Data\.costs: expected a number, got much$"
+    ):
+        decode_request(asked)
 
 
 def test_the_first_difference_is_named() -> None:
