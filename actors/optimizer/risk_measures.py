@@ -1,11 +1,10 @@
 """Risk measures for actions with execution errors: mean or CVaR of a surrogate over disturbances.
 
-`RiskProcess` is a surrogate of the measure; `conditional_value_at_risk` computes the CVaR of losses.
+`RiskProcess` is a surrogate of the measure; `tail_weights` are those of equally likely losses in their CVaR.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -45,17 +44,6 @@ def tail_weights(losses: Array, level: float) -> Array:
     weights = np.empty_like(losses)
     np.put_along_axis(weights, np.argsort(-losses, axis=1, kind="stable"), by_rank[None, :], axis=1)
     return weights
-
-
-def conditional_value_at_risk(losses: Sequence[float] | Array, level: float) -> float:
-    """CVaR of equally likely losses; see `tail_weights`. Raises ValueError without any, or for a level outside [0, 1).
-
-    Limitations: for a few draws it is biased low and scatters; it is meant for the many draws of a surrogate.
-    """
-    row = np.asarray(losses, dtype=np.float64)[None, :]
-    if row.size == 0 or not 0.0 <= level < 1.0:
-        raise ValueError(f"CVaR needs losses and a level in [0, 1), got {row.size} and {level}")
-    return float((tail_weights(row, level) * row).sum())
 
 
 @dataclass(frozen=True)

@@ -303,12 +303,6 @@ def _possible(liquid: Liquid, factor: float) -> bool:
     return liquid.is_thick or changed.is_thick
 
 
-def _thicker(recording: PourRecording, factor: float) -> PourRecording:
-    scene = recording.scene
-    changed = {"dynamic_viscosity": factor * scene.liquid.dynamic_viscosity}
-    return replace(recording, scene=replace(scene, liquid=scene.liquid.model_copy(update=changed)))
-
-
 PER_POUR = len(OWN) + 1
 
 
