@@ -59,8 +59,8 @@ class Trials:
     as pending even if they have been answered. The requests of a seeded campaign therefore do not depend on timing.
     """
 
-    def __init__(self) -> None:
-        self.width = 1
+    def __init__(self, width: int = 1) -> None:
+        self.width = width
         self.all: list[Trial] = []
         self._unissued: deque[tuple[int, int]] = deque()
         self._open: dict[Simulate, deque[tuple[int, int]]] = {}

@@ -204,7 +204,8 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
         return plan.settings.build(replace(plan, known=known_simulations(plan, results)), pours, seed)
 
     def evaluation(results: Results, seed: int) -> Strategy:
-        theta, plain = calibrated_theta(results).theta, plan.uncalibrated
+        theta, remembered = calibrated_theta(results).theta, result_of(results, CALIBRATION, Calibrated).memory
+        plain = plan.without_memory(() if remembered is None else remembered.contradicted).uncalibrated
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
         drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()

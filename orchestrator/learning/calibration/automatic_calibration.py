@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import deepcopy
 
 from actors.optimizer.questions import (
     CalibrationQuery,
@@ -19,7 +20,7 @@ from actors.optimizer.questions import (
 )
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.calibration_base import THETA_MAP_RESOLUTION, Calibrated
-from orchestrator.learning.calibration.campaign_memory import CONTRADICTED, log_memory, remembered_point
+from orchestrator.learning.calibration.campaign_memory import log_memory, remembered_point
 from orchestrator.learning.calibration.pointwise_calibration import DiscrepancyOverPours, discrepancies
 from orchestrator.learning.calibration.posterior_summary import (
     left_open,
@@ -29,7 +30,7 @@ from orchestrator.learning.calibration.posterior_summary import (
 from orchestrator.learning.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
 from orchestrator.learning.requests import Decision, Outcome, Request, Simulate
 from orchestrator.learning.strategy import Progress
-from orchestrator.learning.trials import Trial
+from orchestrator.learning.trials import OptimizerQueries, Trial, Trials
 from sim_engine.liquids import SimulationParameters
 
 STARTS_PER_PARAMETER = 10
@@ -72,7 +73,9 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     describes them worse than the uncalibrated θ, if that lies in the searched box: the evaluation repeats the same
     simulations. With a memory, half of the space-filling θ lie where it expects them, and θ* has the highest posterior
     density. The uncalibrated θ is then the expected one, which has the highest prior density, so that the same holds.
-    A memory that the pours contradict does not count for θ*.
+
+    As soon as a posterior contradicts the memory of a group, the calibration starts again without it, with all of its
+    simulations. It then makes the same requests as a campaign that never had this memory, and ends with the same θ*.
 
     Source: candidates from the posterior on a surrogate: Wang & Li, Adaptive Gaussian process approximation for
     Bayesian inference with expensive likelihood functions, 2018.
@@ -87,13 +90,23 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         self._kappa = kappa
         contexts = Contexts.of(plan)
         self._places = {seed: contexts.point(pour) for seed, pour in zip(self._seed_of_pour, self._usable, strict=True)}
-        self._plain = plan.uncalibrated
-        self._plain_at: Point = ()
-        values = {axis.name: float(getattr(self._plain, axis.name)) for axis in plan.parameters.axes}
-        if all(axis.lower <= values[axis.name] <= axis.upper for axis in plan.parameters.axes):
-            self._plain_at = tuple(map(float, plan.parameters.encode(values)))
-        self._before, self._starts = 0, 0
+        self._earlier: list[Trials] = []
         self._ended: str | None = None
+        self._initial_seeds = deepcopy(self._seeds)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin, or begin again, with the memory that is relied on."""
+        self._seeds = deepcopy(self._initial_seeds)
+        self._questions = OptimizerQueries(self._seeds)
+        self._trials = Trials(self._trials.width)
+        self._posterior = None
+        self._before, self._starts = 0, 0
+        space = self._plan.parameters
+        self._plain = self._plan.without_memory(self._lost).uncalibrated
+        values = {axis.name: float(getattr(self._plain, axis.name)) for axis in space.axes}
+        inside = all(axis.lower <= values[axis.name] <= axis.upper for axis in space.axes)
+        self._plain_at: Point = tuple(map(float, space.encode(values))) if inside else ()
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -129,6 +142,11 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         def drawn(suggestion: Suggestion) -> None:
             if suggestion.posterior is None:
                 raise self._no_discrepancies()
+            if self._contradicts(suggestion.posterior):
+                self._earlier.append(self._trials)
+                self._begin()
+                self.decisions.append(Decision(f"calibration starts again after {self._spent} simulations"))
+                return
             before, self._posterior = self._posterior, suggestion.posterior
             new, self._before = self._trials.answered - self._before, self._trials.answered
             change = None if before is None else posterior_change(before, suggestion.posterior)
@@ -207,12 +225,12 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     def _merit(self, trial: Trial, score: float) -> float:
         """The mean |r_i − c_s(a_i, θ)|; with a memory, minus the logarithm of the posterior density.
 
-        The likelihood is that of independent errors of an unknown common scale. For θ*, groups that the pours
-        contradict do not count: the density at a remembered place is high, however improbable the memory has become.
+        The likelihood is that of independent errors of an unknown common scale.
         """
-        held = () if self._posterior is None or self._ended is None else self._posterior.held or ()
-        kept = [one for i, one in enumerate(self._memory or ()) if i >= len(held) or held[i] >= CONTRADICTED]
-        return len(self._usable) * math.log(WEIGHED + score) - log_memory(trial.point, kept) if kept else score
+        memory = self._memory
+        return (
+            score if memory is None else len(self._usable) * math.log(WEIGHED + score) - log_memory(trial.point, memory)
+        )
 
     def _discrepancy(self, request: Simulate, simulated: float) -> float:
         """r_i − c_s(a_i, θ), with its sign."""
@@ -227,11 +245,26 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         """θ_s at a point of the unit cube; exactly the uncalibrated θ at its point."""
         return self._plain if point and point == self._plain_at else super().parameters_at(point)
 
+    @property
+    def _spent(self) -> int:
+        """Number of simulations answered before the last beginning."""
+        return sum(trials.answered for trials in self._earlier)
+
     def progress(self) -> Progress:
         """As in the base class; no further simulations after the end."""
         answered = self._trials.answered
-        return Progress(answered, self._budget if self._ended is None else answered)
+        return Progress(self._spent + answered, self._spent + (self._budget if self._ended is None else answered))
 
     def result(self) -> Calibrated:
         """As in the base class, with the reason of the end and the seeds of the training pours."""
-        return super().result().model_copy(update={"ended": self._ended, "pour_seeds": tuple(self._seed_of_pour)})
+        found = super().result()
+        before = [trial for trials in self._earlier for trial in trials.all if trial.closed]
+        return found.model_copy(
+            update={
+                "ended": self._ended,
+                "pour_seeds": tuple(self._seed_of_pour),
+                "simulations": self._spent + found.simulations,
+                "lost": sum(trials.lost for trials in self._earlier) + found.lost,
+                "trials": (*(self._row(i, trial) for i, trial in enumerate(before)), *found.trials),
+            }
+        )

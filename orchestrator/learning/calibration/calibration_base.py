@@ -16,7 +16,14 @@ from typing import Annotated, ClassVar, Generic, Literal, Self, TypeVar, cast
 from pydantic import Field
 
 from actors.optimizer.questions import Point, Posterior, Suggestion
-from orchestrator.learning.calibration.campaign_memory import MemoryFound, memory_found, unit_memory, verdicts
+from orchestrator.learning.calibration.campaign_memory import (
+    CONTRADICTED,
+    CampaignMemory,
+    MemoryFound,
+    memory_found,
+    unit_memory,
+    verdicts,
+)
 from orchestrator.learning.calibration.posterior_summary import PosteriorFound, posterior_found
 from orchestrator.learning.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
 from orchestrator.learning.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
@@ -163,6 +170,7 @@ class Calibration(ABC, Generic[S]):
         self._posterior: Posterior | None = None
         self._alone: Posterior | None = None
         self._memory = unit_memory(plan.memory, plan.parameters)
+        self._shares: dict[str, float] = {}
         self.decisions = [Decision(line) for line in (() if plan.memory is None else plan.memory.lines)]
 
     # -- asking ----------------------------------------------------------------------------------------------------
@@ -270,11 +278,34 @@ class Calibration(ABC, Generic[S]):
     def _row(self, number: int, trial: Trial) -> TriedOnPours | TriedOnce:
         """Convert a trial to its row in the result."""
 
+    @property
+    def _lost(self) -> list[str]:
+        """Groups whose memory a posterior has contradicted."""
+        return [group for group, share in self._shares.items() if share < CONTRADICTED]
+
+    @property
+    def _relied(self) -> CampaignMemory:
+        """The rest of the memory."""
+        return (self._plan.memory or CampaignMemory(())).without(self._lost)
+
+    def _contradicts(self, posterior: Posterior) -> bool:
+        """Whether a posterior contradicts the memory of further groups, which are then no longer relied on."""
+        shares = dict(zip(self._relied.groups, posterior.held or (), strict=True))
+        self._shares |= shares
+        lost = {group: share for group, share in shares.items() if share < CONTRADICTED}
+        if lost and self._plan.memory is not None:
+            self.decisions += verdicts(self._plan.memory, lost)
+            self._memory = unit_memory(self._relied, self._plan.parameters)
+        return bool(lost)
+
     def _remember(self, alone: Posterior | None) -> None:
-        """Record the posterior from the pours alone, and decide whether the memory agrees with the pours."""
-        self._alone = alone
-        if self._memory is not None and self._plan.memory is not None and self._posterior is not None:
-            self.decisions += verdicts(self._plan.memory, self._posterior)
+        """Record the posterior from the pours alone, and the groups whose memory agrees with the pours.
+
+        Args:
+            alone: None if no memory is relied on, because the posterior is then that of the pours alone.
+        """
+        self._alone = self._posterior if alone is None else alone
+        self.decisions += verdicts(self._relied, {group: self._shares[group] for group in self._relied.groups})
 
     def _posterior_found(self) -> PosteriorFound | None:
         """Posterior of the θ that fit the pours, if the strategy has one."""
@@ -291,7 +322,7 @@ class Calibration(ABC, Generic[S]):
             training_pours=len(self._usable),
             trials=tuple(self._row(i, trial) for i, trial in enumerate(self._trials.all) if trial.closed),
             found=self._found() if self.finished else None,
-            memory=memory_found(self._plan.memory, self._posterior, self._alone, self._plan.parameters),
+            memory=memory_found(self._plan.memory, self._shares, self._alone, self._plan.parameters),
         )
 
     def _found(self) -> CalibratedTheta:

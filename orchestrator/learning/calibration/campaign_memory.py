@@ -11,8 +11,8 @@ as a whole, independent of the others.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -37,7 +37,7 @@ RELIANCE = 0.8
 """Prior probability that the memory of a group holds in a new campaign."""
 
 CONTRADICTED = 0.5
-"""Posterior probability below which the memory of a group is reported as contradicted."""
+"""Posterior probability below which the memory of a group is reported as contradicted, and no longer used."""
 
 SPREAD, OTHER_VESSEL, OF_TOLERANCE = 0.05, 0.15, 0.5
 """Scale of the differences between campaigns before any were observed: fraction of a parameter's whole range, the same
@@ -130,6 +130,10 @@ class CampaignMemory:
         """The parameters by group."""
         found = {group: tuple(one for one in self.parameters if one.name in names) for group, names in GROUPS.items()}
         return {group: parameters for group, parameters in found.items() if parameters}
+
+    def without(self, groups: Collection[str]) -> CampaignMemory:
+        """The same without the parameters of some groups."""
+        return replace(self, parameters=tuple(one for one in self.parameters if group_of(one.name) not in groups))
 
     @property
     def means(self) -> dict[str, float]:
@@ -246,16 +250,27 @@ class MemoryFound(ResultPart):
     text: str
     """The runs that the prior comes from, and what the pours say about it."""
 
+    @property
+    def contradicted(self) -> tuple[str, ...]:
+        """Groups that the pours contradict."""
+        return tuple(one.group for one in self.groups if one.contradicted)
 
-def verdicts(memory: CampaignMemory, posterior: Posterior) -> list[Decision]:
-    """The agreement of each group with the pours, as decisions; a contradiction is urgent."""
+
+def verdicts(memory: CampaignMemory, shares: Mapping[str, float]) -> list[Decision]:
+    """The agreement of groups with the pours, as decisions; a contradiction is urgent.
+
+    Args:
+        memory: prior of the campaign.
+        shares: posterior probability of the memory of each group to be reported.
+    """
     decisions = []
-    for (group, parameters), share in zip(memory.groups.items(), posterior.held or (), strict=True):
+    for group, share in shares.items():
+        parameters = memory.groups[group]
         runs = ", ".join(dict.fromkeys(run for one in parameters for run in one.runs))
         if share < CONTRADICTED:
             text = (
                 f"the pours contradict the memory of the {group} ({runs}; {', '.join(map(str, parameters))}): it holds "
-                f"with a probability of {100 * share:.0f} %, and has lost its weight"
+                f"with a probability of {100 * share:.0f} %, and is no longer used"
             )
         else:
             text = f"the pours agree with the memory of the {group} ({runs}): probability {100 * share:.0f} %"
@@ -264,27 +279,34 @@ def verdicts(memory: CampaignMemory, posterior: Posterior) -> list[Decision]:
 
 
 def memory_found(
-    memory: CampaignMemory | None, posterior: Posterior | None, alone: Posterior | None, space: Space
+    memory: CampaignMemory | None, shares: Mapping[str, float], alone: Posterior | None, space: Space
 ) -> MemoryFound | None:
-    """The memory's part of a result; None without a memory or before its end."""
+    """The memory's part of a result; None without a memory or before its end.
+
+    Args:
+        memory: prior of the campaign.
+        shares: posterior probability of the memory of each group.
+        alone: posterior without the memory.
+        space: searched θ.
+    """
     if memory is None:
         return None
     if not memory.parameters:
         return MemoryFound(groups=(), alone={}, left_out=memory.left_out, text=memory.text)
-    if posterior is None or alone is None:
+    if alone is None:
         return None
     groups = tuple(
         MemoryGroup(
             group=group,
             parameters={one.name: (one.mean, one.deviation) for one in parameters},
             runs=tuple(dict.fromkeys(run for one in parameters for run in one.runs)),
-            probability=share,
-            contradicted=share < CONTRADICTED,
+            probability=shares[group],
+            contradicted=shares[group] < CONTRADICTED,
         )
-        for (group, parameters), share in zip(memory.groups.items(), posterior.held or (), strict=True)
+        for group, parameters in memory.groups.items()
     )
     rows = [space.decode(point) for point in alone.points]
-    text = "; ".join([memory.text, *(one.text for one in verdicts(memory, posterior))])
+    text = "; ".join([memory.text, *(one.text for one in verdicts(memory, {g: shares[g] for g in memory.groups}))])
     return MemoryFound(groups=groups, alone=estimates(rows), left_out=memory.left_out, text=text)
 
 

@@ -17,6 +17,7 @@ from actors.optimizer.questions import (
     Point,
     PosteriorQuestion,
     RegressionQuery,
+    RememberedGroup,
     SpaceFillingQuery,
     Suggestion,
 )
@@ -236,6 +237,9 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._posterior = suggestion.posterior
             if self._posterior is None:
                 raise self._no_discrepancies()
+            if self._contradicts(self._posterior):
+                ask(self._memory)
+                return
             self.decisions += [Decision(text) for text in left_open(self._posterior, self._plan.parameters.names)]
             self._ask_expected(central(self._posterior))
 
@@ -245,8 +249,12 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
                 for spillage, expected in zip(weighed, regression.predictions, strict=True)
             )
             noise = (regression.hyperparameters or {}).get("noise", 0.0)
-            self._weighed = PosteriorQuestion(places, offsets, noise, prior=unit_prior(self._plan), memory=self._memory)
-            query = self._query(everything=True, count=0, posterior=self._weighed)
+            self._weighed = PosteriorQuestion(places, offsets, noise, prior=unit_prior(self._plan))
+            ask(self._memory)
+
+        def ask(memory: tuple[RememberedGroup, ...] | None) -> None:
+            assert self._weighed is not None
+            query = self._query(everything=True, count=0, posterior=replace(self._weighed, memory=memory))
             self._questions.put(query, "posterior", drawn)
 
         data = Data(places, weighed)
@@ -260,7 +268,7 @@ class ContinuousBayesianCalibration(Calibration[C4Settings]):
             self._remember(suggestion.posterior)
             self._settle(point, suggestion.predictions[0], suggestion.prediction_deviations[0])
 
-        alone = None if self._memory is None or self._weighed is None else replace(self._weighed, memory=None)
+        alone = None if self._memory is None else self._weighed
         query = self._query(
             everything=True,
             count=0,
