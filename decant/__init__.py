@@ -6,153 +6,73 @@ Whatever is not named in `__all__` may change without notice.
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from decant.lazy_names import import_name, names_for_type_checkers
+
 if TYPE_CHECKING:
-    from actors.interfaces import LaboratoryError
-    from decant.ask_tell import AskedPour, AskTell
-    from decant.catalogue_tables import find_pours, find_runs
-    from decant.run_results import Run, open_run, publish
-    from decant.running import (
-        RunningCampaign,
-        build_campaign,
-        calibrate,
-        check,
-        doctor,
-        load_campaign,
-        load_vessel,
-        plan,
-        run,
-        shipped,
-        start,
-        starting_set,
-    )
-    from decant.simulation import Simulation, simulate
-    from decant.station import Station, StationPour
-    from orchestrator.campaigns.action_assignments import AssignmentError
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-    from orchestrator.learning.campaign_plan import CampaignPlan
-    from orchestrator.learning.run_errors import RunError
-    from orchestrator.materials.vessel_account import VesselAccount, VesselContent
-    from orchestrator.records import events
-    from orchestrator.records.events import Event
-    from orchestrator.reports.publishing import Published
-    from orchestrator.reports.recording_export import export_recordings
-    from orchestrator.reports.recording_figures import replay_figure
-    from orchestrator.reports.recording_file import PourRecording, load_recording, load_recordings
-    from orchestrator.reports.recording_fit import Fit, Judgement, fit_recordings, judge_recording
-    from orchestrator.reports.recording_replay import PourReplay, ReplayValues, replay_recording
-    from orchestrator.runs.added_pours import add_pour
-    from orchestrator.runs.bench_check import BenchReport
-    from orchestrator.runs.run_service import CheckReport
-    from sim_engine.errors import DecantError, InvalidArgumentError
-    from sim_engine.liquids import SimulationParameters
-    from sim_engine.resources import MissingExtraError
-    from sim_engine.vessel.shapes import VesselSpec
+    from actors.interfaces import LaboratoryError as LaboratoryError
+    from decant.ask_tell import AskedPour as AskedPour
+    from decant.ask_tell import AskTell as AskTell
+    from decant.catalogue_tables import find_pours as find_pours
+    from decant.catalogue_tables import find_runs as find_runs
+    from decant.run_results import Run as Run
+    from decant.run_results import open_run as open_run
+    from decant.run_results import publish as publish
+    from decant.running import RunningCampaign as RunningCampaign
+    from decant.running import build_campaign as build_campaign
+    from decant.running import calibrate as calibrate
+    from decant.running import check as check
+    from decant.running import doctor as doctor
+    from decant.running import load_campaign as load_campaign
+    from decant.running import load_vessel as load_vessel
+    from decant.running import plan as plan
+    from decant.running import run as run
+    from decant.running import shipped as shipped
+    from decant.running import start as start
+    from decant.running import starting_set as starting_set
+    from decant.simulation import Simulation as Simulation
+    from decant.simulation import simulate as simulate
+    from decant.station import Station as Station
+    from decant.station import StationPour as StationPour
+    from orchestrator.campaigns.action_assignments import AssignmentError as AssignmentError
+    from orchestrator.campaigns.yaml.yaml_errors import ConfigError as ConfigError
+    from orchestrator.learning.campaign_plan import CampaignPlan as CampaignPlan
+    from orchestrator.learning.run_errors import RunError as RunError
+    from orchestrator.materials.vessel_account import VesselAccount as VesselAccount
+    from orchestrator.materials.vessel_account import VesselContent as VesselContent
+    from orchestrator.records import events as events
+    from orchestrator.records.events import Event as Event
+    from orchestrator.reports.publishing import Published as Published
+    from orchestrator.reports.recording_export import export_recordings as export_recordings
+    from orchestrator.reports.recording_figures import replay_figure as replay_figure
+    from orchestrator.reports.recording_file import PourRecording as PourRecording
+    from orchestrator.reports.recording_file import load_recording as load_recording
+    from orchestrator.reports.recording_file import load_recordings as load_recordings
+    from orchestrator.reports.recording_fit import Fit as Fit
+    from orchestrator.reports.recording_fit import Judgement as Judgement
+    from orchestrator.reports.recording_fit import fit_recordings as fit_recordings
+    from orchestrator.reports.recording_fit import judge_recording as judge_recording
+    from orchestrator.reports.recording_replay import PourReplay as PourReplay
+    from orchestrator.reports.recording_replay import ReplayValues as ReplayValues
+    from orchestrator.reports.recording_replay import replay_recording as replay_recording
+    from orchestrator.runs.added_pours import add_pour as add_pour
+    from orchestrator.runs.bench_check import BenchReport as BenchReport
+    from orchestrator.runs.run_service import CheckReport as CheckReport
+    from sim_engine.errors import DecantError as DecantError
+    from sim_engine.errors import InvalidArgumentError as InvalidArgumentError
+    from sim_engine.liquids import SimulationParameters as SimulationParameters
+    from sim_engine.resources import MissingExtraError as MissingExtraError
+    from sim_engine.vessel.shapes import VesselSpec as VesselSpec
 
-__all__ = [
-    "AskTell",
-    "AskedPour",
-    "AssignmentError",
-    "BenchReport",
-    "CampaignPlan",
-    "CheckReport",
-    "ConfigError",
-    "DecantError",
-    "Event",
-    "Fit",
-    "InvalidArgumentError",
-    "Judgement",
-    "LaboratoryError",
-    "MissingExtraError",
-    "PourRecording",
-    "PourReplay",
-    "Published",
-    "ReplayValues",
-    "Run",
-    "RunError",
-    "RunningCampaign",
-    "Simulation",
-    "SimulationParameters",
-    "Station",
-    "StationPour",
-    "VesselAccount",
-    "VesselContent",
-    "VesselSpec",
-    "add_pour",
-    "build_campaign",
-    "calibrate",
-    "check",
-    "doctor",
-    "events",
-    "export_recordings",
-    "find_pours",
-    "find_runs",
-    "fit_recordings",
-    "judge_recording",
-    "load_campaign",
-    "load_recording",
-    "load_recordings",
-    "load_vessel",
-    "open_run",
-    "plan",
-    "publish",
-    "replay_figure",
-    "replay_recording",
-    "run",
-    "shipped",
-    "simulate",
-    "start",
-    "starting_set",
-]
-
-_HOMES = {
-    "decant.ask_tell": ("AskTell", "AskedPour"),
-    "decant.catalogue_tables": ("find_pours", "find_runs"),
-    "decant.running": (
-        *("build_campaign", "load_campaign", "load_vessel", "shipped", "starting_set"),
-        *("calibrate", "check", "doctor", "plan", "run", "start", "RunningCampaign"),
-    ),
-    "decant.run_results": ("Run", "open_run", "publish"),
-    "decant.simulation": ("Simulation", "simulate"),
-    "decant.station": ("Station", "StationPour"),
-    "actors.interfaces": ("LaboratoryError",),
-    "orchestrator.runs.bench_check": ("BenchReport",),
-    "orchestrator.materials.vessel_account": ("VesselAccount", "VesselContent"),
-    "orchestrator.campaigns.action_assignments": ("AssignmentError",),
-    "orchestrator.campaigns.yaml.yaml_errors": ("ConfigError",),
-    "orchestrator.learning.run_errors": ("RunError",),
-    "orchestrator.runs.run_service": ("CheckReport",),
-    "orchestrator.runs.added_pours": ("add_pour",),
-    "orchestrator.records.events": ("Event",),
-    "orchestrator.learning.campaign_plan": ("CampaignPlan",),
-    "orchestrator.reports.recording_export": ("export_recordings",),
-    "orchestrator.reports.recording_file": ("PourRecording", "load_recording", "load_recordings"),
-    "orchestrator.reports.recording_fit": ("Fit", "Judgement", "fit_recordings", "judge_recording"),
-    "orchestrator.reports.recording_replay": ("PourReplay", "ReplayValues", "replay_recording"),
-    "orchestrator.reports.publishing": ("Published",),
-    "orchestrator.reports.recording_figures": ("replay_figure",),
-    "sim_engine.errors": ("DecantError", "InvalidArgumentError"),
-    "sim_engine.resources": ("MissingExtraError",),
-    "sim_engine.liquids": ("SimulationParameters",),
-    "sim_engine.vessel.shapes": ("VesselSpec",),
-}
-"""Module → the names that it gives."""
-
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-
+_HOMES = names_for_type_checkers(__file__)
 
 if not TYPE_CHECKING:  # else a type checker would take a misspelt name for Any
+    __all__ = list(_HOMES)
 
     def __getattr__(name: str) -> Any:
-        """Import a name when it is asked for (PEP 562)."""
-        if name == "events":
-            return import_module("orchestrator.records.events")
-        if name not in _HOME_OF:
-            raise AttributeError(f"module 'decant' has no attribute '{name}'; it has {', '.join(__all__)}")
-        return getattr(import_module(_HOME_OF[name]), name)
+        return import_name(__name__, name, _HOMES)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return list(_HOMES)

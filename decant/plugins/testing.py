@@ -11,86 +11,45 @@ How to use them: docs/extend/plug-ins.md. Each name is imported on first use.
 
 from __future__ import annotations
 
-from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+from decant.lazy_names import import_name, names_for_type_checkers
+
 if TYPE_CHECKING:
-    from actors.contract_tests.arm_contract import ArmBench, ArmContract
-    from actors.contract_tests.balance_contract import BalanceBench, BalanceContract
-    from actors.contract_tests.gripper_contract import GripperContract, GripperRig
-    from actors.contract_tests.liquid_device_contracts import PumpContract, PumpRig, SpillRig, SpillSensorContract
-    from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
-    from orchestrator.runs.strategy_harness import (
-        ACTIONS,
-        CALIBRATION_ACTIONS,
-        PARAMETERS,
-        SCENE,
-        THETA,
-        SpillModel,
-        StrategyHarness,
-        check_strategy,
-        failures,
-        outcome_of,
-        replay,
-    )
+    from actors.contract_tests.arm_contract import ArmBench as ArmBench
+    from actors.contract_tests.arm_contract import ArmContract as ArmContract
+    from actors.contract_tests.balance_contract import BalanceBench as BalanceBench
+    from actors.contract_tests.balance_contract import BalanceContract as BalanceContract
+    from actors.contract_tests.gripper_contract import GripperContract as GripperContract
+    from actors.contract_tests.gripper_contract import GripperRig as GripperRig
+    from actors.contract_tests.liquid_device_contracts import PumpContract as PumpContract
+    from actors.contract_tests.liquid_device_contracts import PumpRig as PumpRig
+    from actors.contract_tests.liquid_device_contracts import SpillRig as SpillRig
+    from actors.contract_tests.liquid_device_contracts import SpillSensorContract as SpillSensorContract
+    from actors.emulators.serial_balance.balance_process import VirtualSerialBalance as VirtualSerialBalance
+    from orchestrator.runs.strategy_harness import ACTIONS as ACTIONS
+    from orchestrator.runs.strategy_harness import CALIBRATION_ACTIONS as CALIBRATION_ACTIONS
+    from orchestrator.runs.strategy_harness import PARAMETERS as PARAMETERS
+    from orchestrator.runs.strategy_harness import SCENE as SCENE
+    from orchestrator.runs.strategy_harness import THETA as THETA
+    from orchestrator.runs.strategy_harness import SpillModel as SpillModel
+    from orchestrator.runs.strategy_harness import StrategyHarness as StrategyHarness
+    from orchestrator.runs.strategy_harness import check_strategy as check_strategy
+    from orchestrator.runs.strategy_harness import failures as failures
+    from orchestrator.runs.strategy_harness import outcome_of as outcome_of
+    from orchestrator.runs.strategy_harness import replay as replay
 
-__all__ = [
-    "ACTIONS",
-    "CALIBRATION_ACTIONS",
-    "PARAMETERS",
-    "SCENE",
-    "THETA",
-    "ArmBench",
-    "ArmContract",
-    "BalanceBench",
-    "BalanceContract",
-    "GripperContract",
-    "GripperRig",
-    "PumpContract",
-    "PumpRig",
-    "SpillModel",
-    "SpillRig",
-    "SpillSensorContract",
-    "StrategyHarness",
-    "VirtualSerialBalance",
-    "check_strategy",
-    "failures",
-    "outcome_of",
-    "replay",
-]
+_HOMES = names_for_type_checkers(__file__)
 
-_CONTRACTS = {
-    "ArmBench": "actors.contract_tests.arm_contract",
-    "ArmContract": "actors.contract_tests.arm_contract",
-    "BalanceBench": "actors.contract_tests.balance_contract",
-    "BalanceContract": "actors.contract_tests.balance_contract",
-    "GripperContract": "actors.contract_tests.gripper_contract",
-    "GripperRig": "actors.contract_tests.gripper_contract",
-    "PumpContract": "actors.contract_tests.liquid_device_contracts",
-    "PumpRig": "actors.contract_tests.liquid_device_contracts",
-    "SpillRig": "actors.contract_tests.liquid_device_contracts",
-    "SpillSensorContract": "actors.contract_tests.liquid_device_contracts",
-}
-
-_SOURCE_OF = dict.fromkeys(__all__, "orchestrator.runs.strategy_harness") | {
-    **_CONTRACTS,
-    "VirtualSerialBalance": "actors.emulators.serial_balance.balance_process",
-}
-"""Name → the module that provides it."""
-
-if not TYPE_CHECKING:  # otherwise a type checker would accept misspelt names as Any
+if not TYPE_CHECKING:  # else a type checker would take a misspelt name for Any
+    __all__ = list(_HOMES)
 
     def __getattr__(name: str) -> Any:
-        """Import a name on first use (PEP 562)."""
-        if name not in _SOURCE_OF:
-            raise AttributeError(
-                f"module 'decant.plugins.testing' has no attribute '{name}'; it has {', '.join(__all__)}"
-            )
-        if name in _CONTRACTS and find_spec("pytest") is None:
+        if _HOMES.get(name, "").startswith("actors.contract_tests.") and find_spec("pytest") is None:
             raise ImportError(f"{name} is run by pytest, which is not installed: pip install pytest")
-        return getattr(import_module(_SOURCE_OF[name]), name)
+        return import_name(__name__, name, _HOMES)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return list(_HOMES)
