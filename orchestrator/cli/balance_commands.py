@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message
 
 if TYPE_CHECKING:
     from actors.balance.balance_check import CheckOperator
@@ -37,9 +37,7 @@ machine's."""
 Balance = Annotated[
     str,
     typer.Argument(
-        help="Laboratory file (YAML), or the port of a balance: /dev/serial/by-id/…, or host:port.",
-        metavar="BALANCE",
-        show_default=False,
+        help="Laboratory file (YAML), or the port of a balance: /dev/serial/by-id/…, or host:port.", metavar="BALANCE"
     ),
 ]
 Given = Annotated[
@@ -48,7 +46,6 @@ Given = Annotated[
         "--set",
         help="With a port: a setting of the balance, as in a laboratory file: dialect=kcp, baud=9600, dtr=false. "
         "Repeatable; unless given, dialect and line settings are detected.",
-        show_default=False,
     ),
 ]
 
@@ -74,7 +71,7 @@ def check(
     checks: list[DeviceCheck] = []
     with _settings(balance, given) as (spec, emulator), _tap(record, balance, emulator is not None) as tap:
         if emulator is None and not sys.stdin.isatty():
-            raise RefusalError("the check asks for loads at a terminal, with nothing piped into it", BAD_INPUT)
+            raise RefusalError("the check asks for loads at a terminal, with nothing piped into it")
         hands: CheckOperator = Person() if emulator is None else EmulatedHands(partial(_put, emulator))
         driver = _driver(spec, tap)
         try:
@@ -97,13 +94,13 @@ def check(
 
         print_json(BalanceCheckOutput(balance=balance, ready=not failed, checks=checks))
     if failed:
-        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail")
+        raise RefusalError(f"{len(failed)} of {len(checks)} checks fail", FAILED)
     print_message("ready" if all(one.state == "ok" for one in checks) else "ready, with warnings")
 
 
 def record(
     balance: Balance,
-    to: Annotated[Path, typer.Option(help="File to write (.jsonl); must not exist yet.", show_default=False)],
+    to: Annotated[Path, typer.Option(help="File to write (.jsonl); must not exist yet.")],
     seconds: Annotated[float, typer.Option(min=0.1, help="Duration [s].")] = 60.0,
     listen: Annotated[bool, typer.Option("--listen", help="Request nothing after connecting, only listen.")] = False,
     remarks: Annotated[str, typer.Option(help="Make and model, and what is put on it and when.")] = "",
@@ -156,7 +153,6 @@ def explain(
             help="Recording of 'decant balance record', or any file with the lines as they came: the log of a terminal "
             "program, hexadecimal digits, printed Python bytes.",
             metavar="FILE",
-            show_default=False,
         ),
     ],
     as_json: Json = False,
@@ -189,7 +185,7 @@ def explain(
     else:
         _print_fits(file, capture, fits)
     if not capture.lines:
-        raise RefusalError("the balance sent nothing: is it switched on, and is it the right port and cable?")
+        raise RefusalError("the balance sent nothing: is it switched on, and is it the right port and cable?", FAILED)
     if not best:
         text = "no dialect reads a weight in these lines. "
         if not is_text(b"".join(capture.lines)):
@@ -198,7 +194,7 @@ def explain(
             text += "Set the balance to print the weight in g with its unit, or choose another protocol in its menu"
             if not capture.about:
                 text += ". A program that cuts blanks at the ends of lines off damages them"
-        raise RefusalError(text)
+        raise RefusalError(text, FAILED)
     if not as_json:
         _print_settings(capture, best)
 
@@ -336,7 +332,7 @@ def _ask(prompt: str) -> str:
     try:
         return typed_line(prompt).strip()
     except EOFError:
-        raise RefusalError("the terminal was closed") from None
+        raise RefusalError("the terminal was closed", FAILED) from None
 
 
 @contextlib.contextmanager
@@ -350,10 +346,10 @@ def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBala
         yield _port_settings(target, given), None
         return
     if given:
-        raise RefusalError("--set belongs to a port; a laboratory file has the settings", BAD_INPUT)
+        raise RefusalError("--set belongs to a port; a laboratory file has the settings")
     spec = read_laboratory(Path(target)).balance
     if not isinstance(spec, SerialBalanceSettings) or spec.typed:
-        raise RefusalError(f"{target}: it has no balance on a serial line or over TCP", BAD_INPUT)
+        raise RefusalError(f"{target}: it has no balance on a serial line or over TCP")
     if spec.virtual is None:
         yield spec, None
         return
@@ -383,7 +379,7 @@ def _port_settings(port: str, given: list[str] | None) -> SerialBalanceSettings:
     for text in given or ():
         key, equals, value = text.partition("=")
         if not equals:
-            raise RefusalError(f"--set {text}: should be a key and a value, as dialect=kcp", BAD_INPUT)
+            raise RefusalError(f"--set {text}: should be a key and a value, as dialect=kcp")
         lines.append(f"{key.strip()}: {value.strip()}")
     with Refused(ConfigError):
         report = Report()

@@ -26,7 +26,7 @@ from orchestrator.cli.command_options import (
     Seed,
     Thetas,
 )
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_note
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_note
 
 if TYPE_CHECKING:
     from orchestrator.cli.command_results import CalibrateOutput
@@ -70,7 +70,7 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         plan = request.campaign
         check_campaign_can_run(request)
         if answer is not None and not resume:
-            raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer", BAD_INPUT)
+            raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer")
         require_campaign_flag(request, enabled=enable_motion, task=task)
         flag = "" if laboratory is None else f" --laboratory {laboratory}"
         flag += "" if seed is None else f" --seed {seed}"
@@ -208,7 +208,7 @@ def plan(
         recommended = result.recommended
         if recommended is None:
             raise RefusalError(
-                f"{stage.name}: no action could be planned; every simulation failed. See {run_result.directory}"
+                f"{stage.name}: no action could be planned; every simulation failed. See {run_result.directory}", FAILED
             )
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
         repeated = result_of(run_result.results, PREDICTION + receiver_name, PredictedPour).over_seeds

@@ -18,9 +18,7 @@ from sim_engine.errors import EngineError, WrongOutcomeError
 
 Campaign = Annotated[
     Path,
-    typer.Argument(
-        help="Campaign file (YAML).", metavar="CAMPAIGN", show_default=False, autocompletion=files_of("campaign")
-    ),
+    typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", autocompletion=files_of("campaign")),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished run of this campaign.")]
@@ -32,29 +30,25 @@ Answer = Annotated[
     str | None,
     typer.Option(
         help="With --resume: the outcome of the interrupted pour: 'lost', 'weighed 3.2 0.4' (g spilled, g retained), "
-        "or on the virtual bench 'repeat'. If D3 asks how to continue: 'go on' or 'stop'.",
-        show_default=False,
+        "or on the virtual bench 'repeat'. If D3 asks how to continue: 'go on' or 'stop'."
     ),
 ]
 Laboratory = Annotated[
     Path,
-    typer.Argument(
-        help="Laboratory file (YAML).", metavar="LABORATORY", show_default=False, autocompletion=files_of("laboratory")
-    ),
+    typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", autocompletion=files_of("laboratory")),
 ]
 OtherLaboratory = Annotated[
     Path | None,
     typer.Option(
         "--laboratory",
         help="Laboratory file (YAML) instead of the campaign's.",
-        show_default=False,
         autocompletion=files_of("laboratory"),
     ),
 ]
 Seed = Annotated[
     int | None,
     # The limit equals the schema's, whose module takes too long to import for `--help`.
-    typer.Option(min=0, max=2**63 - 1, help="Seed, instead of the campaign's.", show_default=False),
+    typer.Option(min=0, max=2**63 - 1, help="Seed, instead of the campaign's."),
 ]
 Assignments = Annotated[
     list[str] | None,
@@ -67,7 +61,6 @@ Thetas = Annotated[
         max=50,
         help="Number of posterior draws of θ in --parameters to predict with; 0: θ* alone. By default as many as "
         "seeds, if the file has a posterior.",
-        show_default=False,
     ),
 ]
 SceneName = Annotated[
@@ -98,17 +91,13 @@ LiveAt = Annotated[
         metavar="ADDRESS[:PORT]",
         help="Address of the live view: '0.0.0.0' for other machines too (without a password), optionally with a "
         "port. Default: this machine only, port 9090 or the next free one.",
-        show_default=False,
     ),
 ]
-Parameters = Annotated[
-    Path | None, typer.Option(help="θ: theta.json of a calibration, or a YAML or JSON file.", show_default=False)
-]
+Parameters = Annotated[Path | None, typer.Option(help="θ: theta.json of a calibration, or a YAML or JSON file.")]
 Receiver = Annotated[
     Path | None,
     typer.Option(
         help="Vessel file (YAML) instead of the campaign's receiver.",
-        show_default=False,
         autocompletion=files_of("vessel"),
     ),
 ]
@@ -139,7 +128,7 @@ def _expanded(path: Path) -> Path:
     try:
         return Path(in_home(str(path)))
     except ValueError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
 
 
 def _in_home(value: Any) -> Any:

@@ -30,7 +30,7 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 class RefusalError(Exception):
     """A command can't do its work; the message is printed without a traceback."""
 
-    def __init__(self, message: str, code: int = FAILED) -> None:
+    def __init__(self, message: str, code: int = BAD_INPUT) -> None:
         super().__init__(message)
         self.code = code
 

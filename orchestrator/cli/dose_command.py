@@ -10,15 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Campaign, InProcess, Json, OtherLaboratory, Seed
-from orchestrator.cli.console import (
-    BAD_INPUT,
-    FAILED,
-    RefusalError,
-    Refused,
-    print_json,
-    print_message,
-    print_note,
-)
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message, print_note
 
 if TYPE_CHECKING:
     from actors.dosing.dose_series import DoseForecast
@@ -34,8 +26,7 @@ def dose(
         list[str] | None,
         typer.Option(
             help="Wanted in the receiver, for example '50 g'. Repeatable, one dose each. With --dry-run, by default "
-            "the campaign's own series.",
-            show_default=False,
+            "the campaign's own series."
         ),
     ] = None,
     tolerance: Annotated[
@@ -44,9 +35,7 @@ def dose(
     ] = "1 g",
     receiver: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME", help="Name of one of the campaign's receivers; default: the first.", show_default=False
-        ),
+        typer.Option(metavar="NAME", help="Name of one of the campaign's receivers; default: the first."),
     ] = None,
     as_left: Annotated[
         bool,
@@ -107,22 +96,22 @@ def _dose_request(
 
     plan = read_campaign(path, laboratory)
     if not plan.laboratory.pours:
-        raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
+        raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans")
     if not amounts:
         if plan.dispense is None or not dry_run:
             hint = ", for example '50 g'" if plan.dispense is None else f"; 'decant run {path}' pours its own series"
-            raise RefusalError(f"--amount: name the wanted amount{hint}", BAD_INPUT)
+            raise RefusalError(f"--amount: name the wanted amount{hint}")
         return dose_task(plan, as_left=as_left)
     scenes = {scene.receiver.name: scene for scene in reversed(dose_scenes(plan))}
     if receiver is not None and receiver not in scenes:
         known = ", ".join(reversed(scenes))
-        raise RefusalError(f"--receiver {receiver}: the campaign has no such receiver; there are {known}", BAD_INPUT)
+        raise RefusalError(f"--receiver {receiver}: the campaign has no such receiver; there are {known}")
     with Refused(QuantityError, at="--tolerance: "):
         limit = parse_quantity(tolerance, "kg", "1 g")
     with Refused(QuantityError, at="--amount: "):
         wanted = [parse_quantity(text, "kg", "50 g") for text in amounts]
     if limit <= 0.0 or min(wanted) <= limit:
-        raise RefusalError("--amount: every amount should be larger than the tolerance, and both above 0", BAD_INPUT)
+        raise RefusalError("--amount: every amount should be larger than the tolerance, and both above 0")
     return dose_task(plan, wanted, limit, None if receiver is None else scenes[receiver], as_left=as_left)
 
 

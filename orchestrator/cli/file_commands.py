@@ -17,7 +17,6 @@ import typer
 
 from orchestrator.cli.command_options import Json
 from orchestrator.cli.console import (
-    BAD_INPUT,
     FAILED,
     RefusalError,
     WaitingIndicator,
@@ -31,7 +30,7 @@ from orchestrator.cli.console import (
 def validate(
     files: Annotated[
         list[Path],
-        typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files.", show_default=False),
+        typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files."),
     ],
 ) -> None:
     """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured."""
@@ -53,7 +52,7 @@ def validate(
         else:
             print(f"{path}: ok ({note})", flush=True)
     if bad:
-        raise RefusalError(f"{bad} of {len(files)} file(s) can't be used", BAD_INPUT)
+        raise RefusalError(f"{bad} of {len(files)} file(s) can't be used")
 
 
 def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
@@ -115,9 +114,9 @@ def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one
     try:
         campaigns = starting_set(directory)
     except FileExistsError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
     except OSError as error:
-        raise RefusalError(f"{directory}: can't be written: {error.strerror}", BAD_INPUT) from None
+        raise RefusalError(f"{directory}: can't be written: {error.strerror}") from None
     for path in campaigns:
         print(path)
 
@@ -153,5 +152,5 @@ def schema(
     from orchestrator.cli.json_schema import SCHEMAS, schema_text
 
     if which not in SCHEMAS:
-        raise RefusalError(f"no schema '{which}'; there are {', '.join(SCHEMAS)}", BAD_INPUT)
+        raise RefusalError(f"no schema '{which}'; there are {', '.join(SCHEMAS)}")
     sys.stdout.write(schema_text(SCHEMAS[which]()))

@@ -13,7 +13,6 @@ import typer
 
 from orchestrator.cli.command_options import EnableMotion, InProcess, Json, OtherLaboratory
 from orchestrator.cli.console import (
-    BAD_INPUT,
     FAILED,
     RefusalError,
     Refused,
@@ -40,7 +39,7 @@ def first_day(
     folder: Annotated[Path, typer.Argument(help="Folder of the recordings; steps that it has are kept.")],
     campaign: Annotated[
         Path | None,
-        typer.Option(help="Campaign whose bench pours the missing steps, with water.", show_default=False),
+        typer.Option(help="Campaign whose bench pours the missing steps, with water."),
     ] = None,
     laboratory: OtherLaboratory = None,
     practise: Annotated[
@@ -72,17 +71,17 @@ def first_day(
     from sim_engine.settings.quantity import QuantityError, parse_quantity
 
     if practise and campaign is not None:
-        raise RefusalError("--practise: has a bench of its own; leave out --campaign", BAD_INPUT)
+        raise RefusalError("--practise: has a bench of its own; leave out --campaign")
     if wrong is not None and not practise:
-        raise RefusalError("--wrong: goes with --practise; a real rig is as it is", BAD_INPUT)
+        raise RefusalError("--wrong: goes with --practise; a real rig is as it is")
     with Refused(QuantityError, at="--lag: "):
         expected = parse_quantity(lag, "s", "0.35 s")
     if not 0.0 < expected <= 10.0:
-        raise RefusalError(f"--lag: {lag}: should be above 0 and at most 10 s", BAD_INPUT)
+        raise RefusalError(f"--lag: {lag}: should be above 0 and at most 10 s")
     if folder.exists() and not folder.is_dir():
-        raise RefusalError(f"{folder}: is a file; name a folder for the recordings", BAD_INPUT)
+        raise RefusalError(f"{folder}: is a file; name a folder for the recordings")
     if practise and folder.is_dir() and any(folder.iterdir()):
-        raise RefusalError(f"{folder}: is not empty; name a new folder", BAD_INPUT)
+        raise RefusalError(f"{folder}: is not empty; name a new folder")
     if practise or campaign is not None:
         with Refused(OSError):
             folder.mkdir(parents=True, exist_ok=True)
@@ -124,7 +123,7 @@ def _day_of(folder: Path) -> list[PourRecording]:
 
     if not folder.is_dir() or not any(folder.glob("*.yaml")):
         text = f"{folder}: has no recorded pour; name a --campaign whose bench pours, or --practise"
-        raise RefusalError(text, BAD_INPUT)
+        raise RefusalError(text)
     with Refused(ConfigError):
         found = load_recordings([folder])
     for one in found:
@@ -148,14 +147,12 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
     plan = read_campaign(path, laboratory)
     bench = plan.laboratory
     if not bench.pours:
-        raise RefusalError(f"laboratory {bench.name} has no bench: it simulates and plans", BAD_INPUT)
+        raise RefusalError(f"laboratory {bench.name} has no bench: it simulates and plans")
     if plan.deployment is None:
-        raise RefusalError(
-            f"{path}: needs a 'deployment' with the action of the pours, as first-day.yaml has", BAD_INPUT
-        )
+        raise RefusalError(f"{path}: needs a 'deployment' with the action of the pours, as first-day.yaml has")
     if bench.balance is None or bench.balance.placement != "receiver":
         text = f"laboratory {bench.name}: the first day needs 'balance: {{placement: receiver}}', for its readings"
-        raise RefusalError(text, BAD_INPUT)
+        raise RefusalError(text)
     again = f"decant recording first-day {folder} --campaign {path}"
     again += "" if laboratory is None else f" --laboratory {laboratory}"
     if bench.mode != "hardware":

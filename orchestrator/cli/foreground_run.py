@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from orchestrator.cli.console import (
-    BAD_INPUT,
     FAILED,
     INTERRUPTED,
     RefusalError,
@@ -131,7 +130,7 @@ def check_output(path: Path | None, option: str, suffix: str) -> None:
         problem = f"can't be written: {why}"
     else:
         return
-    raise RefusalError(f"{option} {path}: {problem}", BAD_INPUT)
+    raise RefusalError(f"{option} {path}: {problem}")
 
 
 def _why_not_opened(path: Path) -> str | None:
@@ -206,13 +205,13 @@ def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Pa
     from orchestrator.runs.run_folder import create_run, find_run
 
     if run_id is not None and not resume:
-        raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun", BAD_INPUT)
+        raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun")
     try:
         return find_run(plan, run_id) if resume else create_run(plan)
     except RunError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
     except OSError as error:
-        raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}", BAD_INPUT) from None
+        raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}") from None
 
 
 def run_in_front_of_people(
@@ -281,7 +280,9 @@ def run_in_front_of_people(
     except OSError as error:
         if error.errno is None:
             raise  # not a file's: a defect, which wants its traceback
-        raise RefusalError(f"{file_trouble(error, directory)}{_way_on(directory, again, not_resumed)}") from None
+        raise RefusalError(
+            f"{file_trouble(error, directory)}{_way_on(directory, again, not_resumed)}", FAILED
+        ) from None
     except (asyncio.CancelledError, KeyboardInterrupt):
         if done := finished_without_report(directory):
             way_on = done
@@ -468,8 +469,7 @@ def check_somebody_is_there(spec: LaboratorySettings) -> None:
     if spec.needs_person and not somebody_at_the_terminal():
         raise RefusalError(
             f"laboratory {spec.name} asks a person (operator: answers: person), and there is no terminal to ask at; "
-            "run this in a terminal, with nothing piped into it",
-            BAD_INPUT,
+            "run this in a terminal, with nothing piped into it"
         )
 
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message
+from orchestrator.cli.console import RefusalError, Refused, print_json, print_message
 from orchestrator.cli.queue_commands import State, Url, connected_client
 
 if TYPE_CHECKING:
@@ -30,11 +30,10 @@ VesselName = Annotated[
     typer.Argument(
         metavar="VESSEL",
         help="Id or bar code of a vessel of the daemon, or LABORATORY/VESSEL for the source of a campaign.",
-        show_default=False,
     ),
 ]
 Deviation = Annotated[str, typer.Option(help="Standard deviation of the mass.")]
-Note = Annotated[str, typer.Option(help="Text of the entry.", show_default=False)]
+Note = Annotated[str, typer.Option(help="Text of the entry.")]
 
 
 @contextmanager
@@ -72,7 +71,7 @@ def _mass(text: str, option: str) -> float:
     with Refused(QuantityError, at=f"{option}: "):
         found = parse_quantity(text, "kg", "412.3 g")
     if found < 0.0:
-        raise RefusalError(f"{option}: {text} should be 0 g or more", BAD_INPUT)
+        raise RefusalError(f"{option}: {text} should be 0 g or more")
     return found
 
 
@@ -82,8 +81,7 @@ def _of_campaign(vessel: str) -> str:
     if not (laboratory and slash and name):
         raise RefusalError(
             f"{vessel}: without a daemon, only sources of campaigns can be changed: write LABORATORY/VESSEL, for "
-            "example virtual/beaker. A vessel of the station needs 'decant server start'",
-            BAD_INPUT,
+            "example virtual/beaker. A vessel of the station needs 'decant server start'"
         )
     return vessel
 
@@ -153,8 +151,8 @@ def history(
 
 def weigh(
     vessel: VesselName,
-    mass: Annotated[str, typer.Argument(help="Its content, for example '123.4 g'.", show_default=False)],
-    liquid: Annotated[str, typer.Option(help="Liquid, for an empty vessel.", show_default=False)] = "",
+    mass: Annotated[str, typer.Argument(help="Its content, for example '123.4 g'.")],
+    liquid: Annotated[str, typer.Option(help="Liquid, for an empty vessel.")] = "",
     deviation: Deviation = "0.1 g",
     note: Note = "",
     url: Url = None,
@@ -206,11 +204,7 @@ def place(
     vessel: VesselName,
     where: Annotated[
         str,
-        typer.Argument(
-            metavar="PLACE",
-            help="Place of the laboratory, or position of the daemon; '' for nowhere.",
-            show_default=False,
-        ),
+        typer.Argument(metavar="PLACE", help="Place of the laboratory, or position of the daemon; '' for nowhere."),
     ],
     note: Note = "",
     url: Url = None,

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from actors.arm.arm_interface import NotAcceptedError
 from actors.interfaces import LaboratoryError
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_message, print_note
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message, print_note
 from orchestrator.runs.motion_approval import SafetyRecordError, required_checksum
 
 if TYPE_CHECKING:
@@ -100,8 +100,7 @@ def consent_to_motion(request: RunRequest, count: str = "", path: PathReport | N
     found = envelope(laboratory.arm, campaign_pours(plan, request.stages))
     if not found.reports:
         raise RefusalError(
-            f"none of {len(found.refused)} actions could be poured by this arm; the first: {found.refused[0]}",
-            BAD_INPUT,
+            f"none of {len(found.refused)} actions could be poured by this arm; the first: {found.refused[0]}"
         )
     confirm(laboratory, [*lines, *envelope_lines(found)])
     return checksum
@@ -116,8 +115,7 @@ def require_flag(laboratory: LaboratorySettings, *, enabled: bool, again: str) -
     if laboratory.mode == "hardware" and not enabled:
         raise RefusalError(
             f"laboratory {laboratory.name} is hardware: {laboratory.dispenser} would move. Try it without moving first "
-            f"('decant robot check', 'decant pour --dry-run'); then enable motion for this one run: {again}",
-            BAD_INPUT,
+            f"('decant robot check', 'decant pour --dry-run'); then enable motion for this one run: {again}"
         )
 
 
@@ -141,15 +139,14 @@ def confirm(laboratory: LaboratorySettings, lines: Sequence[str]) -> None:
     if not sys.stdin.isatty():
         raise RefusalError(
             f"laboratory {laboratory.name} is hardware: an operator enables its motion, who reads what it will do and "
-            "types its name. That needs a terminal, with nothing piped into it",
-            BAD_INPUT,
+            "types its name. That needs a terminal, with nothing piped into it"
         )
     announce(laboratory.name, laboratory.dispenser, lines, " for this run")
     termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # discard keys that were pressed before this text was shown
     print("> ", end="", file=sys.stderr, flush=True)
     typed = sys.stdin.readline()
     if typed.strip() != laboratory.name:
-        raise RefusalError(f"motion is not enabled: '{typed.strip()}' was typed; nothing has moved", BAD_INPUT)
+        raise RefusalError(f"motion is not enabled: '{typed.strip()}' was typed; nothing has moved")
     print_message(f"motion is enabled, for this run only: {laboratory.name}")
 
 
@@ -174,7 +171,9 @@ def connected(spec: LaboratorySettings, accepted: str | None) -> Iterator[tuple[
         with Refused(NotAcceptedError):
             facts = arm.connect()
         if facts.problem:
-            raise RefusalError(f"{spec.arm.title}: {facts.problem}; 'decant robot check' says what to do about it")
+            raise RefusalError(
+                f"{spec.arm.title}: {facts.problem}; 'decant robot check' says what to do about it", FAILED
+            )
         yield arm, facts
     finally:
         arm.close()

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, print_json, print_message, stdout_for_results
+from orchestrator.cli.console import FAILED, RefusalError, print_json, print_message, stdout_for_results
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,17 +69,14 @@ N is the number of particles.
 
 
 def validate_solver(
-    cases: Annotated[list[str] | None, typer.Argument(help="Names of cases; default: all.", show_default=False)] = None,
+    cases: Annotated[list[str] | None, typer.Argument(help="Names of cases; default: all.")] = None,
     full: Annotated[bool, typer.Option("--full", help="Use all resolutions and seeds; takes several minutes.")] = False,
-    pours: Annotated[
-        int | None, typer.Option(min=1, help="Number of random pours in the case 'walls'.", show_default=False)
-    ] = None,
+    pours: Annotated[int | None, typer.Option(min=1, help="Number of random pours in the case 'walls'.")] = None,
     write: Annotated[
         Path | None,
         typer.Option(
             help="Folder for the page validation.md, its data and figures. Cases that are not run keep their "
-            "previous results.",
-            show_default=False,
+            "previous results."
         ),
     ] = None,
     list_cases: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
@@ -103,7 +100,7 @@ def validate_solver(
         return
     chosen = _chosen(cases or [])
     if write is not None and not write.is_dir():
-        raise RefusalError(f"--write {write}: there is no such folder", BAD_INPUT)
+        raise RefusalError(f"--write {write}: there is no such folder")
     fingerprint = solver_fingerprint()
     records: dict[str, dict[str, Any]] = {}
     simulator = PourSimulator()
@@ -152,7 +149,7 @@ def _chosen(names: list[str]) -> list[Case]:
     try:
         wanted = {case(name).name for name in names}
     except KeyError as error:
-        raise RefusalError(str(error.args[0]), BAD_INPUT) from None
+        raise RefusalError(str(error.args[0])) from None
     return [one for one in CASES if not names or one.name in wanted]
 
 

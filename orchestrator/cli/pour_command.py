@@ -22,16 +22,7 @@ from orchestrator.cli.command_options import (
     OtherLaboratory,
     SceneName,
 )
-from orchestrator.cli.console import (
-    BAD_INPUT,
-    FAILED,
-    RefusalError,
-    Refused,
-    print_json,
-    print_message,
-    print_note,
-    print_warning,
-)
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message, print_note, print_warning
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Executed, PlannedPour
@@ -53,9 +44,7 @@ def pour(
     connect: Annotated[
         bool, typer.Option("--connect", help="With --dry-run: also check whether the arm is at home.")
     ] = False,
-    png: Annotated[
-        Path | None, typer.Option(help="Draw the arm's path from the side and from above.", show_default=False)
-    ] = None,
+    png: Annotated[Path | None, typer.Option(help="Draw the arm's path from the side and from above.")] = None,
     empty: Annotated[
         bool, typer.Option("--empty", help="Run the whole cycle with an empty pourer, without weighing.")
     ] = False,
@@ -78,8 +67,7 @@ def pour(
     bench = chosen.plan.laboratory
     if chosen.path is None and (dry_run or empty or png is not None):
         raise RefusalError(
-            f"laboratory {bench.name} has no arm whose path could be planned; its bench is made of numbers",
-            BAD_INPUT,
+            f"laboratory {bench.name} has no arm whose path could be planned; its bench is made of numbers"
         )
     if png is not None:
         _draw(chosen, png)
@@ -112,13 +100,12 @@ class Chosen:
 
 def _check_options(*, dry_run: bool, connect: bool, empty: bool, slow: float) -> None:
     if connect and not dry_run:
-        raise RefusalError("--connect: goes with --dry-run; any other pour connects anyway", BAD_INPUT)
+        raise RefusalError("--connect: goes with --dry-run; any other pour connects anyway")
     if dry_run and empty:
-        raise RefusalError("--dry-run moves nothing, --empty moves the arm: choose one", BAD_INPUT)
+        raise RefusalError("--dry-run moves nothing, --empty moves the arm: choose one")
     if slow != 1.0 and not empty:
         raise RefusalError(
-            "--slow: goes with --empty; a pour with liquid is as fast as its action says: choose a slower action",
-            BAD_INPUT,
+            "--slow: goes with --empty; a pour with liquid is as fast as its action says: choose a slower action"
         )
 
 
@@ -152,15 +139,15 @@ def chosen_pour(plan: CampaignPlan, assignments: list[str], scene_name: str | No
     wanted = wanted_in(plan, scene, scene_name)
     problems = check_vessels(scene, plan.source, wanted, warn=print_warning)
     if problems:
-        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
+        raise RefusalError("\n".join(map(str, problems)))
     if not plan.laboratory.pours:
-        raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans", BAD_INPUT)
+        raise RefusalError(f"laboratory {plan.laboratory.name} has no bench: it simulates and plans")
     planned = None
     if plan.laboratory.arm is not None:
         try:
             planned = arm_kind(plan.laboratory.arm).plan(scene, action)
         except (InvalidActionError, ValueError) as error:
-            raise RefusalError(f"{action.display()}: {error}", BAD_INPUT) from None
+            raise RefusalError(f"{action.display()}: {error}") from None
     return Chosen(plan, scene, action, planned)
 
 
@@ -173,7 +160,7 @@ def _draw(chosen: Chosen, png: Path) -> None:
 
     arm = chosen.plan.laboratory.arm
     if not isinstance(chosen.path, PourPath) or not isinstance(arm, UrArmSettings):
-        raise RefusalError("--png: draws the joints of an arm, and this arm's path has none", BAD_INPUT)
+        raise RefusalError("--png: draws the joints of an arm, and this arm's path has none")
     pourer, receiver = build_vessel(chosen.scene.pourer), build_vessel(chosen.scene.receiver)
     figure = draw_path(
         chosen.path,
@@ -308,7 +295,7 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
     assert laboratory.arm is not None
     hardware = laboratory.mode == "hardware"
     if hardware and not sys.stdin.isatty():
-        raise RefusalError("--empty asks a person before the arm moves: run it in a terminal", BAD_INPUT)
+        raise RefusalError("--empty asks a person before the arm moves: run it in a terminal")
     with Refused(SafetyRecordError):
         checksum = required_checksum(plan) if hardware else None
     lines = [f"one cycle      with an EMPTY pourer, at {100 * slow:g} % of its speed", *report_lines(path.report)]
@@ -331,7 +318,7 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
     except LaboratoryError as error:
         raise RefusalError(str(error), FAILED) from None
     except OSError as error:
-        raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}", BAD_INPUT) from None
+        raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}") from None
     record = {
         "mode": laboratory.mode,
         "laboratory": laboratory.name,

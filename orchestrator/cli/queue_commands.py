@@ -23,7 +23,7 @@ from orchestrator.cli.command_options import (
     Receiver,
     Seed,
 )
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message, print_note
+from orchestrator.cli.console import RefusalError, Refused, print_json, print_message, print_note
 from orchestrator.cli.shell_completion import files_of, queued_campaigns
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ CampaignId = Annotated[
     typer.Argument(
         metavar="CAMPAIGN_ID",
         help="Id as shown by 'decant queue list', or a prefix of it.",
-        show_default=False,
         autocompletion=queued_campaigns,
     ),
 ]
@@ -44,11 +43,9 @@ CampaignOrQueue = Annotated[
 ]
 Url = Annotated[
     str | None,
-    typer.Option(help="URL of the daemon; default: $DECANT_URL, or the daemon on this machine.", show_default=False),
+    typer.Option(help="URL of the daemon; default: $DECANT_URL, or the daemon on this machine."),
 ]
-State = Annotated[
-    Path | None, typer.Option(help="The daemon's state directory; default: $DECANT_STATE.", show_default=False)
-]
+State = Annotated[Path | None, typer.Option(help="The daemon's state directory; default: $DECANT_STATE.")]
 
 
 def start(
@@ -56,17 +53,12 @@ def start(
         Path | None,
         typer.Argument(
             help="Settings file (YAML); default: a virtual laboratory.",
-            show_default=False,
             autocompletion=files_of("daemon"),
         ),
     ] = None,
     state: State = None,
-    port: Annotated[
-        int | None, typer.Option(min=0, max=65535, help="TCP port; 0 selects a free one.", show_default=False)
-    ] = None,
-    simulators: Annotated[
-        int | None, typer.Option(min=0, help="Number of simulators; 0: one per core.", show_default=False)
-    ] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port; 0 selects a free one.")] = None,
+    simulators: Annotated[int | None, typer.Option(min=0, help="Number of simulators; 0: one per core.")] = None,
     in_process: Annotated[
         bool, typer.Option("--in-process", help="Use one simulator without Ray, for trying it out.")
     ] = False,
@@ -97,13 +89,13 @@ def start(
         text = f"state in {chosen.state}. 'decant queue submit CAMPAIGN' queues one"
         server_process.serve(chosen, lambda url: print_message(f"serving {url}; {text}"))
     except ConfigError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
     except RunError as error:
         raise RefusalError(str(error), error.exit_code) from None
     except OSError as error:
         where = error.filename or "state directory"
         cure = "--state or $DECANT_STATE names another folder"
-        raise RefusalError(f"{where}: {error.strerror}; {cure}", BAD_INPUT) from None
+        raise RefusalError(f"{where}: {error.strerror}; {cure}") from None
 
 
 def _require_extra() -> None:
@@ -131,7 +123,7 @@ def connected_client(url: str | None, state: Path | None) -> Iterator[Client]:
 def submit(
     campaign: Campaign,
     task: Annotated[str, typer.Option(help="Task: run, calibrate or plan.")] = "run",
-    rig: Annotated[str, typer.Option(help="Rig to run on, if several match.", show_default=False)] = "",
+    rig: Annotated[str, typer.Option(help="Rig to run on, if several match.")] = "",
     priority: Annotated[int, typer.Option(help="Higher priorities run first.")] = 0,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
@@ -139,7 +131,7 @@ def submit(
     receiver: Receiver = None,
     iterations: Annotated[
         int | None,
-        typer.Option(min=1, help="With --task plan: simulations instead of the campaign's.", show_default=False),
+        typer.Option(min=1, help="With --task plan: simulations instead of the campaign's."),
     ] = None,
     url: Url = None,
     state: State = None,
@@ -154,12 +146,12 @@ def submit(
         from orchestrator.cli.campaign_commands import planning_request
 
         if task != "plan":
-            raise RefusalError("--parameters, --receiver and --iterations go with --task plan", BAD_INPUT)
+            raise RefusalError("--parameters, --receiver and --iterations go with --task plan")
         plan = planning_request(plan, parameters, receiver, iterations).campaign
     try:
         packed, files = pack(plan, parameters)
     except OSError as error:
-        raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
+        raise RefusalError(f"{error.filename}: {error.strerror}") from None
     with connected_client(url, state) as client:
         body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority}
         found = client.post("/campaigns", body)
@@ -377,7 +369,7 @@ def estop(
     """
     reason = " ".join(filter(None, (reason, *(words or ()))))
     if clear and reason:
-        raise RefusalError("--clear takes only --rig, --url and --state: nothing was cleared", BAD_INPUT)
+        raise RefusalError("--clear takes only --rig, --url and --state: nothing was cleared")
     with connected_client(url, state) as client:
         if clear:
             client.post("/emergency-stop/clear", {"rig": rig})
@@ -394,8 +386,8 @@ def estop(
 
 
 def answer(
-    question: Annotated[int | None, typer.Argument(help="Number of the question.", show_default=False)] = None,
-    text: Annotated[list[str] | None, typer.Argument(help="The answer.", show_default=False)] = None,
+    question: Annotated[int | None, typer.Argument(help="Number of the question.")] = None,
+    text: Annotated[list[str] | None, typer.Argument(help="The answer.")] = None,
     url: Url = None,
     state: State = None,
 ) -> None:
@@ -421,9 +413,7 @@ def answer(
                 )
             return
         if not text:
-            raise RefusalError(
-                f"question {question}: what is the answer? 'decant queue answer' lists the questions", BAD_INPUT
-            )
+            raise RefusalError(f"question {question}: what is the answer? 'decant queue answer' lists the questions")
         found = client.post(f"/questions/{question}/answer", {"answer": " ".join(text)})
     print(f"question {found['id']}: {found['answer']}")
 
@@ -448,8 +438,7 @@ def enable(key: CampaignId, url: Url = None, state: State = None) -> None:
     if not sys.stdin.isatty():
         raise RefusalError(
             "motion of hardware is enabled by an operator, who reads what it will do and types its name: that needs "
-            "a terminal",
-            BAD_INPUT,
+            "a terminal"
         )
     with connected_client(url, state) as client:
         print_message("planning paths from all over the actions …")
@@ -462,16 +451,16 @@ def enable(key: CampaignId, url: Url = None, state: State = None) -> None:
 
 def move(
     key: CampaignId,
-    before: Annotated[str | None, typer.Option(help="Move in front of this campaign.", show_default=False)] = None,
+    before: Annotated[str | None, typer.Option(help="Move in front of this campaign.")] = None,
     first: Annotated[bool, typer.Option("--first", help="Move to the head of the queue.")] = False,
-    priority: Annotated[int | None, typer.Option(help="Higher priorities run first.", show_default=False)] = None,
+    priority: Annotated[int | None, typer.Option(help="Higher priorities run first.")] = None,
     url: Url = None,
     state: State = None,
 ) -> None:
     """Move a queued campaign to another place."""
     before = "" if first else before
     if before is None and priority is None:
-        raise RefusalError("where to? --first, --before CAMPAIGN_ID or --priority N", BAD_INPUT)
+        raise RefusalError("where to? --first, --before CAMPAIGN_ID or --priority N")
     with connected_client(url, state) as client:
         client.post(f"/campaigns/{key}/move", {"before": before, "priority": priority})
         queue = client.get("/campaigns", state="queued")

@@ -11,7 +11,6 @@ import typer
 
 from orchestrator.cli.command_options import Json, Parameters
 from orchestrator.cli.console import (
-    BAD_INPUT,
     FAILED,
     RefusalError,
     Refused,
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 
 Recordings = Annotated[
     list[Path],
-    typer.Argument(help="Recorded pours (YAML), or folders of them.", metavar="RECORDING", show_default=False),
+    typer.Argument(help="Recorded pours (YAML), or folders of them.", metavar="RECORDING"),
 ]
 
 
@@ -40,7 +39,6 @@ def export(
         typer.Argument(
             help="Folder of a run, or its name in runs/.",
             metavar="RUN",
-            show_default=False,
             autocompletion=local_runs,
         ),
     ],
@@ -61,7 +59,7 @@ def export(
 
     folder = run if run.exists() or len(run.parts) > 1 else RUNS / run
     if not (folder / JOURNAL_NAME).is_file():
-        raise RefusalError(f"{folder}: is no run; name the folder of a run, which has a {JOURNAL_NAME}", BAD_INPUT)
+        raise RefusalError(f"{folder}: is no run; name the folder of a run, which has a {JOURNAL_NAME}")
     with Refused(RunError, OSError):
         written, left_out = export_recordings(folder, to)
     for reason in left_out:
@@ -82,12 +80,10 @@ def replay(
     parameters: Parameters = None,
     values: Annotated[
         Path | None,
-        typer.Option("--fitted", help="Values that 'decant recording fit --output' has written.", show_default=False),
+        typer.Option("--fitted", help="Values that 'decant recording fit --output' has written."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Seed of simulation and estimator.")] = 0,
-    png: Annotated[
-        Path | None, typer.Option(help="Folder for a picture of each pour: NAME.png.", show_default=False)
-    ] = None,
+    png: Annotated[Path | None, typer.Option(help="Folder for a picture of each pour: NAME.png.")] = None,
     as_json: Json = False,
 ) -> None:
     """Replay recorded pours: simulate the recorded tilt, run the dosing estimator over the readings, and compare.
@@ -148,13 +144,9 @@ def fit(
     ] = None,
     judged: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--judge", help="Recorded pour (or folder) to predict with the fit. Repeatable.", show_default=False
-        ),
+        typer.Option("--judge", help="Recorded pour (or folder) to predict with the fit. Repeatable."),
     ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write the values to this JSON file.", show_default=False)
-    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the values to this JSON file.")] = None,
     as_json: Json = False,
 ) -> None:
     """Fit unknown quantities that recorded pours share, with 90 % intervals, and judge the fit on other readings.
@@ -169,12 +161,12 @@ def fit(
     with Refused(QuantityError, at="--until: "):
         seconds = None if until is None else parse_quantity(until, "s", "6 s")
     if output is not None and (output.suffix != ".json" or not output.parent.is_dir()):
-        raise RefusalError(f"--output {output}: should be a .json file in a folder that exists", BAD_INPUT)
+        raise RefusalError(f"--output {output}: should be a .json file in a folder that exists")
     loaded = _loaded(recordings)
     others = _loaded(judged or ())
     if both := sorted({one.path for one in loaded} & {one.path for one in others}):
         text = f"--judge: {both[0].name} is fitted, too; judge another, or fit its beginning with --until"
-        raise RefusalError(text, BAD_INPUT)
+        raise RefusalError(text)
     with Refused(DecantError), waiting_for(lambda: f"fitting {len(loaded)} recorded pours"):
         found = fit_recordings(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
         judgements = [judge_recording(found, one) for one in (*(loaded if seconds is not None else ()), *others)]

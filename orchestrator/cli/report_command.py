@@ -8,14 +8,7 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import (
-    BAD_INPUT,
-    RefusalError,
-    Refused,
-    print_json,
-    print_note,
-    print_warning,
-)
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_note, print_warning
 from orchestrator.cli.shell_completion import RUNS, files_of, local_runs
 
 
@@ -25,13 +18,12 @@ def report(
         typer.Argument(
             help="Folder of a run, or its name in runs/; folder or file of a study.",
             metavar="RUN|STUDY",
-            show_default=False,
             autocompletion=lambda incomplete: local_runs(incomplete) + files_of("study")(incomplete),
         ),
     ],
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Other file than report.html in the run's folder.", show_default=False),
+        typer.Option("--output", "-o", help="Other file than report.html in the run's folder."),
     ] = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also write every figure of a run as PDF, for LaTeX.")] = False,
     as_json: Json = False,
@@ -52,10 +44,10 @@ def report(
         page, figures = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
     elif (folder / SETTINGS).is_file() or folder.suffix in (".yaml", ".yml"):
         if output is not None or pdf:
-            raise RefusalError(f"{folder}: is a study; its page and figures (PNG, SVG) go to its folder", BAD_INPUT)
+            raise RefusalError(f"{folder}: is a study; its page and figures (PNG, SVG) go to its folder")
         page, figures = _of_study(folder), []
     else:
-        raise RefusalError(_nothing_there(folder), BAD_INPUT)
+        raise RefusalError(_nothing_there(folder))
     print_note(f"report  {page}")
     if as_json:
         from orchestrator.cli.command_results import ReportOutput
@@ -89,7 +81,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
     from orchestrator.reports.publishing import publish_if_missing, report_on, write_reduced_report
     from orchestrator.runs.run_folder import RESOLVED, missing_plugins, read_versions
 
-    with Refused(JournalFormatError, code=BAD_INPUT):
+    with Refused(JournalFormatError):
         check = check_journal(folder / JOURNAL_NAME)
     for problem in check.problems:
         print_warning(problem)
@@ -108,13 +100,13 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
             print_note("summary.json and theta.json were missing, and are written now")
         page, figures = report_on(plan, result, output, formats)
     except RunError as error:
-        raise RefusalError(str(error)) from None
+        raise RefusalError(str(error), FAILED) from None
     except OSError as error:
-        raise RefusalError(f"{error.filename or folder}: {error.strerror}") from None
+        raise RefusalError(f"{error.filename or folder}: {error.strerror}", FAILED) from None
     except (LookupError, TypeError, ValueError, AttributeError):
         if not check.problems:
             raise
-        raise RefusalError(f"{folder}: no report can be made of damaged records; {check.verdict}") from None
+        raise RefusalError(f"{folder}: no report can be made of damaged records; {check.verdict}", FAILED) from None
     return page, list(figures.values())
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from orchestrator.cli.command_options import EnableMotion, Json, Laboratory
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm
@@ -51,7 +51,6 @@ def check(
         typer.Option(
             "--record",
             help="Also write what the controller sent into this new file (.json), for 'decant robot archive'.",
-            show_default=False,
         ),
     ] = None,
     as_json: Json = False,
@@ -72,7 +71,7 @@ def check(
     spec = read_laboratory(laboratory)
     if spec.pump is not None and (accept_safety or record_to is not None):
         text = f"--accept-safety and --record read the controller of an arm; laboratory {spec.name} pours with a pump"
-        raise RefusalError(text, BAD_INPUT)
+        raise RefusalError(text)
     if spec.arm is None and spec.pump is None:
         raise without_arm(
             laboratory,
@@ -88,7 +87,7 @@ def check(
         record = None if virtual else read_record(laboratory)
     except SafetyRecordError as error:
         if not accept_safety:
-            raise RefusalError(str(error), BAD_INPUT) from None
+            raise RefusalError(str(error)) from None
         record = None
     with Refused(LaboratoryError):
         check_bench_packages(spec)
@@ -108,17 +107,15 @@ def check(
         print_table(report.checks)
     if report.failed:
         count = f"{len(report.failed)} of {len(report.checks)}"
-        raise RefusalError(f"{count} checks fail; nothing should move before they are fixed")
+        raise RefusalError(f"{count} checks fail; nothing should move before they are fixed", FAILED)
     print_message("ready" if all(check.state == "ok" for check in report.checks) else "ready, with warnings")
 
 
 def archive(
-    archive: Annotated[
-        Path, typer.Argument(help="The archive (.zip); created if it does not exist.", show_default=False)
-    ],
+    archive: Annotated[Path, typer.Argument(help="The archive (.zip); created if it does not exist.")],
     recordings: Annotated[
         list[Path] | None,
-        typer.Argument(help="Recordings to add: files of '--record', and run folders.", show_default=False),
+        typer.Argument(help="Recordings to add: files of '--record', and run folders."),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -136,7 +133,7 @@ def archive(
         if recordings:
             kept.add(recordings)
         elif not archive.exists():
-            raise RefusalError(f"{archive}: there is no such archive, and no recording to begin one with", BAD_INPUT)
+            raise RefusalError(f"{archive}: there is no such archive, and no recording to begin one with")
     checks = list(kept.replay())
     failed = [one for one in checks if one.state == "fail"]
     if as_json:
@@ -144,7 +141,7 @@ def archive(
     else:
         print_table(checks)
     if failed:
-        raise RefusalError(f"{len(failed)} of {len(checks)} recordings are read differently")
+        raise RefusalError(f"{len(failed)} of {len(checks)} recordings are read differently", FAILED)
     print_message(f"{archive}: {len(checks)} recordings, read as on the day")
 
 
@@ -157,8 +154,7 @@ def without_arm(path: Path, spec: LaboratorySettings, asked: str) -> RefusalErro
     has = "its bench is simulated" if spec.bench is not None else "it has no bench"
     return RefusalError(
         f"{path}: laboratory {spec.name} has no 'arm', {has}: {asked}. Name a laboratory that has one, for example "
-        "laboratories/virtual.yaml",
-        BAD_INPUT,
+        "laboratories/virtual.yaml"
     )
 
 
@@ -218,7 +214,7 @@ def _accept(path: Path, look: ArmDiagnostics) -> SafetyRecord:
     try:
         written = write_record(path, record)
     except OSError as error:
-        raise RefusalError(f"{record_path(path)}: can't be written: {error.strerror}", BAD_INPUT) from None
+        raise RefusalError(f"{record_path(path)}: can't be written: {error.strerror}") from None
     print_message(
         f"safety checksum {record.checksum} of robot {record.serial} is accepted by {record.accepted_by}: {written}\n"
         "Compare it with the teach pendant, have a second person read the safety settings, and commit the file."
@@ -256,10 +252,10 @@ def home(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
         with Refused(JogError, LaboratoryError, code=FAILED):
             confirmed = session.home()
         if not confirmed:
-            raise RefusalError("not confirmed; nothing has moved", BAD_INPUT)
+            raise RefusalError("not confirmed; nothing has moved")
 
 
-PlaceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the place.", show_default=False)]
+PlaceName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the place.")]
 
 TRIED = 0.25
 """Fraction of its usual speed at which a way is tried."""
@@ -270,9 +266,7 @@ def teach(
     name: PlaceName,
     use: Annotated[
         Literal["stand", "balance", "source"] | None,
-        typer.Option(
-            help="'balance' under the receiver, 'source' under the outlet of the refill pump.", show_default=False
-        ),
+        typer.Option(help="'balance' under the receiver, 'source' under the outlet of the refill pump."),
     ] = None,
 ) -> None:
     """Read where the arm stands and write it into the laboratory file as a place. Nothing moves.
@@ -302,7 +296,7 @@ def teach(
     places = [*(other for other in spec.places if other.name != name), place]
     problems = [text for number, text in arm_kind(arm).place_problems(places, {}) if number == len(places) - 1]
     if problems:
-        raise RefusalError("nothing is written: " + "; ".join(problems), BAD_INPUT)
+        raise RefusalError("nothing is written: " + "; ".join(problems))
     with Refused(PlaceWritingError, OSError):
         write_place(laboratory, place)
     x, y, z = (1e3 * value for value in pose.as_list[:3])
@@ -323,14 +317,14 @@ def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMoti
     place = next((one for one in spec.places if one.name == name), None)
     if place is None:
         known = ", ".join(f"'{one.name}'" for one in spec.places) or "none"
-        raise RefusalError(f"{laboratory}: there is no place '{name}'; there are {known}", BAD_INPUT)
+        raise RefusalError(f"{laboratory}: there is no place '{name}'; there are {known}")
     lines = f"from home to the place '{name}' and back, at a quarter of the usual speed"
     with _session(laboratory, "try", lines, enable_motion) as (driver, arm), Refused(LaboratoryError, code=FAILED):
         way = arm_kind(arm).way(place, spec.places, {}).slowed(TRIED)
         print_message(f"{way.approach_time:.0f} s for each way. The fingers must be open, and hands out of the cell.")
         for homewards, text in ((False, f"down to '{name}'"), (True, "back home")):
             if typed_line(f"type 'yes' to move {text} > ").strip() != "yes":
-                raise RefusalError("not confirmed; the arm stays where it is", BAD_INPUT)
+                raise RefusalError("not confirmed; the arm stays where it is")
             driver.release()
             step = dataclasses.replace(way, homewards=homewards)
             stoppable(driver, lambda step=step: driver.carry(step))  # type: ignore[misc, attr-defined]
@@ -360,9 +354,7 @@ def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Itera
         raise without_arm(laboratory, spec, f"'decant robot {command}' moves an arm that a driver controls")
     require_flag(spec, enabled=enabled, again=f"decant robot {command} {laboratory} --enable-motion")
     if not sys.stdin.isatty():
-        raise RefusalError(
-            f"'decant robot {command}' asks for confirmation at a terminal, with nothing piped into it", BAD_INPUT
-        )
+        raise RefusalError(f"'decant robot {command}' asks for confirmation at a terminal, with nothing piped into it")
     with Refused(SafetyRecordError):
         accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
     if spec.mode == "hardware":

@@ -20,7 +20,7 @@ import typer
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
-from orchestrator.cli.console import BAD_INPUT, FAILED, RefusalError, Refused, print_json, print_message, print_note
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message, print_note
 from orchestrator.cli.shell_completion import catalogued, catalogued_runs
 
 if TYPE_CHECKING:
@@ -65,7 +65,6 @@ State = Annotated[
         callback=_state,
         is_eager=True,
         help="The state directory; default: $DECANT_STATE, or ~/.local/state/decant.",
-        show_default=False,
     ),
 ]
 Daemon = Annotated[
@@ -297,7 +296,7 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
     folder = Path(run)
     if folder.is_dir():
         if not has_begun(folder / JOURNAL_NAME):
-            raise RefusalError(f"{folder}: there is no run in this folder", BAD_INPUT)
+            raise RefusalError(f"{folder}: there is no run in this folder")
     else:
         with _client() as client:
             folder = Path(client.run(run)["path"])
@@ -318,9 +317,7 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
 
 @_command("decant runs compare quickstart-20300301-1 quickstart-20300301-2")
 def compare(
-    which: Annotated[
-        list[str], typer.Argument(help="Two or more runs.", show_default=False, autocompletion=catalogued_runs)
-    ],
+    which: Annotated[list[str], typer.Argument(help="Two or more runs.", autocompletion=catalogued_runs)],
     state: State = None,
     daemon: Daemon = False,
     as_json: Json = False,
@@ -329,7 +326,7 @@ def compare(
     from orchestrator.reports.console_view import print_table
 
     if len(which) < 2:
-        raise RefusalError("comparing takes two runs or more: decant runs compare RUN RUN", BAD_INPUT)
+        raise RefusalError("comparing takes two runs or more: decant runs compare RUN RUN")
     with _client(daemon) as client:
         found = client.compare(which)
     if as_json:
@@ -355,7 +352,7 @@ def tag(
 ) -> None:
     """Add tags to a run, or remove them. They are stored in the run's folder and are copied with it."""
     if not tags and not remove:
-        raise RefusalError("name tags to put on the run, or --remove those to take off", BAD_INPUT)
+        raise RefusalError("name tags to put on the run, or --remove those to take off")
     with _client(daemon) as client:
         found = client.tag(run, tags or [], remove or [])
     print(f"{found['run']}: {', '.join(found['tags']) or 'no tags'}")
@@ -392,12 +389,12 @@ def export(
     from sim_engine.resources import MissingExtraError
 
     if wrong := sorted(set(formats or ()) - set(FORMATS)):
-        raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(FORMATS)}", BAD_INPUT)
+        raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(FORMATS)}")
     try:
         with _client(daemon) as client:
             found = client.export(folder, conditions, formats or FORMATS)
     except MissingExtraError as error:
-        raise RefusalError(f"{error}; or --format csv", BAD_INPUT) from None
+        raise RefusalError(f"{error}; or --format csv") from None
     if as_json:
         print_json(found)
         return
@@ -428,10 +425,10 @@ def add(
             return
     for folder in folders:
         if not folder.is_dir():
-            raise RefusalError(f"{folder}: is not a folder", BAD_INPUT)
+            raise RefusalError(f"{folder}: is not a folder")
         below = list(runs_below(folder.absolute()))
         if not below:
-            raise RefusalError(f"{folder}: there is no run in it (no journal.sqlite, at any depth)", BAD_INPUT)
+            raise RefusalError(f"{folder}: there is no run in it (no journal.sqlite, at any depth)")
         found += below
     with _refusing():
         enter(found)
@@ -586,7 +583,7 @@ def _client(daemon: bool = False) -> Iterator[CatalogueClient]:
             with _catalogue() as catalogue, _refusing():
                 yield catalogue
     except ValueError as error:  # an invalid date
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
 
 
 @contextlib.contextmanager
@@ -622,6 +619,6 @@ def _refusing() -> Iterator[None]:
     try:
         yield
     except RunError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
     except OSError as error:
-        raise RefusalError(f"{error.filename or ''}: {error.strerror or error}".lstrip(": "), BAD_INPUT) from None
+        raise RefusalError(f"{error.filename or ''}: {error.strerror or error}".lstrip(": ")) from None

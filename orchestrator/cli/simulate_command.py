@@ -25,7 +25,6 @@ from orchestrator.cli.command_options import (
     Thetas,
 )
 from orchestrator.cli.console import (
-    BAD_INPUT,
     FAILED,
     RefusalError,
     Refused,
@@ -57,9 +56,7 @@ def simulate(
     source: Annotated[
         Path | None,
         typer.Option(
-            "--from",
-            help="Table of weighed pours (CSV, .xlsx), as for a calibration: predict and score all of them.",
-            show_default=False,
+            "--from", help="Table of weighed pours (CSV, .xlsx), as for a calibration: predict and score all of them."
         ),
     ] = None,
     parameters: Parameters = None,
@@ -71,14 +68,12 @@ def simulate(
     thetas: Thetas = None,
     scene: SceneName = None,
     as_json: Json = False,
-    rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.", show_default=False)] = None,
+    rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.")] = None,
     png: Annotated[
         Path | None,
-        typer.Option(help="Draw four moments of the pour; with --from: measured over predicted.", show_default=False),
+        typer.Option(help="Draw four moments of the pour; with --from: measured over predicted."),
     ] = None,
-    csv: Annotated[
-        Path | None, typer.Option(help="With --from: write a table of the predictions as CSV.", show_default=False)
-    ] = None,
+    csv: Annotated[Path | None, typer.Option(help="With --from: write a table of the predictions as CSV.")] = None,
 ) -> None:
     """Simulate one pour of a campaign's scene with several seeds, and print the fate of the liquid.
 
@@ -94,13 +89,13 @@ def simulate(
     options = SimulateOptions(assignments, parameters, receiver, thetas, seed, seeds, scene, csv, rrd, png, as_json)
     if source is None:
         if csv is not None:
-            raise RefusalError(f"--csv {csv}: goes with --from, a table of weighed pours", BAD_INPUT)
+            raise RefusalError(f"--csv {csv}: goes with --from, a table of weighed pours")
         _simulate_pour(campaign, options)
         return
     if assignments:
-        raise RefusalError("--set: the table given with --from says what is poured; remove one of them", BAD_INPUT)
+        raise RefusalError("--set: the table given with --from says what is poured; remove one of them")
     if rrd is not None:
-        raise RefusalError(f"--rrd {rrd}: records one pour; it does not go with --from", BAD_INPUT)
+        raise RefusalError(f"--rrd {rrd}: records one pour; it does not go with --from")
     _predict_table(campaign, options, source)
 
 
@@ -145,7 +140,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     wanted = wanted_in(plan, scene, options.scene)
     problems = check_vessels(scene, plan.source, wanted, warn=print_warning)
     if problems:
-        raise RefusalError("\n".join(map(str, problems)), BAD_INPUT)
+        raise RefusalError("\n".join(map(str, problems)))
     frame_rate = 20.0 if options.rrd or options.png else 0.0
     tasks = known.tasks(scene, action, options.seed, options.seeds, frame_rate)
     simulator = PourSimulator()
@@ -277,7 +272,7 @@ def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scen
     if name is None:
         return next(iter(scenes.values()))
     if name not in scenes:
-        raise RefusalError(f"--scene {name}: the campaign has no such scene; there are {', '.join(scenes)}", BAD_INPUT)
+        raise RefusalError(f"--scene {name}: the campaign has no such scene; there are {', '.join(scenes)}")
     return scenes[name]
 
 
@@ -412,7 +407,7 @@ def _pours(scene: Scene, records: RecordSet | None, source: Path) -> tuple[Recor
             problems.append(Problem(source, row.line, 1, "", f"makes no action of scene '{scene.name}': {error}"))
             break  # all rows have the same problem
     if problems:
-        raise RefusalError(str(ConfigError(problems)), BAD_INPUT)
+        raise RefusalError(str(ConfigError(problems)))
     return table, pours
 
 
@@ -439,7 +434,7 @@ def _check(simulator: PourSimulator, table: RecordTable, source: Path, tasks: Se
                 problems.append(Problem(source, row.line, 1, "", str(error)))
             done += 1
     if problems:
-        raise RefusalError(str(ConfigError(problems)), BAD_INPUT)
+        raise RefusalError(str(ConfigError(problems)))
 
 
 def _simulated(simulator: PourSimulator, tasks: Sequence[Sequence[PourTask]]) -> list[list[PourOutcome]]:
@@ -577,7 +572,7 @@ def prediction_inputs(plan: CampaignPlan, parameters: Path | None, thetas: int |
 
     if parameters is None:
         if thetas:
-            raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration", BAD_INPUT)
+            raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration")
         return PredictionInputs(plan.parameters)
     with Refused(ConfigError):
         theta = load_parameters(parameters, plan.parameters)

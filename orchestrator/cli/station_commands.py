@@ -11,18 +11,18 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Assignments, Json
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_json, print_message
+from orchestrator.cli.console import RefusalError, Refused, print_json, print_message
 from orchestrator.cli.queue_commands import CampaignId, State, Url, connected_client
 from orchestrator.daemon.pour_request import PourIn, described
 
-BatchId = Annotated[str, typer.Argument(help="Id of the batch.", show_default=False)]
+BatchId = Annotated[str, typer.Argument(help="Id of the batch.")]
 
 
 def order(
     key: Annotated[str, typer.Argument(metavar="ID", help=described("id"))],
     source: Annotated[str, typer.Option("--from", help=described("source"))],
     receiver: Annotated[str, typer.Option("--into", help=described("receiver"))],
-    amount: Annotated[str | None, typer.Option(help=described("amount"), show_default=False)] = None,
+    amount: Annotated[str | None, typer.Option(help=described("amount"))] = None,
     tolerance: Annotated[str, typer.Option(help=described("tolerance"))] = PourIn.model_fields["tolerance"].default,
     assignments: Assignments = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help=described("dry_run"))] = False,
@@ -36,9 +36,7 @@ def order(
     for text in assignments or []:
         name, equals, value = (part.strip() for part in text.partition("="))
         if not equals:
-            raise RefusalError(
-                f"--set: {text!r} should be name=value, for example angular_velocity='60 deg/s'", BAD_INPUT
-            )
+            raise RefusalError(f"--set: {text!r} should be name=value, for example angular_velocity='60 deg/s'")
         action[name] = value
     with connected_client(url, state) as client:
         from orchestrator.daemon.daemon_client import order_body
@@ -84,7 +82,7 @@ def batch(
     try:
         body = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise RefusalError(f"{file}: can't be read as JSON: {error}", BAD_INPUT) from None
+        raise RefusalError(f"{file}: can't be read as JSON: {error}") from None
     with connected_client(url, state) as client:
         found = client.post("/batches", body)
     _show_batch(found, as_json=as_json)
@@ -118,7 +116,7 @@ def hold(
 
 
 def reserve(
-    rig: Annotated[str, typer.Argument(help="Name of the rig.", show_default=False)],
+    rig: Annotated[str, typer.Argument(help="Name of the rig.")],
     hours: Annotated[float, typer.Option(min=0.01, help="Duration from now.")] = 1.0,
     note: Annotated[str, typer.Option(help="Reason, for other users.")] = "",
     url: Url = None,
@@ -137,17 +135,15 @@ def serve_sila(
     host: Annotated[str, typer.Option(help="Address to listen at; another one than loopback needs TLS.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port; 0 selects a free one.")] = 50052,
     certificate: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="Certificate for TLS (PEM).", show_default=False)
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Certificate for TLS (PEM).")
     ] = None,
     key: Annotated[
-        Path | None, typer.Option(exists=True, dir_okay=False, help="Key of the certificate (PEM).", show_default=False)
+        Path | None, typer.Option(exists=True, dir_okay=False, help="Key of the certificate (PEM).")
     ] = None,
     clients: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="Admit only clients with a certificate of this authority (PEM).",
-            show_default=False,
-        ),
+            exists=True, dir_okay=False, help="Admit only clients with a certificate of this authority (PEM)."),
     ] = None,
 ) -> None:  # fmt: skip
     """Serve a running daemon to SiLA 2 clients: pour, weigh, run a campaign, observe the state.
@@ -174,9 +170,7 @@ def serve_sila(
             asyncio.run(sila_server.serve(client, ready, host=host, port=port, **files))
 
 
-def backup(
-    file: Annotated[Path, typer.Argument(help="Archive to write (.zip).", show_default=False)], state: State = None
-) -> None:
+def backup(file: Annotated[Path, typer.Argument(help="Archive to write (.zip).")], state: State = None) -> None:
     """Back up a daemon's state, also while it runs: queue, orders, materials, campaigns, runs and tokens."""
     from orchestrator.daemon.state_backup import back_up
     from orchestrator.learning.run_errors import RunError
@@ -189,7 +183,7 @@ def backup(
 
 
 def restore(
-    file: Annotated[Path, typer.Argument(help="Archive of 'decant server backup'.", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="Archive of 'decant server backup'.")],
     state: State = None,
 ) -> None:
     """Restore a backup into a new state directory. The queue is paused: check the pours made since the backup."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import BAD_INPUT, INTERRUPTED, RefusalError, Refused, print_json, print_note
+from orchestrator.cli.console import FAILED, INTERRUPTED, RefusalError, Refused, print_json, print_note
 from orchestrator.cli.shell_completion import files_of
 
 if TYPE_CHECKING:
@@ -25,20 +25,16 @@ SHOWN_FAILURES = 5
 
 StudyPath = Annotated[
     Path,
-    typer.Argument(help="Study file (YAML).", metavar="STUDY", show_default=False, autocompletion=files_of("study")),
+    typer.Argument(help="Study file (YAML).", metavar="STUDY", autocompletion=files_of("study")),
 ]
 
 
 def run_study(
     file: StudyPath,
-    jobs: Annotated[
-        int | None, typer.Option(min=1, help="Number of cells at a time; default: one per core.", show_default=False)
-    ] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of cells at a time; default: one per core.")] = None,
     ray: Annotated[
         str | None,
-        typer.Option(
-            metavar="HOST:PORT", help="Run the cells on the Ray cluster with this head node.", show_default=False
-        ),
+        typer.Option(metavar="HOST:PORT", help="Run the cells on the Ray cluster with this head node."),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
@@ -72,7 +68,7 @@ def run_study(
         lines = [f"{len(status.failed)} of {len(cells)} cells failed, {len(status.skipped)} need one of them:"]
         lines += [f"  {name}: {why}" for name, why in shown]
         lines.append(f"finished cells are kept; correct that and continue with: decant study run {file}")
-        raise RefusalError("\n".join(lines))
+        raise RefusalError("\n".join(lines), FAILED)
 
 
 def _checked_cluster(address: str) -> RaySettings:
@@ -85,7 +81,7 @@ def _checked_cluster(address: str) -> RaySettings:
     try:
         settings = RaySettings(address=address)
     except ValidationError as error:
-        raise RefusalError(f"--ray: {error.errors()[0]['msg']}", BAD_INPUT) from None
+        raise RefusalError(f"--ray: {error.errors()[0]['msg']}") from None
     print_note(f"looking at the Ray cluster at {address} …")
     with Refused(LaboratoryError, at="--ray: "):
         check_cluster(settings, need_bench=False)

@@ -17,14 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import typer
 
 from orchestrator.cli.command_options import Json, grouped
-from orchestrator.cli.console import (
-    BAD_INPUT,
-    RefusalError,
-    print_json,
-    print_note,
-    print_warning,
-    waiting_for,
-)
+from orchestrator.cli.console import RefusalError, print_json, print_note, print_warning, waiting_for
 
 if TYPE_CHECKING:
     from sim_engine.vessel.shapes import LengthUnit
@@ -51,7 +44,7 @@ LEVEL = 2.0
 BAND = 2.0
 """Standard deviations that the band shows to either side."""
 
-Out = Annotated[Path, typer.Argument(help="Vessel file to write (YAML).", metavar="OUT", show_default=False)]
+Out = Annotated[Path, typer.Argument(help="Vessel file to write (YAML).", metavar="OUT")]
 Up = Annotated[str, typer.Option(help="Axis of the file that points out of the opening.")]
 Unit = Annotated[str | None, typer.Option(help="Unit of the file: m, cm, mm, in; default: by its extent.")]
 Wall = Annotated[str | None, typer.Option(help="Thickness of the wall: '3 mm'.")]
@@ -136,7 +129,7 @@ def profile(out: Out, sizes: Sizes, vessel: Vessel) -> None:
 
 @grouped
 def photo(
-    picture: Annotated[Path, typer.Argument(help="Photograph from the side.", metavar="PICTURE", show_default=False)],
+    picture: Annotated[Path, typer.Argument(help="Photograph from the side.", metavar="PICTURE")],
     out: Out,
     known_height: Annotated[str | None, typer.Option(help="Outer height, for the scale of the photograph.")] = None,
     known_width: Annotated[str | None, typer.Option(help="Largest outer width, for the scale.")] = None,
@@ -161,8 +154,7 @@ def photo(
         if (tall is None) == (wide is None):
             raise RefusalError(
                 "a photograph needs one known outer length for its scale: --known-height '99 mm' or --known-width "
-                "'78 mm'",
-                BAD_INPUT,
+                "'78 mm'"
             )
         grey = read_photograph(picture)
         known: Literal["height", "width"] = "height" if tall is not None else "width"
@@ -174,9 +166,7 @@ def photo(
 
 @grouped
 def points(
-    cloud: Annotated[
-        Path, typer.Argument(help="Points: PLY, PCD, XYZ, or CSV with x, y, z.", metavar="POINTS", show_default=False)
-    ],
+    cloud: Annotated[Path, typer.Argument(help="Points: PLY, PCD, XYZ, or CSV with x, y, z.", metavar="POINTS")],
     out: Out,
     unit: Unit = None,
     up: Up = "z",
@@ -201,9 +191,7 @@ def points(
 
 @grouped
 def depth(
-    image: Annotated[
-        Path, typer.Argument(help="Depth image: PNG of 16 bits, or NPY.", metavar="IMAGE", show_default=False)
-    ],
+    image: Annotated[Path, typer.Argument(help="Depth image: PNG of 16 bits, or NPY.", metavar="IMAGE")],
     out: Out,
     focal: Annotated[float | None, typer.Option(help="Focal length of the depth camera [pixels].", min=1.0)] = None,
     centre: Annotated[
@@ -226,8 +214,7 @@ def depth(
         if focal is None:
             raise RefusalError(
                 "a depth image needs its camera's focal length in pixels: --focal 615; the camera's software tells it "
-                "(fx)",
-                BAD_INPUT,
+                "(fx)"
             )
         found = points_on_table(read_depth(image, _unit(unit)), focal, _centre(centre))
         pixel = float(found[:, 1].min()) / focal
@@ -238,7 +225,7 @@ def depth(
 
 @grouped
 def mesh(
-    file: Annotated[Path, typer.Argument(help="Mesh: STL, OBJ, PLY or GLB.", metavar="MESH", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="Mesh: STL, OBJ, PLY or GLB.", metavar="MESH")],
     out: Out,
     unit: Unit = None,
     up: Up = "z",
@@ -273,18 +260,18 @@ def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
     from sim_engine.vessel.shapes import VesselError
 
     if out.suffix not in (".yaml", ".yml"):
-        raise RefusalError(f"{out}: a vessel file is YAML; write {out.with_suffix('.yaml')}", BAD_INPUT)
+        raise RefusalError(f"{out}: a vessel file is YAML; write {out.with_suffix('.yaml')}")
     if not out.parent.is_dir():
-        raise RefusalError(f"{out}: the folder {out.parent} does not exist; make it first", BAD_INPUT)
+        raise RefusalError(f"{out}: the folder {out.parent} does not exist; make it first")
     if out.exists():
-        raise RefusalError(f"{out}: exists already; choose another name, or remove it first", BAD_INPUT)
+        raise RefusalError(f"{out}: exists already; choose another name, or remove it first")
     try:
         with waiting_for(lambda: "measuring the vessel"):
             found = work([])
     except (VesselError, QuantityError) as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
     except OSError as error:
-        raise RefusalError(f"{error.filename}: {error.strerror}", BAD_INPUT) from None
+        raise RefusalError(f"{error.filename}: {error.strerror}") from None
     for note in found.notes:
         print_note(f"note: {note}")
     for doubt in found.doubts:
@@ -314,7 +301,7 @@ def _quantity(text: str | None, what: str, unit: str, example: str) -> float | N
     try:
         return parse_quantity(text, unit, example)
     except QuantityError as error:
-        raise RefusalError(f"{what} {text!r}: {error}", BAD_INPUT) from None
+        raise RefusalError(f"{what} {text!r}: {error}") from None
 
 
 # -- turned vessels ----------------------------------------------------------------------------------------------------
@@ -347,7 +334,7 @@ def _turned(
     given, floor, height = sizes.lengths()
     wall = given or wall
     if wall is None:
-        raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'", BAD_INPUT)
+        raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'")
     floor = wall if floor is None else floor
     evidence: list[Evidence] = []
     off = HEIGHT
@@ -358,7 +345,7 @@ def _turned(
             height, off = inside, max(off, pixel)
     if height is None:
         raise RefusalError(
-            "how deep is it inside, from floor to rim? Say it with --height, for example --height '95 mm'", BAD_INPUT
+            "how deep is it inside, from floor to rim? Say it with --height, for example --height '95 mm'"
         )
     evidence += _measured(sizes, vessel, height)
     outline = find_outline(height, evidence, wall, floor, height_deviation=off)
@@ -445,8 +432,7 @@ def _scanned(out: Path, sizes: Sizes, vessel: Vessel, notes: list[str], scan: Sc
         return _written_mesh(out, vessel, *mesh_of(scan, wall, floor), notes)
     if (wall or between) is None:
         raise RefusalError(
-            "the points are of one surface: how thick is the wall? Say it with --wall, for example --wall '3 mm'",
-            BAD_INPUT,
+            "the points are of one surface: how thick is the wall? Say it with --wall, for example --wall '3 mm'"
         )
 
     def seen(wall: float, floor: float) -> tuple[Radii, float]:
@@ -464,21 +450,19 @@ def _centre(text: str | None) -> tuple[float, float] | None:
     try:
         column, row = map(float, text.split(","))
     except ValueError:
-        raise RefusalError(
-            f"--centre {text!r}: should be a column and a row, such as '318.2, 241.5'", BAD_INPUT
-        ) from None
+        raise RefusalError(f"--centre {text!r}: should be a column and a row, such as '318.2, 241.5'") from None
     return column, row
 
 
 def _unit(text: str | None) -> LengthUnit | None:
     if text not in (None, "m", "cm", "mm", "in"):
-        raise RefusalError(f"--unit {text!r}: should be m, cm, mm or in", BAD_INPUT)
+        raise RefusalError(f"--unit {text!r}: should be m, cm, mm or in")
     return cast("LengthUnit | None", text)
 
 
 def _axis(text: str) -> Axis:
     if text not in ("x", "y", "z", "-x", "-y", "-z"):
-        raise RefusalError(f"--up {text!r}: should be x, y or z, or one of them with a minus", BAD_INPUT)
+        raise RefusalError(f"--up {text!r}: should be x, y or z, or one of them with a minus")
     return cast("Axis", text)
 
 
@@ -576,7 +560,7 @@ def _written_mesh(
 
     name, path = vessel.name or out.stem, out.with_suffix(".stl")
     if path.exists():
-        raise RefusalError(f"{path}: exists already; choose another name, or remove it first", BAD_INPUT)
+        raise RefusalError(f"{path}: exists already; choose another name, or remove it first")
     trimesh.Trimesh(1e3 * vertices, faces, process=False).export(path)
     try:
         built = build_vessel(VesselSpec(name=name, shape=MeshShape(path=path, unit="mm", up=up)))

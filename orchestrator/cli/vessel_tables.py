@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.campaigns.table_columns import KnownColumn, columns_of
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_note
+from orchestrator.cli.console import RefusalError, Refused, print_note
 from sim_engine.settings.quantity import QuantityError, parse_quantity
 
 if TYPE_CHECKING:
@@ -66,16 +66,15 @@ def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
             heights.append(parse_quantity(at.strip(), "m", "95 mm"))
             widths.append(parse_quantity(wide.strip(), "m", "72 mm"))
         except QuantityError as error:
-            raise RefusalError(f"--diameters: '{pair}': {error}", BAD_INPUT) from None
+            raise RefusalError(f"--diameters: '{pair}': {error}") from None
         if not 0.0 <= heights[-1] <= height + 1e-9:
             raise RefusalError(
-                f"--diameters: '{pair}': that is not between the inner floor (0 mm) and the rim ({1e3 * height:g} mm)",
-                BAD_INPUT,
+                f"--diameters: '{pair}': that is not between the inner floor (0 mm) and the rim ({1e3 * height:g} mm)"
             )
         if not 0.0 < widths[-1] < 1.0:
-            raise RefusalError(f"--diameters: '{pair}': a diameter should be above 0 and below 1 m", BAD_INPUT)
+            raise RefusalError(f"--diameters: '{pair}': a diameter should be above 0 and below 1 m")
     if not heights:
-        raise RefusalError("--diameters: has no pair; write for example '5 mm: 60 mm, 95 mm: 72 mm'", BAD_INPUT)
+        raise RefusalError("--diameters: has no pair; write for example '5 mm: 60 mm, 95 mm: 72 mm'")
     return np.array(heights), np.array(widths)
 
 
@@ -101,8 +100,7 @@ def read_fill_table(
             raise RefusalError(
                 f"{path}:{line}: {mass:g} g below {level:g} mm make a vessel of {diameter:.3g} mm in diameter; should "
                 f"be {NARROWEST_MM:g} to {WIDEST_MM:g} mm. Are the levels in mm above the inner floor, the masses in g "
-                "of the liquid alone?",
-                BAD_INPUT,
+                "of the liquid alone?"
             )
     return table
 
@@ -131,7 +129,7 @@ def _monotonic(
     values, masses = table[:, 0], table[:, 1]
     if (different := len(np.unique(values))) < FEWEST_ROWS:
         raise RefusalError(
-            f"{path}: has {different} different value(s); at least {FEWEST_ROWS} say something about a shape", BAD_INPUT
+            f"{path}: has {different} different value(s); at least {FEWEST_ROWS} say something about a shape"
         )
     steepness = float(np.ptp(masses) / np.ptp(values))
     # three standard deviations of the difference of two readings
@@ -144,8 +142,7 @@ def _monotonic(
             other = k - 1 if repeated else best
             raise RefusalError(
                 f"{path}:{rows[k][0]}: mass_g is {masses[k]:g} at {values[k]:g}, and {masses[other]:g} at "
-                f"{values[other]:g} (line {rows[other][0]}); {rule}",
-                BAD_INPUT,
+                f"{values[other]:g} (line {rows[other][0]}); {rule}"
             )
         best = k if back <= 0.0 else best
     return values, masses
@@ -166,7 +163,7 @@ def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, floa
     names = [one.standard for one in columns if one is not None]
     missing = [one.standard for one in wanted if one.standard not in names]
     if missing:
-        raise RefusalError(f"{path}:1: the column '{missing[0]}' is missing; write '{column},mass_g'", BAD_INPUT)
+        raise RefusalError(f"{path}:1: the column '{missing[0]}' is missing; write '{column},mass_g'")
     if table.note:
         print_note(f"note: {table.note}")
     found: list[tuple[int, float, float]] = []
@@ -177,20 +174,18 @@ def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, floa
         except ValueError:
             numbers = []
         if len(numbers) != len(names):
-            raise RefusalError(f"{at}: should be two numbers, {column} and mass_g", BAD_INPUT)
+            raise RefusalError(f"{at}: should be two numbers, {column} and mass_g")
         values = {one.standard: n * one.factor for one, n in zip(columns, numbers, strict=True) if one is not None}
         value, mass = values[column], values["mass_g"]
         if not 0.0 < value <= upper * (1.0 + 1e-9):
-            raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}", BAD_INPUT)
+            raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}")
         if not 0.0 <= mass < 1e5:
-            raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0", BAD_INPUT)
+            raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0")
         found.append((row.line, value, mass))
         if len(found) > MOST_ROWS:
-            raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows", BAD_INPUT)
+            raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows")
     if len(found) < FEWEST_ROWS:
-        raise RefusalError(
-            f"{path}: has {len(found)} row(s); at least {FEWEST_ROWS} say something about a shape", BAD_INPUT
-        )
+        raise RefusalError(f"{path}: has {len(found)} row(s); at least {FEWEST_ROWS} say something about a shape")
     return found
 
 
@@ -217,16 +212,16 @@ def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str])
     try:
         points = _loaded(path)
     except VesselError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
     except Exception as error:  # readers raise arbitrary errors for damaged files
-        raise RefusalError(f"{path}: can't be read as points ({error})", BAD_INPUT) from None
+        raise RefusalError(f"{path}: can't be read as points ({error})") from None
     if points.ndim != 2 or points.shape[1] < 3:
-        raise RefusalError(f"{path}: should have x, y, z in each row", BAD_INPUT)
+        raise RefusalError(f"{path}: should have x, y, z in each row")
     points = points[:, :3]
     # depth cameras write pixels without a measurement as NaN, or as the camera's own position
     measured = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
     if not measured.any():
-        raise RefusalError(f"{path}: none of its {len(points):,} points has finite x, y and z", BAD_INPUT)
+        raise RefusalError(f"{path}: none of its {len(points):,} points has finite x, y and z")
     if missing := len(points) - int(measured.sum()):
         notes.append(
             f"{missing:,} of {len(points):,} points without a measurement (not a number, or 0, 0, 0) were left out"
@@ -273,11 +268,11 @@ def read_photograph(path: Path) -> Floats:
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # large ones: see below
             if picture.width * picture.height > MOST_PIXELS:
-                raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller", BAD_INPUT)
+                raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller")
             upright = ImageOps.exif_transpose(picture)  # cameras store the sensor's rows and their orientation
             return np.asarray(upright.convert("L"), dtype=float)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # truncated, damaged
-        raise RefusalError(f"{path}: is not a picture that can be read ({error})", BAD_INPUT) from None
+        raise RefusalError(f"{path}: is not a picture that can be read ({error})") from None
 
 
 def read_depth(path: Path, unit: LengthUnit | None) -> Floats:
@@ -299,12 +294,11 @@ def read_depth(path: Path, unit: LengthUnit | None) -> Floats:
             with Image.open(path) as picture:
                 depth = np.asarray(picture)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        raise RefusalError(f"{path}: is not a depth image that can be read ({error})", BAD_INPUT) from None
+        raise RefusalError(f"{path}: is not a depth image that can be read ({error})") from None
     if depth.ndim != 2 or depth.dtype.kind not in "uif" or depth.dtype.itemsize < 2:
         raise RefusalError(
             f"{path}: should be a grey image of 16 bits, or an array of rows and columns, with distances in it; a "
-            "picture in colours or of 8 bits shows them, and has none",
-            BAD_INPUT,
+            "picture in colours or of 8 bits shows them, and has none"
         )
     result: Floats = np.nan_to_num(depth.astype(float), posinf=0.0, neginf=0.0) * UNITS[unit or "mm"]
     return result
@@ -312,8 +306,8 @@ def read_depth(path: Path, unit: LengthUnit | None) -> Floats:
 
 def _check_size(path: Path) -> None:
     if path.is_dir():
-        raise RefusalError(f"{path}: is a folder; name a file in it", BAD_INPUT)
+        raise RefusalError(f"{path}: is a folder; name a file in it")
     if not path.is_file():
-        raise RefusalError(f"{path}: there is no such file", BAD_INPUT)
+        raise RefusalError(f"{path}: there is no such file")
     if (size := path.stat().st_size) > LARGEST_FILE:
-        raise RefusalError(f"{path}: {size / 1e6:.0f} MB; at most {LARGEST_FILE / 1e6:.0f} MB are read", BAD_INPUT)
+        raise RefusalError(f"{path}: {size / 1e6:.0f} MB; at most {LARGEST_FILE / 1e6:.0f} MB are read")

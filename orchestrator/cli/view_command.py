@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from orchestrator.cli.command_options import LiveAt
-from orchestrator.cli.console import BAD_INPUT, RefusalError, Refused, print_message, print_note
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message, print_note
 from orchestrator.cli.shell_completion import local_runs
 
 if TYPE_CHECKING:
@@ -31,7 +31,6 @@ def view(
         typer.Argument(
             help="Folders of runs, their names in runs/, or recordings (.rrd).",
             metavar="RUN…",
-            show_default=False,
             autocompletion=local_runs,
         ),
     ],
@@ -41,15 +40,13 @@ def view(
     ] = None,
     particles: Annotated[
         int | None,
-        typer.Option(min=200, max=50_000, help="With --pour: number of particles instead of θ*'s.", show_default=False),
+        typer.Option(min=200, max=50_000, help="With --pour: number of particles instead of θ*'s."),
     ] = None,
     stage: Annotated[
         str | None,
         typer.Option(help="With --pour: stage of the pour, if several stages number their pours from 1."),
     ] = None,
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Write the recording here and exit.", show_default=False)
-    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the recording here and exit.")] = None,
     at: LiveAt = None,
 ) -> None:
     """Serve recordings for a browser and print the address, until Ctrl-C. Needs no display.
@@ -61,11 +58,11 @@ def view(
     from sim_engine.resources import installed
 
     if not installed("rerun"):
-        raise RefusalError("view: needs Rerun, which is not installed: pip install 'decant-pouring[live]'", BAD_INPUT)
+        raise RefusalError("view: needs Rerun, which is not installed: pip install 'decant-pouring[live]'")
     if pour is None and (particles is not None or stage is not None):
-        raise RefusalError("--particles and --stage go with --pour", BAD_INPUT)
+        raise RefusalError("--particles and --stage go with --pour")
     if pour is not None and len(recordings) != 1:
-        raise RefusalError("--pour takes one run", BAD_INPUT)
+        raise RefusalError("--pour takes one run")
     check_output(output, "--output", ".rrd")
     with tempfile.TemporaryDirectory(prefix="decant-view-") as scratch:
         if pour is not None:
@@ -97,9 +94,9 @@ def _serve(shown: Path, at: str | None) -> None:
             while not stopped and live.alive:
                 time.sleep(0.2)
             if not stopped:
-                raise RefusalError("the viewer's server has ended")
+                raise RefusalError("the viewer's server has ended", FAILED)
     except LiveError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
+        raise RefusalError(str(error)) from None
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -116,9 +113,9 @@ def _again(what: Path, number: int, particles: int | None, stage: str | None, pa
     try:
         pour = find_pour(run, number, stage)
     except NoSuchPourError as error:
-        raise RefusalError(str(error), BAD_INPUT) from None
-    except RunError as error:
         raise RefusalError(str(error)) from None
+    except RunError as error:
+        raise RefusalError(str(error), FAILED) from None
     task = task_of(plan, run, pour, particles)
     simulator, begin = PourSimulator(), time.monotonic()
     with contextlib.closing(simulator), waiting_for(lambda: f"simulating, {time.monotonic() - begin:.0f} s so far"):
@@ -157,7 +154,7 @@ def _recording_of(what: Path) -> Path:
     found = sorted(run.glob("campaign*.rrd"), key=lambda path: path.stat().st_mtime)
     found = [path for path in found if "optimising" not in path.name]
     if not found:
-        raise RefusalError(f"{run}: has no recording; was it run with 'outputs: {{recording: false}}'?", BAD_INPUT)
+        raise RefusalError(f"{run}: has no recording; was it run with 'outputs: {{recording: false}}'?")
     return found[-1]
 
 
@@ -166,7 +163,7 @@ def _run_of(what: Path) -> Path:
 
     run = what if what.exists() or len(what.parts) > 1 else Path("runs") / what
     if not (run / JOURNAL_NAME).is_file():
-        raise RefusalError(f"{run}: is not the folder of a run: it has no {JOURNAL_NAME}", BAD_INPUT)
+        raise RefusalError(f"{run}: is not the folder of a run: it has no {JOURNAL_NAME}")
     return run
 
 
@@ -196,19 +193,17 @@ def live_view(plan: CampaignPlan, *, live: bool, at: str | None) -> LiveView | N
     if not live and at is None:
         return None
     if not installed("rerun"):
-        raise RefusalError("--live: needs Rerun, which is not installed: pip install 'decant-pouring[live]'", BAD_INPUT)
+        raise RefusalError("--live: needs Rerun, which is not installed: pip install 'decant-pouring[live]'")
     if not plan.outputs.recording:
         raise RefusalError(
             f"--live: {plan.source} says 'outputs: {{recording: false}}', and a live view shows what is recorded; "
-            "leave that out",
-            BAD_INPUT,
+            "leave that out"
         )
     address, port = parsed(at) if at is not None else (LOOPBACK, None)
     if port is not None and not is_free(address, port):
         raise RefusalError(
             f"--live-at {at}: port {port} is taken, by another live view perhaps, or {address} is not an address of "
-            "this machine; leave the port out, and a free one is found",
-            BAD_INPUT,
+            "this machine; leave the port out, and a free one is found"
         )
     return LiveView(address=address, web_port=port)
 
@@ -222,5 +217,5 @@ def parsed(at: str) -> tuple[str, int | None]:
     found = re.fullmatch(r"(?P<address>[A-Za-z0-9.-]+|\[[0-9a-fA-F:]+\])(:(?P<port>\d+))?", at)
     port = None if found is None or found["port"] is None else int(found["port"])
     if found is None or (port is not None and not 0 < port < 65536):
-        raise RefusalError(f"--live-at {at!r}: write ADDRESS or ADDRESS:PORT, as 127.0.0.1:9090", BAD_INPUT)
+        raise RefusalError(f"--live-at {at!r}: write ADDRESS or ADDRESS:PORT, as 127.0.0.1:9090")
     return found["address"].strip("[]"), port
