@@ -54,8 +54,7 @@ def check(
     balance: Balance,
     given: Given = None,
     record: Annotated[
-        Path | None,
-        typer.Option(help="Also record the raw traffic into this file, as 'decant balance record' does."),
+        Path | None, typer.Option(help="Also record the raw traffic into this file, as 'decant balance record' does.")
     ] = None,
     as_json: Json = False,
 ) -> None:

@@ -173,11 +173,7 @@ def plan(
 
     Actions are shown in deg, deg/s, mm and s.
     """
-    from orchestrator.cli.foreground_run import (
-        check_campaign_can_run,
-        read_campaign,
-        run_task_at_terminal,
-    )
+    from orchestrator.cli.foreground_run import check_campaign_can_run, read_campaign, run_task_at_terminal
     from orchestrator.cli.simulate_command import prediction_inputs
     from orchestrator.learning.deployment.deployment_result import Deployed
     from orchestrator.learning.single_action import PredictedPour

@@ -17,14 +17,12 @@ from orchestrator.cli.shell_completion import files_of, local_runs
 from sim_engine.errors import EngineError, WrongOutcomeError
 
 Campaign = Annotated[
-    Path,
-    typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", autocompletion=files_of("campaign")),
+    Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", autocompletion=files_of("campaign"))
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished run of this campaign.")]
 RunId = Annotated[
-    str | None,
-    typer.Option("--run", help="With --resume: name of the run's folder.", autocompletion=local_runs),
+    str | None, typer.Option("--run", help="With --resume: name of the run's folder.", autocompletion=local_runs)
 ]
 Answer = Annotated[
     str | None,
@@ -34,15 +32,12 @@ Answer = Annotated[
     ),
 ]
 Laboratory = Annotated[
-    Path,
-    typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", autocompletion=files_of("laboratory")),
+    Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", autocompletion=files_of("laboratory"))
 ]
 OtherLaboratory = Annotated[
     Path | None,
     typer.Option(
-        "--laboratory",
-        help="Laboratory file (YAML) instead of the campaign's.",
-        autocompletion=files_of("laboratory"),
+        "--laboratory", help="Laboratory file (YAML) instead of the campaign's.", autocompletion=files_of("laboratory")
     ),
 ]
 Seed = Annotated[
@@ -96,10 +91,7 @@ LiveAt = Annotated[
 Parameters = Annotated[Path | None, typer.Option(help="θ: theta.json of a calibration, or a YAML or JSON file.")]
 Receiver = Annotated[
     Path | None,
-    typer.Option(
-        help="Vessel file (YAML) instead of the campaign's receiver.",
-        autocompletion=files_of("vessel"),
-    ),
+    typer.Option(help="Vessel file (YAML) instead of the campaign's receiver.", autocompletion=files_of("vessel")),
 ]
 _QUIET = inspect.Parameter(
     "quiet",

@@ -34,8 +34,7 @@ def dose(
         typer.Option(help="Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %."),
     ] = "1 g",
     receiver: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Name of one of the campaign's receivers; default: the first."),
+        str | None, typer.Option(metavar="NAME", help="Name of one of the campaign's receivers; default: the first.")
     ] = None,
     as_left: Annotated[
         bool,

@@ -29,8 +29,7 @@ from orchestrator.cli.console import (
 
 def validate(
     files: Annotated[
-        list[Path],
-        typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files."),
+        list[Path], typer.Argument(help="Campaign, study, vessel, laboratory, daemon or recording files.")
     ],
 ) -> None:
     """Check files without starting anything: keys, units, bounds, vessels, and whether some action can be poured."""

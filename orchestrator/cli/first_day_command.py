@@ -38,16 +38,14 @@ PAGE, RESULT, PICTURE = "first-day.html", "first-day.json", "first-day.png"
 def first_day(
     folder: Annotated[Path, typer.Argument(help="Folder of the recordings; steps that it has are kept.")],
     campaign: Annotated[
-        Path | None,
-        typer.Option(help="Campaign whose bench pours the missing steps, with water."),
+        Path | None, typer.Option(help="Campaign whose bench pours the missing steps, with water.")
     ] = None,
     laboratory: OtherLaboratory = None,
     practise: Annotated[
         bool, typer.Option("--practise", help="Record the day on a virtual dosing bench instead, without a clock.")
     ] = False,
     wrong: Annotated[
-        str | None,
-        typer.Option(help="With --practise: wrong on that bench: lag, holds, grip, height or viscosity."),
+        str | None, typer.Option(help="With --practise: wrong on that bench: lag, holds, grip, height or viscosity.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="With --practise: seed of that bench.")] = 0,
     lag: Annotated[str, typer.Option(help="Lag of the balance that you expect.")] = "0.35 s",

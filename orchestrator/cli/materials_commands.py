@@ -203,8 +203,7 @@ def poured(
 def place(
     vessel: VesselName,
     where: Annotated[
-        str,
-        typer.Argument(metavar="PLACE", help="Place of the laboratory, or position of the daemon; '' for nowhere."),
+        str, typer.Argument(metavar="PLACE", help="Place of the laboratory, or position of the daemon; '' for nowhere.")
     ],
     note: Note = "",
     url: Url = None,

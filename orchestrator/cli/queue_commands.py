@@ -15,14 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import (
-    Campaign,
-    Json,
-    OtherLaboratory,
-    Parameters,
-    Receiver,
-    Seed,
-)
+from orchestrator.cli.command_options import Campaign, Json, OtherLaboratory, Parameters, Receiver, Seed
 from orchestrator.cli.console import RefusalError, Refused, print_json, print_message, print_note
 from orchestrator.cli.shell_completion import files_of, queued_campaigns
 
@@ -42,8 +35,7 @@ CampaignOrQueue = Annotated[
     typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue.", autocompletion=queued_campaigns),
 ]
 Url = Annotated[
-    str | None,
-    typer.Option(help="URL of the daemon; default: $DECANT_URL, or the daemon on this machine."),
+    str | None, typer.Option(help="URL of the daemon; default: $DECANT_URL, or the daemon on this machine.")
 ]
 State = Annotated[Path | None, typer.Option(help="The daemon's state directory; default: $DECANT_STATE.")]
 
@@ -51,10 +43,7 @@ State = Annotated[Path | None, typer.Option(help="The daemon's state directory; 
 def start(
     settings: Annotated[
         Path | None,
-        typer.Argument(
-            help="Settings file (YAML); default: a virtual laboratory.",
-            autocompletion=files_of("daemon"),
-        ),
+        typer.Argument(help="Settings file (YAML); default: a virtual laboratory.", autocompletion=files_of("daemon")),
     ] = None,
     state: State = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port; 0 selects a free one.")] = None,
@@ -130,8 +119,7 @@ def submit(
     parameters: Parameters = None,
     receiver: Receiver = None,
     iterations: Annotated[
-        int | None,
-        typer.Option(min=1, help="With --task plan: simulations instead of the campaign's."),
+        int | None, typer.Option(min=1, help="With --task plan: simulations instead of the campaign's.")
     ] = None,
     url: Url = None,
     state: State = None,

@@ -28,19 +28,13 @@ if TYPE_CHECKING:
     from orchestrator.reports.recording_replay import PourReplay
 
 Recordings = Annotated[
-    list[Path],
-    typer.Argument(help="Recorded pours (YAML), or folders of them.", metavar="RECORDING"),
+    list[Path], typer.Argument(help="Recorded pours (YAML), or folders of them.", metavar="RECORDING")
 ]
 
 
 def export(
     run: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder of a run, or its name in runs/.",
-            metavar="RUN",
-            autocompletion=local_runs,
-        ),
+        Path, typer.Argument(help="Folder of a run, or its name in runs/.", metavar="RUN", autocompletion=local_runs)
     ],
     to: Annotated[
         Path | None, typer.Option(help="Folder for the files; default: 'recordings' in the run's folder.")
@@ -79,8 +73,7 @@ def replay(
     ] = 1000,
     parameters: Parameters = None,
     values: Annotated[
-        Path | None,
-        typer.Option("--fitted", help="Values that 'decant recording fit --output' has written."),
+        Path | None, typer.Option("--fitted", help="Values that 'decant recording fit --output' has written.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Seed of simulation and estimator.")] = 0,
     png: Annotated[Path | None, typer.Option(help="Folder for a picture of each pour: NAME.png.")] = None,

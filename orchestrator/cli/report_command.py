@@ -22,8 +22,7 @@ def report(
         ),
     ],
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Other file than report.html in the run's folder."),
+        Path | None, typer.Option("--output", "-o", help="Other file than report.html in the run's folder.")
     ] = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also write every figure of a run as PDF, for LaTeX.")] = False,
     as_json: Json = False,

@@ -43,8 +43,7 @@ def check(
         ),
     ] = False,
     tare: Annotated[
-        bool,
-        typer.Option("--tare", help="Also tare the balance as a test: the load on it then reads zero."),
+        bool, typer.Option("--tare", help="Also tare the balance as a test: the load on it then reads zero.")
     ] = False,
     record_to: Annotated[
         Path | None,
@@ -114,8 +113,7 @@ def check(
 def archive(
     archive: Annotated[Path, typer.Argument(help="The archive (.zip); created if it does not exist.")],
     recordings: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Recordings to add: files of '--record', and run folders."),
+        list[Path] | None, typer.Argument(help="Recordings to add: files of '--record', and run folders.")
     ] = None,
     as_json: Json = False,
 ) -> None:

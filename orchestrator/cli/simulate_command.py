@@ -15,15 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import (
-    Assignments,
-    Campaign,
-    Json,
-    Parameters,
-    Receiver,
-    SceneName,
-    Thetas,
-)
+from orchestrator.cli.command_options import Assignments, Campaign, Json, Parameters, Receiver, SceneName, Thetas
 from orchestrator.cli.console import (
     FAILED,
     RefusalError,
@@ -70,8 +62,7 @@ def simulate(
     as_json: Json = False,
     rrd: Annotated[Path | None, typer.Option(help="Write a Rerun recording.")] = None,
     png: Annotated[
-        Path | None,
-        typer.Option(help="Draw four moments of the pour; with --from: measured over predicted."),
+        Path | None, typer.Option(help="Draw four moments of the pour; with --from: measured over predicted.")
     ] = None,
     csv: Annotated[Path | None, typer.Option(help="With --from: write a table of the predictions as CSV.")] = None,
 ) -> None:

@@ -143,7 +143,7 @@ def serve_sila(
     clients: Annotated[
         Path | None,
         typer.Option(
-            exists=True, dir_okay=False, help="Admit only clients with a certificate of this authority (PEM)."),
+            exists=True, dir_okay=False, help="Admit only clients with a certificate of this authority (PEM).")
     ] = None,
 ) -> None:  # fmt: skip
     """Serve a running daemon to SiLA 2 clients: pour, weigh, run a campaign, observe the state.

@@ -24,8 +24,7 @@ SHOWN_FAILURES = 5
 
 
 StudyPath = Annotated[
-    Path,
-    typer.Argument(help="Study file (YAML).", metavar="STUDY", autocompletion=files_of("study")),
+    Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", autocompletion=files_of("study"))
 ]
 
 
@@ -33,8 +32,7 @@ def run_study(
     file: StudyPath,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of cells at a time; default: one per core.")] = None,
     ray: Annotated[
-        str | None,
-        typer.Option(metavar="HOST:PORT", help="Run the cells on the Ray cluster with this head node."),
+        str | None, typer.Option(metavar="HOST:PORT", help="Run the cells on the Ray cluster with this head node.")
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")

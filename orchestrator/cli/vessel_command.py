@@ -56,8 +56,7 @@ class Sizes:
 
     height: Annotated[str | None, typer.Option(help="Depth inside, from floor to rim: '95 mm'.")] = None
     diameters: Annotated[
-        str | None,
-        typer.Option(help="Inner diameters by height above the inner floor: '5 mm: 60 mm, 95 mm: 72 mm'."),
+        str | None, typer.Option(help="Inner diameters by height above the inner floor: '5 mm: 60 mm, 95 mm: 72 mm'.")
     ] = None
     fill: Annotated[Path | None, typer.Option(help="Table of levels and masses: level_mm, mass_g.")] = None
     tilt: Annotated[Path | None, typer.Option(help="Table of tilts and retained masses: tilt_deg, mass_g.")] = None

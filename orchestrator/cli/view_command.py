@@ -39,12 +39,10 @@ def view(
         typer.Option(min=1, help="Simulate this pour of the run again, with the arm's motion and the run's θ*."),
     ] = None,
     particles: Annotated[
-        int | None,
-        typer.Option(min=200, max=50_000, help="With --pour: number of particles instead of θ*'s."),
+        int | None, typer.Option(min=200, max=50_000, help="With --pour: number of particles instead of θ*'s.")
     ] = None,
     stage: Annotated[
-        str | None,
-        typer.Option(help="With --pour: stage of the pour, if several stages number their pours from 1."),
+        str | None, typer.Option(help="With --pour: stage of the pour, if several stages number their pours from 1.")
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the recording here and exit.")] = None,
     at: LiveAt = None,
