@@ -11,7 +11,12 @@ class DecantError(Exception):
     """Base of all errors that Decant's public functions raise deliberately; the text is for the user.
 
     Errors of files that cannot be opened, read or written remain Python's (`OSError`).
+
+    Attributes:
+        exit_code: of the command line: 1 failed, 2 bad input, 3 an answer of the operator is needed.
     """
+
+    exit_code = 2
 
 
 class InvalidArgumentError(DecantError, ValueError):
@@ -28,6 +33,8 @@ class EngineError(DecantError, RuntimeError):
 
 class WrongOutcomeError(EngineError):
     """The first pour of an engine differs from its stored outcome: every other outcome could be wrong, too."""
+
+    exit_code = 1
 
 
 class SimulationCancelled(Exception):  # noqa: N818 - a notification, not an error

@@ -371,7 +371,6 @@ def _port_settings(port: str, given: list[str] | None) -> SerialBalanceSettings:
     """
     from actors.balance.balance_settings import SerialBalanceSettings
     from orchestrator.campaigns.yaml.section_validation import PlacedProblems, validate
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 
     lines = [f"port: {json.dumps(port)}"]
@@ -380,13 +379,12 @@ def _port_settings(port: str, given: list[str] | None) -> SerialBalanceSettings:
         if not equals:
             raise RefusalError(f"--set {text}: should be a key and a value, as dialect=kcp")
         lines.append(f"{key.strip()}: {value.strip()}")
-    with Refused(ConfigError):
-        report = Report()
-        place = Place(Document.parse("\n".join(lines), Path("--set")))
-        settings = validate(SerialBalanceSettings, place, report)
-        if settings is not None:
-            settings.check_laboratory(PlacedProblems(place, report), mode="hardware")
-        report.raise_if_any()
+    report = Report()
+    place = Place(Document.parse("\n".join(lines), Path("--set")))
+    settings = validate(SerialBalanceSettings, place, report)
+    if settings is not None:
+        settings.check_laboratory(PlacedProblems(place, report), mode="hardware")
+    report.raise_if_any()
     assert settings is not None, "settings without problems are settings"
     return settings
 

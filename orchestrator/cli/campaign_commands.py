@@ -26,7 +26,7 @@ from orchestrator.cli.command_options import (
     Seed,
     Thetas,
 )
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_note
+from orchestrator.cli.console import FAILED, RefusalError, print_json, print_note
 
 if TYPE_CHECKING:
     from orchestrator.cli.command_results import CalibrateOutput
@@ -61,12 +61,10 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         from orchestrator.cli.motion_control import require_campaign_flag
         from orchestrator.cli.view_command import live_view
         from orchestrator.reports.run_summary import summary_json
-        from orchestrator.runs.run_service import RunTaskError
         from orchestrator.runs.run_tasks import TASKS
 
-        with Refused(RunTaskError):
-            resumed = functools.partial(run_directory, resume=True, run_id=run_id) if resume else None
-            request = TASKS[task](read_campaign(campaign, laboratory, seed, resumed))
+        resumed = functools.partial(run_directory, resume=True, run_id=run_id) if resume else None
+        request = TASKS[task](read_campaign(campaign, laboratory, seed, resumed))
         plan = request.campaign
         check_campaign_can_run(request)
         if answer is not None and not resume:
@@ -243,13 +241,10 @@ def planning_request(
         prediction: see `plan_task`.
 
     Raises:
-        RefusalError: it has nothing to plan with, or a file is wrong (exit code 2).
+        ConfigError, RunTaskError: a file is wrong, or it has nothing to plan with.
     """
     from orchestrator.campaigns.file_loading import load_vessel
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-    from orchestrator.runs.run_service import RunTaskError
     from orchestrator.runs.run_tasks import plan_task, read_theta
 
-    with Refused(ConfigError, RunTaskError):
-        given = None if parameters is None else read_theta(parameters, plan)
-        return plan_task(plan, given, None if receiver is None else load_vessel(receiver), iterations, **prediction)
+    given = None if parameters is None else read_theta(parameters, plan)
+    return plan_task(plan, given, None if receiver is None else load_vessel(receiver), iterations, **prediction)

@@ -12,9 +12,9 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.console import BAD_INPUT, FAILED, INTERRUPTED, RefusalError, fail, set_quiet
+from orchestrator.cli.console import INTERRUPTED, RefusalError, fail, set_quiet
 from orchestrator.cli.shell_completion import files_of, local_runs
-from sim_engine.errors import EngineError, WrongOutcomeError
+from sim_engine.errors import DecantError
 
 Campaign = Annotated[
     Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", autocompletion=files_of("campaign"))
@@ -133,17 +133,15 @@ def _in_home(value: Any) -> Any:
 
 
 def call(work: Callable[..., None], /, *args: Any, **kwargs: Any) -> None:
-    """Run a command; a refusal is printed and sets the exit code. `~` in paths is the home directory."""
+    """Run a command; the text of an error is printed, and its exit code is used. `~` in paths is the home directory."""
     try:
         if os.environ.get("DECANT_ENGINE"):
             from sim_engine.engine_package import engine_name
 
             engine_name()  # an unknown one is refused before anything starts
         work(*map(_in_home, args), **{name: _in_home(value) for name, value in kwargs.items()})
-    except RefusalError as refusal:
-        fail(refusal)
-    except EngineError as error:
-        fail(RefusalError(str(error), FAILED if isinstance(error, WrongOutcomeError) else BAD_INPUT))
+    except DecantError as error:
+        fail(error)
     except KeyboardInterrupt:
         fail(RefusalError("interrupted before anything had begun", INTERRUPTED))
 

@@ -38,6 +38,8 @@ _KEPT = (JOURNAL_NAME, LEDGER_NAME, EMPTY_POUR)
 class ArchiveError(RunError):
     """A file is no recording, or the archive cannot be read or written."""
 
+    exit_code = 2
+
 
 @dataclasses.dataclass(frozen=True)
 class ArchivedRecording:

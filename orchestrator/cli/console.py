@@ -20,6 +20,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
+from sim_engine.errors import DecantError
+
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
@@ -27,16 +29,18 @@ FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 """Exit codes in addition to 0 (success) and 3 (an operator must answer; `RunError.exit_code`)."""
 
 
-class RefusalError(Exception):
+class RefusalError(DecantError):
     """A command can't do its work; the message is printed without a traceback."""
 
-    def __init__(self, message: str, code: int = BAD_INPUT) -> None:
+    def __init__(self, message: str, exit_code: int = BAD_INPUT) -> None:
         super().__init__(message)
-        self.code = code
+        self.exit_code = exit_code
 
 
 class Refused:
     """Context manager that converts errors of given types to refusals with the same message.
+
+    `call` prints every DecantError with its own exit code; this is for other errors, other codes, and prefixes.
 
     Args:
         kinds: types of errors whose messages are written for users.
@@ -120,10 +124,10 @@ def stdout_for_results() -> Iterator[None]:
         os.close(kept)
 
 
-def fail(refusal: RefusalError) -> NoReturn:
-    """Print a refusal and exit with its code."""
-    print_message(f"decant: {refusal}" if refusal.code != BAD_INPUT else str(refusal))
-    raise SystemExit(refusal.code)
+def fail(error: DecantError) -> NoReturn:
+    """Print an error and exit with its code."""
+    print_message(f"decant: {error}" if error.exit_code != BAD_INPUT else str(error))
+    raise SystemExit(error.exit_code)
 
 
 PATIENCE = 2.0

@@ -84,7 +84,7 @@ def first_day(
         with Refused(OSError):
             folder.mkdir(parents=True, exist_ok=True)
     if practise:
-        with Refused(DecantError, OSError), waiting_for(lambda: "recording ten pours and five doses"):
+        with Refused(OSError), waiting_for(lambda: "recording ten pours and five doses"):
             practice_day(folder, seed, wrong)
     elif campaign is not None:
         _pour_day(folder, campaign, laboratory, enable_motion=enable_motion, in_process=in_process)
@@ -95,7 +95,7 @@ def first_day(
         with Refused(DecantError, at=f"{one.path.name}: "), waiting_for(lambda text=text: text):  # type: ignore[misc]
             theta = SimulationParameters(particles=max(particles, 200))
             replays.append(replay_recording(one, parameters=theta, particles=particles > 0).document())
-    with Refused(DecantError), waiting_for(lambda: "comparing explanations"):
+    with waiting_for(lambda: "comparing explanations"):
         found = diagnose(recordings, expected)
     words = summary_words(found, replays)
     print("\n".join(words))
@@ -116,14 +116,12 @@ def _day_of(folder: Path) -> list[PourRecording]:
     Raises:
         RefusalError: there are none, or one is invalid (exit code 2).
     """
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.reports.recording_file import load_recordings
 
     if not folder.is_dir() or not any(folder.glob("*.yaml")):
         text = f"{folder}: has no recorded pour; name a --campaign whose bench pours, or --practise"
         raise RefusalError(text)
-    with Refused(ConfigError):
-        found = load_recordings([folder])
+    found = load_recordings([folder])
     for one in found:
         for warning in one.warnings:
             print_warning(warning)
@@ -140,7 +138,6 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
     from orchestrator.cli.motion_control import require_flag
     from orchestrator.cli.simulate_command import scene_to_simulate
     from orchestrator.reports.first_day import first_day as steps_of
-    from sim_engine.errors import DecantError
 
     plan = read_campaign(path, laboratory)
     bench = plan.laboratory
@@ -156,8 +153,7 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
     if bench.mode != "hardware":
         print_message("a virtual bench weighs pours only at their end: this day is replayed, but not explained")
     require_flag(bench, enabled=enable_motion, again=f"{again} --enable-motion")
-    with Refused(DecantError):
-        steps = steps_of(scene_to_simulate(plan)[0].pourer, plan.deployment.scenes[0].liquid.density)
+    steps = steps_of(scene_to_simulate(plan)[0].pourer, plan.deployment.scenes[0].liquid.density)
     for number, step in enumerate(steps, start=1):
         if (folder / f"{step.name}.yaml").exists():
             continue

@@ -22,7 +22,6 @@ from orchestrator.cli.console import (
     FAILED,
     INTERRUPTED,
     RefusalError,
-    Refused,
     WaitingIndicator,
     is_quiet,
     print_message,
@@ -59,28 +58,26 @@ def read_campaign(
         resumed: finds the run that is resumed; its prior from earlier campaigns is kept.
 
     Raises:
-        RefusalError: with all problems of its files, exit code 2.
+        ConfigError: with all problems of its files.
     """
     from orchestrator.campaigns.file_loading import load_campaign
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.catalogue.catalogue import posterior_source
     from orchestrator.runs.run_folder import RESOLVED
 
-    with Refused(ConfigError):
-        plan = load_campaign(path, laboratory, seed, posteriors=posterior_source)
-        if resumed is None or plan.memory is None:
-            return plan
-        memory = load_campaign(resumed(plan) / RESOLVED).memory
-        return load_campaign(path, laboratory, seed, memory=memory)
+    plan = load_campaign(path, laboratory, seed, posteriors=posterior_source)
+    if resumed is None or plan.memory is None:
+        return plan
+    memory = load_campaign(resumed(plan) / RESOLVED).memory
+    return load_campaign(path, laboratory, seed, memory=memory)
 
 
 def check_campaign_can_run(request: RunRequest) -> None:
     """Vessels, loads and motions of a campaign, before anything starts; its warnings are shown.
 
     Raises:
-        RefusalError: with every problem, exit code 2.
+        RunTaskError: with every problem.
     """
-    from orchestrator.runs.run_service import RunService, RunTaskError
+    from orchestrator.runs.run_service import RunService
 
     memory = request.campaign.memory
     for line in () if memory is None else memory.lines:
@@ -89,24 +86,21 @@ def check_campaign_can_run(request: RunRequest) -> None:
         report = RunService().check(request, doing=doing)
     for text in report.warnings:
         print_warning(text)
-    with Refused(RunTaskError):
-        report.require()
+    report.require()
 
 
 def check_laboratory_answers(request: RunRequest, resources: RunResources) -> None:
     """The requirements of the laboratory, on this machine and on others, before anything starts.
 
     Raises:
-        RefusalError: something is missing; exit code 2.
+        LaboratoryError: something is missing.
     """
-    from actors.interfaces import LaboratoryError
     from orchestrator.runs.run_service import RunService
 
     laboratory = resources.settings(request.campaign)
     if laboratory.ray is not None and not laboratory.in_process:
         print_note(f"looking at the Ray cluster at {laboratory.ray.address} …")
-    with Refused(LaboratoryError):
-        RunService().check_laboratory(request, resources)
+    RunService().check_laboratory(request, resources)
 
 
 def check_output(path: Path | None, option: str, suffix: str) -> None:

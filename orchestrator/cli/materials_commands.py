@@ -160,7 +160,6 @@ def weigh(
 ) -> None:
     """Enter what a vessel holds, as weighed: it replaces the estimate."""
     from orchestrator.materials.vessel_account import VesselAccount
-    from sim_engine.errors import InvalidArgumentError
 
     kilograms, spread = _mass(mass, "MASS"), _mass(deviation, "--deviation")
     with _opened(url, state) as where:
@@ -169,8 +168,7 @@ def weigh(
             where.post(f"/materials/vessels/{vessel}/weighed", body)
         else:
             name = _of_campaign(vessel)
-            with Refused(InvalidArgumentError):
-                where.weigh(name, kilograms, spread, liquid=liquid, by=getpass.getuser(), note=note)
+            where.weigh(name, kilograms, spread, liquid=liquid, by=getpass.getuser(), note=note)
     print(f"{vessel}: {mass}")
 
 
@@ -211,13 +209,11 @@ def place(
 ) -> None:
     """Correct where a vessel stands, for example after an interrupted motion has left it UNKNOWN."""
     from orchestrator.materials.vessel_account import VesselAccount
-    from sim_engine.errors import InvalidArgumentError
 
     with _opened(url, state) as account:
         if not isinstance(account, VesselAccount):
             account.post(f"/materials/vessels/{vessel}/place", {"position": where})
         else:
             name = _of_campaign(vessel)
-            with Refused(InvalidArgumentError):
-                account.put(name, where or None, by=getpass.getuser(), note=note or "corrected")
+            account.put(name, where or None, by=getpass.getuser(), note=note or "corrected")
     print(f"{vessel}: {where or 'UNKNOWN'}")

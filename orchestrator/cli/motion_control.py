@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from actors.arm.arm_interface import NotAcceptedError
 from actors.interfaces import LaboratoryError
 from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message, print_note
-from orchestrator.runs.motion_approval import SafetyRecordError, required_checksum
+from orchestrator.runs.motion_approval import required_checksum
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, ArmFacts, Executed, PathReport, PlannedPour
@@ -91,8 +91,7 @@ def consent_to_motion(request: RunRequest, count: str = "", path: PathReport | N
     if laboratory.arm is None:
         confirm(laboratory, lines)
         return ""
-    with Refused(SafetyRecordError):
-        checksum = required_checksum(plan)
+    checksum = required_checksum(plan)
     if path is not None:
         confirm(laboratory, [*lines, *report_lines(path)])
         return checksum

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import Campaign, Json, OtherLaboratory, Parameters, Receiver, Seed
-from orchestrator.cli.console import RefusalError, Refused, print_json, print_message, print_note
+from orchestrator.cli.console import RefusalError, print_json, print_message, print_note
 from orchestrator.cli.shell_completion import files_of, queued_campaigns
 
 if TYPE_CHECKING:
@@ -59,8 +59,6 @@ def start(
     second signal at once.
     """
     from orchestrator.campaigns.yaml.file_access import resolved
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-    from orchestrator.learning.run_errors import RunError
 
     _require_extra()
     from orchestrator.daemon import server_process
@@ -77,10 +75,6 @@ def start(
         server_process.log_lines()
         text = f"state in {chosen.state}. 'decant queue submit CAMPAIGN' queues one"
         server_process.serve(chosen, lambda url: print_message(f"serving {url}; {text}"))
-    except ConfigError as error:
-        raise RefusalError(str(error)) from None
-    except RunError as error:
-        raise RefusalError(str(error), error.exit_code) from None
     except OSError as error:
         where = error.filename or "state directory"
         cure = "--state or $DECANT_STATE names another folder"
@@ -88,11 +82,10 @@ def start(
 
 
 def _require_extra() -> None:
-    from sim_engine.resources import MissingExtraError, require
+    from sim_engine.resources import require
 
     for module in ("fastapi", "uvicorn", "httpx", "prometheus_client", "pythonjsonlogger"):
-        with Refused(MissingExtraError):
-            require(module, "the daemon")
+        require(module, "the daemon")
 
 
 @contextmanager
@@ -100,13 +93,9 @@ def connected_client(url: str | None, state: Path | None) -> Iterator[Client]:
     """Open a client of the daemon; its refusals end the command."""
     _require_extra()
     from orchestrator.daemon.daemon_client import Client
-    from orchestrator.learning.run_errors import RunError
 
-    try:
-        with Client(url, state) as client:
-            yield client
-    except RunError as error:
-        raise RefusalError(str(error), error.exit_code) from None
+    with Client(url, state) as client:
+        yield client
 
 
 def submit(

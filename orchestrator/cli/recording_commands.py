@@ -85,7 +85,6 @@ def replay(
     if a file is invalid.
     """
     from orchestrator.campaigns.file_loading import load_parameters
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.reports.figure_style import save
     from orchestrator.reports.recording_figures import replay_figure
     from orchestrator.reports.recording_fit import read_values
@@ -94,8 +93,7 @@ def replay(
     from sim_engine.liquids import SimulationParameters
     from sim_engine.simulator import PourSimulator
 
-    with Refused(ConfigError):
-        theta = None if parameters is None else load_parameters(parameters)
+    theta = None if parameters is None else load_parameters(parameters)
     with Refused(ValueError, OSError, at="--fitted: "):
         given = ReplayValues() if values is None else read_values(values)
     loaded = _loaded(recordings)
@@ -148,7 +146,6 @@ def fit(
     the recordings of '--judge', and with '--until' the later readings of the fitted ones.
     """
     from orchestrator.reports.recording_fit import fit_recordings, judge_recording
-    from sim_engine.errors import DecantError
     from sim_engine.settings.quantity import QuantityError, parse_quantity
 
     with Refused(QuantityError, at="--until: "):
@@ -160,7 +157,7 @@ def fit(
     if both := sorted({one.path for one in loaded} & {one.path for one in others}):
         text = f"--judge: {both[0].name} is fitted, too; judge another, or fit its beginning with --until"
         raise RefusalError(text)
-    with Refused(DecantError), waiting_for(lambda: f"fitting {len(loaded)} recorded pours"):
+    with waiting_for(lambda: f"fitting {len(loaded)} recorded pours"):
         found = fit_recordings(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
         judgements = [judge_recording(found, one) for one in (*(loaded if seconds is not None else ()), *others)]
     print(fit_text(found, judgements))
@@ -176,11 +173,9 @@ def fit(
 
 def _loaded(paths: Sequence[Path]) -> list[PourRecording]:
     """Recorded pours; their warnings are printed."""
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.reports.recording_file import load_recordings
 
-    with Refused(ConfigError):
-        found = load_recordings(paths)
+    found = load_recordings(paths)
     for one in found:
         for warning in one.warnings:
             print_warning(warning)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_note, print_warning
+from orchestrator.cli.console import FAILED, RefusalError, print_json, print_note, print_warning
 from orchestrator.cli.shell_completion import RUNS, files_of, local_runs
 
 
@@ -74,14 +74,12 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
     from orchestrator.learning.run_errors import RunError
     from orchestrator.records.journal import JOURNAL_NAME
     from orchestrator.records.journal_check import check_journal
-    from orchestrator.records.journal_file import JournalFormatError
     from orchestrator.records.run_record import read_result
     from orchestrator.reports.html_report import REPORT_NAME
     from orchestrator.reports.publishing import publish_if_missing, report_on, write_reduced_report
     from orchestrator.runs.run_folder import RESOLVED, missing_plugins, read_versions
 
-    with Refused(JournalFormatError):
-        check = check_journal(folder / JOURNAL_NAME)
+    check = check_journal(folder / JOURNAL_NAME)
     for problem in check.problems:
         print_warning(problem)
     try:
@@ -111,10 +109,9 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
 
 def _of_study(what: Path) -> Path:
     from orchestrator.cli.study_command import read_study
-    from orchestrator.study.study_folder import StudyError, check_settings, file_of
+    from orchestrator.study.study_folder import check_settings, file_of
     from orchestrator.study.study_page import write_report
 
-    with Refused(StudyError):
-        plan = read_study(what if what.is_file() else file_of(what))
-        check_settings(plan)
-        return write_report(plan, plan.folder)
+    plan = read_study(what if what.is_file() else file_of(what))
+    check_settings(plan)
+    return write_report(plan, plan.folder)

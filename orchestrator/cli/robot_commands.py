@@ -84,12 +84,11 @@ def check(
     )
     try:
         record = None if virtual else read_record(laboratory)
-    except SafetyRecordError as error:
+    except SafetyRecordError:
         if not accept_safety:
-            raise RefusalError(str(error)) from None
+            raise
         record = None
-    with Refused(LaboratoryError):
-        check_bench_packages(spec)
+    check_bench_packages(spec)
 
     def read(look: ArmDiagnostics) -> SafetyRecord | None:
         found = _accept(laboratory, look) if accept_safety and not virtual else record
@@ -124,9 +123,9 @@ def archive(
     differently. Nothing is connected.
     """
     from orchestrator.cli.command_results import ArchiveOutput
-    from orchestrator.cli.commissioning_archive import ArchiveError, CommissioningArchive
+    from orchestrator.cli.commissioning_archive import CommissioningArchive
 
-    with Refused(ArchiveError, OSError):
+    with Refused(OSError):
         kept = CommissioningArchive(archive)
         if recordings:
             kept.add(recordings)
@@ -160,13 +159,11 @@ def read_laboratory(path: Path) -> LaboratorySettings:
     """Load a laboratory's file.
 
     Raises:
-        RefusalError: the file is invalid; lists all problems, exit code 2.
+        ConfigError: the file is invalid; lists all problems.
     """
     from orchestrator.campaigns.file_loading import load_laboratory
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
-    with Refused(ConfigError):
-        return load_laboratory(path)
+    return load_laboratory(path)
 
 
 def print_table(checks: Sequence[DeviceCheck]) -> None:
@@ -276,15 +273,14 @@ def teach(
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from actors.places import PlaceSettings
-    from orchestrator.campaigns.place_writing import PlaceWritingError, write_place
+    from orchestrator.campaigns.place_writing import write_place
     from orchestrator.cli.motion_control import connected
-    from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum
+    from orchestrator.runs.motion_approval import accepted_checksum
 
     spec = read_laboratory(laboratory)
     if spec.arm is None or (tool := getattr(spec.arm, "tool", None)) is None:
         raise without_arm(laboratory, spec, "'decant robot teach' reads the pose of an arm's tool")
-    with Refused(SafetyRecordError):
-        accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
+    accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
     with Refused(LaboratoryError, code=FAILED), reached(spec) as ready, connected(ready, accepted) as (driver, facts):
         pose = driver.where().tool
         arm = (ready.arm or spec.arm).fitted_to(facts)
@@ -295,7 +291,7 @@ def teach(
     problems = [text for number, text in arm_kind(arm).place_problems(places, {}) if number == len(places) - 1]
     if problems:
         raise RefusalError("nothing is written: " + "; ".join(problems))
-    with Refused(PlaceWritingError, OSError):
+    with Refused(OSError):
         write_place(laboratory, place)
     x, y, z = (1e3 * value for value in pose.as_list[:3])
     print_message(f"{laboratory}: place '{name}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm ({place.use})")
@@ -345,7 +341,7 @@ def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Itera
     from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from orchestrator.cli.motion_control import WARNING_TIME, confirm, connected, require_flag
-    from orchestrator.runs.motion_approval import SafetyRecordError, accepted_checksum
+    from orchestrator.runs.motion_approval import accepted_checksum
 
     spec = read_laboratory(laboratory)
     if spec.arm is None:
@@ -353,8 +349,7 @@ def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Itera
     require_flag(spec, enabled=enabled, again=f"decant robot {command} {laboratory} --enable-motion")
     if not sys.stdin.isatty():
         raise RefusalError(f"'decant robot {command}' asks for confirmation at a terminal, with nothing piped into it")
-    with Refused(SafetyRecordError):
-        accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
+    accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
     if spec.mode == "hardware":
         confirm(spec, [f"steps          {steps}"])
     else:

@@ -20,7 +20,7 @@ import typer
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message, print_note
+from orchestrator.cli.console import FAILED, RefusalError, print_json, print_message, print_note
 from orchestrator.cli.shell_completion import catalogued, catalogued_runs
 
 if TYPE_CHECKING:
@@ -439,11 +439,9 @@ def add(
 
 def _import_posteriors(paths: Sequence[Path]) -> None:
     from orchestrator.campaigns.file_loading import load_posterior_file
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.catalogue.known_posteriors import import_posterior
 
-    with Refused(ConfigError):
-        read = [load_posterior_file(path) for path in paths]
+    read = [load_posterior_file(path) for path in paths]
     with _refusing():
         for one in read:
             import_posterior(one)
@@ -572,18 +570,15 @@ def _date(seconds: float | None) -> str:
 @contextlib.contextmanager
 def _client(daemon: bool = False) -> Iterator[CatalogueClient]:
     """Open a client of this machine's catalogue or of the daemon's."""
-    try:
-        if daemon:
-            from orchestrator.cli.queue_commands import connected_client
-            from orchestrator.daemon.daemon_client import RemoteCatalogueClient
+    if daemon:
+        from orchestrator.cli.queue_commands import connected_client
+        from orchestrator.daemon.daemon_client import RemoteCatalogueClient
 
-            with connected_client(None, None) as client, _refusing():
-                yield RemoteCatalogueClient(client)
-        else:
-            with _catalogue() as catalogue, _refusing():
-                yield catalogue
-    except ValueError as error:  # an invalid date
-        raise RefusalError(str(error)) from None
+        with connected_client(None, None) as client, _refusing():
+            yield RemoteCatalogueClient(client)
+    else:
+        with _catalogue() as catalogue, _refusing():
+            yield catalogue
 
 
 @contextlib.contextmanager

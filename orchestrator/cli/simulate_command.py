@@ -112,15 +112,13 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     from orchestrator.campaigns.action_assignments import assigned_action
     from orchestrator.campaigns.campaign_checks import check_vessels
     from orchestrator.campaigns.file_loading import load_vessel
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.cli.foreground_run import check_output, read_campaign
     from sim_engine.prediction_band import band_of, spreads
     from sim_engine.simulator import InvalidSceneError, PourSimulator
 
     plan = read_campaign(path)
     known = prediction_inputs(plan, options.parameters, options.thetas, options.seeds)
-    with Refused(ConfigError):
-        vessel = None if options.receiver is None else load_vessel(options.receiver)
+    vessel = None if options.receiver is None else load_vessel(options.receiver)
     scene, space = scene_to_simulate(plan, options.scene)
     if vessel is not None:
         scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
@@ -350,7 +348,6 @@ def _scene(plan: CampaignPlan, options: SimulateOptions, source: Path) -> tuple[
         The scene, and the records that define how such a file is read, if the campaign has any.
     """
     from orchestrator.campaigns.file_loading import load_vessel
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
     calibration = plan.calibration
     sets = {} if calibration is None else {"calibration": calibration.records, "transfer": calibration.transfer}
@@ -360,8 +357,7 @@ def _scene(plan: CampaignPlan, options: SimulateOptions, source: Path) -> tuple[
         name = own[0] if own else ("calibration" if calibration is not None else None)
     scene, _ = scene_to_simulate(plan, name)
     if options.receiver is not None:
-        with Refused(ConfigError):
-            vessel = load_vessel(options.receiver)
+        vessel = load_vessel(options.receiver)
         scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
     records = sets.get(name or "") or sets.get("calibration")
     return scene, records
@@ -551,7 +547,7 @@ def prediction_inputs(plan: CampaignPlan, parameters: Path | None, thetas: int |
         seeds: simulations of a pour.
 
     Raises:
-        RefusalError: the file is invalid, or it lacks the requested posterior (exit code 2).
+        ConfigError, RefusalError: the file is invalid, or it lacks the requested posterior.
     """
     from orchestrator.campaigns.file_loading import (
         load_discrepancy,
@@ -559,15 +555,13 @@ def prediction_inputs(plan: CampaignPlan, parameters: Path | None, thetas: int |
         load_posterior,
         predicts_with_posterior,
     )
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 
     if parameters is None:
         if thetas:
             raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration")
         return PredictionInputs(plan.parameters)
-    with Refused(ConfigError):
-        theta = load_parameters(parameters, plan.parameters)
-        if thetas is None:
-            thetas = seeds if predicts_with_posterior(parameters) else 0
-        drawn = load_posterior(parameters, thetas, plan.parameters) if thetas else ()
-        return PredictionInputs(theta, drawn, load_discrepancy(parameters))
+    theta = load_parameters(parameters, plan.parameters)
+    if thetas is None:
+        thetas = seeds if predicts_with_posterior(parameters) else 0
+    drawn = load_posterior(parameters, thetas, plan.parameters) if thetas else ()
+    return PredictionInputs(theta, drawn, load_discrepancy(parameters))

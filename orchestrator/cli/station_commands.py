@@ -152,10 +152,9 @@ def serve_sila(
     motion of hardware is enabled with 'decant queue enable' only.
     """
     from orchestrator.learning.run_errors import RunError
-    from sim_engine.resources import MissingExtraError, require
+    from sim_engine.resources import require
 
-    with Refused(MissingExtraError):
-        require("unitelabs", "the SiLA 2 server")
+    require("unitelabs", "the SiLA 2 server")
     from orchestrator.daemon import sila_server
 
     with connected_client(url, state) as client:

@@ -44,21 +44,20 @@ def run_study(
     Figures (PNG, SVG, CSV), tables and a page are written to runs/study-NAME/report/. Run the same command again to
     continue a study that was stopped or killed, also on a cluster (--ray) or without it.
     """
-    from orchestrator.study.study_folder import StudyError, check_settings, opened
+    from orchestrator.study.study_folder import check_settings, opened
     from orchestrator.study.study_plan import cells_of
 
     plan = read_study(file)
     cluster = None if ray is None or dry_run else _checked_cluster(ray)
     cells = cells_of(plan)
-    with Refused(StudyError):
-        if dry_run:
-            check_settings(plan)
-            _print_remaining(plan, cells, as_json)
-            return
-        with opened(plan) as folder:
-            with _workers(plan, folder, jobs, cluster) as workers:
-                status = _run(plan, folder, workers, file)
-            page = _report(plan, folder)
+    if dry_run:
+        check_settings(plan)
+        _print_remaining(plan, cells, as_json)
+        return
+    with opened(plan) as folder:
+        with _workers(plan, folder, jobs, cluster) as workers:
+            status = _run(plan, folder, workers, file)
+        page = _report(plan, folder)
     if as_json:
         _print_result(plan, folder, page, len(cells), len(status.finished))
     if status.failed:
@@ -94,21 +93,20 @@ def _workers(plan: StudyPlan, folder: Path, jobs: int | None, cluster: RaySettin
     if cluster is None:
         yield LocalCells(plan, folder, jobs or os.cpu_count() or 1)
         return
-    from actors.interfaces import LaboratoryError
     from actors.runtime.ray_tasks import ClusterTasks
     from orchestrator.study.cluster_cells import ClusterCells
 
-    with Refused(LaboratoryError), ClusterTasks(cluster) as tasks:
+    with ClusterTasks(cluster) as tasks:
         yield ClusterCells(plan, folder, tasks, jobs)
 
 
 def report_study(file: StudyPath, as_json: Json = False) -> None:
     """Write figures, tables and the page of a study from the results that there are."""
-    from orchestrator.study.study_folder import StudyError, opened
+    from orchestrator.study.study_folder import opened
     from orchestrator.study.study_plan import cells_of
 
     plan = read_study(file)
-    with Refused(StudyError), opened(plan) as folder:
+    with opened(plan) as folder:
         page = _report(plan, folder)
     if as_json:
         _print_result(plan, folder, page, len(cells_of(plan)), None)
@@ -124,17 +122,15 @@ def read_study(path: Path) -> StudyPlan:
     """Load a study, build its vessels and check its actions.
 
     Raises:
-        RefusalError: the files are invalid; lists all problems, exit code 2.
+        ConfigError, RunTaskError: the files are invalid; lists all problems.
     """
     from dataclasses import replace
 
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.cli.foreground_run import check_campaign_can_run
     from orchestrator.runs.run_service import RunRequest
     from orchestrator.study.study_file import load_study
 
-    with Refused(ConfigError):
-        plan = load_study(path)
+    plan = load_study(path)
     deployment = None
     if plan.deployments:  # the cells use draws of θ from the calibration cells
         deployment = replace(plan.deployments[0].plan, thetas=(plan.base.parameters,))

@@ -256,7 +256,6 @@ def mesh(
 def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
     """Make a vessel, and print what was made. Nothing is written over."""
     from sim_engine.settings.quantity import QuantityError
-    from sim_engine.vessel.shapes import VesselError
 
     if out.suffix not in (".yaml", ".yml"):
         raise RefusalError(f"{out}: a vessel file is YAML; write {out.with_suffix('.yaml')}")
@@ -267,7 +266,7 @@ def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
     try:
         with waiting_for(lambda: "measuring the vessel"):
             found = work([])
-    except (VesselError, QuantityError) as error:
+    except QuantityError as error:
         raise RefusalError(str(error)) from None
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}") from None

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.campaigns.table_columns import KnownColumn, columns_of
-from orchestrator.cli.console import RefusalError, Refused, print_note
+from orchestrator.cli.console import RefusalError, print_note
 from sim_engine.settings.quantity import QuantityError, parse_quantity
 
 if TYPE_CHECKING:
@@ -155,11 +155,10 @@ def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, floa
 
     wanted = (COLUMNS[column], COLUMNS["mass_g"])
     problems: list[Problem] = []
-    with Refused(ConfigError):
-        table = read_saved_table(path, limit=LARGEST_TABLE)
-        columns = columns_of(table, wanted, {}, problems)
-        if problems:
-            raise ConfigError(problems)
+    table = read_saved_table(path, limit=LARGEST_TABLE)
+    columns = columns_of(table, wanted, {}, problems)
+    if problems:
+        raise ConfigError(problems)
     names = [one.standard for one in columns if one is not None]
     missing = [one.standard for one in wanted if one.standard not in names]
     if missing:
@@ -211,8 +210,8 @@ def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str])
     _check_size(path)
     try:
         points = _loaded(path)
-    except VesselError as error:
-        raise RefusalError(str(error)) from None
+    except VesselError:
+        raise
     except Exception as error:  # readers raise arbitrary errors for damaged files
         raise RefusalError(f"{path}: can't be read as points ({error})") from None
     if points.ndim != 2 or points.shape[1] < 3:
@@ -228,8 +227,7 @@ def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str])
         )
     points = points[measured]
     extent = float(np.ptp(points, axis=0).max())
-    with Refused(VesselError):
-        scale = UNITS[likely_unit(extent, path)] if unit is None else scale_of(extent, MeshShape(path=path, unit=unit))
+    scale = UNITS[likely_unit(extent, path)] if unit is None else scale_of(extent, MeshShape(path=path, unit=unit))
     result: Floats = points @ to_z(up).T * scale
     return result
 

@@ -102,18 +102,12 @@ def _serve(shown: Path, at: str | None) -> None:
 
 def _again(what: Path, number: int, particles: int | None, stage: str | None, path: Path) -> Path:
     from orchestrator.cli.console import waiting_for
-    from orchestrator.learning.run_errors import RunError
-    from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, simulation_rrd, task_of
+    from orchestrator.live_view.simulation_view import find_pour, simulation_rrd, task_of
     from sim_engine.simulator import PourSimulator
 
     run = _run_of(what)
     plan = _plan_of(run)
-    try:
-        pour = find_pour(run, number, stage)
-    except NoSuchPourError as error:
-        raise RefusalError(str(error)) from None
-    except RunError as error:
-        raise RefusalError(str(error), FAILED) from None
+    pour = find_pour(run, number, stage)
     task = task_of(plan, run, pour, particles)
     simulator, begin = PourSimulator(), time.monotonic()
     with contextlib.closing(simulator), waiting_for(lambda: f"simulating, {time.monotonic() - begin:.0f} s so far"):

@@ -6,11 +6,7 @@ from sim_engine.errors import DecantError
 
 
 class RunError(DecantError):
-    """A run can't begin or continue. The text is for the user who can fix the cause.
-
-    Attributes:
-        exit_code: of the command line: 1 failed, 2 bad input, 3 an answer of the operator is needed.
-    """
+    """A run can't begin or continue. The text is for the user who can fix the cause."""
 
     exit_code = 1
 

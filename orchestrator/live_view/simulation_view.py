@@ -23,6 +23,7 @@ from orchestrator.records.run_clock import run_time
 from orchestrator.records.run_record import RunPour, read_record
 from orchestrator.reports import figure_style as style
 from orchestrator.runs.stages import scenes_of
+from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, SampledMotion, Scene
@@ -156,7 +157,7 @@ DETAIL = 30.0
 """Frames per simulated second [1/s]."""
 
 
-class NoSuchPourError(ValueError):
+class NoSuchPourError(InvalidArgumentError):
     """The journal has no such pour; the message lists the pours it has."""
 
 

@@ -35,6 +35,8 @@ SOURCE = "study-file.txt"
 class StudyError(RunError):
     """The study can't begin or continue; the text gives the reason."""
 
+    exit_code = 2
+
 
 def run_folder(folder: Path, cell: str) -> Path:
     """Folder of a cell's run."""

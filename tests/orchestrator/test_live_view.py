@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.cli.console import RefusalError
 from orchestrator.cli.view_command import live_view, parsed
 from orchestrator.live_view.blueprints import put_beside
 from orchestrator.live_view.live_server import LiveError, LiveView, answers
@@ -20,6 +19,7 @@ from orchestrator.live_view.recording_sink import SENDING
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.live_view.viewer_server import run_rerun
 from orchestrator.records.events import LogLine
+from sim_engine.errors import DecantError
 from tests.support import example_run
 from tests.support.rerun_recordings import Contents, seen, tabs_as_they_came, viewer
 from tests.support.waiting import PATIENCE
@@ -121,7 +121,7 @@ def test_taken_port_is_refused_where_it_was_asked_for_and_passed_over_otherwise(
         port = taken.getsockname()[1]
         with pytest.raises(LiveError, match=f"port {port} of 127.0.0.1 is taken"):
             LiveView(web_port=port).open()
-        with pytest.raises(RefusalError, match=f"port {port} is taken"):
+        with pytest.raises(DecantError, match=f"port {port} is taken"):
             live_view(example_run.campaign(), live=False, at=f"127.0.0.1:{port}")
     with LiveView() as one, LiveView() as other:
         assert not {*one._ports} & {*other._ports}
@@ -131,7 +131,7 @@ def test_address_that_is_not_one_is_refused_with_what_would_be_right() -> None:
     assert parsed("0.0.0.0") == ("0.0.0.0", None)
     assert parsed("[::1]:9000") == ("::1", 9000)
     for wrong in ("9090:", "a b", "127.0.0.1:99999"):
-        with pytest.raises(RefusalError, match="write ADDRESS or ADDRESS:PORT"):
+        with pytest.raises(DecantError, match="write ADDRESS or ADDRESS:PORT"):
             parsed(wrong)
 
 

@@ -20,10 +20,10 @@ from typer.testing import CliRunner
 
 from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.app import app
-from orchestrator.cli.console import RefusalError
 from orchestrator.cli.file_commands import validate
 from orchestrator.cli.vessel_tables import read_points
 from orchestrator.reports.pour_figures import section
+from sim_engine.errors import DecantError
 from sim_engine.vessel.exact_cavity import exact_cavity
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import VesselError, VesselSpec
@@ -274,9 +274,9 @@ def test_a_body_in_the_cavity_of_a_mesh_in_a_vessel_file_is_a_warning(
 def test_a_surface_without_thickness_in_the_cavity_of_a_mesh_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(RefusalError) as refused:
+    with pytest.raises(DecantError) as refused:
         validate([vessel_file(tmp_path, "surface")])
-    assert refused.value.code == 2
+    assert refused.value.exit_code == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "bound no solid: a sheet without thickness" in said
     assert "decant vessel mesh cup.stl NEW.yaml" in said
@@ -372,14 +372,14 @@ def test_pcd_is_read_in_every_encoding_and_missing_points_are_left_out(
 )
 def test_a_damaged_pcd_file_is_one_clear_error(tmp_path: Path, content: bytes, said: str) -> None:
     (tmp_path / "cloud.pcd").write_bytes(content)
-    with pytest.raises(RefusalError, match=said) as refused:
+    with pytest.raises(DecantError, match=said) as refused:
         read_points(tmp_path / "cloud.pcd", "mm", "z", [])
-    assert refused.value.code == 2
+    assert refused.value.exit_code == 2
 
 
 def test_points_in_metres_that_are_called_millimetres_are_refused_with_the_likely_unit(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "cloud.xyz", 1e-3 * POINTS)
-    with pytest.raises(RefusalError, match=r"largest extent of 0\.087 mm is not a vessel's size.*'m' \(87 mm\)"):
+    with pytest.raises(DecantError, match=r"largest extent of 0\.087 mm is not a vessel's size.*'m' \(87 mm\)"):
         read_points(tmp_path / "cloud.xyz", "mm", "z", [])
 
 

@@ -12,8 +12,8 @@ import trimesh
 from PIL import ExifTags, Image
 
 from orchestrator.campaigns.file_loading import load_vessel
-from orchestrator.cli.console import RefusalError
 from orchestrator.cli.vessel_tables import read_fill_table, read_photograph
+from sim_engine.errors import DecantError
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
 from tests.support.measured_vessel import FOCAL, MeasuredVessel, vessel
@@ -190,7 +190,7 @@ def test_a_sheet_is_thickened_and_holes_are_closed(tmp_path: Path) -> None:
     keep[len(keep) // 2 : len(keep) // 2 + 3] = False
     sheet.update_faces(keep)
     sheet.export(tmp_path / "sheet.stl")
-    with pytest.raises(RefusalError, match=r"a sheet without thickness.*--wall 3mm"):
+    with pytest.raises(DecantError, match=r"a sheet without thickness.*--wall 3mm"):
         made(tmp_path, {"mesh": tmp_path / "sheet.stl"})
     capacity = made(tmp_path, {"mesh": tmp_path / "sheet.stl", "wall": "3 mm"})
     assert capacity == pytest.approx(of.vessel.capacity, rel=0.02)
@@ -282,16 +282,16 @@ def written(text: str) -> Door:
     ],
 )
 def test_what_makes_no_vessel_is_refused_and_nothing_is_written(tmp_path: Path, door: Door, said: str) -> None:
-    with pytest.raises(RefusalError, match=said) as refused:
+    with pytest.raises(DecantError, match=said) as refused:
         vessel(tmp_path / "cup.yaml", **door(measured("tumbler"), tmp_path))
-    assert refused.value.code == 2
+    assert refused.value.exit_code == 2
     assert not (tmp_path / "cup.yaml").exists()
     assert not (tmp_path / "cup.stl").exists()
 
 
 def test_no_file_is_written_over(tmp_path: Path) -> None:
     (tmp_path / "cup.yaml").write_text("name: cup\n")
-    with pytest.raises(RefusalError, match="exists already"):
+    with pytest.raises(DecantError, match="exists already"):
         vessel(tmp_path / "cup.yaml")
 
 

@@ -16,7 +16,6 @@ from actors.arm.arm_settings import arm_kind
 from actors.arm.ur_settings import UrArmSettings
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.file_loading import load_laboratory
-from orchestrator.cli.console import RefusalError
 from orchestrator.cli.view_command import _recording_of, view
 from orchestrator.learning.requests import Pour, Poured
 from orchestrator.live_view.blueprints import put_beside
@@ -24,6 +23,7 @@ from orchestrator.live_view.run_recording import CampaignRecording
 from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, task_of
 from orchestrator.records.events import Requested, RequestFinished
 from orchestrator.records.journal import JOURNAL_NAME, Header, Journal
+from sim_engine.errors import DecantError
 from sim_engine.outcome import PourMeasurement
 from tests.support import example_run
 from tests.support.rerun_recordings import Contents, seen, viewer
@@ -120,9 +120,9 @@ def test_what_is_not_there_is_refused_with_what_is(recording: Path, tmp_path: Pa
     _journal(tmp_path)
     with pytest.raises(NoSuchPourError, match="no weighed pour 7; weighed were pours: 1; deployment:narrow cup: 1"):
         find_pour(tmp_path, 7)
-    with pytest.raises(RefusalError, match="has no recording"):
+    with pytest.raises(DecantError, match="has no recording"):
         _recording_of(tmp_path)
-    with pytest.raises(RefusalError, match="is not the folder of a run"):
+    with pytest.raises(DecantError, match="is not the folder of a run"):
         _recording_of(tmp_path / "nowhere")
-    with pytest.raises(RefusalError, match="--particles and --stage go with --pour"):
+    with pytest.raises(DecantError, match="--particles and --stage go with --pour"):
         view([recording], particles=500)

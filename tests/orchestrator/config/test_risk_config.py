@@ -15,10 +15,10 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli import campaign_commands as campaigns
-from orchestrator.cli.console import RefusalError
 from orchestrator.cli.json_schema import campaign_schema
 from orchestrator.learning.deployment.d1 import D1Settings
 from sim_engine.action import DEG
+from sim_engine.errors import DecantError
 from sim_engine.scene import PoseError
 from tests.support import plans
 
@@ -107,22 +107,22 @@ def test_a_posterior_that_nobody_makes_is_refused_before_anything_starts(tmp_pat
     del content["calibration"]
     content["simulator"] = {"parameters": {"particles": 500}}
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    with pytest.raises(RefusalError, match="this campaign has no calibration") as refused:
+    with pytest.raises(DecantError, match="this campaign has no calibration") as refused:
         campaigns.run(path, in_process=True)
-    assert refused.value.code == 2
+    assert refused.value.exit_code == 2
     assert not (tmp_path / "runs").exists()
 
 
 def test_planning_takes_the_posterior_from_parameters_and_nowhere_else(tmp_path: Path) -> None:
     plan = load_campaign(written(tmp_path, {"risk": RISK}))
-    with pytest.raises(RefusalError, match="needs --parameters") as refused:
+    with pytest.raises(DecantError, match="needs --parameters") as refused:
         campaigns.planning_request(plan, None, None, None)
-    assert refused.value.code == 2
+    assert refused.value.exit_code == 2
     theta = tmp_path / "theta.json"
     theta.write_text('{"theta": {"cohesion": 0.02}}', encoding="utf-8")
-    with pytest.raises(RefusalError, match="has no 'posterior'") as refused:
+    with pytest.raises(DecantError, match="has no 'posterior'") as refused:
         campaigns.planning_request(plan, theta, None, None)
-    assert refused.value.code == 2
+    assert refused.value.exit_code == 2
     rows = [{"theta": {"cohesion": 0.01}, "weight": 3.0}, {"theta": {"cohesion": 0.05}, "weight": 1.0}]
     theta.write_text(json.dumps({"theta": {"cohesion": 0.02}, "posterior": rows}), encoding="utf-8")
     planning = campaigns.planning_request(plan, theta, None, None).campaign

@@ -156,15 +156,15 @@ def test_a_campaign_begins_with_what_is_not_simulated_in_it_each_kind_once(verb:
 
 
 def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from orchestrator.cli.console import RefusalError
     from orchestrator.cli.foreground_run import run_in_front_of_people
     from orchestrator.runs.run_service import RunResources
     from orchestrator.runs.run_tasks import run_task
+    from sim_engine.errors import DecantError
 
     request = replace(run_task(load_campaign(folder / "small.yaml")), folder=folder)
     resumed = replace(request, resume="yes")
     for each, times in ((request, 1), (resumed, 0)):
-        with pytest.raises(RefusalError, match="No space left"):
+        with pytest.raises(DecantError, match="No space left"):
             run_in_front_of_people(each, RunResources(), again="")
         assert capsys.readouterr().err.count("not simulated (docs") == times
 
