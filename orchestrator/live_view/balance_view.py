@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from actors.interfaces import DoseProgress, PourProgress
@@ -62,9 +63,7 @@ class BalanceStage:
     """
 
     def __init__(self, sink: RecordingSink, time_scale: float) -> None:
-        import rerun as rr
-
-        self._rr, self._sink, self._scale = rr, sink, time_scale
+        self._sink, self._scale = sink, time_scale
         self._simulated: dict[str, list[tuple[Action, PourOutcome]]] = {}
         self._running: _Running | None = None
         self._checkpoint = self._phase = ""
@@ -202,7 +201,7 @@ class BalanceStage:
         self._sink.clear(f"{PLACE}/pour", recursive=True)
 
     def _curve(self, name: str, times: FloatArray, values: FloatArray) -> Track:
-        return Track(f"{PLACE}/{name}", times, columns_of(self._rr.Scalars.columns(scalars=values)))
+        return Track(f"{PLACE}/{name}", times, columns_of(rr.Scalars.columns(scalars=values)))
 
     def _predicted(self, pour: Pour, scene: Scene) -> tuple[FloatArray, FloatArray | None]:
         known = self._simulated.get(pour.scene, [])

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
 
 from orchestrator.reports.figure_style import safe_name
-
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
 
 Moment = Literal["calibrating", "deploying", "replaying"]
 
@@ -25,8 +26,6 @@ LEGEND = 0.5
 
 def simulation_blueprint() -> rrb.Blueprint:
     """Return the layout of one simulated pour: the scene above the fractions of the liquid."""
-    import rerun.blueprint as rrb
-
     return _blueprint(rrb.Vertical(_simulation(), _shares(), row_shares=[3, 1]), "replaying")
 
 
@@ -49,8 +48,6 @@ def campaign_blueprint(
         action_slices: whether actions have more axes.
         doses: the campaign pours wanted amounts and does nothing else.
     """
-    import rerun.blueprint as rrb
-
     if doses:
         dosing = rrb.Horizontal(
             _cell(),
@@ -128,8 +125,6 @@ def beside_blueprint(names: Sequence[str]) -> rrb.Blueprint:
     Args:
         names: first parts of the entities' paths.
     """
-    import rerun.blueprint as rrb
-
     columns = [
         rrb.Vertical(
             _cell(f"/{name}", f"{name}: the cell"),
@@ -144,8 +139,6 @@ def beside_blueprint(names: Sequence[str]) -> rrb.Blueprint:
 
 
 def _blueprint(root: Any, moment: Moment) -> rrb.Blueprint:
-    import rerun.blueprint as rrb
-
     # After a campaign, the wall clock has minutes of computation between short pours. Playback
     # therefore uses the timeline of simulated time, in a loop.
     time = (
@@ -159,8 +152,6 @@ def _blueprint(root: Any, moment: Moment) -> rrb.Blueprint:
 
 
 def _cell(under: str = "", name: str = "The cell: planned (orange), done (blue)") -> Any:
-    import rerun.blueprint as rrb
-
     eye = rrb.EyeControls3D(position=(0.45, -0.95, 0.62), look_target=(0.12, 0.15, 0.22), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
         origin=f"{under}/cell",
@@ -172,8 +163,6 @@ def _cell(under: str = "", name: str = "The cell: planned (orange), done (blue)"
 
 
 def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its liquid") -> Any:
-    import rerun.blueprint as rrb
-
     # From the side, slightly above: as in the figure of docs/reference/frames.md.
     eye = rrb.EyeControls3D(position=(-0.05, -0.42, 0.22), look_target=(-0.04, 0.0, 0.08), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
@@ -188,9 +177,6 @@ def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its
 
 def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/**", **more: Any) -> Any:
     """Return a view of curves over the last seconds; the space to the right of the cursor holds the legend."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     at = rr.TimeRangeBoundary.cursor_relative
     shown = [
         rrb.VisibleTimeRange(line, start=at(seconds=-before), end=at(seconds=0.0)) for line in ("wall", "sim_time")
@@ -208,9 +194,6 @@ def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/*
 
 def _whole(origin: str, name: str, *, contents: Any = "$origin/**") -> Any:
     """Return a view of curves over the whole campaign; the viewer's default is half a minute around the cursor."""
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     ever = rr.TimeRangeBoundary.infinite
     return rrb.TimeSeriesView(
         origin=origin,
@@ -222,8 +205,6 @@ def _whole(origin: str, name: str, *, contents: Any = "$origin/**") -> Any:
 
 
 def _shares() -> Any:
-    import rerun.blueprint as rrb
-
     axis = rrb.ScalarAxis(range=(-3.0, 104.0))
     return _recent("/simulation/share", "Simulated: where the liquid is [%]", 12.0, axis_y=axis)
 
@@ -264,14 +245,10 @@ def _loss(place: str, name: str) -> Any:
 
 
 def _picture(entity: str, name: str) -> Any:
-    import rerun.blueprint as rrb
-
     return rrb.Spatial2DView(origin=entity, name=name)
 
 
 def _activity() -> Any:
-    import rerun.blueprint as rrb
-
     return rrb.Tabs(rrb.StateTimelineView(origin="/machine/activity", name="Activity"), _machine())
 
 
@@ -281,21 +258,15 @@ def _machine() -> Any:
 
 
 def _status(under: str = "") -> Any:
-    import rerun.blueprint as rrb
-
     return rrb.TextDocumentView(origin=f"{under}/status", name="Status")
 
 
 def _outcome(under: str = "") -> Any:
     """Return a view of the run's outcome, which does not depend on the time cursor, unlike `_status`."""
-    import rerun.blueprint as rrb
-
     return rrb.TextDocumentView(origin=f"{under}/outcome", name="How it ended")
 
 
 def _log() -> Any:
-    import rerun.blueprint as rrb
-
     # An empty list would show the active timeline as a narrow column of truncated numbers.
     hidden = [rrb.encodings.TimelineColumn(timeline, visible=False) for timeline in ("wall", "sim_time", "step")]
     columns = rrb.TextLogColumns(text_log_columns=[rrb.encodings.TextLogColumn("Body")], timeline_columns=hidden)
@@ -315,9 +286,6 @@ def put_beside(recordings: Mapping[str, Path], path: Path) -> Path:
     Raises:
         OSError: a file can't be read or written.
     """
-    import rerun as rr
-    from rerun.chunk import RrdReader
-
     path.open("wb").close()
     stream = rr.RecordingStream("decant beside")
     stream.set_sinks(rr.FileSink(str(path)))

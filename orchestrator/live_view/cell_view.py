@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from actors.arm.arm_interface import ArmFigure
@@ -52,9 +53,7 @@ class CellScene:
     """
 
     def __init__(self, sink: RecordingSink, films: PlaybackQueue, plan: CampaignPlan) -> None:
-        import rerun as rr
-
-        self._rr, self._sink, self._films = rr, sink, films
+        self._sink, self._films = sink, films
         laboratory = plan.laboratory
         self._figure: ArmFigure | None = None if laboratory.arm is None else arm_kind(laboratory.arm).figure()
         scales = [one.time_scale for one in (laboratory.bench, laboratory.arm) if one is not None]
@@ -69,7 +68,6 @@ class CellScene:
         self._furnish()
 
     def _furnish(self) -> None:
-        rr = self._rr
         table = -_TRAY if self._figure is None else min(self._figure.table, -_TRAY)
         self._sink.log(
             f"{PLACE}/tray",
@@ -250,7 +248,7 @@ class CellScene:
         return poses[:, :3] if self._figure is None else self._figure.tool_of(poses)
 
     def _line(self, points: FloatArray, colour: str, radius: float) -> Any:
-        return self._rr.LineStrips3D([np.asarray(points, np.float32)], colors=[shapes.rgb(colour)], radii=[radius])
+        return rr.LineStrips3D([np.asarray(points, np.float32)], colors=[shapes.rgb(colour)], radii=[radius])
 
 
 def planned_poses(scene: Scene, pour: Pour) -> FloatArray | None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from actors.optimizer.questions import (
@@ -78,9 +79,7 @@ class LearningStage:
     """
 
     def __init__(self, sink: RecordingSink, plan: CampaignPlan) -> None:
-        import rerun as rr
-
-        self._rr, self._sink, self._plan = rr, sink, plan
+        self._sink, self._plan = sink, plan
         self._names = receiver_names(plan)
         self._styled: set[str] = set()
         self._scene_of_stage: dict[str, str] = {}
@@ -105,7 +104,7 @@ class LearningStage:
 
     def _coming(self, place: str, text: str) -> None:
         picture = png(words(text))
-        self._sink.log(f"{PLACE}/{place}", self._rr.EncodedImage(contents=picture, media_type="image/png"))
+        self._sink.log(f"{PLACE}/{place}", rr.EncodedImage(contents=picture, media_type="image/png"))
 
     def about(self, stage: str, scene: str) -> None:
         """Associate a stage with a scene."""
@@ -195,7 +194,7 @@ class LearningStage:
     def _draw(self, entity: str, now: float, draw: Callable[[], bytes]) -> None:
         self._waiting.pop(entity, None)
         self._drawn[entity] = now
-        self._sink.log(entity, self._rr.EncodedImage(contents=draw(), media_type="image/png"))
+        self._sink.log(entity, rr.EncodedImage(contents=draw(), media_type="image/png"))
 
     def _number(
         self, entity: str, value: float, name: str, colour: str, *, marker: float = 0.0, width: float = 3.0
@@ -203,9 +202,9 @@ class LearningStage:
         if entity not in self._styled:
             self._styled.add(entity)
             appearance = (
-                self._rr.SeriesPoints(names=name, colors=shapes.rgb(colour), marker_sizes=marker)
+                rr.SeriesPoints(names=name, colors=shapes.rgb(colour), marker_sizes=marker)
                 if marker
-                else self._rr.SeriesLines(names=name, colors=shapes.rgb(colour), widths=width)
+                else rr.SeriesLines(names=name, colors=shapes.rgb(colour), widths=width)
             )
             self._sink.log(entity, appearance, static=True)
         self._sink.number(entity, float(value))

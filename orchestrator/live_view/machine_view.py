@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import re
 
+import rerun as rr
+
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
@@ -46,9 +48,7 @@ class MachineView:
     """
 
     def __init__(self, sink: RecordingSink) -> None:
-        import rerun as rr
-
-        self._rr, self._sink = rr, sink
+        self._sink = sink
         self._simulators = 1
         self._slots: dict[int, int] = {}
         self._styled: set[str] = set()
@@ -110,9 +110,9 @@ class MachineView:
             self._styled.add(entity)
             known = list(_PURPOSES)
             colours = [shapes.rgb(_PURPOSES[each]) for each in known]
-            appearance = self._rr.StateConfiguration(values=known, labels=known, colors=colours)
+            appearance = rr.StateConfiguration(values=known, labels=known, colors=colours)
             self._sink.log(entity, appearance, static=True)
-        self._sink.log(entity, self._rr.StateChange(state=doing or IDLE))
+        self._sink.log(entity, rr.StateChange(state=doing or IDLE))
 
     def dropped(self, count: int) -> None:
         """Log the number of events dropped so far."""
@@ -120,19 +120,19 @@ class MachineView:
 
     def line(self, text: str, level: str = "info", source: str = "campaign") -> None:
         """Add a line to the log."""
-        log = self._rr.TextLogLevel
+        log = rr.TextLogLevel
         levels = {"info": log.INFO, "warning": log.WARN, "error": log.ERROR}
-        self._sink.log(f"{LOG}/{safe_name(source)}", self._rr.TextLog(text, level=levels.get(level, log.INFO)))
+        self._sink.log(f"{LOG}/{safe_name(source)}", rr.TextLog(text, level=levels.get(level, log.INFO)))
 
     def status(self, markdown: str) -> None:
         """Replace the status page."""
         if markdown != self._page:
             self._page = markdown
-            self._sink.log(STATUS, self._rr.TextDocument(markdown, media_type="text/markdown"))
+            self._sink.log(STATUS, rr.TextDocument(markdown, media_type="text/markdown"))
 
     def outcome(self, markdown: str) -> None:
         """Log the outcome of the run, shown at every position of a viewer's time cursor."""
-        self._sink.log(OUTCOME, self._rr.TextDocument(markdown, media_type="text/markdown"), static=True)
+        self._sink.log(OUTCOME, rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
     def _load(self) -> None:
         running = len(self._slots)

@@ -19,19 +19,18 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
+from orchestrator.live_view.viewer_server import SENDING
 
 FILING = 2.0
 """Time for which rows of the file are collected [s]: packing a few rows at a time costs more than making them."""
-
-SENDING = 0.75
-"""Time for which rows for viewers are collected, likewise: `RecordingSink.send` is called at this interval [s]."""
 
 LAST_WORDS = 5.0
 """Time that a server may take for the last rows [s]."""
@@ -60,8 +59,6 @@ class RecordingSink:
     """
 
     def __init__(self, path: Path, *, application: str, name: str, url: str = "") -> None:
-        import rerun as rr
-
         path.parent.mkdir(parents=True, exist_ok=True)
         # FileSink only logs if it can't write; detect this while the caller can still report it.
         path.open("wb").close()
@@ -109,8 +106,6 @@ class RecordingSink:
             for end in self._ends:
                 end.stream.log(entity, *what, static=True)
             return
-        import pyarrow as pa
-
         batches = [batch for each in what for batch in each.as_component_batches()]
         arrays = [batch.as_arrow_array() for batch in batches]
         columns = [
@@ -149,8 +144,6 @@ class RecordingSink:
             entity: path of the entity.
             recursive: also clear the entities below it.
         """
-        import rerun as rr
-
         # If several rows have the same time, the last one sent is valid.
         for end in self._ends:
             end.send(entity)
@@ -276,9 +269,6 @@ class _End:
             self.due = float("inf")
 
     def _send(self, entity: str, timelines: Iterable[str], components: Iterable[Any], rows: _Gathered) -> None:
-        import pyarrow as pa
-        import rerun as rr
-
         indexes = [_index(name, [moment[name] for moment in rows.moments]) for name in timelines]
         columns: Iterable[Any] = (
             rr.Scalars.columns(scalars=rows.numbers)
@@ -303,9 +293,6 @@ class _Column:
 
 
 def _index(name: str, values: list[int]) -> Any:
-    import numpy as np
-    import rerun as rr
-
     if name == "wall":
         return rr.TimeColumn(name, timestamp=np.array(values, "datetime64[ns]"))
     if name == "step":

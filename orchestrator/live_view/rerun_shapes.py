@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from orchestrator.live_view.recording_sink import Columns, Track, columns_of
@@ -40,8 +41,6 @@ def vessel(spec: VesselSpec) -> Vessel:
 
 def mesh(spec: VesselSpec) -> Any:
     """Return the exact surface of a vessel."""
-    import rerun as rr
-
     solid = vessel(spec)
     vertices, faces = np.asarray(solid.solid_vertices, np.float32), np.asarray(solid.solid_faces, np.uint32)
     # Unshared vertices with flat normals keep rims and bottoms sharp.
@@ -58,16 +57,12 @@ def mesh(spec: VesselSpec) -> Any:
 
 def placed(pose: FloatArray) -> Any:
     """Convert a pose (7,) x y z qw qx qy qz to a transform."""
-    import rerun as rr
-
     turn = rr.Quaternion(xyzw=[pose[4], pose[5], pose[6], pose[3]])
     return rr.Transform3D(translation=pose[:3], quaternion=turn)
 
 
 def places(poses: FloatArray) -> Columns:
     """Convert poses (T, 7) to transforms at T times."""
-    import rerun as rr
-
     return columns_of(rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, [4, 5, 6, 3]]))
 
 
@@ -90,8 +85,6 @@ def bars(figure: ArmFigure, ends: FloatArray) -> Any:
         figure: shape of the arm.
         ends: ends of its links for any joints, shape (bars, 2, 3) [m].
     """
-    import rerun as rr
-
     return rr.Capsules3D(
         lengths=np.linalg.norm(ends[:, 1] - ends[:, 0], axis=-1),
         radii=[bar.radius for bar in figure.bars],
@@ -108,8 +101,6 @@ def stances(ends: FloatArray) -> Columns:
     Args:
         ends: ends of its links, shape (T, bars, 2, 3) [m].
     """
-    import rerun as rr
-
     along = ends[..., 1, :] - ends[..., 0, :]
     axes = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
     # A capsule lies along z; rotations about its axis are invisible. The rotation from z to an axis a is the
@@ -123,8 +114,6 @@ def stances(ends: FloatArray) -> Columns:
 
 def fates() -> Any:
     """Return the legend of the particles' colours."""
-    import rerun as rr
-
     return rr.AnnotationContext(
         [
             rr.AnnotationInfo(id=i, label=text, color=rgb(colour))
@@ -135,8 +124,6 @@ def fates() -> Any:
 
 def swarms(positions: Sequence[NDArray[np.float32]], states: Sequence[NDArray[np.uint8]], radius: float) -> Columns:
     """Return particles by their fate at several times, with positions (N, 3) [m] and states (N,) for each."""
-    import rerun as rr
-
     places = np.concatenate([np.asarray(each, np.float32) for each in positions])
     fate = np.concatenate([np.asarray(each, np.uint16) for each in states])
     points = rr.Points3D.columns(positions=places, class_ids=fate).partition([len(each) for each in positions])

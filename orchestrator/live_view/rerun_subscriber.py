@@ -26,8 +26,7 @@ from typing import IO, TYPE_CHECKING, Any, Generic, TypeVar
 
 from actors.runtime.child_process import ChildProcess
 from orchestrator.learning.campaign_plan import CampaignPlan
-from orchestrator.live_view.recording_sink import SENDING
-from orchestrator.live_view.viewer_server import environment
+from orchestrator.live_view.viewer_server import SENDING, environment
 from orchestrator.records.events import Event
 
 if TYPE_CHECKING:

@@ -11,7 +11,9 @@ timelines:
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import rerun as rr
+import rerun.blueprint as rrb
 
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.learning.campaign_plan import CampaignPlan
@@ -43,9 +45,6 @@ from orchestrator.reports.progress_state import ProgressState
 from orchestrator.reports.stage_views import receiver_names
 from orchestrator.runs.stages import scenes_of
 
-if TYPE_CHECKING:
-    import rerun.blueprint as rrb
-
 
 class CampaignRecording:
     """Handles the events of a campaign. For one thread.
@@ -60,8 +59,6 @@ class CampaignRecording:
     """
 
     def __init__(self, path: Path, plan: CampaignPlan, *, url: str = "") -> None:
-        import rerun as rr
-
         self.path, self._plan = path, plan
         self._scenes = scenes_of(plan)
         self._progress, reality = ProgressState(plan), MODE_LABELS[plan.laboratory.mode]

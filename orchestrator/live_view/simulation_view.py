@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import rerun as rr
 from numpy.typing import NDArray
 
 from actors.arm.arm_settings import arm_kind
@@ -45,9 +46,7 @@ class SimulatedStage:
     """
 
     def __init__(self, sink: RecordingSink, films: PlaybackQueue) -> None:
-        import rerun as rr
-
-        self._rr, self._sink, self._films = rr, sink, films
+        self._sink, self._films = sink, films
         self._shown: dict[tuple[str, bool], str] = {}
         sink.log(f"{PLACE}/liquid", shapes.fates(), static=True)
         for state, name in enumerate(SHARES):
@@ -76,7 +75,7 @@ class SimulatedStage:
         liquid = shapes.swarms([frames.positions[index] for index in kept], states, radius)
         tracks = [shapes.moving(f"{PLACE}/pourer", moments, poses), Track(f"{PLACE}/liquid", moments, liquid)]
         for state, share in enumerate(np.transpose(shares)[: len(SHARES)]):
-            curve = columns_of(self._rr.Scalars.columns(scalars=share))
+            curve = columns_of(rr.Scalars.columns(scalars=share))
             tracks.append(Track(f"{PLACE}/share/{state}", moments, curve))
         film = Playback(
             float(moments[-1]),
@@ -87,7 +86,7 @@ class SimulatedStage:
         self._films.add(now, step, film)
 
     def _set(self, scene: Scene, title: str) -> None:
-        self._sink.log(f"{PLACE}/title", self._rr.TextDocument(f"### {title}", media_type="text/markdown"))
+        self._sink.log(f"{PLACE}/title", rr.TextDocument(f"### {title}", media_type="text/markdown"))
         for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
             # Viewers of the wall clock don't see rows that are left out of it.
             key, place = spec.content_hash(), (what, self._sink.on_wall)
@@ -123,8 +122,6 @@ def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str
         ValueError: the result has no frames.
         OSError: the file can't be written.
     """
-    import rerun as rr
-
     if result.frames is None:
         raise ValueError("this simulation kept no frames to record; simulate it with a record rate above 0")
     scene, outcome = task.scene, result.outcome

@@ -17,6 +17,9 @@ from actors.runtime.child_process import ChildProcess, Completed, run
 
 OPTIMISING_TIME = 120.0
 
+SENDING = 0.75
+"""Time for which rows for viewers are collected: `RecordingSink.send` is called at this interval [s]."""
+
 
 def rerun_program() -> str:
     """Return the path of Rerun's program, which is part of its Python package.
