@@ -21,7 +21,7 @@ from orchestrator.campaigns.file_loading import load_campaign, load_vessel
 from orchestrator.campaigns.search_ranges import EXAMPLES
 from orchestrator.campaigns.vessel_file import VesselFile
 from orchestrator.campaigns.yaml.section_validation import sections_in
-from orchestrator.cli import foreground_run as common
+from orchestrator.cli import console as common
 from orchestrator.daemon.daemon_settings import DaemonFile
 from orchestrator.records.journal import Kind
 from orchestrator.runs.resume import OperatorNeededError

@@ -20,6 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
+from orchestrator.campaigns.yaml.file_access import why_unreadable
 from sim_engine.errors import DecantError
 
 if TYPE_CHECKING:
@@ -135,6 +136,41 @@ PATIENCE = 2.0
 
 EVERY = 10.0
 """Interval of messages if stderr is not a terminal, such as a log file [s]."""
+
+
+def check_output(path: Path | None, option: str, suffix: str) -> None:
+    """A file that a command is to write, before hours are spent on what goes into it.
+
+    Raises:
+        RefusalError: it can't be written there, or has the wrong suffix (exit code 2).
+    """
+    if path is None:
+        return
+    folder = path.absolute().parent
+    if why_unreadable(path) == "is a directory; name a file in it":
+        problem = "is a folder; name a file in it"
+    elif path.suffix.lower() != suffix:
+        problem = f"should end in {suffix}"
+    elif not folder.is_dir():
+        problem = "its folder does not exist"
+    elif (why := _why_not_opened(path)) is not None:
+        problem = f"can't be written: {why}"
+    else:
+        return
+    raise RefusalError(f"{option} {path}: {problem}")
+
+
+def _why_not_opened(path: Path) -> str | None:
+    """Found out by opening it: permissions don't tell of full disks, names too long, and folders of the system."""
+    there = why_unreadable(path) != "no such file"
+    try:
+        with path.open("ab"):
+            pass
+        if not there:
+            path.unlink()
+    except (OSError, ValueError) as error:
+        return getattr(error, "strerror", None) or str(error)
+    return None
 
 
 class WaitingIndicator:

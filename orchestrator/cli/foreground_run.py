@@ -18,6 +18,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from actors.arm.arm_interface import PathReport
+from actors.interfaces import LaboratoryError, Operator
+from actors.laboratory_settings import LaboratorySettings
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.fingerprint import fingerprint
+from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.cli.console import (
     FAILED,
     INTERRUPTED,
@@ -29,18 +35,23 @@ from orchestrator.cli.console import (
     print_warning,
     stdout_for_results,
 )
+from orchestrator.cli.motion_control import consent_to_motion
+from orchestrator.cli.terminal_operator import TerminalOperator, somebody_at_the_terminal
+from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.run_errors import RunError
+from orchestrator.live_view.live_server import LiveView, can_record, recorder_of
+from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.records.codec import digest
+from orchestrator.records.journal import JOURNAL_NAME
+from orchestrator.records.journal_file import MB, TO_BEGIN, JournalError, free_space
+from orchestrator.records.run_record import CampaignResult, read_header, read_record, read_result
+from orchestrator.records.states import State
+from orchestrator.runs.resume import AskOperator
+from orchestrator.runs.run_folder import RESOLVED, create_run, find_run
+from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
 
 if TYPE_CHECKING:
-    from actors.arm.arm_interface import PathReport
-    from actors.interfaces import Operator
-    from actors.laboratory_settings import LaboratorySettings
-    from orchestrator.learning.campaign_plan import CampaignPlan
-    from orchestrator.live_view.live_server import LiveView
-    from orchestrator.live_view.rerun_subscriber import RerunMonitor
-    from orchestrator.records.run_record import CampaignResult
     from orchestrator.reports.publishing import Published
-    from orchestrator.runs.resume import AskOperator
-    from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources
 
 
 def read_campaign(
@@ -60,10 +71,6 @@ def read_campaign(
     Raises:
         ConfigError: with all problems of its files.
     """
-    from orchestrator.campaigns.file_loading import load_campaign
-    from orchestrator.catalogue.catalogue import posterior_source
-    from orchestrator.runs.run_folder import RESOLVED
-
     plan = load_campaign(path, laboratory, seed, posteriors=posterior_source)
     if resumed is None or plan.memory is None:
         return plan
@@ -77,8 +84,6 @@ def check_campaign_can_run(request: RunRequest) -> None:
     Raises:
         RunTaskError: with every problem.
     """
-    from orchestrator.runs.run_service import RunService
-
     memory = request.campaign.memory
     for line in () if memory is None else memory.lines:
         print_note(line)
@@ -95,51 +100,10 @@ def check_laboratory_answers(request: RunRequest, resources: RunResources) -> No
     Raises:
         LaboratoryError: something is missing.
     """
-    from orchestrator.runs.run_service import RunService
-
     laboratory = resources.settings(request.campaign)
     if laboratory.ray is not None and not laboratory.in_process:
         print_note(f"looking at the Ray cluster at {laboratory.ray.address} …")
     RunService().check_laboratory(request, resources)
-
-
-def check_output(path: Path | None, option: str, suffix: str) -> None:
-    """A file that a command is to write, before hours are spent on what goes into it.
-
-    Raises:
-        RefusalError: it can't be written there, or has the wrong suffix (exit code 2).
-    """
-    from orchestrator.campaigns.yaml.file_access import why_unreadable
-
-    if path is None:
-        return
-    folder = path.absolute().parent
-    if why_unreadable(path) == "is a directory; name a file in it":
-        problem = "is a folder; name a file in it"
-    elif path.suffix.lower() != suffix:
-        problem = f"should end in {suffix}"
-    elif not folder.is_dir():
-        problem = "its folder does not exist"
-    elif (why := _why_not_opened(path)) is not None:
-        problem = f"can't be written: {why}"
-    else:
-        return
-    raise RefusalError(f"{option} {path}: {problem}")
-
-
-def _why_not_opened(path: Path) -> str | None:
-    """Found out by opening it: permissions don't tell of full disks, names too long, and folders of the system."""
-    from orchestrator.campaigns.yaml.file_access import why_unreadable
-
-    there = why_unreadable(path) != "no such file"
-    try:
-        with path.open("ab"):
-            pass
-        if not there:
-            path.unlink()
-    except (OSError, ValueError) as error:
-        return getattr(error, "strerror", None) or str(error)
-    return None
 
 
 def run_task_at_terminal(
@@ -169,9 +133,6 @@ def run_task_at_terminal(
     Raises:
         RefusalError: refused (exit code 2), or as `run_in_front_of_people`.
     """
-    from orchestrator.cli.motion_control import consent_to_motion
-    from orchestrator.runs.run_service import RunResources
-
     checksum = consent_to_motion(request, *motion)
     if request.pours:
         check_somebody_is_there(request.campaign.laboratory)
@@ -195,9 +156,6 @@ def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Pa
     Raises:
         RefusalError: there is none, or it can't be made (exit code 2).
     """
-    from orchestrator.learning.run_errors import RunError
-    from orchestrator.runs.run_folder import create_run, find_run
-
     if run_id is not None and not resume:
         raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun")
     try:
@@ -233,13 +191,9 @@ def run_in_front_of_people(
     Raises:
         RefusalError: it failed, was interrupted, or needs a person.
     """
-    from actors.interfaces import LaboratoryError
-    from orchestrator.learning.run_errors import RunError
-    from orchestrator.live_view.live_server import can_record, recorder_of
     from orchestrator.reports.console_progress import ProgressDisplay
     from orchestrator.reports.console_view import print_summary
     from orchestrator.reports.publishing import not_simulated, publish_run
-    from orchestrator.runs.run_service import RunService
 
     plan, directory = request.campaign, request.folder
     assert directory is not None
@@ -312,8 +266,6 @@ def _close(handle: RunHandle | None, live: LiveView | None) -> None:
 
 
 def _way_on(directory: Path, again: str, not_resumed: str) -> str:
-    from orchestrator.records.journal import JOURNAL_NAME
-
     if not (directory / JOURNAL_NAME).is_file():
         return "\nnothing had begun"
     return f"\n{not_resumed} is in {directory}. {again}" if not_resumed else f"\nwhat is done so far is kept: {again}"
@@ -382,10 +334,6 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
 
 def finished_without_report(directory: Path) -> str:
     """Follows 'interrupted' if all stages of a run are done and its results may not be published; empty otherwise."""
-    from orchestrator.records.journal_file import JournalError
-    from orchestrator.records.run_record import read_record
-    from orchestrator.records.states import State
-
     with contextlib.suppress(JournalError):
         if read_record(directory).state is State.FINISHED:
             return (
@@ -397,9 +345,6 @@ def finished_without_report(directory: Path) -> str:
 
 def given_up_pours(directory: Path) -> list[str]:
     """Pours of a run that had begun and have no outcome: 'pour 3 of stage deployment:narrow'."""
-    from orchestrator.records.journal_file import JournalError
-    from orchestrator.records.run_record import read_record
-
     with contextlib.suppress(JournalError):
         return [f"pour {one.request.number} of stage {one.stage}" for one in read_record(directory).unknown_pours]
     return []
@@ -410,9 +355,6 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
 
     Whatever goes wrong with it, a further Ctrl-C too, is no reason to say less about the run itself.
     """
-    from orchestrator.campaigns.fingerprint import fingerprint
-    from orchestrator.records.codec import digest
-    from orchestrator.records.run_record import read_header, read_result
     from orchestrator.reports.publishing import report_on
 
     with contextlib.suppress(Exception, KeyboardInterrupt):
@@ -424,8 +366,6 @@ def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
 
 def file_trouble(error: OSError, directory: Path) -> str:
     """What went wrong with a file of a run: which one, and how much room there should be where the disk is full."""
-    from orchestrator.records.journal_file import MB, TO_BEGIN, free_space
-
     where = error.filename or directory
     text = f"{where}: {error.strerror}"
     if error.errno not in (errno.ENOSPC, errno.EDQUOT):
@@ -445,8 +385,6 @@ def person_at_the_terminal(
         spec: of the laboratory.
         paused: entered while a question is open.
     """
-    from orchestrator.cli.terminal_operator import TerminalOperator
-
     if not spec.needs_person:
         return None
     return TerminalOperator(spec.operator, paused=paused)
@@ -458,8 +396,6 @@ def check_somebody_is_there(spec: LaboratorySettings) -> None:
     Raises:
         RefusalError: there is none (exit code 2).
     """
-    from orchestrator.cli.terminal_operator import somebody_at_the_terminal
-
     if spec.needs_person and not somebody_at_the_terminal():
         raise RefusalError(
             f"laboratory {spec.name} asks a person (operator: answers: person), and there is no terminal to ask at; "

@@ -22,7 +22,16 @@ from orchestrator.cli.command_options import (
     OtherLaboratory,
     SceneName,
 )
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message, print_note, print_warning
+from orchestrator.cli.console import (
+    FAILED,
+    RefusalError,
+    Refused,
+    check_output,
+    print_json,
+    print_message,
+    print_note,
+    print_warning,
+)
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Executed, PlannedPour
@@ -58,7 +67,6 @@ def pour(
 
     A pour with liquid is recorded in a journal and weighed, as a small run; `--empty` writes a record, pour.json.
     """
-    from orchestrator.cli.foreground_run import check_output
     from orchestrator.cli.motion_control import require_flag
 
     _check_options(dry_run=dry_run, connect=connect, empty=empty, slow=slow)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import FAILED, RefusalError, print_json, print_note, print_warning
+from orchestrator.cli.console import FAILED, RefusalError, check_output, print_json, print_note, print_warning
 from orchestrator.cli.shell_completion import RUNS, files_of, local_runs
 
 
@@ -33,7 +33,6 @@ def report(
     with its expected deviation, and lists open questions. Runs that are paused, failed or unknown have reports too,
     which state this.
     """
-    from orchestrator.cli.foreground_run import check_output
     from orchestrator.records.journal import JOURNAL_NAME
     from orchestrator.study.study_folder import SETTINGS
 

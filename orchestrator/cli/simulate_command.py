@@ -20,6 +20,7 @@ from orchestrator.cli.console import (
     FAILED,
     RefusalError,
     Refused,
+    check_output,
     print_json,
     print_note,
     print_warning,
@@ -112,7 +113,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     from orchestrator.campaigns.action_assignments import assigned_action
     from orchestrator.campaigns.campaign_checks import check_vessels
     from orchestrator.campaigns.file_loading import load_vessel
-    from orchestrator.cli.foreground_run import check_output, read_campaign
+    from orchestrator.cli.foreground_run import read_campaign
     from sim_engine.prediction_band import band_of, spreads
     from sim_engine.simulator import InvalidSceneError, PourSimulator
 
@@ -279,7 +280,7 @@ def _show(task: PourTask, pour: SimulatedPour, options: SimulateOptions) -> None
 
 def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     """Predict all pours of a table with simulations in this process."""
-    from orchestrator.cli.foreground_run import check_output, read_campaign
+    from orchestrator.cli.foreground_run import read_campaign
     from orchestrator.reports.prediction_scores import scores
     from sim_engine.prediction_band import LEVEL
     from sim_engine.simulator import PourSimulator

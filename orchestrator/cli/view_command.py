@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from orchestrator.cli.command_options import LiveAt
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message, print_note
+from orchestrator.cli.console import FAILED, RefusalError, Refused, check_output, print_message, print_note
 from orchestrator.cli.shell_completion import local_runs
 
 if TYPE_CHECKING:
@@ -52,7 +52,6 @@ def view(
     Several runs are shown side by side, on the timeline of simulated time. With --pour, the liquid of one pour is
     simulated again from the journal; -o keeps that recording.
     """
-    from orchestrator.cli.foreground_run import check_output
     from sim_engine.resources import installed
 
     if not installed("rerun"):
