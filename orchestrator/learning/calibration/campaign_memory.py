@@ -36,8 +36,9 @@ GROUPS: dict[str, tuple[str, ...]] = {
 RELIANCE = 0.8
 """Prior probability that the memory of a group holds in a new campaign."""
 
-CONTRADICTED = 0.5
-"""Posterior probability below which the memory of a group is reported as contradicted, and no longer used."""
+CONTRADICTED = 0.7
+"""Posterior probability below which the memory of a group is reported as contradicted, and no longer used: the pours
+make the searched range at least 1.7 times as likely as the memory. A wrong memory costs more than a missing one."""
 
 SPREAD, OTHER_VESSEL, OF_TOLERANCE = 0.05, 0.15, 0.5
 """Scale of the differences between campaigns before any were observed: fraction of a parameter's whole range, the same
@@ -269,8 +270,8 @@ def verdicts(memory: CampaignMemory, shares: Mapping[str, float]) -> list[Decisi
         runs = ", ".join(dict.fromkeys(run for one in parameters for run in one.runs))
         if share < CONTRADICTED:
             text = (
-                f"the pours contradict the memory of the {group} ({runs}; {', '.join(map(str, parameters))}): it holds "
-                f"with a probability of {100 * share:.0f} %, and is no longer used"
+                f"the pours contradict the memory of the {group} ({runs}; {', '.join(map(str, parameters))}): its "
+                f"probability falls from {100 * RELIANCE:.0f} to {100 * share:.0f} %, and it is no longer used"
             )
         else:
             text = f"the pours agree with the memory of the {group} ({runs}): probability {100 * share:.0f} %"
