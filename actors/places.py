@@ -9,6 +9,7 @@ The ways to the places are planned in `actors.arm.planning.place_ways`, and driv
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -51,6 +52,9 @@ class PlaceSettings(Settings):
 
     clearance: Annotated[float, Quantity("m", "15 mm", 5e-3, 0.2)] = 15e-3
     """Gap that arm, gripper and carried vessel keep from a vessel that stands there."""
+
+    tray: Annotated[float, Quantity("m^3", "500 mL", 1e-6, 0.1)] | None = None
+    """Liquid that the spill tray around the balance holds. What is spilled is added up; before it may overflow, the operator is asked to empty it. Not watched unless given."""  # noqa: E501
 
 
 TIME_OF_DAY = r"^([01]\d|2[0-3]):[0-5]\d$"
@@ -120,6 +124,8 @@ def check_places(problems: Problems, places: Sequence[PlaceSettings], tool: Pose
         if place.name in names:
             problems.add(f"two places are named '{place.name}'", "places", number, "name")
         names.add(place.name)
+        if place.tray is not None and place.use != "balance":
+            problems.add("belongs to the place with 'use: balance', over which is poured", "places", number, "tray")
         if tool is not None and _differ(place.tool, tool):
             problems.add(
                 f"place '{place.name}' was taught with another tool than the arm's: teach it again with 'decant robot "
@@ -131,7 +137,18 @@ def check_places(problems: Problems, places: Sequence[PlaceSettings], tool: Pose
 
 
 def _differ(one: Pose, other: Pose) -> bool:
-    return any(abs(a - b) > 1e-4 for a, b in zip(one.as_list, other.as_list, strict=True))
+    """Whether two poses differ by more than 0.1 mm or 0.1 mrad. Near half a turn, a controller shows either of two
+    opposite rotation vectors for the same pose."""
+    apart = math.dist(one.as_list[:3], other.as_list[:3])
+    first, second = (_quaternion(pose) for pose in (one, other))
+    turned = min(math.dist(first, second), math.dist(first, tuple(-part for part in second)))
+    return apart > 1e-4 or 2.0 * turned > 1e-4
+
+
+def _quaternion(pose: Pose) -> tuple[float, ...]:
+    angle = math.hypot(*(vector := pose.as_list[3:]))
+    share = math.sin(0.5 * angle) / angle if angle > 0.0 else 0.0
+    return (math.cos(0.5 * angle), *(share * part for part in vector))
 
 
 class PlaceRecord(Protocol):
@@ -151,4 +168,8 @@ class PlaceRecord(Protocol):
 
     def content(self, vessel: str, mass: float | None, deviation: float, liquid: str) -> None:
         """Enter the weighed content of a vessel [kg]; None: unknown until it is weighed again."""
+        ...
+
+    def held(self, vessel: str) -> tuple[float, float] | None:
+        """The content of a vessel and its deviation [kg]; None if it was never entered, or is unknown."""
         ...

@@ -183,6 +183,8 @@ class BenchContents:
         match about:
             case "tray_wiped":
                 self.on_tray, self.on_balance = 0.0, under
+            case "tray_full":
+                self.on_tray = 0.0
             case "laid_out":
                 self.in_receiver = self.in_pourer = 0.0
                 self.on_balance = under

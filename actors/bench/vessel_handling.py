@@ -62,6 +62,15 @@ BACK_SPEED, BACK_ANGLE, BACK_HOLD = 20 * DEG, 135 * DEG, 4.0
 IN_GRIPPER = ""
 """Place of the vessel in the gripper."""
 
+TRAY, RESERVOIR = "tray", "reservoir"
+"""Their names in the account of vessels."""
+
+SET_UP = "put the pourer down, put the receiver on the balance, and take the pourer"
+CLEAR = "put the pourer down, and take the receiver off the balance"
+WEIGH = "put the pourer on the balance"
+BACK = "pour the receiver back into the pourer on the balance, slowly, and put it down"
+"""Sequences of motions, as the operator agrees to them."""
+
 
 class MotionConsent(Protocol):
     """The operator's consent to motions; see `actors.bench.consent.Consent`."""
@@ -116,8 +125,11 @@ def check_handling(
     Raises:
         InvalidActionError: it cannot; the text states why.
     """
-    Layout.of(places)
     vessels, kind = _vessels(scene), arm_kind(spec)
+    if (room := Layout.of(places).balance.tray) is not None and room < scene.liquid.volume:
+        raise InvalidActionError(
+            f"the spill tray holds {1e6 * room:.0f} ml, and one pour may spill {1e6 * scene.liquid.volume:.0f} ml"
+        )
     for role in ROLES:
         name, grip = vessels[role].name, vessels[role].spec.grip
         if grip is None or grip.mass is None:
@@ -225,6 +237,8 @@ class VesselHandling:
         self._gross: PourMasses | None = None
         self._pending: tuple[_Poured, PourMasses, PourMasses] | None = None
         self._cycle: dict[str, float] = {}
+        self._agreed, self._asked = "", False
+        self._in_tray = (0.0, 0.0)
 
     # ---- checks
 
@@ -266,14 +280,14 @@ class VesselHandling:
             LaboratoryError: something failed; nothing was poured in this pour yet.
         """
         self._cycle = {}
+        await self._room_for_spills(consent)
         if self._poured is None or empty is None or self._gross is None:
             await self._lay_out(consent)
             return {}
         assert self._scene is not None
         self._require_known()
         poured, before = self._poured, self._gross
-        text = "pour the receiver back into the pourer on the balance, slowly, and put it down"
-        async with self._driving(consent, text):
+        async with self._driving(consent, BACK, then=SET_UP):
             await self._take("receiver", consent)
             await self._pour_back(consent, seed)
             self._mass["receiver"] = 0.0
@@ -284,6 +298,29 @@ class VesselHandling:
         self._mass["pourer"] = full.mass - empty.mass
         self._enter("pourer", full.mass - empty.mass, math.hypot(full.uncertainty, empty.uncertainty))
         return {"pourer_full": full}
+
+    async def _room_for_spills(self, consent: MotionConsent) -> None:
+        """Have the spill tray emptied if the liquid of one more pour could overflow it."""
+        assert self._scene is not None
+        room, liquid, held = self._layout.balance.tray, self._scene.liquid, self._record.held(TRAY)
+        if room is None:
+            return
+        if held is None or held[0] + SURE * held[1] + liquid.mass > room * liquid.density:
+            holds = "An unknown mass" if held is None else f"About {1e3 * held[0]:.0f} g"
+            question = OperatorQuestion(
+                f"{holds} is in the spill tray, and one more pour may spill up to {1e3 * liquid.mass:.0f} g. Empty it.",
+                "done",
+                about="tray_full",
+                details={} if held is None else {"held_g": 1e3 * held[0]},
+            )
+            await self._ask(question, consent)
+            held = (0.0, 0.0)
+            self._enter(TRAY, *held)
+        self._in_tray = held
+
+    def _spilled(self, mass: float, deviation: float) -> None:
+        """Add what was spilled [kg]; a loss within its uncertainty counts as well, a gain does not."""
+        self._in_tray = (self._in_tray[0] + max(mass, 0.0), math.hypot(self._in_tray[1], deviation))
 
     async def _pour_back(self, consent: MotionConsent, seed: int) -> None:
         """Pour from the receiver in the gripper into the pourer on the balance; the arm ends at home."""
@@ -318,14 +355,17 @@ class VesselHandling:
                 return now
             if missing > 0.0 and tries < REFILLS and rest.use == "source" and self._supply is not None:
                 tries += 1
+                reserve = await self._reserve(missing, consent)
                 async with self._driving(consent, f"carry the pourer to '{rest.name}', where it is filled up"):
                     await self._move("pourer", rest.name, consent)
                     filled = await self._supply.top_up(missing, liquid.density, seed)
                     self._mass["pourer"] = liquid.mass
                     await self._move("pourer", self._layout.balance.name, consent)
                 if filled:
-                    problem = "the refill device has not filled it up"
-                    now = await self._weigh()
+                    problem, before, now = "the refill device has not filled it up", now, await self._weigh()
+                    if reserve is not None:
+                        spread = math.hypot(reserve[1], before.uncertainty, now.uncertainty)
+                        self._enter(RESERVOIR, reserve[0] - (now.mass - before.mass), spread)
                     continue
             question = OperatorQuestion(
                 f"The pourer on the balance should hold {1e3 * liquid.mass:.1f} g and holds "
@@ -335,8 +375,28 @@ class VesselHandling:
                 about="top_up",
                 details={"missing_g": 1e3 * missing},
             )
-            await consent.asked(question)
+            await self._ask(question, consent)
             now, problem = await self._weigh(), "it does not hold what is asked for"
+
+    async def _reserve(self, missing: float, consent: MotionConsent) -> tuple[float, float] | None:
+        """What the reservoir of the refill device holds [kg]; None if the account has no content of it.
+
+        While it may hold less than is `missing` [kg], a person is asked to fill it and to enter what it holds.
+        """
+        problem = ""
+        while (held := self._record.held(RESERVOIR)) is not None and held[0] - SURE * held[1] < missing:
+            question = OperatorQuestion(
+                f"The reservoir of the refill device holds {1e3 * held[0]:.0f} g by the account of vessels, and "
+                f"{1e3 * missing:.0f} g are needed. Fill it, and enter what it holds with 'decant materials weigh "
+                f"LABORATORY/{RESERVOIR}', where LABORATORY is the name of this one.",
+                "done",
+                problem,
+                about="reservoir",
+                details={"held_g": 1e3 * held[0], "missing_g": 1e3 * missing},
+            )
+            await self._ask(question, consent)
+            problem = "the account has not enough for it yet"
+        return held
 
     async def _lay_out(self, consent: MotionConsent) -> None:
         """Have the operator lay out the vessels; afterwards it is known where they stand."""
@@ -353,7 +413,7 @@ class VesselHandling:
             about="laid_out",
             details={"receiver": rest},
         )
-        await consent.asked(question)
+        await self._ask(question, consent)
         self._at, self._mass, self._dry, self._gross = {"receiver": rest}, {}, None, None
         self._poured = self._pending = None
         for name in self._record.stands():  # frees the places before they are filled
@@ -372,16 +432,16 @@ class VesselHandling:
                 await self._set_up(consent)
                 return "done"
             if about == "cleared_after":
-                async with self._driving(consent, "put the pourer down, and take the receiver off the balance"):
+                async with self._driving(consent, CLEAR, then=WEIGH):
                     await self._put("pourer", rest["pourer"].name)
                     await self._move("receiver", rest["receiver"].name, consent)
                 return "done"
             if about == "pourer_after":
-                async with self._driving(consent, "put the pourer on the balance"):
+                async with self._driving(consent, WEIGH):
                     await self._move("pourer", balance, consent)
                 return "done"
         details = {**question.details, "place": balance}
-        answer = await consent.asked(replace(question, text=question.text.replace(GRIP, ""), details=details))
+        answer = await self._ask(replace(question, text=question.text.replace(GRIP, ""), details=details), consent)
         if about in ("pourer_empty", "pourer_full"):
             self._at["pourer"] = balance
             self._record.put("pourer", balance, "put there by the operator")
@@ -392,8 +452,7 @@ class VesselHandling:
     async def _set_up(self, consent: MotionConsent) -> None:
         """Receiver on the balance, weighed with what stuck to it; pourer in the gripper."""
         balance, rest = self._layout.balance.name, self._layout.rest
-        text = "put the pourer down, put the receiver on the balance, and take the pourer"
-        async with self._driving(consent, text):
+        async with self._driving(consent, SET_UP):
             await self._move("pourer", rest["pourer"].name, consent)
             await self._move("receiver", balance, consent)
             gross = await self._weigh()
@@ -416,6 +475,7 @@ class VesselHandling:
         parts = (before, poured.received, gross, back, poured.pourer_after)
         sigma = math.sqrt(sum(part.uncertainty**2 for part in parts))
         missing = left - gained
+        self._spilled(missing, sigma)
         self._cycle |= {"poured_back_g": 1e3 * gained, "missing_g": 1e3 * missing, "uncertainty_g": 1e3 * sigma}
         self._tell(
             Notice(
@@ -455,17 +515,25 @@ class VesselHandling:
 
     async def _go_on(self, question: OperatorQuestion, consent: MotionConsent) -> None:
         """Ask a person about masses, and then for the rest of the sequence."""
-        if (await consent.asked(question)).strip().lower() not in ("yes", "y"):
+        if (await self._ask(question, consent)).strip().lower() not in ("yes", "y"):
             raise LaboratoryError("the masses are not what they should be, and the operator ended the cycle")
         await consent.given(move_question("take the pourer"))
 
     def poured(self, weighed: Mapping[str, PourMasses]) -> None:
         """The pour was weighed: what it poured is in the receiver, and the pourer stands on the balance."""
-        received, after, empty = (weighed[key] for key in ("received", "pourer_after", "pourer_empty"))
+        received, full, after, empty = (
+            weighed[key] for key in ("received", "pourer_full", "pourer_after", "pourer_empty")
+        )
         self._poured = _Poured(received, after)
-        self._mass = {"pourer": after.mass - empty.mass, "receiver": received.mass}
-        for role, parts in (("pourer", (after, empty)), ("receiver", (received,))):
-            self._enter(role, self._mass[role], math.hypot(*(part.uncertainty for part in parts)))  # type: ignore[arg-type, index]
+        film = tuple(part for part in (self._gross, self._dry) if part is not None and self._gross is not self._dry)
+        left = film[0].mass - film[1].mass if len(film) == 2 else 0.0
+        self._mass = {"pourer": after.mass - empty.mass, "receiver": received.mass + left}
+        for role, parts in (("pourer", (after, empty)), ("receiver", (received, *film))):
+            self._enter(role, self._mass[role], math.hypot(*(part.uncertainty for part in parts)))  # type: ignore[index]
+        spread = math.hypot(*(part.uncertainty for part in (full, received, after)))
+        self._spilled(full.mass - after.mass - received.mass, spread)
+        if self._layout.balance.tray is not None:
+            self._enter(TRAY, *self._in_tray)
 
     @property
     def cycle(self) -> dict[str, float]:
@@ -474,20 +542,34 @@ class VesselHandling:
 
     def forget(self) -> None:
         """The cycle was interrupted: the vessels are laid out again before the next pour."""
-        self._at, self._poured, self._pending = {}, None, None
+        self._at, self._poured, self._pending, self._agreed = {}, None, None, ""
+
+    async def _ask(self, question: OperatorQuestion, consent: MotionConsent) -> str:
+        """Ask a person, who may reach into the cell: motions that follow are agreed to again."""
+        self._agreed, self._asked = "", True
+        return await consent.asked(question)
 
     # ---- moves
 
     @contextlib.asynccontextmanager
-    async def _driving(self, consent: MotionConsent, text: str) -> AsyncIterator[None]:
+    async def _driving(self, consent: MotionConsent, does: str, then: str = "") -> AsyncIterator[None]:
         """Drive a sequence after one consent; a stop ends it, and a person brings the arm home.
+
+        Args:
+            consent: of the pour.
+            does: the sequence.
+            then: the one that follows once the balance is read, and needs no other consent unless a person is asked
+                something before it.
 
         Raises:
             LaboratoryError: it was interrupted; the vessel that was moved is UNKNOWN.
         """
-        await consent.given(move_question(text))
+        if self._agreed != does:
+            await consent.given(move_question(f"{does}; once the balance is read, {then}" if then else does))
+        self._agreed, self._asked = "", False
         try:
             yield
+            self._agreed = "" if self._asked else then
         except LaboratoryError as error:
             self.forget()
             if self._away or isinstance(error, STUCK):
@@ -535,7 +617,7 @@ class VesselHandling:
                 about="grasp_failed",
                 details={"role": role, "place": place},
             )
-            if (await consent.asked(question)).strip().lower() not in ("yes", "y"):
+            if (await self._ask(question, consent)).strip().lower() not in ("yes", "y"):
                 raise LaboratoryError(problem)
             await self._held.open_at(vessel)
             await self._truth.between(role, place, width)
@@ -606,14 +688,14 @@ class VesselHandling:
         weight = await self._balance.weigh()
         return PourMasses(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))
 
-    def _enter(self, role: Role, mass: float | None, deviation: float) -> None:
+    def _enter(self, vessel: str, mass: float | None, deviation: float) -> None:
         assert self._scene is not None
-        self._record.content(role, mass, deviation, self._scene.liquid.name)
+        self._record.content(vessel, mass, deviation, self._scene.liquid.name)
 
     def _unknown_contents(self) -> None:
         """A pour begins: the contents are unknown until they are weighed."""
-        for role in ROLES:
-            self._enter(role, None, 0.0)
+        for name in (*ROLES, *([] if self._layout.balance.tray is None else [TRAY])):
+            self._enter(name, None, 0.0)
 
 
 def move_question(text: str) -> OperatorQuestion:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import queue
 import threading
@@ -34,8 +35,14 @@ Occasion = Literal["question", "ended", "failed", "silence", "emergency"]
 
 OCCASIONS: tuple[Occasion, ...] = ("question", "ended", "failed", "silence", "emergency")
 
+_FOR_PERSON = ("question", "failed", "silence")
+"""Occasions that need a person."""
+
 _BY_PEOPLE = ("", "stopped on request")
 """Reasons of a campaign that an operator paused."""
+
+PRESENT = 600.0
+"""Time after an answer in which a person is expected to see further questions on the page [s]."""
 
 _EVENTS_WITH_DATA = (
     "CampaignLeased",
@@ -174,7 +181,11 @@ class Notifier:
                     lines.append("Answer with one of: " + ", ".join(map(str, options)))
                 return self._made("question", campaign, "an answer is needed", lines)
             case "QuestionAnswered" | "QuestionClosed" if news is not None:
-                news.question = ""
+                news.question, question = "", data.get("question", {})
+                if kind == "QuestionAnswered":
+                    news.told, news.answered = False, self._clock()
+                    if question.get("about") == "unattended" and question.get("answer") == "yes":
+                        news.unattended, news.answered = True, -math.inf
             case "CampaignRests":
                 message = self._rests(data, campaign)
                 self._news.pop(campaign, None)
@@ -183,6 +194,18 @@ class Notifier:
                 lines = [f"By {data.get('by')}.", str(data.get("detail") or ""), "Nothing begins before it is cleared."]
                 return self._made("emergency", "", "EMERGENCY STOP", lines)
         return None
+
+    def _first(self, news: _CampaignNews | None) -> bool:
+        """Whether to tell that a person is needed: in a run that had a consent for a night only the first time.
+
+        That is once until somebody answers, and not while the one who answered is expected to be at the page.
+        """
+        if news is None or not news.unattended:
+            return True
+        if news.told or self._clock() - news.answered < PRESENT:
+            return False
+        news.told = True
+        return True
 
     def _rests(self, data: Mapping[str, Any], campaign: str) -> Notification | None:
         state, reason = str(data["state"]), str(data.get("reason") or "")
@@ -196,9 +219,9 @@ class Notifier:
         return self._made("ended", campaign, f"is {state}", [reason])
 
     def _made(self, occasion: Occasion, campaign: str, what: str, lines: Sequence[str]) -> Notification | None:
-        if occasion not in self._about:
-            return None
         news = self._news.get(campaign)
+        if occasion not in self._about or (occasion in _FOR_PERSON and not self._first(news)):
+            return None
         mode = f"{MODE_LABELS[news.mode]} " if news is not None and news.mode in MODE_LABELS else ""
         rig = "" if news is None or not news.rig else f" at {news.rig}"
         title = f"Decant: {what}" if not campaign else f"Decant, {mode}{campaign}{rig}: {what}"
@@ -268,6 +291,12 @@ class _CampaignNews:
     mode: str = ""
     question: str = ""
     reported: bool = False
+    unattended: bool = False
+    """A consent for a night was given in this run."""
+    told: bool = False
+    """Since then, somebody was told that a person is needed, and nobody has answered."""
+    answered: float = -math.inf
+    """Time of the last answer since then."""
 
 
 @dataclass

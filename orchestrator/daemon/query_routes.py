@@ -123,25 +123,28 @@ async def campaign(daemon: Daemon, queue: Queue, person: Viewer, key: str) -> Ca
     item = found_item(queue, key)
     summary: dict[str, Any] | None = None
     pours: list[PourSummary] = []
+    night: list[dict[str, Any]] = []
     if item.run is not None:
         directory = daemon.settings.runs / item.run
 
         # A process that was killed leaves a journal that ends in the middle of the pour.
         live = daemon.progress(item) is not None
 
-        def read() -> tuple[list[PourSummary], dict[str, Any] | None]:
+        def read() -> tuple[tuple[list[PourSummary], list[dict[str, Any]]], dict[str, Any] | None]:
             def plan() -> CampaignPlan:
                 return run_request(daemon.settings, item, daemon.settings.rig(item.rig)).campaign
 
             return daemon.pours.of(directory, plan, live=live), summary_of(directory)
 
         try:
-            pours, summary = await asyncio.to_thread(read)
+            (pours, night), summary = await asyncio.to_thread(read)
         except (ConfigError, RunError, KeyError):  # for example, a rig that the settings no longer contain
             summary = await asyncio.to_thread(summary_of, directory)
     table = campaign_out(daemon, item).model_dump()
     audit = daemon.store.audit(item.id)
-    return CampaignDetailOut.model_validate({**table, "pours_made": pours, "summary": summary, "audit": audit})
+    return CampaignDetailOut.model_validate(
+        {**table, "pours_made": pours, "night": night, "summary": summary, "audit": audit}
+    )
 
 
 @router.get(

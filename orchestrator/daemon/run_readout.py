@@ -9,15 +9,18 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 from actors.arm.arm_settings import arm_kind
 from actors.balance.balance_settings import balance_diagnostics
+from actors.bench.night_consent import MOTIONS
 from actors.interfaces import LaboratoryError
 from actors.laboratory import reached
 from actors.laboratory_settings import LaboratorySettings
@@ -47,8 +50,10 @@ class Pours:
         self._read: OrderedDict[Path, tuple[CampaignPlan, RunState]] = OrderedDict()
         self._guard = Lock()
 
-    def of(self, directory: Path, plan: Callable[[], CampaignPlan], *, live: bool) -> list[PourSummary]:
-        """Return the requested pours of a run in order, with predictions and measurements.
+    def of(
+        self, directory: Path, plan: Callable[[], CampaignPlan], *, live: bool
+    ) -> tuple[list[PourSummary], list[dict[str, Any]]]:
+        """Return the requested pours of a run in order, with predictions and measurements; and its `night`.
 
         Args:
             directory: folder of the run.
@@ -61,11 +66,51 @@ class Pours:
             try:
                 record = read_record(directory, known=known)
             except (JournalError, CodecError, OSError):
-                return []  # being created, or of another version: read from its start at the next call
+                return [], []  # being created, or of another version: read from its start at the next call
             self._read[directory] = made, record
             if len(self._read) > self._keep:
                 self._read.popitem(last=False)
-            return pour_summaries(made, record, live=live)
+            pours = pour_summaries(made, record, live=live)
+            return pours, night(record, pours)
+
+
+_ANSWERED = re.compile(r"operator \((\w+)\): .* → (.*)", re.DOTALL)
+_CONSENT, _ENDED = "unattended: agreed", "unattended: the consent has ended. "
+_BACK = "poured back: "
+
+
+def night(record: RunState, pours: Sequence[PourSummary]) -> list[dict[str, Any]]:
+    """The timeline of unattended pours since the first consent: consents, pours, masses, faults, answers.
+
+    Args:
+        record: of the run.
+        pours: of the run.
+
+    Returns:
+        Time [s since 1970], kind and text of each, in order; empty without a consent.
+    """
+    begun = next((t for t, text in record.notes if text.startswith(_CONSENT)), math.inf)
+    found: list[tuple[float, str, str]] = []
+    for t, text in record.notes:
+        answered = _ANSWERED.fullmatch(text)
+        if t < begun:
+            continue
+        if text.startswith(_CONSENT):
+            found.append((t, "consent", text.partition(": ")[2]))
+        elif text.startswith(_ENDED):
+            reason = text.removeprefix(_ENDED)
+            planned = reason.startswith("it is ") or reason.endswith(" pours were made")
+            found.append((t, "end" if planned else "fault", reason.removeprefix("a question: ")))
+        elif text.startswith(_BACK):
+            found.append((t, "accounted", text))
+        elif answered is not None and answered[1] not in ("unattended", *MOTIONS):
+            found.append((t, "answer", f"{answered[1].replace('_', ' ')}: {answered[2]}"))
+    for pour in pours:
+        if pour.time is not None and pour.time >= begun and pour.state not in ("asked", "under way"):
+            found.append(
+                (pour.time, "pour", pour.line if pour.state == "weighed" else f"pour {pour.number}: {pour.state}")
+            )
+    return [{"time": t, "kind": kind, "text": text} for t, kind, text in sorted(found)]
 
 
 def summary_of(directory: Path) -> dict[str, Any] | None:

@@ -169,10 +169,21 @@ class CampaignOut(_Out):
     """URL of the live view."""
 
 
+class NightEventOut(_Out):
+    """An entry of the timeline of unattended pours."""
+
+    time: float
+    kind: Literal["consent", "pour", "accounted", "fault", "answer", "end"]
+    text: str
+
+
 class CampaignDetailOut(CampaignOut):
     """A submitted campaign with its results so far."""
 
     pours_made: list[PourSummary]
+    night: list[NightEventOut]
+    """Unattended pours since the first consent; empty without one."""
+
     summary: dict[str, Any] | None
     """`summary.json` of its run, after publication."""
 

@@ -464,6 +464,12 @@ class LaboratoryPlaces:
             else:
                 self._account.weigh(self._prefix + vessel, max(mass, 0.0), deviation, liquid=liquid)
 
+    def held(self, vessel: str) -> tuple[float, float] | None:
+        """See `PlaceRecord.held`."""
+        with _writable():
+            found = self._account.content(self._prefix + vessel)
+        return None if found is None or found.mass is None else (found.mass, found.deviation)
+
 
 @contextlib.contextmanager
 def _writable() -> Iterator[None]:

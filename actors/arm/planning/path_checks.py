@@ -157,6 +157,9 @@ SLACK = 1e-6
 THROUGH = 0.02
 """Below this distance from a singularity a path counts as passing through it when speeds are checked."""
 
+MOVE = "move the receiver"
+"""How the problems of a pour's path are solved."""
+
 LARGEST_STEP = math.radians(15.0)
 """The largest step of a joint between two waypoints [rad]; a larger one is a jump."""
 
@@ -181,7 +184,8 @@ def check_way_limits(sampled: SampledPath, points: FloatArray) -> list[str]:
         points: outermost points of the carried vessel, shape (V, 3) [m].
     """
     table, _ = nearest_links(sampled, None)
-    problems = [*_ranges(sampled), *_singular(sampled), *_tilts(sampled), *_places(sampled, points)]
+    cure = "teach another pose"
+    problems = [*_ranges(sampled), *_singular(sampled, cure), *_tilts(sampled), *_places(sampled, points, cure)]
     if table.distance < 0.0:
         problems.append(
             f"the {table.name} would come {-1e3 * table.distance:.0f} mm too near to the table, "
@@ -189,7 +193,7 @@ def check_way_limits(sampled: SampledPath, points: FloatArray) -> list[str]:
         )
     if sampled.margins.min() >= THROUGH:
         problems += [*_joint_speeds(sampled), *_speeds(sampled, points)]
-    return [text.replace("move the receiver", "teach another pose") for text in problems]
+    return problems
 
 
 def check_clearance(sampled: SampledPath, until: float, pourer: Vessel, receiver: Vessel) -> tuple[Nearest, list[str]]:
@@ -346,7 +350,7 @@ def _slower(s: SampledPath, limit: str | None) -> str:
     return f"lower {lower}" + ("" if limit is None else f", or raise arm.limits.{limit}")
 
 
-def _singular(s: SampledPath) -> Iterator[str]:
+def _singular(s: SampledPath, cure: str = MOVE) -> Iterator[str]:
     least = s.spec.limits.singularity
     worst = np.argmin(s.margins, axis=0)
     margins = s.margins[worst, np.arange(3)]
@@ -355,7 +359,7 @@ def _singular(s: SampledPath) -> Iterator[str]:
     if shoulder < least:
         yield (
             f"{s.when(worst[0])}: the wrist {1e3 * shoulder * reach:.0f} mm from above the base's axis, "
-            f"{1e3 * least * reach:.0f} mm are asked for; move the receiver away from the base"
+            f"{1e3 * least * reach:.0f} mm are asked for; {cure} away from the base"
         )
     asked = math.degrees(math.asin(least))
     if elbow < least:
@@ -363,12 +367,12 @@ def _singular(s: SampledPath) -> Iterator[str]:
         state, help_ = ("folded", "away from the base") if folded else ("straight", "nearer or lower")
         yield (
             f"{s.when(worst[1])}: elbow {math.degrees(math.asin(elbow)):.1f} deg from {state}, {asked:.1f} deg are "
-            f"asked for; move the receiver {help_}"
+            f"asked for; {cure} {help_}"
         )
     if wrist < least:
         yield (
             f"{s.when(worst[2])}: wrist 2 {math.degrees(math.asin(wrist)):.1f} deg from where joints 4 and 6 turn "
-            f"about one axis, {asked:.1f} deg are asked for; turn 'direction', or move the receiver sideways"
+            f"about one axis, {asked:.1f} deg are asked for; turn 'direction', or {cure} sideways"
         )
 
 
@@ -401,7 +405,7 @@ def _tilts(s: SampledPath) -> Iterator[str]:
         )
 
 
-def _places(s: SampledPath, points: FloatArray) -> Iterator[str]:
+def _places(s: SampledPath, points: FloatArray, cure: str = MOVE) -> Iterator[str]:
     """Violations of box, planes and table by the TCP and points (V, 3) of the pourer."""
     limits = s.spec.limits
     for k, axis in enumerate("xyz"):
@@ -409,7 +413,7 @@ def _places(s: SampledPath, points: FloatArray) -> Iterator[str]:
             for thing, where, value in _beyond(s, sign * np.eye(3)[k], sign * bound, points):
                 yield (
                     f"{thing} would leave the box at {axis} = {sign * value:.3f} m, {s.when(where)}; "
-                    f"at {word} {bound:.3f} m are allowed: move the receiver, or widen arm.limits.box"
+                    f"at {word} {bound:.3f} m are allowed: {cure}, or widen arm.limits.box"
                 )
     for number, plane in enumerate(limits.planes, 1):
         for thing, where, value in _beyond(s, np.array(plane.normal), plane.offset, points):

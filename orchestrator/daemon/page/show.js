@@ -199,6 +199,19 @@ export function vesselsTable(vessels) {
       cell("Holds", content.mass_g === null ? "unknown" : `${content.mass_g.toFixed(1)} g ${content.liquid}`)))));
 }
 
+const NIGHT = { consent: "Consent", pour: "Pour", accounted: "Masses", fault: "FAULT", answer: "Answer", end: "End" };
+
+/** Unattended pours as one timeline, the newest first. */
+export function nightTimeline(events) {
+  const count = (kind) => events.filter((one) => one.kind === kind).length;
+  const many = (number, word) => `${number} ${word}${number === 1 ? "" : "s"}`;
+  return [
+    el("p", {}, `${many(count("pour"), "pour")} since ${clock(events[0].time)}, ${many(count("fault"), "fault")}`),
+    el("ol", { class: "night", tabindex: "0", "aria-label": "Timeline" }, [...events].reverse().map(({ time, kind, text }) =>
+      el("li", { class: kind }, el("time", {}, clock(time)), el("b", {}, NIGHT[kind]), el("span", {}, text)))),
+  ];
+}
+
 const SPILLED = "Spilled / loaded";
 
 /** A cell; `meaning` says what its value is. */

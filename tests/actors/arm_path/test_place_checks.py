@@ -7,20 +7,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from actors.arm.arm_geometry import Pose
-from actors.arm.planning.place_ways import FULL_SPEED, SWINGS, full_acceleration, way_to
+from actors.arm.planning.kinematics import forward, transform_of
+from actors.arm.planning.place_ways import FULL_SPEED, SWINGS, full_acceleration, place_problems, way_to
 from actors.arm.planning.trajectory import TOOL_ACCELERATION, SampledPath
+from actors.arm.ur.robot_models import MODELS
 from actors.arm.ur_settings import UrArmSettings
 from actors.bench.pour_feasibility import vessel
 from actors.bench.vessel_handling import check_handling, plan_back
 from actors.grippers.gripper_interface import GRIPPERS
 from actors.interfaces import InvalidActionError
-from actors.places import UnattendedSettings
+from actors.places import UnattendedSettings, check_places
 from orchestrator.campaigns.campaign_checks import check_campaign
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.campaigns.place_writing import write_place
@@ -148,3 +152,64 @@ def test_the_shipped_night_can_be_poured() -> None:
 def test_the_end_of_a_night_is_a_time_of_day() -> None:
     with pytest.raises(ValidationError, match=r"'25:00' should be a time of day from 00:00 to 23:59, such as '07:00'"):
         UnattendedSettings(until="25:00")
+
+
+# What others have published of places that they taught by hand.
+
+
+def test_a_tool_counts_as_the_same_with_the_opposite_rotation_vector() -> None:
+    """A UR3e showed both signs for one pose, from one reading to the next: dof.robotiq.com/discussion/1785."""
+    shown, later = (2.221970676, 0.000207703, 2.220909453), (-2.221970757, 0.000233551, -2.220909802)
+    angle = math.hypot(*shown)
+    opposite = tuple((1.0 - 2.0 * math.pi / angle) * part for part in shown)
+    assert max(abs(a - b) for a, b in zip(opposite, later, strict=True)) < 5e-4  # the vector that the arm showed later
+    for tool, wanted in ((opposite, 0), ((2.2, 0.0, 2.2), 1)):
+        places = [load_laboratory(NIGHT).places[0].with_values(tool=Pose.of(0.0, 0.0, 0.17, *tool))]
+        problems = Mock()
+        check_places(problems, places, Pose.of(0.0, 0.0, 0.17, *shown))
+        assert problems.add.call_count == wanted
+
+
+def test_a_waypoint_that_polyscope_saved_without_a_tool_is_refused_for_an_arm_with_one() -> None:
+    """Joints, pose and TCP offset of a UR10e's waypoint as its .urp and .script files have them: notes.md of
+    github.com/pharmbio/robotlab."""
+    q = (
+        1.9942498207092285,
+        -1.6684614620604457,
+        1.9330504576312464,
+        -0.2718423169902344,
+        1.3209004402160645,
+        0.0036344528,
+    )
+    pose = Pose.of(0.433025361705, -0.467959205379, 0.522310714714, 1.500318891221, 0.521427297251, 0.530987104689)
+    rotation, position = forward(np.array([q]), MODELS["ur10e"])
+    taught = transform_of(pose)
+    assert np.linalg.norm(position[0] - taught.position) < 5e-3  # the pose is the flange's: its robot is calibrated
+    assert np.abs(rotation[0] - taught.rotation).max() < 5e-3
+    place = load_laboratory(NIGHT).places[0].with_values(pose=pose, tool=Pose())
+    problems = Mock()
+    check_places(problems, [place], Pose(z=0.17))
+    assert "was taught with another tool than the arm's" in problems.add.call_args.args[0]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "overlap"),
+    [
+        ((197.7, -603.5, 562.9), (392.4, -603.6, 562.8), False),  # next to each other: A21.jsonl
+        ((132.8, -521.8, 454.2), (132.8, -521.8, 420.4), True),  # shelves of a hotel: H12.jsonl
+    ],
+)
+def test_places_of_a_plate_hotel_are_told_apart_from_above_only(
+    first: tuple[float, ...], second: tuple[float, ...], overlap: bool
+) -> None:
+    """Positions [mm] that github.com/pharmbio/robotlab has taught for plates, in cellpainter/movelists."""
+    spec = load_laboratory(NIGHT)
+    assert isinstance(spec.arm, UrArmSettings)
+    old = spec.places[1]
+    places = [
+        old.with_values(name=name, pose=Pose.of(*(1e-3 * value for value in at), *old.pose.as_list[3:]))
+        for name, at in (("one", first), ("other", second))
+    ]
+    cup = replace_grip(cylinder("cup", inner_radius=0.06, inner_height=0.02))
+    problems = [text for _, text in place_problems(places, spec.arm, {"pourer": vessel(cup), "receiver": vessel(cup)})]
+    assert any("places 'one' and 'other' overlap" in text for text in problems) == overlap

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -14,16 +13,15 @@ import pytest
 
 from actors.arm.arm_geometry import Pose
 from actors.balance.weighing_plan import Placement
-from actors.bench.bench_operators import BenchContents
 from actors.bench.night_consent import NightConsent
 from actors.grippers.gripper_interface import GRIPPERS
 from actors.interfaces import Notice, NotPouredError, OperatorQuestion
 from actors.laboratory_settings import LaboratorySettings
 from actors.liquid_devices import PUMPS, SourceSettings
 from actors.places import PlaceSettings, UnattendedSettings
-from orchestrator.materials.vessel_account import LaboratoryPlaces, VesselAccount
-from sim_engine.vessel.shapes import VesselGrip, VesselSpec
-from tests.support.wired_bench import ACTION, SCENE, OpenStage, Stage, wired_spec
+from orchestrator.materials.vessel_account import VesselAccount
+from tests.reliability.night import HANDLED, Watched
+from tests.support.wired_bench import ACTION, OpenStage, Stage, wired_spec
 
 TURN = 2.0 * math.pi / (3.0 * math.sqrt(3.0))
 
@@ -41,44 +39,10 @@ PLACES = (
 )
 
 
-def carried(vessel: VesselSpec, mass: float) -> VesselSpec:
-    return vessel.model_copy(update={"grip": VesselGrip(mass=mass)})
-
-
-HANDLED = replace(SCENE, pourer=carried(SCENE.pourer, 0.312), receiver=carried(SCENE.receiver, 0.186))
-
-
 def placed_spec(**changes: Any) -> LaboratorySettings:
     spec = wired_spec(Placement.RECEIVER, hurried=True)
     gripper = GRIPPERS.get("robotiq")(model="2F-140")
     return spec.with_values(**{"gripper": gripper, "places": PLACES, **changes})
-
-
-class Watched(LaboratoryPlaces):
-    """An account of places that tells when a motion begins or ends."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(account(folder), "virtual")
-        self.once: dict[str, Callable[[], Awaitable[Any]]] = {}
-        self.tasks: list[asyncio.Future[Any]] = []
-        self.truth: BenchContents | None = None
-
-    def follow(self, truth: BenchContents) -> None:
-        """Compare with the true places whenever one of them changes: then a killed program leaves a true account."""
-        move, self.truth = truth.move, truth
-
-        def moved(vessel: str, place: str, *, on_balance: bool) -> None:
-            assert self.stands()[vessel] is None, f"{vessel} moves, and is not UNKNOWN"
-            move(vessel, place, on_balance=on_balance)
-
-        truth.move = moved  # type: ignore[method-assign]
-
-    def put(self, vessel: str, place: str | None, note: str = "") -> None:
-        super().put(vessel, place, note)
-        if place is not None and self.truth is not None:
-            assert self.truth.stands.get(vessel) == place, f"{vessel} is not at '{place}'"
-        if (hook := self.once.pop(f"{vessel}: {note}", None)) is not None:
-            self.tasks.append(asyncio.ensure_future(hook()))
 
 
 def account(folder: Path) -> VesselAccount:
@@ -93,9 +57,9 @@ def played(
     open_stage: OpenStage, folder: Path, play: Callable[[Stage, Watched], Awaitable[Any]], **changes: Any
 ) -> tuple[Any, Stage]:
     async def run() -> tuple[Any, Stage]:
-        record = Watched(folder)
+        record = Watched(folder, "virtual")
         async with open_stage(spec=placed_spec(**changes), record=record) as stage:
-            record.follow(stage.contents)
+            record.follow(stage)
             return await play(stage, record), stage
 
     return asyncio.run(run())
@@ -121,12 +85,19 @@ def test_the_arm_does_what_the_operator_did_between_two_pours(open_stage: OpenSt
     async def play(stage: Stage, record: Watched) -> list[Any]:
         return [await pour(stage) for _ in range(2)]
 
-    (first, second), stage = played(open_stage, tmp_path, play)
+    places = (PLACES[0].with_values(tray=204e-6), *PLACES[1:])
+    (first, second), stage = played(open_stage, tmp_path, play, places=places)
     assert stage.heard == [
-        *PREPARED,
-        *("move", "start", "move", "move"),
-        *("move", "top_up", "move", "start", "move", "move"),
+        *("tray_full", *PREPARED),
+        *("move", "start", "move"),
+        *("tray_full", "move", "top_up", "move", "start", "move"),  # one more pour could overflow it
     ]
+    assert stage.operator.heard[0].text.startswith("An unknown mass is in the spill tray")
+    spilled = next(one for one in reversed(stage.operator.heard) if one.about == "tray_full").details["held_g"]
+    assert spilled == pytest.approx(1e3 * first.spilled, abs=0.1)
+    in_tray = account(tmp_path).content("virtual/tray")
+    assert in_tray is not None
+    assert in_tray.mass == pytest.approx(stage.contents.on_tray, abs=3e-4)
     assert stage.unsafe == []
     assert first.notes["cycle"] == {}
     cycle = second.notes["cycle"]
@@ -137,7 +108,7 @@ def test_the_arm_does_what_the_operator_did_between_two_pours(open_stage: OpenSt
     assert standing(tmp_path) == {"pourer": "pan", "receiver": "right"}
     held = account(tmp_path).content("virtual/receiver")
     assert held is not None
-    assert held.mass == pytest.approx(1e-3 * second.notes["received_g"], abs=1e-5)
+    assert held.mass == pytest.approx(stage.contents.in_receiver, abs=1e-4)  # with the film
 
 
 @pytest.mark.realtime
@@ -146,6 +117,7 @@ def test_one_consent_lasts_for_a_night_of_pours_and_every_gram_is_accounted(
     open_stage: OpenStage, tmp_path: Path
 ) -> None:
     async def play(stage: Stage, record: Watched) -> list[Any]:
+        record.content("reservoir", 2.0, 1e-3, "water")
         return [await pour(stage) for _ in range(3)]
 
     places = (PLACES[0], PLACES[1].with_values(use="source"), PLACES[2])
@@ -158,6 +130,10 @@ def test_one_consent_lasts_for_a_night_of_pours_and_every_gram_is_accounted(
     for one in measured[1:]:
         assert abs(one.notes["cycle"]["missing_g"]) < 0.5
         assert one.loaded == pytest.approx(0.2, abs=5e-3)
+    there = stage.contents.in_pourer + stage.contents.in_receiver + stage.contents.on_tray
+    reserve = account(tmp_path).content("virtual/reservoir")
+    assert reserve is not None
+    assert reserve.mass == pytest.approx(2.0 - (there - measured[0].loaded), abs=5e-4)
 
 
 @pytest.mark.realtime
@@ -183,7 +159,7 @@ def test_a_vessel_lost_on_its_way_is_unknown_and_ends_the_consent(open_stage: Op
     assert [one["receiver"] for one in seen] == [None, None]
     assert stage.heard == [
         *(*PREPARED, "unattended", "recover", "home"),
-        *("laid_out", "cleared", "pourer_full", "move", "start", "move", "move"),  # the consent does not renew itself
+        *("laid_out", "cleared", "pourer_full", "move", "start", "move"),  # the consent does not renew itself
     ]
     assert "it is unknown where the receiver stands" in stage.operator.heard[7].problem
     assert "unattended: the consent has ended. a question: the gripper may have lost" in stage.said("warning")
@@ -194,15 +170,23 @@ def test_a_vessel_lost_on_its_way_is_unknown_and_ends_the_consent(open_stage: Op
 @pytest.mark.realtime
 def test_masses_that_do_not_close_are_asked_about(open_stage: OpenStage, tmp_path: Path) -> None:
     async def play(stage: Stage, record: Watched) -> Any:
+        async def fill() -> None:
+            record.content("reservoir", 1.0, 1e-3, "water")
+
+        record.content("reservoir", 1e-3, 1e-4, "water")
+        stage.before["reservoir"] = fill
         await pour(stage)
         stage.contents.spilt_back = 5e-3
         return await pour(stage)
 
-    measured, stage = played(open_stage, tmp_path, play, **NIGHT)
+    places = (PLACES[0], PLACES[1].with_values(use="source"), PLACES[2])
+    measured, stage = played(open_stage, tmp_path, play, **NIGHT, places=places)
+    assert stage.heard.count("reservoir") == 1
+    assert stage.said("warning").count("the consent has ended. a question: The reservoir of the refill device") == 1
     asked = next(one for one in stage.operator.heard if one.about == "mass")
     assert asked.details["missing_g"] == pytest.approx(5.0, abs=0.5)
     assert measured.notes["cycle"]["missing_g"] == pytest.approx(5.0, abs=0.5)
-    assert stage.heard[stage.heard.index("mass") :] == ["mass", "move", "start", "move", "move"]
+    assert stage.heard[stage.heard.index("mass") :] == ["mass", "move", "start", "move"]
 
 
 @pytest.mark.slow
@@ -220,71 +204,11 @@ def test_a_vessel_that_is_not_grasped_is_put_right_by_a_person(open_stage: OpenS
         return await pour(stage)
 
     measured, stage = played(open_stage, tmp_path, play, **NIGHT)
-    assert stage.heard == [*PREPARED, "unattended", "grasp_failed", "move", "start", "move", "move"]
+    assert stage.heard == [*PREPARED, "unattended", "grasp_failed", "move", "start", "move"]
     assert "the receiver was not grasped at 'right'" in next(
         one.problem for one in stage.operator.heard if one.about == "grasp_failed"
     )
     assert measured.loaded == pytest.approx(0.2, abs=5e-3)
-
-
-async def protective_stop(stage: Stage) -> None:
-    await stage.site.fault("protective_stop")
-
-
-async def lost(stage: Stage) -> None:
-    await stage.site.gripper_fault("lost")
-
-
-async def spilt(stage: Stage) -> None:
-    stage.contents.spilt_back = 5e-3
-
-
-FAULTS: dict[int, tuple[str, Callable[[Stage], Awaitable[None]], str]] = {
-    2: ("receiver: the arm began to take it from 'right'", spilt, "mass"),
-    3: ("pourer: the arm began to carry it to 'left'", protective_stop, "recover"),
-    4: ("receiver: the arm began to carry it to 'right'", lost, "recover"),
-    5: ("receiver: the arm began to take it from 'right'", protective_stop, "recover"),
-}
-"""Number of a pour, the motion at whose begin something fails, the failure, and what a person is asked first."""
-
-
-@pytest.mark.slow
-@pytest.mark.realtime
-def test_a_virtual_night_with_faults_ends_each_in_a_safe_state_and_a_person_continues_it(
-    open_stage: OpenStage, tmp_path: Path
-) -> None:
-    async def play(stage: Stage, record: Watched) -> dict[int, list[str]]:
-        asked: dict[int, list[str]] = {}
-        measured: list[Any] = []
-
-        for number in range(1, 7):
-            begun = len(stage.heard)
-            if number in FAULTS:
-                where, fault, _ = FAULTS[number]
-                record.once[where] = lambda fault=fault: fault(stage)  # type: ignore[misc]
-            try:
-                measured.append(await pour(stage))
-            except NotPouredError:
-                measured.append(await pour(stage))  # the campaign is resumed
-            asked[number] = stage.heard[begun:]
-            assert record.once == {}
-        assert len(measured) == 6
-        for one in measured:
-            assert one.loaded == pytest.approx(0.2, abs=5e-3)
-            missing = one.notes["cycle"].get("missing_g", 0.0)
-            assert abs(missing) < 0.5 or missing == pytest.approx(5.0, abs=0.5)
-        return asked
-
-    places = (PLACES[0], PLACES[1].with_values(use="source"), PLACES[2])
-    asked, stage = played(open_stage, tmp_path, play, **NIGHT, places=places)
-    assert asked[1] == [*PREPARED, "unattended"]
-    for number, (_, _, first) in FAULTS.items():
-        motions = {"move", "start"}
-        assert next(one for one in asked[number] if one not in motions) == first, asked[number]
-    assert stage.heard.count("unattended") == 1
-    assert stage.unsafe == []
-    assert stage.said("warning").count("unattended: the consent has ended") == 1
-    assert standing(tmp_path) == {"pourer": "pan", "receiver": "right"}
 
 
 @pytest.mark.parametrize(

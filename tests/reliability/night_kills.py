@@ -1,0 +1,271 @@
+"""The daemon of an unattended campaign is killed at random points of the cycle.
+
+python -m tests.reliability.night_kills --kills 30    # some twenty minutes; writes build/night-kills.jsonl
+
+The daemon is in a process of its own; a client answers its questions over HTTP, and resumes the campaign. Arm, gripper
+and balance are emulated behind their protocols, the liquid is a formula. In each life the daemon ends by SIGKILL soon
+after a motion of random number has begun, counted from its first one. Afterwards the account is compared with what
+truly stood where and what it held:
+
+- a vessel stands where the account says, or that says UNKNOWN; likewise its content, within `ACCOUNTED`;
+- the next life moves nothing before its own consent was given;
+- no pour is made twice, and no process of a killed daemon is left.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import shutil
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ruamel.yaml import YAML
+
+from actors.arm.arm_device import DeviceArm
+from actors.bench.bench_operators import BenchContents
+from actors.bench.liquid_supply import LiquidSupply
+from actors.laboratory import WarmSimulators
+from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.daemon.daemon_client import Client, DaemonError
+from orchestrator.daemon.daemon_settings import load_settings
+from orchestrator.daemon.server_process import serve
+from orchestrator.daemon.submissions import pack
+from orchestrator.materials.vessel_account import FILE_NAME, VesselAccount
+from tests.reliability import strikes
+from tests.reliability.formula import LOG, Formula
+from tests.reliability.night import ACCOUNTED, ROOT
+from tests.reliability.rig import LEAVING, PATIENCE, leftovers, warm_up
+
+RESULTS = ROOT / "build" / "night-kills.jsonl"
+
+MOTIONS = 61
+"""Motions of the arm from the first consent to the end of the second pour."""
+
+LATEST = 0.5
+"""Longest time from the begin of a motion to the kill [s]: on an idle machine a motion takes a third of it."""
+
+SEED = 11
+
+
+@dataclass
+class Killed:
+    """A life of the daemon, and what it left.
+
+    Attributes:
+        motion: number of the motion that had begun.
+        during: what it was.
+        places, contents: of pourer and receiver: 'right', 'UNKNOWN', or 'wrong'.
+        wrong: what should not be.
+    """
+
+    motion: int
+    during: str
+    places: dict[str, str]
+    contents: dict[str, str]
+    wrong: list[str]
+
+
+class KilledNight:
+    """A campaign in a daemon that is killed again and again.
+
+    Args:
+        place: folder to work in.
+    """
+
+    def __init__(self, place: Path) -> None:
+        self.place, self.state, self._log = place, place / "state", place / "log"
+        (place / "tmp").mkdir()
+        self._campaign = _write_campaign(place)
+        self.plan = load_campaign(self._campaign)
+
+    def kill(self, motion: int, delay: float) -> Killed:
+        """One life: until it is killed so long [s] after a motion has begun."""
+        (self.state / "url").unlink(missing_ok=True)
+        self._note("life", "")
+        child = os.fork()
+        if child == 0:
+            self._serve(motion, delay)
+        wrong, end = [], time.monotonic() + PATIENCE
+        while os.waitpid(child, os.WNOHANG)[0] == 0:
+            time.sleep(0.05)
+            if time.monotonic() > end:
+                strikes.kill([child])
+                os.waitpid(child, 0)
+                wrong.append("it was not killed in time")
+                break
+            if (self.state / "url").exists():
+                with contextlib.suppress(DaemonError, OSError), Client(state=self.state) as client:
+                    self._attend(client)
+        return self._look(motion, [*wrong, *self._left()])
+
+    def twice(self) -> list[str]:
+        """Pours that were made twice, as seeds of their liquid."""
+        poured = self.place / "poured"
+        made = Counter(poured.read_text("utf-8").split()) if poured.exists() else Counter[str]()
+        return [seed for seed, count in made.items() if count > 1]
+
+    def _note(self, what: str, value: Any) -> None:
+        with self._log.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([what, value]) + "\n")
+
+    # ---- the client
+
+    def _attend(self, client: Client) -> None:
+        items = client.get("/campaigns")
+        if not items:
+            text, files = pack(load_campaign(self._campaign))
+            client.post("/campaigns", {"text": text, "files": files})
+            return
+        for question in client.get("/questions"):
+            answer = {"done": "done", "yes or no": "yes", "option": "lost"}[question["wants"]]
+            self._note("answered", question["about"])
+            client.post(f"/questions/{question['id']}/answer", {"answer": answer})
+        if items[0]["state"] in ("failed", "paused", "unknown") and not items[0]["progress"]:
+            client.post(f"/campaigns/{items[0]['id']}/resume")
+
+    # ---- the daemon's process
+
+    def _serve(self, motion: int, delay: float) -> NoReturn:
+        try:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            os.dup2(os.open(self.place / "errors", os.O_WRONLY | os.O_CREAT | os.O_APPEND), 2)
+            os.environ |= {"TMPDIR": str(self.place / "tmp"), LOG: str(self.place / "poured")}
+            tempfile.tempdir = None
+            WarmSimulators.__init__.__kwdefaults__["make"] = Formula
+            self._follow_truth()
+            self._count_motions(motion, delay)
+            serve(replace(load_settings(None, state=self.state, port=0, in_process=True), keep_free=0))
+        finally:
+            os._exit(1)
+
+    def _follow_truth(self) -> None:
+        """Write down each change of what truly stands where and what it holds."""
+
+        def tell(contents: BenchContents) -> None:
+            self._note("true", [contents.stands, contents.in_pourer, contents.in_receiver])
+
+        for name in ("move", "pour_back", "receive", "do"):
+            change: Callable[..., Any] = getattr(BenchContents, name)
+
+            def told(contents: BenchContents, *values: Any, _change: Any = change, **named: Any) -> None:
+                _change(contents, *values, **named)
+                tell(contents)
+
+            setattr(BenchContents, name, told)
+        top_up = LiquidSupply.top_up
+
+        async def topped(supply: LiquidSupply, *values: Any) -> bool:
+            done = await top_up(supply, *values)
+            if supply._contents is not None:
+                tell(supply._contents)
+            return done
+
+        LiquidSupply.top_up = topped  # type: ignore[method-assign]
+
+    def _count_motions(self, motion: int, delay: float) -> None:
+        """Write down each motion when it begins, and end this process in one of them."""
+        count = 0
+        for name in ("carry", "move_to_start", "execute", "retreat"):
+            move: Callable[..., Any] = getattr(DeviceArm, name)
+
+            async def moved(
+                arm: DeviceArm, path: Any, *values: Any, _move: Any = move, _name: str = name, **named: Any
+            ) -> Any:
+                nonlocal count
+                count += 1
+                where = f" {'from' if path.homewards else 'to'} '{path.place}'" if _name == "carry" else ""
+                self._note("motion", f"{_name}{where}{' with a vessel' if named.get('loaded') else ''}")
+                if count == motion:
+                    threading.Timer(delay, os.kill, (os.getpid(), 9)).start()
+                return await _move(arm, path, *values, **named)
+
+            setattr(DeviceArm, name, moved)
+
+    # ---- afterwards
+
+    def _look(self, motion: int, wrong: list[str]) -> Killed:
+        lines = [json.loads(line) for line in self._log.read_text("utf-8").splitlines()]
+        life = lines[max(n for n, (what, _) in enumerate(lines) if what == "life") :]
+        moved = next((n for n, (what, _) in enumerate(life) if what == "motion"), len(life))
+        if ["answered", "unattended"] not in life[:moved]:
+            wrong.append("the arm moved before a consent")
+        motions = [value for what, value in life if what == "motion"]
+        stands, in_pourer, in_receiver = next(value for what, value in reversed(life) if what == "true")
+        account = VesselAccount(self.state / FILE_NAME)
+        places: dict[str, str] = {}
+        contents: dict[str, str] = {}
+        for vessel, true in (("pourer", in_pourer), ("receiver", in_receiver)):
+            name = f"{self.plan.laboratory.name}/{vessel}"
+            place, held = account.places()[name].place, account.content(name)
+            places[vessel] = "UNKNOWN" if place is None else "right" if place == stands.get(vessel) else "wrong"
+            mass = None if held is None else held.mass
+            contents[vessel] = "UNKNOWN" if mass is None else "right" if abs(mass - true) <= ACCOUNTED else "wrong"
+            if "wrong" in (places[vessel], contents[vessel]):
+                wrong.append(f"the {vessel}: {place}, {mass}; in truth {stands.get(vessel)}, {true}")
+        return Killed(motion, motions[-1] if motions else "", places, contents, wrong)
+
+    def _left(self) -> list[str]:
+        end = time.monotonic() + LEAVING
+        while (left := leftovers(self.place)) and time.monotonic() < end:
+            time.sleep(0.1)
+        strikes.kill([process.pid for process in left])
+        return [f"left running: {[process.cmdline() for process in left]}"] if left else []
+
+
+def _write_campaign(folder: Path) -> Path:
+    """The shipped campaign of a night, with a person at its laboratory and many short pours."""
+    yaml = YAML()
+    laboratory = yaml.load(ROOT / "configs" / "laboratories" / "night.yaml")
+    laboratory["operator"] = {"answers": "person"}
+    yaml.dump(laboratory, folder / "lab.yaml")
+    campaign = yaml.load(ROOT / "configs" / "campaigns" / "night.yaml")
+    campaign["laboratory"] = "lab.yaml"
+    campaign["unattended"]["until"] = "23:59"
+    campaign["outputs"] = {"directory": "runs", "recording": False, "figures": False}
+    campaign["on_unknown"] = "ask"
+    yaml.dump(campaign, folder / "night.yaml")
+    return folder / "night.yaml"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=30)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    options = parser.parse_args()
+    options.results.parent.mkdir(exist_ok=True)
+    place = Path(tempfile.mkdtemp(prefix="n", dir="/tmp"))
+    rng, found = random.Random(SEED), list[Killed]()
+    try:
+        night = KilledNight(place)
+        warm_up(load_campaign(_small(place)))
+        with options.results.open("w", encoding="utf-8") as out:
+            for _ in range(options.kills):
+                found.append(night.kill(rng.randint(1, MOTIONS), rng.uniform(0.0, LATEST)))
+                out.write(json.dumps(asdict(found[-1])) + "\n")
+                out.flush()
+                print(found[-1], flush=True)
+        if twice := night.twice():
+            found[-1].wrong.append(f"made twice: {twice}")
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+    return 1 if any(one.wrong for one in found) else 0
+
+
+def _small(folder: Path) -> Path:
+    from tests.support.small_campaign import write_campaign
+
+    return write_campaign(folder)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
