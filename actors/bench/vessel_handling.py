@@ -237,7 +237,8 @@ class VesselHandling:
         self._gross: PourMasses | None = None
         self._pending: tuple[_Poured, PourMasses, PourMasses] | None = None
         self._cycle: dict[str, float] = {}
-        self._agreed, self._asked = "", False
+        self._agreed: tuple[str, ...] = ()
+        self._asked = False
         self._in_tray = (0.0, 0.0)
 
     # ---- checks
@@ -287,7 +288,7 @@ class VesselHandling:
         assert self._scene is not None
         self._require_known()
         poured, before = self._poured, self._gross
-        async with self._driving(consent, BACK, then=SET_UP):
+        async with self._driving(consent, BACK, *([self._fill] if self._refills else []), SET_UP):
             await self._take("receiver", consent)
             await self._pour_back(consent, seed)
             self._mass["receiver"] = 0.0
@@ -353,10 +354,10 @@ class VesselHandling:
             missing = liquid.mass - (now.mass - empty.mass)
             if abs(missing) <= 0.5 * self._weighing.load_tolerance:
                 return now
-            if missing > 0.0 and tries < REFILLS and rest.use == "source" and self._supply is not None:
+            if missing > 0.0 and tries < REFILLS and self._refills and self._supply is not None:
                 tries += 1
                 reserve = await self._reserve(missing, consent)
-                async with self._driving(consent, f"carry the pourer to '{rest.name}', where it is filled up"):
+                async with self._driving(consent, self._fill, SET_UP):
                     await self._move("pourer", rest.name, consent)
                     filled = await self._supply.top_up(missing, liquid.density, seed)
                     self._mass["pourer"] = liquid.mass
@@ -377,6 +378,14 @@ class VesselHandling:
             )
             await self._ask(question, consent)
             now, problem = await self._weigh(), "it does not hold what is asked for"
+
+    @property
+    def _refills(self) -> bool:
+        return self._layout.rest["pourer"].use == "source" and self._supply is not None
+
+    @property
+    def _fill(self) -> str:
+        return f"carry the pourer to '{self._layout.rest['pourer'].name}', where it is filled up"
 
     async def _reserve(self, missing: float, consent: MotionConsent) -> tuple[float, float] | None:
         """What the reservoir of the refill device holds [kg]; None if the account has no content of it.
@@ -432,7 +441,7 @@ class VesselHandling:
                 await self._set_up(consent)
                 return "done"
             if about == "cleared_after":
-                async with self._driving(consent, CLEAR, then=WEIGH):
+                async with self._driving(consent, CLEAR, WEIGH):
                     await self._put("pourer", rest["pourer"].name)
                     await self._move("receiver", rest["receiver"].name, consent)
                 return "done"
@@ -542,34 +551,34 @@ class VesselHandling:
 
     def forget(self) -> None:
         """The cycle was interrupted: the vessels are laid out again before the next pour."""
-        self._at, self._poured, self._pending, self._agreed = {}, None, None, ""
+        self._at, self._poured, self._pending, self._agreed = {}, None, None, ()
 
     async def _ask(self, question: OperatorQuestion, consent: MotionConsent) -> str:
         """Ask a person, who may reach into the cell: motions that follow are agreed to again."""
-        self._agreed, self._asked = "", True
+        self._agreed, self._asked = (), True
         return await consent.asked(question)
 
     # ---- moves
 
     @contextlib.asynccontextmanager
-    async def _driving(self, consent: MotionConsent, does: str, then: str = "") -> AsyncIterator[None]:
+    async def _driving(self, consent: MotionConsent, does: str, *then: str) -> AsyncIterator[None]:
         """Drive a sequence after one consent; a stop ends it, and a person brings the arm home.
 
         Args:
             consent: of the pour.
             does: the sequence.
-            then: the one that follows once the balance is read, and needs no other consent unless a person is asked
-                something before it.
+            then: those that may follow once the balance is read, and need no other consent unless a person is asked
+                something before them.
 
         Raises:
             LaboratoryError: it was interrupted; the vessel that was moved is UNKNOWN.
         """
-        if self._agreed != does:
-            await consent.given(move_question(f"{does}; once the balance is read, {then}" if then else does))
-        self._agreed, self._asked = "", False
+        if does not in self._agreed:
+            await consent.given(move_question("; once the balance is read, ".join((does, *then))))
+        self._agreed, self._asked = (), False
         try:
             yield
-            self._agreed = "" if self._asked else then
+            self._agreed = () if self._asked else then
         except LaboratoryError as error:
             self.forget()
             if self._away or isinstance(error, STUCK):

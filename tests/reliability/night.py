@@ -28,7 +28,7 @@ import statistics
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,6 @@ from tests.support.wired_bench import ACTION, LABORATORIES, PACE, SCENE, Stage, 
 
 ROOT = Path(__file__).parents[2]
 PAGE, RESULTS = ROOT / "docs" / "evidence" / "reliability.md", ROOT / "build" / "night.jsonl"
-BEGIN, END = "<!-- measured: night -->\n", "<!-- end of what was measured -->"
 
 ACCOUNTED = 0.5e-3
 """Largest error of an account [kg]."""
@@ -508,14 +507,42 @@ def chosen(pours: int, faults: int, seed: int = 7) -> dict[int, Fault]:
     return {number + apart: fault for (apart, number), fault in zip(enumerate(found), FAULTS[:faults], strict=True)}
 
 
-def table(results: Path) -> str:
-    """Of what was written."""
-    head, *rows = [json.loads(line) for line in results.read_text("utf-8").splitlines()]
-    end = rows.pop()
-    cycles = [Cycle(**row) for row in rows]
+def table(results: Path) -> list[str]:
+    """Lines of the page's table, of what was written."""
+    rows = [json.loads(line) for line in results.read_text("utf-8").splitlines()]
+    cycles = [Cycle(**row) for row in rows if "number" in row]
+    ends = [row for row in rows if "runs" in row]
     faulty = [cycle for cycle in cycles if cycle.fault]
-    lines = [json.dumps(head), json.dumps(end), str(len(faulty)), str(statistics.median(c.pace for c in cycles))]
-    return "\n".join(lines)
+    unplanned = [cycle for cycle in cycles if cycle.unplanned]
+    poured = Counter(cycle.number for cycle in cycles if cycle.outcome != "not poured")
+    missing = max(abs(cycle.missing) for cycle in cycles if cycle.missing is not None)
+
+    def kinds(outcome: str) -> str:
+        found = Counter(cycle.fault for cycle in faulty if cycle.outcome == outcome)
+        return ", ".join(f"{kind} ({count})" if count > 1 else kind for kind, count in found.items()) or "–"
+
+    return [
+        "| | |",
+        "|---|---|",
+        f"| pours, tries, consents | {len(poured)}, {len(cycles)}, {len(faulty) + len(unplanned) + 1} |",
+        f"| made twice | {sum(count > 1 for count in poured.values())} |",
+        f"| faults; of them with one message | {len(faulty)}; {sum(cycle.messages == 1 for cycle in faulty)} |",
+        f"| consents that ended without a fault | {len(unplanned)} |",
+        f"| a person mended it, and the same pour was made and weighed | {kinds('weighed')} |",
+        f"| nothing was poured; another run made the pour | {kinds('not poured')} |",
+        f"| the pour is UNKNOWN, and its masses were weighed | {kinds('unknown')} |",
+        f"| largest imbalance of a cycle, besides injected spills [g] | {1e3 * missing:.2f} |",
+        f"| largest error of the account of contents and spill tray [g] | {1e3 * max(c.wrong for c in cycles):.2f} |",
+        f"| bench seconds per second, median | {statistics.median(cycle.pace for cycle in cycles):.1f} |",
+        f"| other than it should be | {len([text for end in ends for text in end['wrong']])} |",
+    ]
+
+
+def write(page: Path, name: str, lines: Sequence[str]) -> None:
+    """Replace what stands between the marks of a measurement on a page."""
+    text, (begin, end) = page.read_text("utf-8"), (f"<!-- measured: {name} -->\n", "<!-- end of what was measured -->")
+    head, rest = text.split(begin)
+    page.write_text(head + begin + "\n".join(lines) + "\n" + end + rest.partition(end)[2], encoding="utf-8")
 
 
 def main() -> int:
@@ -527,7 +554,7 @@ def main() -> int:
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     if options.write:
-        print(table(options.results))
+        write(PAGE, "night", table(options.results))
         return 0
     options.results.parent.mkdir(exist_ok=True)
     begun = time.monotonic()

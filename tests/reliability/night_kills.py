@@ -1,6 +1,7 @@
 """The daemon of an unattended campaign is killed at random points of the cycle.
 
 python -m tests.reliability.night_kills --kills 30    # some twenty minutes; writes build/night-kills.jsonl
+python -m tests.reliability.night_kills --write       # no kill: the table of docs/evidence/reliability.md
 
 The daemon is in a process of its own; a client answers its questions over HTTP, and resumes the campaign. Arm, gripper
 and balance are emulated behind their protocols, the liquid is a formula. In each life the daemon ends by SIGKILL soon
@@ -43,7 +44,7 @@ from orchestrator.daemon.submissions import pack
 from orchestrator.materials.vessel_account import FILE_NAME, VesselAccount
 from tests.reliability import strikes
 from tests.reliability.formula import LOG, Formula
-from tests.reliability.night import ACCOUNTED, ROOT
+from tests.reliability.night import ACCOUNTED, PAGE, ROOT, write
 from tests.reliability.rig import LEAVING, PATIENCE, leftovers, warm_up
 
 RESULTS = ROOT / "build" / "night-kills.jsonl"
@@ -237,11 +238,39 @@ def _write_campaign(folder: Path) -> Path:
     return folder / "night.yaml"
 
 
+def table(results: Path) -> list[str]:
+    """Lines of the page's table, of what was written."""
+    found = [Killed(**json.loads(line)) for line in results.read_text("utf-8").splitlines()]
+    moments = {
+        "the arm carried a vessel": lambda text: "with a vessel" in text,
+        "the arm moved to a vessel, or away from it": lambda text: text.startswith("carry") and "with" not in text,
+        "the arm poured, or poured back": lambda text: not text.startswith("carry"),
+    }
+    lines = [
+        "| killed while or after | kills | places right, UNKNOWN | contents right, UNKNOWN | wrong |",
+        "|---|---|---|---|---|",
+    ]
+    for words, holds in moments.items():
+        these = [one for one in found if holds(one.during)]
+        counts = [
+            ", ".join(
+                str(sum(list(getattr(one, what).values()).count(how) for one in these)) for how in ("right", "UNKNOWN")
+            )
+            for what in ("places", "contents")
+        ]
+        lines.append(f"| {words} | {len(these)} | {counts[0]} | {counts[1]} | {sum(len(one.wrong) for one in these)} |")
+    return lines
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=30)
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
+    if options.write:
+        write(PAGE, "night kills", table(options.results))
+        return 0
     options.results.parent.mkdir(exist_ok=True)
     place = Path(tempfile.mkdtemp(prefix="n", dir="/tmp"))
     rng, found = random.Random(SEED), list[Killed]()

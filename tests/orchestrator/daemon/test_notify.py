@@ -159,6 +159,40 @@ def test_a_campaign_without_news_is_told_once_until_it_gives_some(web: WebReceiv
     ]
 
 
+def test_of_a_night_the_first_thing_that_needs_a_person_is_told_once(web: WebReceiver) -> None:
+    now = [0.0]
+    notifier = Notifier([web.url], silence=600.0, clock=lambda: now[0])
+
+    def asked(about: str, answer: str = "") -> None:
+        question = {"text": about, "about": about}
+        notifier.note("QuestionAsked", {"question": question}, "night")
+        if answer:
+            notifier.note("QuestionAnswered", {"question": {**question, "answer": answer}}, "night")
+
+    begun(notifier, "night")
+    asked("unattended", "yes")
+    now[0] = 30.0
+    asked("recover")
+    now[0] = 700.0
+    notifier.listen_for_silence()  # nobody has come
+    asked("recover", "yes")
+    now[0] = 710.0
+    asked("home", "yes")  # the one who came is at the page
+    asked("laid_out")
+    now[0] = 2000.0
+    asked("tray_full")  # and has left again
+    notifier.note("CampaignRests", {"state": "paused", "reason": "no answer within 1800 s"}, "night")
+    begun(notifier, "night")
+    notifier.note("CampaignRests", {"state": "failed", "reason": "no balance"}, "night")  # of a run without a consent
+    notifier.close()
+    assert [m["message"].partition("\n")[0] for m in web.messages] == [
+        "unattended",
+        "recover",
+        "tray_full",
+        "no balance",
+    ]
+
+
 def test_silence_is_noticed_without_anybody_asking(web: WebReceiver) -> None:
     notifier = Notifier([web.url], silence=0.2)
     begun(notifier)

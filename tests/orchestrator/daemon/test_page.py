@@ -18,7 +18,7 @@ import httpx
 import pytest
 
 from actors.emulators.ur_controller.controller_process import VirtualController
-from actors.interfaces import OperatorQuestion
+from actors.interfaces import Notice, OperatorQuestion
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon.access_tokens import Role, token_of
@@ -386,6 +386,40 @@ def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_
         cells = page.locator("#pours tbody tr").first.locator("td").all_inner_texts()
         assert cells[0] == "cup"
         assert cells[5].split("\n")[-1].strip() == "(spilled + retained) / loaded"
+
+
+class NightLaboratory(HeldLaboratory):
+    """Tells what a bench tells of pours without a person."""
+
+    def listen(self, hear: Any) -> None:
+        for level, text in (
+            ("note", "operator (laid_out): Put the receiver on the place 'right'. → 'done' after 4.0 s"),
+            ("info", "unattended: agreed, up to 200 pours until 2026-11-27 07:00"),
+            ("note", "poured back: 163.62 g left the receiver, 163.58 g are in the pourer, missing 0.04 ± 0.05 g"),
+            ("warning", "unattended: the consent has ended. a question: protective stop during carry"),
+            ("note", "operator (recover): The arm was stopped. Shall it be made ready again? → 'yes' after 12.0 s"),
+            ("note", "operator (move): Hands out of the cell. May it? → 'yes' after 1.0 s"),
+        ):
+            hear(Notice(level, text))  # type: ignore[arg-type]
+
+
+@pytest.mark.slow
+def test_a_night_is_one_timeline_of_pours_masses_faults_and_answers(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, NightLaboratory) as lab:
+        key = lab.do(lab.served.submit())
+        found = lab.do(lab.served.until(key, "finished"))
+        assert [one["kind"] for one in found["night"]] == ["consent", "accounted", "fault", "answer", *["pour"] * 3]
+        page.goto(lab.address())
+        page.locator("#night li").first.wait_for()
+        assert re.fullmatch(r"3 pours since \d\d:\d\d, 1 fault", page.locator("#night p").inner_text())
+        lines = page.locator("#night li").all_inner_texts()
+        assert "Pour" in lines[0]  # the newest first
+        assert "g spilled" in lines[0]
+        assert "agreed, up to 200 pours" in lines[-1]
+        assert "protective stop during carry" in page.locator("#night .fault").inner_text()
+        assert "recover: 'yes' after 12.0 s" in page.locator("#night .answer").inner_text()
+        if folder := os.environ.get("DECANT_PICTURES"):
+            page.screenshot(path=f"{folder}/night.png", full_page=True)
 
 
 @pytest.mark.slow
