@@ -41,7 +41,7 @@ _FIRST_LOOK = 0.02
 """Interval of the first sampling of a motion [s]: no pour moves away and back within that time."""
 
 FEWEST_POINTS, MOST_POINTS = 3_000, 16_000
-PATCHES = 160
+PATCHES, BATCH = 160, 16
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,10 @@ class _Samples:
 _samples: WeakKeyDictionary[Vessel, _Samples] = WeakKeyDictionary()
 
 
+def _size(group: Floats) -> int:
+    return len(group[0])
+
+
 def _sampled(vessel: Vessel) -> _Samples:
     if vessel not in _samples:
         corners = vessel.solid_vertices[vessel.solid_faces]
@@ -82,16 +86,16 @@ def _sampled(vessel: Vessel) -> _Samples:
         patches = PATCHES
         each = math.ceil(float(np.clip(wanted, FEWEST_POINTS, MOST_POINTS)) / patches)
         points = vessel.surface_points(each * patches)
-        # repeated halving along the longest side gives compact patches of equal size
-        groups = [points]
+        # repeated halving along the longest side gives compact patches of equal size; rows are x, y, z
+        groups = [np.ascontiguousarray(points.T)]
         while len(groups) < patches:
-            groups.sort(key=len)
+            groups.sort(key=_size)
             group = groups.pop()
-            axis = int(np.argmax(np.ptp(group, axis=0)))
-            group = group[np.argsort(group[:, axis], kind="stable")]
-            groups += [group[: len(group) // 2], group[len(group) // 2 :]]
-        longest = max(len(group) for group in groups)
-        padded = np.stack([np.concatenate([g, np.repeat(g[-1:], longest - len(g), axis=0)]) for g in groups])
+            axis = int(np.argmax(group.max(axis=1) - group.min(axis=1)))
+            group = group[:, np.argsort(group[axis], kind="stable")]
+            groups += np.split(group, [_size(group) // 2], axis=1)
+        longest = max(map(_size, groups))
+        padded = np.stack([g[:, np.minimum(np.arange(longest), _size(g) - 1)].T for g in groups])
         centres = (padded.min(axis=1) + padded.max(axis=1)) / 2.0
         radii = np.linalg.norm(padded - centres[:, None], axis=2).max(axis=1)
         _samples[vessel] = _Samples(padded, centres, radii)
@@ -293,13 +297,14 @@ def _centre_gap(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
     return gap
 
 
-def clearance(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
+def clearance(pourer: Vessel, receiver: Vessel, poses: Floats, below: float = math.inf) -> Floats:
     """Smallest distance between two vessels at every pose.
 
     Args:
         pourer: the moving one.
         receiver: at the world's origin.
         poses: shape (T, 7), see `first_contact`.
+        below: largest distance of interest [m]; where the distance is larger, the result is `below`.
 
     Returns:
         Shape (T,) [m]; negative if they overlap (then the depth as in `Contact`). Accurate to a part of the grids'
@@ -310,14 +315,14 @@ def clearance(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
     """
     poses = _check_poses(poses)
     into_receiver, into_pourer, _ = _directions(pourer, receiver, poses)
-    result = np.full(len(poses), np.inf)
+    result = np.full(len(poses), below)
     for direction in (into_receiver, into_pourer):
         least = direction.centre_distances()
-        for row in range(len(poses)):
+        order = np.argsort(least, axis=1)
+        for row in np.flatnonzero(least.min(axis=1) < result).tolist():
             # nearest patches first, until no other one can be closer
-            order = np.argsort(least[row])
-            for start in range(0, len(order), 16):
-                batch = order[start : start + 16]
+            for start in range(0, PATCHES, BATCH):
+                batch = order[row, start : start + BATCH]
                 if least[row, batch[0]] >= result[row]:
                     break
                 result[row] = min(result[row], direction.nearest(row, batch)[0])

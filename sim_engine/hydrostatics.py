@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -152,6 +153,11 @@ class _Table:
     head: float
     flows: Floats
 
+    @cached_property
+    def lists(self) -> tuple[list[list[float]], list[list[float]]]:
+        """Levels and flows; single numbers are read faster from lists."""
+        return self.levels.tolist(), self.flows.tolist()
+
 
 _tables: WeakKeyDictionary[Vessel, _Table] = WeakKeyDictionary()
 
@@ -216,40 +222,36 @@ def _lip_flow(radius: float, heads: Floats, tilt: float) -> Floats:
     return flow
 
 
-def _rows(grid: Floats, table: Floats, at: Floats) -> Floats:
-    """Rows of a table interpolated along its first axis (evenly spaced `grid`), shape (len(at), columns)."""
-    place = np.clip((at - grid[0]) / (grid[1] - grid[0]), 0.0, len(grid) - 1.0)
-    first = np.minimum(place.astype(np.int64), len(grid) - 2)
-    part = (place - first)[:, None]
-    result: Floats = table[first] * (1.0 - part) + table[first + 1] * part
-    return result
-
-
 def _drain(
     vessel: Vessel, volume: float, times: Floats, tilts: Floats, discharge: float
 ) -> tuple[Floats, Floats, Floats]:
     """Volume still in the vessel (T,) [m³], outflow (T,) [m³/s] and head (T,) [m], explicit in steps that never
     overshoot rest."""
     table = _table(vessel)
-    levels = _rows(table.tilts, table.levels, np.abs(tilts)).tolist()
-    flows = _rows(table.tilts, table.flows, np.abs(tilts)).tolist()
+    rows = np.clip((np.abs(tilts) - table.tilts[0]) / (table.tilts[1] - table.tilts[0]), 0.0, len(table.tilts) - 1.0)
+    firsts = np.minimum(rows.astype(np.int64), len(table.tilts) - 2)
+    parts = (rows - firsts).tolist()
+    levels, flows = table.lists
     last_cell, last_flow = len(table.volumes) - 2, table.flows.shape[1] - 2
     per_volume, steps = (last_cell + 1) / vessel.capacity, np.diff(times, append=times[-1]).tolist()
     inside, outflow, heads = [0.0] * len(steps), [0.0] * len(steps), [0.0] * len(steps)
     v = volume
-    for k, dt in enumerate(steps):
+    for k, (dt, first, part) in enumerate(zip(steps, firsts.tolist(), parts, strict=True)):
         inside[k] = v
         place = v * per_volume
         cell = min(int(place), last_cell)
-        row = levels[k]
-        slope = row[cell + 1] - row[cell]
-        head = row[cell] + (place - cell) * slope
+        rest, row, after = 1.0 - part, levels[first], levels[first + 1]
+        low = row[cell] * rest + after[cell] * part
+        slope = row[cell + 1] * rest + after[cell + 1] * part - low
+        head = low + (place - cell) * slope
         if head <= 0.0:
             continue
         heads[k] = head
         place = math.sqrt(min(head / table.head, 1.0)) * (last_flow + 1)
         at = min(int(place), last_flow)
-        q = flows[k][at] + (place - at) * (flows[k][at + 1] - flows[k][at])
+        row, after = flows[first], flows[first + 1]
+        low = row[at] * rest + after[at] * part
+        q = low + (place - at) * (row[at + 1] * rest + after[at + 1] * part - low)
         # at most the volume above the spill point: head divided by d(head)/dV, and at most the whole volume
         above = min(head / max(slope * per_volume, 1e-12), v)
         lost = min(discharge * q * dt, above)

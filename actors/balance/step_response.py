@@ -15,6 +15,7 @@ Limitations: a pure delay before the display moves cannot be seen, because the m
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -176,13 +177,17 @@ def _log_likelihood(misfit: Floats, squares: Floats, chances: Floats, changed: i
 
 def _poles(roots: Sequence[complex]) -> Callable[[Floats], Floats]:
     """Step response over time / lag of a low-pass filter with these poles, scaled to a lag of 1."""
-    scaled = np.array(roots) * float(np.real(np.sum(-1.0 / np.array(roots))))
-    weights = [1.0 / np.prod([1.0 - root / other for other in scaled if other != root]) for root in scaled]
-    times = np.linspace(0.0, 50.0, 50_001)
-    rest = np.sum([w * np.exp(root * times) for w, root in zip(weights, scaled, strict=True)], axis=0)
-    table = 1.0 - np.real(rest)
+
     # a fit evaluates millions of values: interpolation is several times faster than the exponentials
-    return lambda time: np.interp(time, times, table)
+    @functools.cache
+    def table() -> tuple[Floats, Floats]:
+        scaled = np.array(roots) * float(np.real(np.sum(-1.0 / np.array(roots))))
+        weights = [1.0 / np.prod([1.0 - root / other for other in scaled if other != root]) for root in scaled]
+        times = np.linspace(0.0, 50.0, 50_001)
+        rest = np.sum([w * np.exp(root * times) for w, root in zip(weights, scaled, strict=True)], axis=0)
+        return times, 1.0 - np.real(rest)
+
+    return lambda time: np.interp(time, *table())
 
 
 _BUTTERWORTH = [

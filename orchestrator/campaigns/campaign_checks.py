@@ -19,10 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from actors.arm.arm_settings import ArmSettings, arm_kind
-from actors.bench.held_vessel import grip_limits
 from actors.bench.pour_feasibility import vessel as built
-from actors.bench.vessel_handling import check_handling, plan_back
-from actors.dosing.simulated_dose import check_straight
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import InvalidActionError, LaboratoryError, UnreachablePlaceError
 from actors.places import PlaceSettings
@@ -341,6 +338,8 @@ class _Checker:
         """Whether the laboratory's gripper can hold the pourer; if not, a problem is added."""
         if self.gripper is None or self.arm is None:
             return True
+        from actors.bench.held_vessel import grip_limits
+
         try:
             grip_limits(pourer, self.gripper, self.arm)
         except LaboratoryError as error:
@@ -352,6 +351,8 @@ class _Checker:
         """Whether the arm can carry the vessels between the places of the laboratory, and pour the receiver back."""
         if not self.places or self.gripper is None or self.arm is None:
             return
+        from actors.bench.vessel_handling import check_handling, plan_back
+
         try:
             check_handling(self.places, self.arm, self.gripper, scene)
             plan_back(self.places, self.arm, scene)
@@ -416,6 +417,8 @@ class _Checker:
             if self.scene(scene, role, largest / scene.liquid.density, dosed=True) is None:
                 continue
             if simulated:
+                from actors.dosing.simulated_dose import check_straight
+
                 try:
                     check_straight(scene)
                 except InvalidActionError as error:

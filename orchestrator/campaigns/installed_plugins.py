@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Any
 
-from sim_engine.settings.plugin_registry import DISTRIBUTION, PluginRegistry, UnloadablePlugin
+from sim_engine.settings.plugin_registry import DISTRIBUTION, PluginRegistry, UnloadablePlugin, entries_of
 
 
 @dataclass(frozen=True)
@@ -44,9 +43,8 @@ def installed() -> list[Plugin]:
 def packages() -> dict[str, tuple[str, list[str]]]:
     """Other packages that register plug-ins: version, and the plug-ins ('decant.balances: spring'). Loads nothing."""
     found: dict[str, tuple[str, list[str]]] = {}
-    everything = entry_points()  # reads every installed package: once, not once per registry
     for door in doors():
-        for entry in everything.select(group=door.group):
+        for entry in entries_of(door.group):
             if entry.dist is not None and entry.dist.name != DISTRIBUTION:
                 _, names = found.setdefault(entry.dist.name, (entry.dist.version, []))
                 names.append(f"{door.group}: {entry.name}")

@@ -11,19 +11,20 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orchestrator.campaigns.fingerprint import scene_by_content
 from orchestrator.learning.calibration.pour_design import DesignPoured
 from orchestrator.learning.campaign_plan import RecordedPour
 from orchestrator.learning.strategy import is_sound
-from orchestrator.records.codec import Results
 from orchestrator.records.journal import JOURNAL_NAME
-from orchestrator.records.run_record import read_record
 from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
+
+if TYPE_CHECKING:
+    from orchestrator.records.codec import Results
 
 SAME = 1e-6
 """Largest difference [SI] between two values of a dimension that count as equal."""
@@ -55,6 +56,8 @@ def read_former_run(directory: Path) -> PreviousRun:
         JournalError: there is no run, or another version wrote it.
         CodecError: an entry can't be decoded.
     """
+    from orchestrator.records.run_record import read_record  # most campaigns use no other run
+
     record = read_record(directory)
     header, splits = record.header.fingerprint, _splits(record.results)
     weighed = [

@@ -6,6 +6,7 @@ that `--help` starts fast.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Annotated
 
@@ -441,4 +442,10 @@ _add(
 
 def main() -> None:
     """Run the command line."""
+    # Typer builds the parameters of all commands before it reads the first word
+    word = sys.argv[1] if len(sys.argv) > 1 else ""
+    commands = [one for one in app.registered_commands if one.name == word]
+    groups = [one for one in app.registered_groups if one.typer_instance and one.typer_instance.info.name == word]
+    if commands or groups:
+        app.registered_commands, app.registered_groups = commands, groups
     app()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,6 +25,9 @@ from orchestrator.cli.console import (
     print_note,
     print_warning,
 )
+
+if TYPE_CHECKING:
+    from orchestrator.campaigns.campaign_prior import PosteriorSource
 
 
 def validate(
@@ -94,9 +97,8 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             return f"daemon, rigs: {', '.join(rig.name for rig in load_settings(path).rigs)}", []
         case _:
             from orchestrator.campaigns.campaign_checks import check_campaign
-            from orchestrator.catalogue.catalogue import posterior_source
 
-            plan = load_campaign(path, posteriors=posterior_source)
+            plan = load_campaign(path, posteriors=_posteriors)
             for line in () if plan.memory is None else plan.memory.lines:
                 print_note(line)
             warned: list[str] = []
@@ -104,6 +106,12 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             for text in dict.fromkeys(warned):
                 print_warning(text)
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
+
+
+def _posteriors() -> PosteriorSource:
+    from orchestrator.catalogue.catalogue import posterior_source  # most campaigns have no prior
+
+    return posterior_source()
 
 
 def init(directory: Annotated[Path, typer.Argument(help="An empty folder, or one that does not exist yet.")]) -> None:

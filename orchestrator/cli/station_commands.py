@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import time
 from pathlib import Path
@@ -155,6 +154,8 @@ def serve_sila(
     from sim_engine.resources import require
 
     require("unitelabs", "the SiLA 2 server")
+    import asyncio
+
     from orchestrator.daemon import sila_server
 
     with connected_client(url, state) as client:

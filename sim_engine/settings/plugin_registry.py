@@ -8,10 +8,11 @@ Decant's own strategies, objectives, balances, arms and vessel sources are regis
 from __future__ import annotations
 
 import difflib
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache, cached_property
+from importlib.metadata import Distribution, EntryPoint, EntryPoints, entry_points
 from typing import Any, Generic, TypeVar
 
 from sim_engine.errors import DecantError
@@ -98,16 +99,12 @@ class PluginRegistry(Generic[T]):
         hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(usable) or 'none'}"
         raise PluginError(f"unknown {self._what} '{name}'; {hint}")
 
-    def forget(self) -> None:
-        """Search the installed packages again at the next use."""
-        self.__dict__.pop("_content", None)
-
     @cached_property
     def _content(self) -> tuple[dict[str, T], tuple[UnloadablePlugin, ...], dict[str, str]]:
         usable: dict[str, T] = {}
         packages: dict[str, str] = {}
         broken: list[UnloadablePlugin] = []
-        for entry in sorted(entry_points(group=self.group), key=_decant_first):
+        for entry in sorted(entries_of(self.group), key=_decant_first):
             package = _package(entry)
             if entry.name in usable:
                 if packages[entry.name] != package:  # the same package may be on the path twice
@@ -161,8 +158,24 @@ def _whole(found: T) -> T:
     return found
 
 
+def entries_of(group: str) -> EntryPoints:
+    """The entry points of a group in all installed packages."""
+    found: EntryPoints = _on_path(tuple(sys.path)).select(group=group)
+    return found
+
+
+@cache
+def _on_path(_: tuple[str, ...]) -> Any:
+    return entry_points()  # reads a file of every package
+
+
+@cache
+def _label(package: Distribution) -> str:
+    return f"{package.name} {package.version}"
+
+
 def _package(entry: EntryPoint) -> str:
-    return "an unknown package" if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
+    return "an unknown package" if entry.dist is None else _label(entry.dist)
 
 
 def _decant_first(entry: EntryPoint) -> tuple[bool, str, str]:

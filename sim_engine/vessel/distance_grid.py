@@ -62,14 +62,15 @@ class SignedDistanceGrid:
         return x, y, z
 
     def _locate(self, points: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
-        """Flat index of the cell's first node (N,), position within the cell (N, 3), distance to the box (N,)."""
-        limits = np.array(self.shape) - 1
-        scaled = (np.asarray(points, dtype=float) - self.origin) / self.spacing
-        clamped = np.clip(scaled, 0.0, limits)
-        beyond = np.linalg.norm(scaled - clamped, axis=-1) * self.spacing
+        """Flat index of the cell's first node (N,), position within the cell (3, N), distance to the box (N,)."""
+        limits = np.array(self.shape)[:, None] - 1
+        scaled = (np.asarray(points, dtype=float).T - self.origin[:, None]) / self.spacing
+        clamped = np.minimum(np.maximum(scaled, 0.0), limits)
+        x, y, z = scaled - clamped
+        beyond = np.sqrt(x * x + y * y + z * z) * self.spacing
         cell = np.minimum(clamped.astype(np.int64), limits - 1)
         _, ny, nz = self.shape
-        return (cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2], clamped - cell, beyond
+        return (cell[0] * ny + cell[1]) * nz + cell[2], clamped - cell, beyond
 
     def _corners(self, first: NDArray[np.int64]) -> Floats:
         """Values at a cell's eight corners, shape (2, 2, 2, N)."""
@@ -88,9 +89,9 @@ class SignedDistanceGrid:
         """
         first, u, beyond = self._locate(points)
         c = self._corners(first)
-        c = c[0] * (1.0 - u[:, 0]) + c[1] * u[:, 0]
-        c = c[0] * (1.0 - u[:, 1]) + c[1] * u[:, 1]
-        result: Floats = c[0] * (1.0 - u[:, 2]) + c[1] * u[:, 2] + beyond
+        c = c[0] * (1.0 - u[0]) + c[1] * u[0]
+        c = c[0] * (1.0 - u[1]) + c[1] * u[1]
+        result: Floats = c[0] * (1.0 - u[2]) + c[1] * u[2] + beyond
         return result
 
     def lower_bound(self, points: Floats) -> Floats:
@@ -119,11 +120,11 @@ class SignedDistanceGrid:
         """
         first, u, _ = self._locate(points)
         c = self._corners(first)
-        along = np.empty((len(u), 3))
+        along = np.empty((len(first), 3))
         for axis in range(3):
             face = np.moveaxis(c, axis, 0)
             difference = face[1] - face[0]
-            v, w = (u[:, i] for i in range(3) if i != axis)
+            v, w = (u[i] for i in range(3) if i != axis)
             difference = difference[0] * (1.0 - v) + difference[1] * v
             along[:, axis] = (difference[0] * (1.0 - w) + difference[1] * w) / self.spacing
         return along

@@ -141,8 +141,8 @@ def outer_profile(inner: Floats, wall: float, floor: float) -> Floats:
             *(end[:, 1] for pair in shifted for end in pair),
         ]
     )
-    levels = np.unique(np.round(levels[(levels >= 0.0) & (levels <= height)], 9))
-    levels = np.union1d(levels, [0.0, height])
+    between = np.round(levels[(levels >= 0.0) & (levels <= height)], 9)
+    levels = np.array(sorted({*between.tolist(), 0.0, height}))  # np.unique imports masked arrays
     reach = wall**2 - (levels[:, None] - points[:, 1]) ** 2
     radius = np.where(reach >= 0.0, points[:, 0] + np.sqrt(np.maximum(reach, 0.0)), 0.0).max(axis=1)
     for start, end in shifted:

@@ -48,11 +48,11 @@ def _outermost_rings(corners: FloatArray) -> NDArray[np.bool_]:
     """
     radius, height = np.round(np.hypot(corners[:, 0], corners[:, 1]), 12), corners[:, 2]
     chain: list[tuple[float, float]] = []
-    for z in np.unique(height):
+    for z in sorted(set(height.tolist())):
         r = float(radius[height == z].max())
-        while len(chain) > 1 and _bent_in(chain[-2], chain[-1], (r, float(z))):
+        while len(chain) > 1 and _bent_in(chain[-2], chain[-1], (r, z)):
             chain.pop()
-        chain.append((r, float(z)))
+        chain.append((r, z))
     kept = np.zeros(len(corners), dtype=bool)
     for r, z in chain:
         kept |= (height == z) & (radius == r)
@@ -105,7 +105,7 @@ def nearest_to_receiver(sampled: SampledPath, until: float, pourer: Vessel, rece
     gap = np.clip(np.searchsorted(coarse, dense, side="right") - 1, 0, len(doubtful) - 1)
     fine = dense[doubtful[gap]]
     indices = np.concatenate([coarse, fine])
-    away = np.concatenate([away, clearance(pourer, receiver, poses[fine])])
+    away = np.concatenate([away, clearance(pourer, receiver, poses[fine], below=float(away.min()))])
     best = int(np.argmin(away))
     return Nearest(float(away[best]) - _pourer_error(sampled, pourer), int(indices[best]))
 
