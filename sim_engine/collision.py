@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.motion import Motion, PourMotion
+from sim_engine.vessel.distance_grid import MARGIN
 from sim_engine.vessel.vessel import Vessel
 
 Floats = NDArray[np.float64]
@@ -74,31 +75,22 @@ class _Samples:
 _samples: WeakKeyDictionary[Vessel, _Samples] = WeakKeyDictionary()
 
 
-def _size(group: Floats) -> int:
-    return len(group[0])
-
-
 def _sampled(vessel: Vessel) -> _Samples:
     if vessel not in _samples:
         corners = vessel.solid_vertices[vessel.solid_faces]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
         wanted = area / (0.5 * vessel.wall_thickness) ** 2
-        patches = PATCHES
-        each = math.ceil(float(np.clip(wanted, FEWEST_POINTS, MOST_POINTS)) / patches)
-        points = vessel.surface_points(each * patches)
-        # repeated halving along the longest side gives compact patches of equal size; rows are x, y, z
-        groups = [np.ascontiguousarray(points.T)]
-        while len(groups) < patches:
-            groups.sort(key=_size)
-            group = groups.pop()
-            axis = int(np.argmax(group.max(axis=1) - group.min(axis=1)))
-            group = group[:, np.argsort(group[axis], kind="stable")]
-            groups += np.split(group, [_size(group) // 2], axis=1)
-        longest = max(map(_size, groups))
-        padded = np.stack([g[:, np.minimum(np.arange(longest), _size(g) - 1)].T for g in groups])
-        centres = (padded.min(axis=1) + padded.max(axis=1)) / 2.0
-        radii = np.linalg.norm(padded - centres[:, None], axis=2).max(axis=1)
-        _samples[vessel] = _Samples(padded, centres, radii)
+        each = math.ceil(float(np.clip(wanted, FEWEST_POINTS, MOST_POINTS)) / PATCHES)
+        points = vessel.surface_points(each * PATCHES)
+        # slabs along the longest side, then halves of halves along theirs: compact patches of equal size
+        groups = points[None]
+        for parts in (PATCHES // 32, 2, 2, 2, 2, 2):
+            longest = np.argmax(np.ptp(groups, axis=1), axis=1)[:, None, None]
+            order = np.argsort(np.take_along_axis(groups, longest, axis=2), axis=1, kind="stable")
+            groups = np.take_along_axis(groups, order, axis=1).reshape(-1, groups.shape[1] // parts, 3)
+        centres = (groups.min(axis=1) + groups.max(axis=1)) / 2.0
+        radii = np.linalg.norm(groups - centres[:, None], axis=2).max(axis=1)
+        _samples[vessel] = _Samples(groups, centres, radii)
     return _samples[vessel]
 
 
@@ -297,14 +289,15 @@ def _centre_gap(pourer: Vessel, receiver: Vessel, poses: Floats) -> Floats:
     return gap
 
 
-def clearance(pourer: Vessel, receiver: Vessel, poses: Floats, below: float = math.inf) -> Floats:
+def clearance(pourer: Vessel, receiver: Vessel, poses: Floats, within: float = math.inf) -> Floats:
     """Smallest distance between two vessels at every pose.
 
     Args:
         pourer: the moving one.
         receiver: at the world's origin.
         poses: shape (T, 7), see `first_contact`.
-        below: largest distance of interest [m]; where the distance is larger, the result is `below`.
+        within: distances that exceed both the smallest one and the grids' margin by more than this may be returned too
+            small, but by at least this more than the two [m].
 
     Returns:
         Shape (T,) [m]; negative if they overlap (then the depth as in `Contact`). Accurate to a part of the grids'
@@ -314,18 +307,23 @@ def clearance(pourer: Vessel, receiver: Vessel, poses: Floats, below: float = ma
         ValueError: poses of another shape, or not finite.
     """
     poses = _check_poses(poses)
-    into_receiver, into_pourer, _ = _directions(pourer, receiver, poses)
-    result = np.full(len(poses), below)
-    for direction in (into_receiver, into_pourer):
-        least = direction.centre_distances()
-        order = np.argsort(least, axis=1)
-        for row in np.flatnonzero(least.min(axis=1) < result).tolist():
+    directions = _directions(pourer, receiver, poses)[:2]
+    bounds = [direction.centre_distances() for direction in directions]
+    orders = [np.argsort(least, axis=1) for least in bounds]
+    bound = np.minimum(*(least.min(axis=1) for least in bounds))
+    result = np.empty(len(poses))
+    most = np.inf
+    for row in np.argsort(bound).tolist():
+        nearest = most
+        for direction, least, order in zip(directions, bounds, orders, strict=True):
             # nearest patches first, until no other one can be closer
             for start in range(0, PATCHES, BATCH):
                 batch = order[row, start : start + BATCH]
-                if least[row, batch[0]] >= result[row]:
+                if least[row, batch[0]] >= nearest:
                     break
-                result[row] = min(result[row], direction.nearest(row, batch)[0])
+                nearest = min(nearest, direction.nearest(row, batch)[0])
+        result[row] = nearest
+        most = min(most, max(nearest, MARGIN) + within)
     return result
 
 

@@ -95,7 +95,7 @@ def nearest_to_receiver(sampled: SampledPath, until: float, pourer: Vessel, rece
     poses = sampled.poses[:last]
     way = way_of(poses, pourer)
     coarse = thinned(way, COARSE)
-    away = clearance(pourer, receiver, poses[coarse])
+    away = clearance(pourer, receiver, poses[coarse], within=0.5 * COARSE)
     # between two poses that differ by a displacement w, no point comes nearer than the nearer pose's distance − w/2
     least = np.minimum(away[:-1], away[1:]) - 0.5 * np.diff(way[coarse])
     # beyond the range of a vessel's grid only a lower bound of the distance is known
@@ -105,7 +105,7 @@ def nearest_to_receiver(sampled: SampledPath, until: float, pourer: Vessel, rece
     gap = np.clip(np.searchsorted(coarse, dense, side="right") - 1, 0, len(doubtful) - 1)
     fine = dense[doubtful[gap]]
     indices = np.concatenate([coarse, fine])
-    away = np.concatenate([away, clearance(pourer, receiver, poses[fine], below=float(away.min()))])
+    away = np.concatenate([away, clearance(pourer, receiver, poses[fine], within=FINE)])
     best = int(np.argmin(away))
     return Nearest(float(away[best]) - _pourer_error(sampled, pourer), int(indices[best]))
 
