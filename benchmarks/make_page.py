@@ -68,6 +68,7 @@ def page_text(records: dict[str, Any]) -> str:
         sections.targets(pours),
         sections.beside_the_peer(pours),
         sections.passes(records["profile"]),
+        sections.limit(),
         sections.cost(scaling),
         sections.memory(scaling),
         sections.start_up(records["start-up"]),
@@ -75,7 +76,6 @@ def page_text(records: dict[str, Any]) -> str:
         sections.plan(records["plan"]),
         sections.validate(records["validate"]),
         sections.pool(records["pool"]),
-        sections.finished(),
     ]
     return "\n".join(parts)
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -149,14 +148,9 @@ class _Table:
 
     tilts: Floats
     volumes: Floats
-    levels: Floats
+    levels: list[list[float]]
     head: float
-    flows: Floats
-
-    @cached_property
-    def lists(self) -> tuple[list[list[float]], list[list[float]]]:
-        """Levels and flows; single numbers are read faster from lists."""
-        return self.levels.tolist(), self.flows.tolist()
+    flows: list[list[float]]
 
 
 _tables: WeakKeyDictionary[Vessel, _Table] = WeakKeyDictionary()
@@ -170,7 +164,7 @@ def _table(vessel: Vessel) -> _Table:
         head = max(float(levels.max()), 1e-6)
         heads = head * np.linspace(0.0, 1.0, 97) ** 2
         flows = np.stack([_lip_flow(vessel.opening_radius, heads, float(tilt)) for tilt in tilts])
-        _tables[vessel] = _Table(tilts, volumes, levels, head, flows)
+        _tables[vessel] = _Table(tilts, volumes, levels.tolist(), head, flows.tolist())
     return _tables[vessel]
 
 
@@ -231,8 +225,8 @@ def _drain(
     rows = np.clip((np.abs(tilts) - table.tilts[0]) / (table.tilts[1] - table.tilts[0]), 0.0, len(table.tilts) - 1.0)
     firsts = np.minimum(rows.astype(np.int64), len(table.tilts) - 2)
     parts = (rows - firsts).tolist()
-    levels, flows = table.lists
-    last_cell, last_flow = len(table.volumes) - 2, table.flows.shape[1] - 2
+    levels, flows = table.levels, table.flows
+    last_cell, last_flow = len(table.volumes) - 2, len(flows[0]) - 2
     per_volume, steps = (last_cell + 1) / vessel.capacity, np.diff(times, append=times[-1]).tolist()
     inside, outflow, heads = [0.0] * len(steps), [0.0] * len(steps), [0.0] * len(steps)
     v = volume

@@ -11,20 +11,18 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from orchestrator.campaigns.fingerprint import scene_by_content
 from orchestrator.learning.calibration.pour_design import DesignPoured
 from orchestrator.learning.campaign_plan import RecordedPour
 from orchestrator.learning.strategy import is_sound
+from orchestrator.records.codec import Results
 from orchestrator.records.journal import JOURNAL_NAME
 from sim_engine.action import ACTION_DIMENSIONS, Action, Dimension
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
-
-if TYPE_CHECKING:
-    from orchestrator.records.codec import Results
 
 SAME = 1e-6
 """Largest difference [SI] between two values of a dimension that count as equal."""

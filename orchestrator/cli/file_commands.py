@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -25,9 +25,6 @@ from orchestrator.cli.console import (
     print_note,
     print_warning,
 )
-
-if TYPE_CHECKING:
-    from orchestrator.campaigns.campaign_prior import PosteriorSource
 
 
 def validate(
@@ -108,7 +105,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]
 
 
-def _posteriors() -> PosteriorSource:
+def _posteriors() -> Any:
     from orchestrator.catalogue.catalogue import posterior_source  # most campaigns have no prior
 
     return posterior_source()
