@@ -39,7 +39,8 @@ from orchestrator.cli.command_results import (
     ValidateSolverOutput,
     VesselOutput,
 )
-from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, StatusOut
+from orchestrator.daemon.daemon_store import Question
+from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, StatusOut
 from orchestrator.daemon.station_schemas import AccountOut, BatchOut, ContentOut, PourOut
 from orchestrator.learning.dispense import Dose
 from orchestrator.learning.single_action import WeighedPour
@@ -136,7 +137,7 @@ class QueueOutput(CommandOutput):
 
     status: StatusOut
     campaigns: list[CampaignOut]
-    questions: list[QuestionOut]
+    questions: list[Question]
 
 
 class EventOutput(BaseModel):

@@ -20,7 +20,7 @@ from fastapi.responses import JSONResponse
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Queue, Stopping, Stops
 from orchestrator.daemon.campaign_queue import RequestRefusedError
-from orchestrator.daemon.daemon_store import ENDED, QueueItem
+from orchestrator.daemon.daemon_store import ENDED, Question, QueueItem
 from orchestrator.daemon.emergency_stop import (
     ALL_STOPPED,
     BODY_TIME,
@@ -31,7 +31,7 @@ from orchestrator.daemon.emergency_stop import (
     read_stop,
 )
 from orchestrator.daemon.query_routes import campaign_out, found_item, status
-from orchestrator.daemon.remote_operator import AnswerError, question_json
+from orchestrator.daemon.remote_operator import AnswerError
 from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.schemas import (
     AnswerIn,
@@ -40,7 +40,6 @@ from orchestrator.daemon.schemas import (
     EmergencyIn,
     EnableIn,
     MoveIn,
-    QuestionOut,
     StatusOut,
     StoppedOut,
     SubmissionIn,
@@ -191,7 +190,7 @@ async def enable(daemon: Daemon, queue: Queue, person: Operator, key: str, body:
 @router.post("/questions/{number}/answer", operation_id="answer")
 async def answer(
     daemon: Daemon, person: Operator, number: Annotated[int, Path(ge=0, lt=2**62)], body: AnswerIn
-) -> QuestionOut:
+) -> Question:
     """Answer a question. The first answer counts."""
     try:
         found = daemon.asking.answer(number, body.answer, person.name)
@@ -200,7 +199,7 @@ async def answer(
     except AnswerError as error:
         raise HTTPException(422, str(error)) from None
     daemon.note(person.name, "answer", found.campaign, f"{found.text} → {found.answer}")
-    return QuestionOut.model_validate(question_json(found))
+    return found
 
 
 @router.post("/queue/pause", operation_id="pause_queue")

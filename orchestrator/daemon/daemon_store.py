@@ -1,7 +1,7 @@
 """Persistent state of the daemon: queue, questions, flags and audit entries.
 
 `Store` is the only writer of one SQLite file and flushes every change to disk. `QueueItem` is a submitted campaign with
-its desired state (`DesiredState`); `StoredQuestion` is a question to the operator. The journal of a run remains the
+its desired state (`DesiredState`); `Question` is a question to the operator. The journal of a run remains the
 authoritative record of its events; this file holds the operators' intentions. The tables of ordered pours and of
 materials are read and written by `pour_orders` and `materials`; the contents of vessels are a file of their own.
 """
@@ -18,6 +18,8 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel, ConfigDict, computed_field
 
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import locked_alone
@@ -166,35 +168,38 @@ class QueueItem:
     not_before: float | None = None
 
 
-@dataclass(frozen=True)
-class StoredQuestion:
-    """A question to the operator.
+class Question(BaseModel):
+    """A question to the operator."""
 
-    Attributes:
-        kind: 'bench' (a step at the arm), 'unknown' (a pour with unknown outcome), 'strategy' (a decision).
-        wants: kind of answer: 'done', 'weight', 'yes or no', or 'option'.
-        options: possible answers if `wants` is 'option'.
-        hands: whether the step requires hands in the cell.
-        closed: why it needs no answer any more; None while it is open.
-    """
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     id: int
     campaign: str
     rig: str
     kind: str
+    """'bench': a step at the arm; 'unknown': a pour with unknown outcome; 'strategy': a decision."""
+
     about: str
     text: str
     problem: str
+    """Why the question is repeated; '' the first time."""
+
     wants: str
-    options: tuple[str, ...]
+    """Kind of answer: 'done', 'weight', 'yes or no', or 'option'."""
+
+    options: list[str]
     details: dict[str, Any]
     hands: bool
-    asked: float
-    answer: str | None = None
-    by: str | None = None
-    answered: float | None = None
-    closed: str | None = None
+    """Whether the step requires hands in the cell."""
 
+    asked: float
+    answer: str | None
+    by: str | None
+    answered: float | None
+    closed: str | None
+    """Why it needs no answer any more; null while it is open."""
+
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def open(self) -> bool:
         """Whether the question waits for an answer."""
@@ -344,7 +349,7 @@ class Store:
 
     # ---- questions
 
-    def ask(self, **values: Any) -> StoredQuestion:
+    def ask(self, **values: Any) -> Question:
         """Store an open question."""
         values["asked"] = time.time()
         names = ", ".join(values)
@@ -365,14 +370,12 @@ class Store:
         """Close a question that needs no answer any more."""
         self.write("update question set closed = ? where id = ? and closed is null", reason, key)
 
-    def question(self, key: int) -> StoredQuestion | None:
+    def question(self, key: int) -> Question | None:
         """Return a question, or None if the id is unknown."""
         row = self._db.execute("select * from question where id = ?", [key]).fetchone()
-        return None if row is None else _question(row)
+        return None if row is None else Question(**_read(row))
 
-    def questions(
-        self, *, only_open: bool = True, campaign: str | None = None, limit: int = 200
-    ) -> list[StoredQuestion]:
+    def questions(self, *, only_open: bool = True, campaign: str | None = None, limit: int = 200) -> list[Question]:
         """Return open questions, oldest first, or all questions, newest first."""
         conditions = ["closed is null"] if only_open else ["1"]
         arguments: list[Any] = []
@@ -381,7 +384,7 @@ class Store:
             arguments.append(campaign)
         order = "id" if only_open else "id desc"
         query = f"select * from question where {' and '.join(conditions)} order by {order} limit ?"
-        return [_question(row) for row in self._db.execute(query, [*arguments, limit])]
+        return [Question(**_read(row)) for row in self._db.execute(query, [*arguments, limit])]
 
     # ---- flags and audit entries
 
@@ -456,11 +459,6 @@ def _read(row: sqlite3.Row) -> dict[str, Any]:
 
 def _item(row: sqlite3.Row) -> QueueItem:
     return QueueItem(**_read(row))
-
-
-def _question(row: sqlite3.Row) -> StoredQuestion:
-    values = _read(row)
-    return StoredQuestion(**values | {"options": tuple(values["options"])})
 
 
 def _quoted(words: Iterable[str]) -> str:

@@ -25,12 +25,11 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.access_control import Daemon, Queue, Stops, Viewer
 from orchestrator.daemon.campaign_queue import CampaignQueue
-from orchestrator.daemon.daemon_store import ENDED, QueueItem
+from orchestrator.daemon.daemon_store import ENDED, Question, QueueItem
 from orchestrator.daemon.emergency_stop import EmergencyStops
-from orchestrator.daemon.remote_operator import question_json
 from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.run_readout import REPORT, summary_of
-from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, QuestionOut, RigOut, StatusOut
+from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, RigOut, StatusOut
 from orchestrator.daemon.submissions import run_request
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
@@ -80,29 +79,14 @@ def rigs_out(daemon: SharedServices, stops: EmergencyStops) -> list[RigOut]:
     """Convert the rigs to their response models."""
     found = []
     for name, worker in daemon.workers.items():
-        running = worker.running
-        checkpoint = "" if running is None else running.checkpoint
-        campaign = None if running is None else running.item.id
-        stop, arm = stops.of_rigs.get(name), worker.arm
-        found.append(
-            RigOut.model_validate(
-                {
-                    "name": name,
-                    "mode": worker.rig.mode,
-                    "campaign": campaign,
-                    "checkpoint": checkpoint,
-                    "emergency": stop,
-                    "arm": None
-                    if arm is None
-                    else {
-                        "state": arm.check.state,
-                        "text": arm.check.found,
-                        "advice": arm.check.advice,
-                        "time": arm.time,
-                    },
-                }
-            )
-        )
+        campaign, checkpoint, arm, told = None, "", worker.arm, None
+        if worker.running is not None:
+            campaign, checkpoint = worker.running.item.id, worker.running.checkpoint
+        rig = {"name": name, "mode": worker.rig.mode, "campaign": campaign, "checkpoint": checkpoint}
+        if arm is not None:
+            check = arm.check
+            told = {"state": check.state, "text": check.found, "advice": check.advice, "time": arm.time}
+        found.append(RigOut.model_validate({**rig, "emergency": stops.of_rigs.get(name), "arm": told}))
     return found
 
 
@@ -168,10 +152,9 @@ async def questions(
     person: Viewer,
     answered: Annotated[bool, Query(description="All questions, newest first.")] = False,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
-) -> list[QuestionOut]:
+) -> list[Question]:
     """List questions to the operator: the open ones, oldest first."""
-    found = daemon.store.questions(only_open=not answered, limit=limit)
-    return [QuestionOut.model_validate(question_json(question)) for question in found]
+    return daemon.store.questions(only_open=not answered, limit=limit)
 
 
 @router.get(

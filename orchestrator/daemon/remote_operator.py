@@ -15,7 +15,7 @@ from typing import Any
 from actors.balance.readings import typed_weight
 from actors.interfaces import LaboratoryError
 from actors.interfaces import OperatorQuestion as BenchQuestion
-from orchestrator.daemon.daemon_store import Store, StoredQuestion
+from orchestrator.daemon.daemon_store import Question, Store
 from orchestrator.runs.resume import parse_answer
 
 GIVE_UP = "give up"
@@ -54,11 +54,11 @@ class Asking:
         """Ask a question and await its answer, without a time limit.
 
         Args:
-            values: fields of `StoredQuestion`.
+            values: fields of `Question`.
         """
         question = self._store.ask(**values)
         self._waiting[question.id] = asyncio.get_running_loop().create_future()
-        self._publish("QuestionAsked", {"question": question_json(question)}, question.campaign)
+        self._publish("QuestionAsked", {"question": question.model_dump(mode="json")}, question.campaign)
         try:
             return await self._waiting[question.id]
         finally:
@@ -66,9 +66,9 @@ class Asking:
             self._store.close_question(question.id, "withdrawn")
             found = self._store.question(question.id)
             if found is not None and found.answer is None:
-                self._publish("QuestionClosed", {"question": question_json(found)}, question.campaign)
+                self._publish("QuestionClosed", {"question": found.model_dump(mode="json")}, question.campaign)
 
-    def answer(self, key: int, answer: str, by: str) -> StoredQuestion:
+    def answer(self, key: int, answer: str, by: str) -> Question:
         """Answer a question.
 
         Args:
@@ -89,11 +89,11 @@ class Asking:
         waiting.set_result(meant)
         found = self._store.question(key)
         assert found is not None
-        self._publish("QuestionAnswered", {"question": question_json(found)}, question.campaign)
+        self._publish("QuestionAnswered", {"question": found.model_dump(mode="json")}, question.campaign)
         return found
 
 
-def understood(question: StoredQuestion, answer: str) -> str:
+def understood(question: Question, answer: str) -> str:
     """Normalise an answer to its question.
 
     Raises:
@@ -199,16 +199,7 @@ class RunQuestions:
             text=question,
             problem=problem,
             wants="option",
-            options=tuple(options),
+            options=list(options),
             details=details,
             hands=False,
         )
-
-
-def question_json(question: StoredQuestion) -> dict[str, Any]:
-    """Return the question as JSON-ready values."""
-    from orchestrator.daemon.event_feed import plain
-
-    table: dict[str, Any] = plain(question)
-    table.pop("type", None)
-    return {**table, "open": question.open}

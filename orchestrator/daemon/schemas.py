@@ -9,18 +9,17 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from orchestrator.daemon.pour_request import RequestModel
 from orchestrator.reports.run_summary import PourSummary
 
 
-class _In(BaseModel):
-    model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)
+class ResponseModel(BaseModel):
+    """Base of the models of responses."""
 
-
-class _Out(BaseModel):
     model_config = ConfigDict(use_attribute_docstrings=True)
 
 
-class SubmissionIn(_In):
+class SubmissionIn(RequestModel):
     """A campaign: `text` with its `files`, or the `path` of a file on the daemon's machine."""
 
     text: str = Field(default="", max_length=500_000)
@@ -40,14 +39,14 @@ class SubmissionIn(_In):
     """Higher priorities run first."""
 
 
-class AnswerIn(_In):
+class AnswerIn(RequestModel):
     """An answer to a question."""
 
     answer: str = Field(min_length=1, max_length=1000)
     """'done', 'yes', 'no', a weight with its unit, one of the options, or 'give up'."""
 
 
-class MoveIn(_In):
+class MoveIn(RequestModel):
     """A new place in the queue."""
 
     before: str | None = Field(default=None, max_length=80)
@@ -56,14 +55,14 @@ class MoveIn(_In):
     priority: int | None = Field(default=None, ge=-1000, le=1000)
 
 
-class EnableIn(_In):
+class EnableIn(RequestModel):
     """Enables motion in the coming part of a run."""
 
     laboratory: str = Field(max_length=80)
     """Name of the laboratory, typed by an operator who has read what will move."""
 
 
-class EmergencyIn(_In):
+class EmergencyIn(RequestModel):
     """Optional body of an emergency stop. Anything else is accepted, too: nothing in a body prevents the stop."""
 
     model_config = ConfigDict(extra="allow")
@@ -75,28 +74,28 @@ class EmergencyIn(_In):
     """Stop only this rig; '' for all. A rig that does not exist stops all. Better named in the query."""
 
 
-class ClearIn(_In):
+class ClearIn(RequestModel):
     """Selects the emergency stop to clear."""
 
     rig: str = Field(default="", max_length=60)
     """Rig whose emergency stop is cleared; '' for the stop of all rigs. Each is cleared separately."""
 
 
-class ProblemOut(_Out):
+class ProblemOut(ResponseModel):
     """An error: the problem, its place and a remedy."""
 
     detail: str | list[dict[str, Any]]
     """Text of the error; a list if fields of the request are invalid."""
 
 
-class HealthOut(_Out):
+class HealthOut(ResponseModel):
     """Health of the daemon."""
 
     ok: bool
     problems: list[str] = []
 
 
-class ProgressOut(_Out):
+class ProgressOut(ResponseModel):
     """Progress of a running campaign."""
 
     stage: str
@@ -119,7 +118,7 @@ class ProgressOut(_Out):
 
 
 # More than 20 fields: a flat JSON object that programs read.
-class CampaignOut(_Out):
+class CampaignOut(ResponseModel):
     """A submitted campaign."""
 
     id: str
@@ -191,37 +190,7 @@ class CampaignDetailOut(CampaignOut):
     """Audit entries of the campaign, newest first."""
 
 
-class QuestionOut(_Out):
-    """A question to the operator."""
-
-    id: int
-    campaign: str
-    rig: str
-    kind: str
-    """'bench': a step at the arm; 'unknown': a pour with unknown outcome; 'strategy': a decision."""
-
-    about: str
-    text: str
-    problem: str
-    """Why the question is repeated; '' the first time."""
-
-    wants: str
-    """Kind of answer: 'done', 'weight', 'yes or no', or 'option'."""
-
-    options: list[str]
-    details: dict[str, Any]
-    hands: bool
-    """Whether the step requires hands in the cell."""
-
-    asked: float
-    answer: str | None
-    by: str | None
-    answered: float | None
-    closed: str | None
-    open: bool
-
-
-class EmergencyOut(_Out):
+class EmergencyOut(ResponseModel):
     """Authors, time and reasons of an emergency stop."""
 
     by: str
@@ -234,7 +203,7 @@ class EmergencyOut(_Out):
     """Reasons, separated by semicolons."""
 
 
-class ArmStatusOut(_Out):
+class ArmStatusOut(ResponseModel):
     """Whether an arm can move, with the text that a run or `decant robot check` would give."""
 
     state: Literal["ok", "warn", "fail"]
@@ -248,7 +217,7 @@ class ArmStatusOut(_Out):
     """Time since which it has been so."""
 
 
-class RigOut(_Out):
+class RigOut(ResponseModel):
     """A laboratory that one campaign at a time leases."""
 
     name: str
@@ -266,7 +235,7 @@ class RigOut(_Out):
     """Last reading while no campaign used the rig; null during a run and without hardware."""
 
 
-class WhatMovesOut(_Out):
+class WhatMovesOut(ResponseModel):
     """The motion of a campaign on hardware."""
 
     laboratory: str
@@ -276,7 +245,7 @@ class WhatMovesOut(_Out):
     lines: list[str]
 
 
-class StatusOut(_Out):
+class StatusOut(ResponseModel):
     """State of the daemon."""
 
     version: str

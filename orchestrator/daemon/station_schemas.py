@@ -8,19 +8,15 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from orchestrator.daemon.pour_request import CallerId, PourIn, Quantity, RequestModel
-from orchestrator.daemon.schemas import SubmissionIn
+from orchestrator.daemon.schemas import ResponseModel, SubmissionIn
 
 ResourceId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,59}$")]
 
 
-class _Out(BaseModel):
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-
-class PredictionOut(_Out):
+class PredictionOut(ResponseModel):
     """Prediction of a pour; intervals contain it with a probability of 90 %."""
 
     amount_g: float | None = None
@@ -50,7 +46,7 @@ class PredictionOut(_Out):
     simulations_lost: int | None = None
 
 
-class WeighedOut(_Out):
+class WeighedOut(ResponseModel):
     """Outcome of a pour; intervals state the uncertainty of the balance, with a probability of 90 %."""
 
     state: str
@@ -75,7 +71,7 @@ class WeighedOut(_Out):
     """Duration in the journal, operator and balance included."""
 
 
-class LimitsOut(_Out):
+class LimitsOut(ResponseModel):
     """Limits of a pour from this source into this receiver."""
 
     available_g: float
@@ -85,7 +81,7 @@ class LimitsOut(_Out):
     """Free volume of the receiver up to the brim."""
 
 
-class PourOut(_Out):
+class PourOut(ResponseModel):
     """An ordered pour."""
 
     id: str
@@ -149,7 +145,7 @@ class BatchIn(RequestModel):
     """Earliest start of all items that state none."""
 
 
-class BatchItemOut(_Out):
+class BatchItemOut(ResponseModel):
     """One item of a batch."""
 
     campaign: str
@@ -167,7 +163,7 @@ class BatchItemOut(_Out):
     """Result of a pour; that of a campaign is at `campaigns/ID`."""
 
 
-class BatchOut(_Out):
+class BatchOut(ResponseModel):
     """A batch with the states and results of its items, in their order."""
 
     id: str
@@ -203,7 +199,7 @@ class ReservationIn(RequestModel):
         return self
 
 
-class ReservationOut(_Out):
+class ReservationOut(ResponseModel):
     """A reservation."""
 
     id: int
@@ -284,7 +280,7 @@ class HandPourIn(RequestModel):
     note: str = Field(default="", max_length=200)
 
 
-class ContentOut(_Out):
+class ContentOut(ResponseModel):
     """Content of a vessel."""
 
     mass_g: float | None
@@ -300,7 +296,7 @@ class ContentOut(_Out):
     """Time of the last weighing."""
 
 
-class VesselOut(_Out):
+class VesselOut(ResponseModel):
     """A vessel with its content."""
 
     id: str
@@ -312,7 +308,7 @@ class VesselOut(_Out):
     """Amounts that queued pours will take."""
 
 
-class SourceOut(_Out):
+class SourceOut(ResponseModel):
     """A vessel that is not registered: the source of a campaign."""
 
     id: str
@@ -324,7 +320,7 @@ class SourceOut(_Out):
     content: ContentOut
 
 
-class LiquidOut(_Out):
+class LiquidOut(ResponseModel):
     """A liquid."""
 
     id: str
@@ -332,7 +328,7 @@ class LiquidOut(_Out):
     properties: dict[str, Any]
 
 
-class PositionOut(_Out):
+class PositionOut(ResponseModel):
     """A position."""
 
     id: str
@@ -341,7 +337,7 @@ class PositionOut(_Out):
     note: str
 
 
-class MaterialsOut(_Out):
+class MaterialsOut(ResponseModel):
     """All materials of the station."""
 
     liquids: list[LiquidOut]
@@ -352,7 +348,7 @@ class MaterialsOut(_Out):
     positions: list[PositionOut]
 
 
-class AccountOut(_Out):
+class AccountOut(ResponseModel):
     """One entry of a vessel's account."""
 
     t: float
