@@ -1,7 +1,7 @@
 """The catalogue of this machine's runs: one SQLite file with the tables `run`, `pour`, `posterior`, `tag` and `note`.
 
-- `CatalogueClient` is the interface for the command line, the HTTP API and the library. `Catalogue` implements it on
-  this machine, and the daemon's client implements it for another one.
+- `Catalogue` serves the command line, the HTTP API and the library. The daemon's client has the same queries for
+  another machine.
 - The file is an index over the runs' folders and may be deleted at any time. `Catalogue.refresh` reads the runs that
   changed since they were last read.
 - Several processes may use it at the same time: runs are read without a lock, and each is entered in a transaction.
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, annotate
 from orchestrator.catalogue.export import write_tables
@@ -44,38 +44,6 @@ class CatalogueError(RunError):
 
 class NoSuchRunError(CatalogueError):
     """The catalogue has no such run."""
-
-
-class CatalogueClient(Protocol):
-    """A catalogue with JSON-ready results. Every call may raise RunError, whose text gives the reason.
-
-    Conditions are those of `queries.condition_sql`, and 'limit', the maximum number of rows. A run is named by its
-    folder, the folder's name, or an unambiguous prefix of the name.
-    """
-
-    def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """Runs, the newest first; see `run_reading.RUNS`. Raises ValueError for an invalid condition."""
-
-    def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """Pours, the oldest first; see `run_reading.POURS`. Raises ValueError for an invalid condition."""
-
-    def run(self, name: str) -> Row:
-        """One run, with its notes (time, by, text) and its pours under 'list_of_pours'."""
-
-    def compare(self, names: Sequence[str]) -> Row:
-        """'runs' (their folders), the differing 'settings', and the 'outcomes' of each run."""
-
-    def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
-        """Change a run's tags; returns 'run' and 'tags'."""
-
-    def note(self, name: str, text: str) -> Row:
-        """Add a note to a run; returns 'run' and 'notes'."""
-
-    def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
-        """Write runs and pours into files.
-
-        Returns 'files' and the numbers of 'runs' and 'pours'. Raises MissingExtraError, OSError.
-        """
 
 
 def posterior_source() -> PosteriorSource:
@@ -110,7 +78,11 @@ class Refreshed:
 
 
 class Catalogue:
-    """The `CatalogueClient` of this machine. Open it, call `refresh`, then query it.
+    """The catalogue of this machine, with JSON-ready results. Open it, call `refresh`, then query it.
+
+    Every query may raise RunError, whose text gives the reason. Conditions are those of `queries.condition_sql`, and
+    'limit', the maximum number of rows. A run is named by its folder, the folder's name, or an unambiguous prefix of
+    the name.
 
     Args:
         state: the state directory, if not the default.
@@ -178,25 +150,25 @@ class Catalogue:
         return Refreshed(0 if rebuild else len(missing), problems)
 
     def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """See `CatalogueClient`."""
+        """Runs, the newest first; see `run_reading.RUNS`. Raises ValueError for an invalid condition."""
         return self._rows("run", *condition_sql("run", conditions), "begun desc, path", conditions.get("limit"))
 
     def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """See `CatalogueClient`."""
+        """Pours, the oldest first; see `run_reading.POURS`. Raises ValueError for an invalid condition."""
         newest = self._rows(
             "pour", *condition_sql("pour", conditions), "time desc, path desc, id desc", conditions.get("limit")
         )
         return newest[::-1]
 
     def run(self, name: str) -> Row:
-        """See `CatalogueClient`."""
+        """One run, with its notes (time, by, text) and its pours under 'list_of_pours'."""
         found = self._find(name)
         notes = self._connection.execute("select time, by, text from note where path = ?", [found["path"]]).fetchall()
         written = [dict(zip(("time", "by", "text"), note, strict=True)) for note in notes]
         return {**found, "notes": written, "list_of_pours": self.pours({"run": found["path"]})}
 
     def compare(self, names: Sequence[str]) -> Row:
-        """See `CatalogueClient`."""
+        """'runs' (their folders), the differing 'settings', and the 'outcomes' of each run."""
         found, plans = [self._find(name) for name in names], []
         for run in found:
             plans.append(read_header(Path(run["path"])).fingerprint)
@@ -204,12 +176,12 @@ class Catalogue:
         return {"runs": [run["path"] for run in found], "settings": differing_settings(plans), "outcomes": results}
 
     def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
-        """See `CatalogueClient`."""
+        """Change a run's tags; returns 'run' and 'tags'."""
         found = self._find(name)
         return {"run": found["run"], "tags": annotate(Path(found["path"]), add=add, remove=remove).tags}
 
     def note(self, name: str, text: str, by: str | None = None) -> Row:
-        """See `CatalogueClient`.
+        """Add a note to a run; returns 'run' and 'notes'.
 
         Args:
             by: author of the note; the user of this process unless given.
@@ -219,7 +191,10 @@ class Catalogue:
         return {"run": found["run"], "notes": [note.model_dump() for note in notes]}
 
     def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
-        """See `CatalogueClient`."""
+        """Write runs and pours into files.
+
+        Returns 'files' and the numbers of 'runs' and 'pours'. Raises MissingExtraError, OSError.
+        """
         tables = {"run": self.runs(conditions), "pour": self.pours(conditions)}
         files = write_tables(tables, folder, formats)
         return {"files": [str(path) for path in files], **{f"{name}s": len(rows) for name, rows in tables.items()}}

@@ -1,7 +1,7 @@
 """The commands `decant runs …`: queries of the catalogue, printed as tables or JSON.
 
-The commands query this machine's catalogue or a daemon's through `CatalogueClient`. Everything slow is imported when a
-command is called, so that `--help` starts fast.
+The commands query this machine's catalogue or a daemon's. Everything slow is imported when a command is called, so that
+`--help` starts fast.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from orchestrator.cli.console import FAILED, RefusalError, print_json, print_mes
 from orchestrator.cli.shell_completion import catalogued, catalogued_runs
 
 if TYPE_CHECKING:
-    from orchestrator.catalogue.catalogue import Catalogue, CatalogueClient
+    from orchestrator.catalogue.catalogue import Catalogue
+    from orchestrator.daemon.daemon_client import RemoteCatalogueClient
     from orchestrator.records.run_record import Row
 
 NEWEST = 20
@@ -568,7 +569,7 @@ def _date(seconds: float | None) -> str:
 
 
 @contextlib.contextmanager
-def _client(daemon: bool = False) -> Iterator[CatalogueClient]:
+def _client(daemon: bool = False) -> Iterator[Catalogue | RemoteCatalogueClient]:
     """Open a client of this machine's catalogue or of the daemon's."""
     if daemon:
         from orchestrator.cli.queue_commands import connected_client

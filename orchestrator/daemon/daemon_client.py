@@ -1,7 +1,7 @@
 """HTTP client of the daemon, for the command line on this machine or another.
 
 `Client` makes the calls and follows the event stream; it passes refusals on unchanged as `DaemonError`.
-`RemoteCatalogueClient` queries the catalogue on the daemon's machine with the interface of `CatalogueClient`.
+`RemoteCatalogueClient` queries the catalogue on the daemon's machine as `Catalogue` does.
 """
 
 from __future__ import annotations
@@ -262,7 +262,7 @@ def _token(state: Path) -> str:
 
 
 class RemoteCatalogueClient:
-    """`CatalogueClient` that queries a daemon.
+    """The queries of a `Catalogue`, answered by a daemon.
 
     Args:
         client: an open client.
@@ -272,31 +272,31 @@ class RemoteCatalogueClient:
         self._client = client
 
     def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """See `CatalogueClient`."""
+        """See `Catalogue`."""
         return list(self._client.get("/runs", **conditions))
 
     def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """See `CatalogueClient`."""
+        """See `Catalogue`."""
         return list(self._client.get("/runs/pours", **conditions))
 
     def run(self, name: str) -> Row:
-        """See `CatalogueClient`."""
+        """See `Catalogue`."""
         return dict(self._client.get(_of(name)))
 
     def compare(self, names: Sequence[str]) -> Row:
-        """See `CatalogueClient`."""
+        """See `Catalogue`."""
         return dict(self._client.get("/runs/compare", run=list(names)))
 
     def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
-        """See `CatalogueClient`."""
+        """See `Catalogue`."""
         return dict(self._client.post(f"{_of(name)}/tags", {"add": list(add), "remove": list(remove)}))
 
     def note(self, name: str, text: str) -> Row:
-        """See `CatalogueClient`."""
+        """See `Catalogue`."""
         return dict(self._client.post(f"{_of(name)}/notes", {"text": text}))
 
     def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
-        """See `CatalogueClient`."""
+        """See `Catalogue`."""
         found = self._client.fetch("/runs/export", format=list(formats), **conditions)
         folder.mkdir(parents=True, exist_ok=True)
         files = []

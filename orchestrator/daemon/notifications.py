@@ -17,11 +17,14 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from actors.laboratory_settings import MODE_LABELS
 from sim_engine.settings.model import Settings, Text
 from sim_engine.settings.quantity import Quantity
+
+if TYPE_CHECKING:
+    from orchestrator.daemon.event_feed import SentEvent
 
 QUEUE = 50
 """Largest number of waiting messages per receiver; further messages are dropped and counted."""
@@ -256,26 +259,7 @@ class Notifier:
             one.put(message)
 
 
-class NotificationResult(Protocol):
-    """An event of the daemon's feed, as `pass_on` reads it."""
-
-    @property
-    def type(self) -> str:
-        """Name of its class, or of one of the daemon's own events."""
-        ...
-
-    @property
-    def data(self) -> str:
-        """JSON."""
-        ...
-
-    @property
-    def campaign(self) -> str:
-        """Campaign of the event; '' if it concerns the daemon."""
-        ...
-
-
-async def pass_on(events: AsyncIterator[NotificationResult | None], notifier: Notifier) -> None:
+async def pass_on(events: AsyncIterator[SentEvent | None], notifier: Notifier) -> None:
     """Pass the events of a feed to a notifier until the feed is closed: `pass_on(feed.read(), notifier)`."""
     async for sent in events:
         if sent is not None:

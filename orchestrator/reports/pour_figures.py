@@ -14,7 +14,7 @@ import math
 import textwrap
 from collections import defaultdict
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,20 +35,6 @@ if TYPE_CHECKING:
     from sim_engine.vessel.vessel import Vessel
 
 Floats = NDArray[np.float64]
-
-
-class Solid(Protocol):
-    """The required part of a vessel: its closed surface in its own frame [m]."""
-
-    @property
-    def solid_vertices(self) -> Any:
-        """(V, 3)."""
-        ...
-
-    @property
-    def solid_faces(self) -> Any:
-        """(F, 3), oriented outwards."""
-        ...
 
 
 def section(vertices: Floats, faces: NDArray[np.integer[Any]]) -> list[Floats]:
@@ -170,8 +156,8 @@ def simulation_figure(task: PourTask, result: SimulatedPour) -> Figure:
 
 def draw_pour(
     result: SimulatedPour,
-    pourer: Solid,
-    receiver: Solid,
+    pourer: Vessel,
+    receiver: Vessel,
     *,
     title: str,
     note: str = "",
@@ -241,7 +227,7 @@ class _Snapshots:
     """Moments of a simulated pour, and the part of the plane y = 0 that shows both vessels in all of them."""
 
     def __init__(
-        self, result: SimulatedPour, pourer: Solid, receiver: Solid, receiver_shift: tuple[float, float], count: int
+        self, result: SimulatedPour, pourer: Vessel, receiver: Vessel, receiver_shift: tuple[float, float], count: int
     ) -> None:
         frames = result.frames
         if frames is None or len(frames.times) == 0:
