@@ -413,21 +413,15 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
         return {"action_id": node.create(name, (body.args if body is not None else None) or {})}
 
     @app.post("/action/{name}/{key}/start")
-    async def start(name: str, key: str) -> Any:
+    async def start(key: str) -> Any:
         return await node.start(key)
 
     @app.get("/action/{name}/{key}/status")
-    async def status_by_name(name: str, key: str) -> Any:
-        return (await node.result(key))["status"]
-
-    @app.get("/action/{name}/{key}/result")
-    async def result_by_name(name: str, key: str) -> Any:
-        return await node.result(key)
-
     @app.get("/action/{key}/status")
     async def action_status(key: str) -> Any:
         return (await node.result(key))["status"]
 
+    @app.get("/action/{name}/{key}/result")
     @app.get("/action/{key}/result")
     async def action_result(key: str) -> Any:
         return await node.result(key)

@@ -207,7 +207,7 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
         """
         order = _order(order_id, source, receiver, amount, tolerance, action, liquid, rig)
         await self._ordered("/pours", order)
-        found = await self._ended(f"/pours/{_part(order_id)}", _pour_end, status, intermediate)
+        found = await self._ended(f"/pours/{_part(order_id)}", status, intermediate)
         result = found["result"]
         masses = (_number(result[name]) for name in ("received_g", "spilled_g", "duration_s"))
         return (*masses, json.dumps(found))  # type: ignore[return-value]
@@ -292,7 +292,7 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
         body = {"id": order_id, "name": "SiLA 2", "items": [{"campaign": {"path": path, "rig": rig}}]}
         batch = await self._ordered("/batches", body)
         key = batch["items"][0]["campaign"]
-        found = await self._ended(f"/campaigns/{_part(key)}", _campaign_end, status, intermediate)
+        found = await self._ended(f"/campaigns/{_part(key)}", status, intermediate)
         return key, found["run"] or "", json.dumps(found)
 
     @sila.UnobservableCommand(errors=CALL)
@@ -419,15 +419,13 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
                     _refuse(error)
             await asyncio.sleep(INTERVAL)
 
-    async def _ended(
-        self, path: str, end_of: Callable[[dict[str, Any]], bool], status: Any, intermediate: Any
-    ) -> dict[str, Any]:
+    async def _ended(self, path: str, status: Any, intermediate: Any) -> dict[str, Any]:
         """Return a pour or a campaign as soon as it has ended well; meanwhile report its state."""
         shown: tuple[str, str] | None = None
         began = time.monotonic()
         while True:
             found: dict[str, Any] = await self._repeated(self._client.get, path)
-            if end_of(found):
+            if _has_ended(found):
                 return found
             reason = found["reason"] or ("an operator has to enable the motion" if found["needs_enabling"] else "")
             if (found["state"], reason) != shown:
@@ -500,25 +498,17 @@ def _refuse(error: DaemonError) -> NoReturn:
     raise kind(str(error)) from None
 
 
-def _pour_end(pour: dict[str, Any]) -> bool:
-    match pour["state"]:
-        case "weighed":
+def _has_ended(found: dict[str, Any]) -> bool:
+    """Whether a pour or a campaign has ended well; another end is an error."""
+    match found["state"]:
+        case "weighed" | "finished":
             return True
         case "failed":
-            raise OrderFailedError(pour["reason"] or f"{pour['id']} has failed")
+            raise OrderFailedError(found["reason"] or f"{found['id']} has failed")
         case "cancelled":
-            raise OrderCancelledError(pour["reason"] or f"{pour['id']} was cancelled")
-    return False
-
-
-def _campaign_end(campaign: dict[str, Any]) -> bool:
-    match campaign["state"]:
-        case "finished":
-            return True
-        case "failed":
-            raise OrderFailedError(campaign["reason"] or f"{campaign['id']} has failed")
+            raise OrderCancelledError(found["reason"] or f"{found['id']} was cancelled")
         case "stopped" | "withdrawn":
-            raise OrderCancelledError(campaign["reason"] or f"{campaign['id']} was stopped")
+            raise OrderCancelledError(found["reason"] or f"{found['id']} was stopped")
     return False
 
 

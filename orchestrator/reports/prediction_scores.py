@@ -120,20 +120,9 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float |
     """Spearman's ρ; None for fewer than three pairs, or if one side has only equal values."""
     if len(first) < 3 or len(set(first)) < 2 or len(set(second)) < 2:
         return None
-    a, b = _ranks(first), _ranks(second)
-    middle = (len(a) - 1) / 2.0
-    products = math.fsum((x - middle) * (y - middle) for x, y in zip(a, b, strict=True))
-    squares = [math.fsum((x - middle) ** 2 for x in ranks) for ranks in (a, b)]
-    return products / math.sqrt(squares[0] * squares[1])
+    from scipy.stats import spearmanr
 
-
-def _ranks(values: Sequence[float]) -> list[float]:
-    """Ranks from 0; equal values share their mean rank."""
-    ordered = sorted(values)
-    places: dict[float, list[int]] = {}
-    for place, value in enumerate(ordered):
-        places.setdefault(value, []).append(place)
-    return [math.fsum(places[value]) / len(places[value]) for value in values]
+    return float(spearmanr(first, second).statistic)
 
 
 NOTE_WIDTH = 44
