@@ -156,7 +156,7 @@ class DeploymentSettings(StrategySettings):
         return False
 
     @property
-    def learns_of_benches(self) -> bool:
+    def learns_offsets(self) -> bool:
         """Whether the strategy uses estimates of the bench from calibration or from pours into another receiver."""
         return False
 

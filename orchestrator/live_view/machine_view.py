@@ -13,6 +13,7 @@ import rerun as rr
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
+from orchestrator.records.run_record import RunState
 from orchestrator.records.states import RESTING, State
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.figure_style import safe_name
@@ -45,11 +46,11 @@ class MachineView:
 
     Args:
         sink: sink of the rows.
+        run: state of the run, which takes each event before the rows are written.
     """
 
-    def __init__(self, sink: RecordingSink) -> None:
-        self._sink = sink
-        self._simulators = 1
+    def __init__(self, sink: RecordingSink, run: RunState) -> None:
+        self._sink, self._run = sink, run
         self._slots: dict[int, int] = {}
         self._styled: set[str] = set()
         self._poured: float | None = None
@@ -69,9 +70,12 @@ class MachineView:
             )
             sink.log(f"{PLACE}/{name}", appearance, static=True)
 
-    def opened(self, simulators: int, *, arm: bool) -> None:
-        """Initialise the rows for a pool of simulators, the optimiser, and an arm if there is one; all are idle."""
-        self._simulators = max(simulators, 1)
+    @property
+    def _simulators(self) -> int:
+        return max(self._run.simulators, 1)
+
+    def opened(self, *, arm: bool) -> None:
+        """Initialise the rows of the simulators, the optimiser, and an arm if there is one; all are idle."""
         for name in (*(["arm"] if arm else []), "optimiser", *(f"simulator {n + 1}" for n in range(self._simulators))):
             self.activity(name, None)
         self._load()
@@ -135,7 +139,7 @@ class MachineView:
         self._sink.log(OUTCOME, rr.TextDocument(markdown, media_type="text/markdown"), static=True)
 
     def _load(self) -> None:
-        running = len(self._slots)
+        running = len(self._run.running)
         self._number("load/busy", min(running, self._simulators))
         self._number("load/queue", max(running - self._simulators, 0))
 

@@ -75,7 +75,7 @@ class CampaignRecording:
         self._cell = CellScene(sink, self._films, plan)
         self._balance = BalanceStage(sink, self._cell.time_scale)
         self._learning = LearningStage(sink, plan)
-        self._machine = MachineView(sink)
+        self._machine = MachineView(sink, self._progress.run)
         self._machine.outcome(
             f"# {reality}: no end\n\nThe run is under way, or its process was killed before it ended.\n"
         )
@@ -116,7 +116,7 @@ class CampaignRecording:
         self._progress(event)
         match event:
             case CampaignOpened():
-                self._machine.opened(event.simulators, arm=self._plan.laboratory.bench is not None)
+                self._machine.opened(arm=self._plan.laboratory.bench is not None)
                 self._learning.opened()
                 self._say(f"{event.name}: {'goes on' if event.resumed else 'begins'}, mode {event.mode}")
             case CampaignStateChanged():

@@ -249,7 +249,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
             known = with_left_over(with_posterior(deployment, results), results)
-            known = with_bench(known, results, _theta(plan, results))
+            known = with_offsets(known, results, _theta(plan, results))
             return known.settings.build(known, scene, _theta(plan, results), seed)
 
         return build
@@ -306,7 +306,7 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     """The deployment with posterior draws of θ from the preceding calibration; its simulations use them in turn.
 
     There are none if the calibration has no posterior, or if the weighed pours do not justify θ*. A strategy that
-    learns the bench's offsets from its pours receives what calibration knows of them separately (`with_bench`): if
+    learns the bench's offsets from its pours receives what calibration knows of them separately (`with_offsets`): if
     offsets were searched, its simulations use θ*.
 
     Raises:
@@ -324,7 +324,7 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
         or not posterior
         or not _justified(results)
         or (
-            deployment.settings.learns_of_benches and set(SimulationParameters.nuisances()).intersection(found.searched)
+            deployment.settings.learns_offsets and set(SimulationParameters.nuisances()).intersection(found.searched)
         )
     ):
         return deployment
@@ -348,13 +348,13 @@ def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParam
     return tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
 
 
-def with_bench(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:
+def with_offsets(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:
     """The deployment with the known bench offsets, from earlier pours into a receiver, the calibration or a memory.
 
     A calibration contributes if it searched nuisance parameters; parameters that it did not search keep their
     tolerances.
     """
-    if not deployment.settings.learns_of_benches or deployment.bench:
+    if not deployment.settings.learns_offsets or deployment.bench:
         return deployment
     previous = [
         result.bench for result in results.values() if isinstance(result, Deployed) and result.bench is not None

@@ -128,7 +128,7 @@ class D3Settings(SearchSettings):
                 complaints.add(f"needs 'model: adaptive', not '{self.model}'", key, key=True)
 
     @property
-    def learns_of_benches(self) -> bool:
+    def learns_offsets(self) -> bool:
         """Whether earlier knowledge of the bench enters the hypotheses."""
         return self.adaptive
 

@@ -24,7 +24,7 @@ from orchestrator.learning.requests import Answered, Ask, Suggest
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.resume import OperatorNeededError
-from orchestrator.runs.stages import DEPLOYMENT, with_bench
+from orchestrator.runs.stages import DEPLOYMENT, with_offsets
 from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
@@ -270,14 +270,14 @@ def test_what_was_learnt_with_one_receiver_is_known_for_the_next() -> None:
     learnt = first.result()
     assert isinstance(learnt, Deployed)
     again = Deployed.model_validate_json(learnt.model_dump_json())
-    told = with_bench(plan, {DEPLOYMENT + "first": again}, THETA)
+    told = with_offsets(plan, {DEPLOYMENT + "first": again}, THETA)
     assert len(told.bench) == 64
     second = Hybrid(told, SCENE, THETA, 2)
     played = StrategyHarness(narrow_cup_biased, narrow_cup).run(second)
     pour = next(r.query for r in played.asked if isinstance(r, Suggest) and r.purpose == "pour")
     assert pour.discrepancy is not None
     assert pour.discrepancy.drawn == told.bench
-    assert with_bench(replace(plan, settings=plan.settings.model_copy(update={"model": "residual"})),
+    assert with_offsets(replace(plan, settings=plan.settings.model_copy(update={"model": "residual"})),
                       {DEPLOYMENT + "first": again}, THETA).bench == ()  # fmt: skip
 
 
@@ -287,11 +287,11 @@ def test_a_calibration_that_searched_where_the_receiver_stands_is_known_too() ->
     found = plans.calibrated(best, rows)
     assert found.found is not None
     found = found.model_copy(update={"found": found.found.model_copy(update={"searched": ("receiver_x",)})})
-    told = with_bench(deployment_plan(model="adaptive"), {"calibration": found}, best)
+    told = with_offsets(deployment_plan(model="adaptive"), {"calibration": found}, best)
     shifts = np.array([one.shifts[1] for one in told.bench]) * 0.07
     assert np.abs(shifts).max() == pytest.approx(0.001)
     nothing = plans.calibrated(best, rows)  # it searched something else
-    assert with_bench(deployment_plan(model="adaptive"), {"calibration": nothing}, best).bench == ()
+    assert with_offsets(deployment_plan(model="adaptive"), {"calibration": nothing}, best).bench == ()
 
 
 # -- asked on resume -------------------------------------------------------------------------------------------------
