@@ -6,6 +6,7 @@ that `--help` starts fast.
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable
 from typing import Annotated
@@ -70,19 +71,20 @@ def decant(
     """Options that precede the command."""
 
 
-def _group(name: str, text: str, *shown: str) -> typer.Typer:
-    """Add a group of commands.
+def _group(name: str, text: str, *shown: str, quiet: bool = False) -> Callable[..., None]:
+    """Add a group of commands; returns `_add` for its commands.
 
     Args:
         name: its name.
         text: its help text.
         shown: examples: how its commands are used together.
+        quiet: whether its commands have the option `--quiet`.
     """
     group = typer.Typer(
         name=name, no_args_is_help=True, rich_markup_mode="markdown", help=text, epilog=examples(*shown)
     )
     app.add_typer(group)
-    return group
+    return functools.partial(_add, to=group, quiet=quiet)
 
 
 def _add(
@@ -173,38 +175,23 @@ _vessel = _group(
     "Make a vessel file from measurements; one command for each kind of source. It states its uncertainty.",
     "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
     "decant vessel mesh scan.stl mug.yaml --unit mm",
+    quiet=True,
 )
-_add(
+_vessel(
     vessel_command.profile,
     "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
     "decant vessel profile cup.yaml --height '95 mm' --fill fill.csv --wall '3 mm' --brimful '322 g'",
-    to=_vessel,
-    quiet=True,
 )
-_add(
+_vessel(
     vessel_command.photo,
     "decant vessel photo side.png cup.yaml --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
-    to=_vessel,
-    quiet=True,
 )
-_add(
-    vessel_command.points,
-    "decant vessel points cloud.ply cup.yaml --unit mm --wall '3 mm'",
-    to=_vessel,
-    quiet=True,
-)
-_add(
-    vessel_command.depth,
-    "decant vessel depth depth.png cup.yaml --focal 615 --wall '3 mm' --height '95 mm'",
-    to=_vessel,
-    quiet=True,
-)
-_add(
+_vessel(vessel_command.points, "decant vessel points cloud.ply cup.yaml --unit mm --wall '3 mm'")
+_vessel(vessel_command.depth, "decant vessel depth depth.png cup.yaml --focal 615 --wall '3 mm' --height '95 mm'")
+_vessel(
     vessel_command.mesh,
     "decant vessel mesh scan.stl mug.yaml --unit mm --wall '3 mm'",
     "decant vessel mesh cup.stl cup.yaml --drop-bodies --brimful '322 g'",
-    to=_vessel,
-    quiet=True,
 )
 
 _add(
@@ -222,17 +209,16 @@ _study = _group(
     "Compare strategies with repetitions, on virtual benches that differ from the simulator.",
     "decant study run configs/studies/quick.yaml",
     "decant study report configs/studies/quick.yaml   # again, from the results that there are",
+    quiet=True,
 )
-_add(
+_study(
     study_command.run_study,
     "decant study run configs/studies/quick.yaml",
     "decant study run configs/studies/paper.yaml --dry-run   # estimate the cost",
     "decant study run configs/studies/paper.yaml --jobs 2    # continues a stopped study",
     name="run",
-    to=_study,
-    quiet=True,
 )
-_add(study_command.report_study, "decant study report configs/studies/quick.yaml", name="report", to=_study, quiet=True)
+_study(study_command.report_study, "decant study report configs/studies/quick.yaml", name="report")
 
 _robot = _group(
     "robot",
@@ -240,42 +226,36 @@ _robot = _group(
     "decant robot check configs/laboratories/ur10-kern.yaml                  # moves nothing",
     "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion    # small steps, typed",
 )
-_add(
+_robot(
     robot_commands.check,
     "decant robot check configs/laboratories/virtual.yaml",
     "decant robot check configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the pendant",
-    to=_robot,
 )
-_add(
+_robot(
     robot_commands.archive,
     "decant robot archive day-one.zip day-one-robot.json day-one-balance.jsonl runs/first-pour-20300131-1",
     "decant robot archive day-one.zip   # replay it without the rig",
-    to=_robot,
 )
-_add(
+_robot(
     robot_commands.jog,
     "decant robot jog configs/laboratories/virtual.yaml         # practise without a robot",
     "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion",
-    to=_robot,
 )
-_add(
+_robot(
     robot_commands.home,
     "decant robot home configs/laboratories/virtual.yaml        # practise without a robot",
     "decant robot home configs/laboratories/ur10-kern.yaml --enable-motion",
-    to=_robot,
 )
-_add(
+_robot(
     robot_commands.teach,
     "decant robot teach my-lab.yaml pan --use balance     # after guiding the arm there by hand",
     "decant robot teach my-lab.yaml left --use source",
-    to=_robot,
 )
-_add(
+_robot(
     robot_commands.try_place,
     "decant robot try configs/laboratories/night.yaml left             # practise without a robot",
     "decant robot try my-lab.yaml left --enable-motion",
     name="try",
-    to=_robot,
 )
 
 _balance = _group(
@@ -284,23 +264,20 @@ _balance = _group(
     "decant balance check configs/laboratories/ur10-kern.yaml",
     "decant balance check /dev/serial/by-id/usb-FTDI_FT232R-if00-port0   # no laboratory file yet",
 )
-_add(
+_balance(
     balance_commands.check,
     "decant balance check configs/laboratories/virtual.yaml       # practise without a balance",
     "decant balance check /dev/serial/by-id/usb-FTDI_FT232R-if00-port0 --record day-one.jsonl",
     "decant balance check 192.168.0.20:4001 --set dialect=a-and-d",
-    to=_balance,
 )
-_add(
+_balance(
     balance_commands.record,
     "decant balance record rig.yaml --to kern.jsonl --remarks 'Kern PCB 3500-2; 200 g put on after 10 s'",
-    to=_balance,
 )
-_add(
+_balance(
     balance_commands.explain,
     "decant balance explain kern.jsonl      # a recording",
     "decant balance explain terminal.log    # the lines as another program saved them",
-    to=_balance,
 )
 
 _recording = _group(
@@ -308,35 +285,25 @@ _recording = _group(
     "Recorded pours: export them from runs, replay them, fit unknown quantities, and record a first day.",
     "decant recording replay configs/recordings/dose-1.yaml",
     "decant recording export runs/dispense-20300131-1",
-)
-_add(
-    recording_commands.export,
-    "decant recording export dispense-20300131-1   # a run in the folder runs/",
-    to=_recording,
     quiet=True,
 )
-_add(
+_recording(recording_commands.export, "decant recording export dispense-20300131-1   # a run in the folder runs/")
+_recording(
     recording_commands.replay,
     "decant recording replay configs/recordings/dose-1.yaml --png pictures",
     "decant recording replay day-one/ --fitted fit.json",
-    to=_recording,
-    quiet=True,
 )
-_add(
+_recording(
     recording_commands.fit,
     "decant recording fit day-one/ --unknown grip --unknown lag --judge day-two/ --output fit.json",
     "decant recording fit configs/recordings/dose-1.yaml --until '5 s'   # judged on the rest",
-    to=_recording,
-    quiet=True,
 )
-_add(
+_recording(
     first_day_command.first_day,
     "decant recording first-day day-one --campaign configs/campaigns/first-day.yaml",
     "decant recording first-day practice --practise --wrong grip   # in minutes, without a laboratory",
     "decant recording first-day day-one   # explain the recordings of a folder again",
     name="first-day",
-    to=_recording,
-    quiet=True,
 )
 
 _server = _group(
@@ -345,25 +312,21 @@ _server = _group(
     "decant server start --state ./lab            # prints the address of its page; runs until Ctrl-C",
     "decant server backup lab.zip --state ./lab   # also while it runs",
 )
-_add(
+_server(
     queue_commands.start,
     "decant server start",
     "decant server start lab.yaml --port 0",
     "decant server start --state ./trials --in-process",
-    to=_server,
 )
-_add(
-    queue_commands.shutdown, "decant server stop   # finishes and weighs a pour that has begun", name="stop", to=_server
-)
-_add(
+_server(queue_commands.shutdown, "decant server stop   # finishes and weighs a pour that has begun", name="stop")
+_server(
     station_commands.serve_sila,
     "decant server sila   # for the daemon of this machine, on loopback",
     "decant server sila --host 192.0.2.7 --certificate station.pem --key station.key --clients authority.pem",
     name="sila",
-    to=_server,
 )
-_add(station_commands.backup, "decant server backup decant-2030-03-01.zip", to=_server)
-_add(station_commands.restore, "decant server restore decant-2030-03-01.zip --state ./restored", to=_server)
+_server(station_commands.backup, "decant server backup decant-2030-03-01.zip")
+_server(station_commands.restore, "decant server restore decant-2030-03-01.zip --state ./restored")
 
 _queue = _group(
     "queue",
@@ -372,40 +335,37 @@ _queue = _group(
     "decant queue logs quickstart-3f2a1c -f                  # follow it",
     "decant queue answer                                     # list what the laboratory asks",
 )
-_add(
+_queue(
     queue_commands.submit,
     "decant queue submit configs/campaigns/quickstart.yaml",
     "decant queue submit my.yaml --rig left --priority 5",
     "decant queue submit my.yaml --task plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
-    to=_queue,
 )
-_add(queue_commands.list_campaigns, "decant queue list", "decant queue list --json", name="list", to=_queue)
-_add(queue_commands.show, "decant queue show quick   # the first letters of an id suffice", to=_queue)
-_add(queue_commands.logs, "decant queue logs -f", "decant queue logs quickstart-3f2a1c --json", to=_queue)
-_add(queue_commands.pause, "decant queue pause quickstart-3f2a1c", "decant queue pause   # the queue", to=_queue)
-_add(queue_commands.resume, "decant queue resume quickstart-3f2a1c", "decant queue resume   # the queue", to=_queue)
-_add(queue_commands.stop, "decant queue stop quickstart-3f2a1c   # its results so far are kept", to=_queue)
-_add(queue_commands.abort, "decant queue abort quickstart-3f2a1c", to=_queue)
-_add(
+_queue(queue_commands.list_campaigns, "decant queue list", "decant queue list --json", name="list")
+_queue(queue_commands.show, "decant queue show quick   # the first letters of an id suffice")
+_queue(queue_commands.logs, "decant queue logs -f", "decant queue logs quickstart-3f2a1c --json")
+_queue(queue_commands.pause, "decant queue pause quickstart-3f2a1c", "decant queue pause   # the queue")
+_queue(queue_commands.resume, "decant queue resume quickstart-3f2a1c", "decant queue resume   # the queue")
+_queue(queue_commands.stop, "decant queue stop quickstart-3f2a1c   # its results so far are kept")
+_queue(queue_commands.abort, "decant queue abort quickstart-3f2a1c")
+_queue(
     queue_commands.answer,
     "decant queue answer",
     "decant queue answer 7 done",
     "decant queue answer 8 weighed 3.2 0.4   # spilled and retained [g]",
-    to=_queue,
 )
-_add(queue_commands.enable, "decant queue enable narrow-1b2c3d", to=_queue)
-_add(queue_commands.move, "decant queue move narrow-1b2c3d --first   # the next to run", to=_queue)
-_add(
+_queue(queue_commands.enable, "decant queue enable narrow-1b2c3d")
+_queue(queue_commands.move, "decant queue move narrow-1b2c3d --first   # the next to run")
+_queue(
     station_commands.order,
     "decant queue pour plan-17:4 --from beaker-1 --into vial-7 --amount '30 g'",
     "decant queue pour plan-17:4 --from beaker-1 --into vial-7 --amount '30 g' --dry-run",
     name="pour",
-    to=_queue,
 )
-_add(station_commands.batch, "decant queue batch plate.json   # again: nothing is queued twice", to=_queue)
-_add(station_commands.batch_status, "decant queue batch-status plate-1", name="batch-status", to=_queue)
-_add(station_commands.hold, "decant queue hold narrow-1b2c3d", "decant queue hold narrow-1b2c3d --release", to=_queue)
-_add(station_commands.reserve, "decant queue reserve left --hours 2", to=_queue)
+_queue(station_commands.batch, "decant queue batch plate.json   # again: nothing is queued twice")
+_queue(station_commands.batch_status, "decant queue batch-status plate-1", name="batch-status")
+_queue(station_commands.hold, "decant queue hold narrow-1b2c3d", "decant queue hold narrow-1b2c3d --release")
+_queue(station_commands.reserve, "decant queue reserve left --hours 2")
 
 _materials = _group(
     "materials",
@@ -413,21 +373,16 @@ _materials = _group(
     "decant materials weigh virtual/beaker '412.3 g' --liquid water   # after filling it",
     "decant materials list                                            # what the pours since then left",
 )
-_add(
-    materials_commands.list_vessels, "decant materials list", "decant materials list --json", name="list", to=_materials
-)
-_add(
+_materials(materials_commands.list_vessels, "decant materials list", "decant materials list --json", name="list")
+_materials(
     materials_commands.weigh,
     "decant materials weigh virtual/beaker '412.3 g' --liquid water   # the source of a campaign",
     "decant materials weigh beaker-1 '412.3 g' --note 'after lunch'     # a vessel of the daemon",
-    to=_materials,
 )
-_add(materials_commands.history, "decant materials history virtual/beaker", to=_materials)
-_add(materials_commands.place, "decant materials place night/receiver right", to=_materials)
-_add(
-    materials_commands.poured,
-    "decant materials poured monday-1 --from beaker-1 --into vial-7 --weighed '30.2 g'",
-    to=_materials,
+_materials(materials_commands.history, "decant materials history virtual/beaker")
+_materials(materials_commands.place, "decant materials place night/receiver right")
+_materials(
+    materials_commands.poured, "decant materials poured monday-1 --from beaker-1 --into vial-7 --weighed '30.2 g'"
 )
 
 _add(
