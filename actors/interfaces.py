@@ -25,6 +25,8 @@ from sim_engine.settings.quantity import Quantity
 class LaboratoryError(DecantError):
     """The laboratory cannot do what was requested; the text is for the person who can fix it."""
 
+    exit_code = 1
+
 
 class BenchLostError(LaboratoryError):
     """The bench's machine is lost: no pour is possible until it is back. The outcome of a running pour is unknown."""

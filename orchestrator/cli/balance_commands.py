@@ -119,25 +119,22 @@ def record(
     ):
         driver = _driver(spec, tap)
         try:
-            with Refused(LaboratoryError, code=FAILED):
-                try:
-                    print_message(driver.connect())
-                except LaboratoryError:
-                    if tap is not None and tap.count:
-                        print_message(f"{to} holds what was sent and received; 'decant balance explain {to}' shows it")
-                    raise
-                end = time.monotonic() + seconds
-                with contextlib.suppress(KeyboardInterrupt):
-                    while (left := end - time.monotonic()) > 0.0:
-                        if listen:
-                            driver.listen(min(left, 1.0))
-                            continue
-                        seen = driver.read()
-                        print(
-                            f"\r{seen.shown or seen.status:<24} {seen.status:<12}", end="", file=sys.stderr, flush=True
-                        )
-                        time.sleep(min(0.05, left))
-                print_message("")
+            try:
+                print_message(driver.connect())
+            except LaboratoryError:
+                if tap is not None and tap.count:
+                    print_message(f"{to} holds what was sent and received; 'decant balance explain {to}' shows it")
+                raise
+            end = time.monotonic() + seconds
+            with contextlib.suppress(KeyboardInterrupt):
+                while (left := end - time.monotonic()) > 0.0:
+                    if listen:
+                        driver.listen(min(left, 1.0))
+                        continue
+                    seen = driver.read()
+                    print(f"\r{seen.shown or seen.status:<24} {seen.status:<12}", end="", file=sys.stderr, flush=True)
+                    time.sleep(min(0.05, left))
+            print_message("")
             _finish(tap, to, driver)
         finally:
             driver.close()
@@ -338,7 +335,6 @@ def _ask(prompt: str) -> str:
 def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBalanceSettings, BalanceEmulator | None]]:
     """The balance's settings, and its emulator in a virtual laboratory."""
     from actors.balance.balance_settings import SerialBalanceSettings, balance_kind
-    from actors.interfaces import LaboratoryError
     from orchestrator.cli.robot_commands import read_laboratory
 
     if not target.endswith((".yaml", ".yml")):
@@ -352,8 +348,7 @@ def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBala
     if spec.virtual is None:
         yield spec, None
         return
-    with Refused(LaboratoryError, code=FAILED):
-        emulator = balance_kind(spec.with_values(time_scale=CHECK_SCALE)).start_emulator()
+    emulator = balance_kind(spec.with_values(time_scale=CHECK_SCALE)).start_emulator()
     assert emulator is not None
     try:
         print_message("virtual: no balance; one is started for this, and its loads are simulated")

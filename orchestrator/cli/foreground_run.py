@@ -28,6 +28,7 @@ from orchestrator.cli.console import (
     FAILED,
     INTERRUPTED,
     RefusalError,
+    Refused,
     WaitingIndicator,
     is_quiet,
     print_message,
@@ -98,12 +99,13 @@ def check_laboratory_answers(request: RunRequest, resources: RunResources) -> No
     """The requirements of the laboratory, on this machine and on others, before anything starts.
 
     Raises:
-        LaboratoryError: something is missing.
+        RefusalError: something is missing (exit code 2).
     """
     laboratory = resources.settings(request.campaign)
     if laboratory.ray is not None and not laboratory.in_process:
         print_note(f"looking at the Ray cluster at {laboratory.ray.address} …")
-    RunService().check_laboratory(request, resources)
+    with Refused(LaboratoryError):
+        RunService().check_laboratory(request, resources)
 
 
 def run_task_at_terminal(
@@ -224,7 +226,7 @@ def run_in_front_of_people(
     except (RunError, LaboratoryError) as error:
         problem = getattr(error, "problem", error) if not_resumed else error
         way_on = _way_on(directory, again, not_resumed)
-        raise RefusalError(f"{problem}{way_on}", getattr(error, "exit_code", FAILED)) from None
+        raise RefusalError(f"{problem}{way_on}", error.exit_code) from None
     except OSError as error:
         if error.errno is None:
             raise  # not a file's: a defect, which wants its traceback

@@ -217,10 +217,9 @@ def _stands_at_home(chosen: Chosen) -> bool:
         RefusalError: it can't be read.
     """
     from actors.arm.arm_settings import arm_kind
-    from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
 
-    with Refused(LaboratoryError, code=FAILED), reached(chosen.plan.laboratory) as ready:
+    with reached(chosen.plan.laboratory) as ready:
         assert ready.arm is not None
         check = arm_kind(ready.arm).diagnostics().at_home()
     print_message(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
@@ -293,7 +292,6 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
         RefusalError: refused (exit code 2), or stopped on the way (1).
     """
     from actors.arm.arm_settings import arm_kind
-    from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from orchestrator.cli.motion_control import EmptyCycle, confirm, connected
     from orchestrator.runs.motion_approval import report_lines, required_checksum
@@ -322,8 +320,6 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
                     path = arm_kind(fitted).plan(chosen.scene, action).slowed(slow)
                 cycle = EmptyCycle(arm, path, ready.arm.on_clock(laboratory.arm.warning_time), ask=hardware)
                 executed = cycle.run()
-    except LaboratoryError as error:
-        raise RefusalError(str(error), FAILED) from None
     except OSError as error:
         raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}") from None
     record = {

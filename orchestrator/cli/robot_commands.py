@@ -88,7 +88,8 @@ def check(
         if not accept_safety:
             raise
         record = None
-    check_bench_packages(spec)
+    with Refused(LaboratoryError):
+        check_bench_packages(spec)
 
     def read(look: ArmDiagnostics) -> SafetyRecord | None:
         found = _accept(laboratory, look) if accept_safety and not virtual else record
@@ -97,8 +98,7 @@ def check(
                 write_robot_check(record_to, laboratory, look, found, virtual=virtual)
         return found
 
-    with Refused(LaboratoryError, code=FAILED):
-        report = check_bench(spec, laboratory, record, tare=tare, read=read)
+    report = check_bench(spec, laboratory, record, tare=tare, read=read)
     if as_json:
         print_json(CheckOutput(**report.document()))
     else:
@@ -237,14 +237,13 @@ def home(laboratory: Laboratory, enable_motion: EnableMotion = False) -> None:
     All joints move by small steps of at most 10 deg at 5 deg/s, in nearly a straight line in joint space, after 'home'
     has been typed. Obstacles are not checked: watch the arm. Ctrl-C stops it. Exit code 2 if nothing was moved.
     """
-    from actors.interfaces import LaboratoryError
     from orchestrator.cli.motion_control import JogError, Jogging, typed_line
 
     lines = "all joints to 'home': steps of at most 10 deg at 5 deg/s; obstacles are not checked"
     with _session(laboratory, "home", lines, enable_motion) as (driver, _):
         session = Jogging(driver, typed_line)
         session.where()
-        with Refused(JogError, LaboratoryError, code=FAILED):
+        with Refused(JogError, code=FAILED):
             confirmed = session.home()
         if not confirmed:
             raise RefusalError("not confirmed; nothing has moved")
@@ -270,7 +269,6 @@ def teach(
     checked: reach, limits, the way from home, distance from other places. Comments in the file are kept.
     """
     from actors.arm.arm_settings import arm_kind
-    from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from actors.places import PlaceSettings
     from orchestrator.campaigns.place_writing import write_place
@@ -281,7 +279,7 @@ def teach(
     if spec.arm is None or (tool := getattr(spec.arm, "tool", None)) is None:
         raise without_arm(laboratory, spec, "'decant robot teach' reads the pose of an arm's tool")
     accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
-    with Refused(LaboratoryError, code=FAILED), reached(spec) as ready, connected(ready, accepted) as (driver, facts):
+    with reached(spec) as ready, connected(ready, accepted) as (driver, facts):
         pose = driver.where().tool
         arm = (ready.arm or spec.arm).fitted_to(facts)
     before = next((place for place in spec.places if place.name == name), None)
@@ -304,7 +302,6 @@ def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMoti
     home with 'decant robot home' then.
     """
     from actors.arm.arm_settings import arm_kind
-    from actors.interfaces import LaboratoryError
     from orchestrator.cli.motion_control import stoppable, typed_line
 
     spec = read_laboratory(laboratory)
@@ -313,7 +310,7 @@ def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMoti
         known = ", ".join(f"'{one.name}'" for one in spec.places) or "none"
         raise RefusalError(f"{laboratory}: there is no place '{name}'; there are {known}")
     lines = f"from home to the place '{name}' and back, at a quarter of the usual speed"
-    with _session(laboratory, "try", lines, enable_motion) as (driver, arm), Refused(LaboratoryError, code=FAILED):
+    with _session(laboratory, "try", lines, enable_motion) as (driver, arm):
         way = arm_kind(arm).way(place, spec.places, {}).slowed(TRIED)
         print_message(f"{way.approach_time:.0f} s for each way. The fingers must be open, and hands out of the cell.")
         for homewards, text in ((False, f"down to '{name}'"), (True, "back home")):
@@ -338,7 +335,6 @@ def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Itera
     Raises:
         RefusalError: the laboratory has no arm, its motion is not enabled, or the arm can't be connected.
     """
-    from actors.interfaces import LaboratoryError
     from actors.laboratory import reached
     from orchestrator.cli.motion_control import WARNING_TIME, confirm, connected, require_flag
     from orchestrator.runs.motion_approval import accepted_checksum
@@ -354,7 +350,7 @@ def _session(laboratory: Path, command: str, steps: str, enabled: bool) -> Itera
         confirm(spec, [f"steps          {steps}"])
     else:
         print_message(f"laboratory {spec.name}, virtual: no hardware moves")
-    with Refused(LaboratoryError, code=FAILED), reached(spec) as ready:
+    with reached(spec) as ready:
         assert ready.arm is not None
         soon = ready.with_values(arm=ready.arm.with_values(warning_time=WARNING_TIME))
         with connected(soon, accepted) as (driver, facts):

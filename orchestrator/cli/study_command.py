@@ -93,10 +93,11 @@ def _workers(plan: StudyPlan, folder: Path, jobs: int | None, cluster: RaySettin
     if cluster is None:
         yield LocalCells(plan, folder, jobs or os.cpu_count() or 1)
         return
+    from actors.interfaces import LaboratoryError
     from actors.runtime.ray_tasks import ClusterTasks
     from orchestrator.study.cluster_cells import ClusterCells
 
-    with ClusterTasks(cluster) as tasks:
+    with Refused(LaboratoryError), ClusterTasks(cluster) as tasks:
         yield ClusterCells(plan, folder, tasks, jobs)
 
 
