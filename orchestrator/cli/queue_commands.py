@@ -283,11 +283,7 @@ def _finished(event: dict[str, Any]) -> str:
     return f"{what}: {outcome['type'].lower()}"
 
 
-def pause(
-    key: CampaignOrQueue = None,
-    url: Url = None,
-    state: State = None,
-) -> None:
+def pause(key: CampaignOrQueue = None, url: Url = None, state: State = None) -> None:
     """Pause a campaign at its next checkpoint: a pour that has started is finished and weighed.
 
     Without a campaign, the queue is paused: no campaign starts, and running ones continue.
@@ -295,11 +291,7 @@ def pause(
     _change(key, "pause", url, state)
 
 
-def resume(
-    key: CampaignOrQueue = None,
-    url: Url = None,
-    state: State = None,
-) -> None:
+def resume(key: CampaignOrQueue = None, url: Url = None, state: State = None) -> None:
     """Resume a paused campaign, or the queue."""
     _change(key, "resume", url, state)
 
@@ -310,7 +302,7 @@ def stop(key: CampaignId, url: Url = None, state: State = None) -> None:
 
 
 def _change(key: str | None, what: str, url: str | None, state: Path | None) -> None:
-    """Pause, resume or stop a campaign, or pause or resume the queue if none is given."""
+    """Pause, resume, stop or abort a campaign, or pause or resume the queue if none is given."""
     with connected_client(url, state) as client:
         found = client.post(f"/queue/{what}" if key is None else f"/campaigns/{key}/{what}")
     if key is None:
@@ -324,9 +316,7 @@ def abort(key: CampaignId, url: Url = None, state: State = None) -> None:
 
     A software stop is not a safety function: keep the robot's own emergency stop within reach.
     """
-    with connected_client(url, state) as client:
-        found = client.post(f"/campaigns/{key}/abort")
-    print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
+    _change(key, "abort", url, state)
 
 
 def estop(
