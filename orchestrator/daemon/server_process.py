@@ -207,7 +207,7 @@ async def _serve(settings: DaemonSettings, ready: Callable[[str], None], restart
     make_state_directory(settings.state)
     tokens = Tokens(settings.tokens)
     with contextlib.ExitStack() as opened:
-        listening = opened.enter_context(restart.listening or _listen(settings))
+        listening = opened.enter_context(restart.listening or _socket(settings.host, settings.port, "--port"))
         restart.keep(listening)
         notifier = _notifier(settings)
         if notifier is not None:
@@ -318,10 +318,6 @@ class _Ending:
         if self.asked.is_set():
             self._daemon.hurry()
         self.asked.set()
-
-
-def _listen(settings: DaemonSettings) -> socket.socket:
-    return _socket(settings.host, settings.port, "--port")
 
 
 def _socket(host: str, port: int, option: str) -> socket.socket:

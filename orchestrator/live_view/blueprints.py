@@ -63,7 +63,7 @@ def campaign_blueprint(
     def losses() -> list[Any]:
         named = [(safe_name(scene), name) for scene, name in receivers.items()]
         return [_loss(place, f"{name}: {loss_label}") for place, name in named] + [
-            _trust(place, f"{name}: model check") for place, name in named
+            _whole(f"/learning/{place}", f"{name}: model check", contents=["$origin/trust"]) for place, name in named
         ]
 
     def maps() -> list[Any]:
@@ -229,10 +229,6 @@ def _display() -> Any:
 
 def _weighed_pour(under: str = "", name: str = "Pour: spilled [g], weighed and simulated") -> Any:
     return _recent(f"{under}/balance/pour", name, 12.0)
-
-
-def _trust(place: str, name: str) -> Any:
-    return _whole(f"/learning/{place}", name, contents=["$origin/trust"])
 
 
 def _surrogate(place: str, name: str, *, sliced: bool) -> list[Any]:

@@ -84,12 +84,9 @@ class ReplayValues:
         mass = liquid.mass + self.fill
         if mass <= 0.0:
             raise InvalidSceneError(f"{recording.name}: the pourer would hold {1e3 * mass:.4g} g")
-        liquid = Liquid(**liquid.model_dump() | _changed(liquid, mass, self.viscosity))
+        changed = {"mass": mass, "dynamic_viscosity": self.viscosity * liquid.dynamic_viscosity}
+        liquid = Liquid(**liquid.model_dump() | changed)
         return replace(scene, pourer=taller(scene.pourer, self.height), liquid=liquid)
-
-
-def _changed(liquid: Liquid, mass: float, viscosity: float) -> dict[str, float]:
-    return {"mass": mass, "dynamic_viscosity": viscosity * liquid.dynamic_viscosity}
 
 
 def taller(spec: VesselSpec, by: float) -> VesselSpec:

@@ -365,7 +365,7 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
             markersize=9,
             markeredgewidth=2.0,
             elinewidth=6.0,
-            ecolor=(*_rgb(style.PREDICTED), 0.35),
+            ecolor=(style.PREDICTED, 0.35),
             color=style.PREDICTED,
             label=f"predicted: mean, {100 * LEVEL:.0f} % interval",
             zorder=2,
@@ -396,10 +396,6 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
     axes.set_xlim(0.4, len(numbers) + 0.6)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     return top
-
-
-def _rgb(colour: str) -> tuple[float, float, float]:
-    return (int(colour[1:3], 16) / 255, int(colour[3:5], 16) / 255, int(colour[5:7], 16) / 255)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from statistics import median_low
+from statistics import fmean, median_low
 
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.learning.calibration.calibration_scores import DRAWS
@@ -198,7 +198,7 @@ class Forecast:
         others = [other for other in self._stages.values() if other is not stage and len(other.waits) >= ENOUGH]
         if not others:
             return PRICE / max(min(self._run.slots, self._run.simulators), 1) * particles
-        return _usual(others[-1].waits) / _mean(others[-1].particles) * particles
+        return _usual(others[-1].waits) / fmean(others[-1].particles) * particles
 
     def _cycle(self, stage: _Stage) -> float:
         """Seconds from the end of a pour to the end of the next."""
@@ -208,7 +208,7 @@ class Forecast:
         cycles = [*stage.cycles[-RECENT:], *[expected] * max(ENOUGH - len(stage.cycles), 1)]
         # the first two include the start of the bench and speculative work
         unusual = 2 if len(stage.cycles) <= RECENT else 1
-        return _mean(sorted(cycles)[:-unusual])
+        return fmean(sorted(cycles)[:-unusual])
 
 
 def _made_before(event: RequestFinished) -> bool:
@@ -216,13 +216,9 @@ def _made_before(event: RequestFinished) -> bool:
     return isinstance(event.outcome, Simulated) and event.seconds < 0.1 * event.outcome.outcome.cpu_s
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
-
-
 def _usual(values: Sequence[float]) -> float:
     """Mean without the largest value, which may include the start of a process and compilation."""
-    return _mean(sorted(values)[:-1])
+    return fmean(sorted(values)[:-1])
 
 
 WEIGHINGS = 15.0

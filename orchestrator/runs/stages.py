@@ -323,9 +323,7 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
         found is None
         or not posterior
         or not _justified(results)
-        or (
-            deployment.settings.learns_offsets and set(SimulationParameters.nuisances()).intersection(found.searched)
-        )
+        or (deployment.settings.learns_offsets and set(SimulationParameters.nuisances()).intersection(found.searched))
     ):
         return deployment
     assert found is not None
