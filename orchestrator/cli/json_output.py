@@ -39,7 +39,7 @@ from orchestrator.cli.command_results import (
     ValidateSolverOutput,
     VesselOutput,
 )
-from orchestrator.daemon.daemon_store import Question
+from orchestrator.daemon.daemon_store import QuestionOut
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, StatusOut
 from orchestrator.daemon.station_schemas import AccountOut, BatchOut, ContentOut, PourOut
 from orchestrator.learning.dispense import Dose
@@ -137,7 +137,7 @@ class QueueOutput(CommandOutput):
 
     status: StatusOut
     campaigns: list[CampaignOut]
-    questions: list[Question]
+    questions: list[QuestionOut]
 
 
 class EventOutput(BaseModel):

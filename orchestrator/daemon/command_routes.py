@@ -20,7 +20,7 @@ from fastapi.responses import JSONResponse
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Queue, Stopping, Stops
 from orchestrator.daemon.campaign_queue import RequestRefusedError
-from orchestrator.daemon.daemon_store import ENDED, Question, QueueItem
+from orchestrator.daemon.daemon_store import ENDED, QuestionOut, QueueItem
 from orchestrator.daemon.emergency_stop import (
     ALL_STOPPED,
     BODY_TIME,
@@ -190,7 +190,7 @@ async def enable(daemon: Daemon, queue: Queue, person: Operator, key: str, body:
 @router.post("/questions/{number}/answer", operation_id="answer")
 async def answer(
     daemon: Daemon, person: Operator, number: Annotated[int, Path(ge=0, lt=2**62)], body: AnswerIn
-) -> Question:
+) -> QuestionOut:
     """Answer a question. The first answer counts."""
     try:
         found = daemon.asking.answer(number, body.answer, person.name)

@@ -1,7 +1,7 @@
 """Persistent state of the daemon: queue, questions, flags and audit entries.
 
 `Store` is the only writer of one SQLite file and flushes every change to disk. `QueueItem` is a submitted campaign with
-its desired state (`DesiredState`); `Question` is a question to the operator. The journal of a run remains the
+its desired state (`DesiredState`); `QuestionOut` is a question to the operator. The journal of a run remains the
 authoritative record of its events; this file holds the operators' intentions. The tables of ordered pours and of
 materials are read and written by `pour_orders` and `materials`; the contents of vessels are a file of their own.
 """
@@ -168,7 +168,7 @@ class QueueItem:
     not_before: float | None = None
 
 
-class Question(BaseModel):
+class QuestionOut(BaseModel):
     """A question to the operator."""
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
@@ -349,7 +349,7 @@ class Store:
 
     # ---- questions
 
-    def ask(self, **values: Any) -> Question:
+    def ask(self, **values: Any) -> QuestionOut:
         """Store an open question."""
         values["asked"] = time.time()
         names = ", ".join(values)
@@ -370,12 +370,12 @@ class Store:
         """Close a question that needs no answer any more."""
         self.write("update question set closed = ? where id = ? and closed is null", reason, key)
 
-    def question(self, key: int) -> Question | None:
+    def question(self, key: int) -> QuestionOut | None:
         """Return a question, or None if the id is unknown."""
         row = self._db.execute("select * from question where id = ?", [key]).fetchone()
-        return None if row is None else Question(**_read(row))
+        return None if row is None else QuestionOut(**_read(row))
 
-    def questions(self, *, only_open: bool = True, campaign: str | None = None, limit: int = 200) -> list[Question]:
+    def questions(self, *, only_open: bool = True, campaign: str | None = None, limit: int = 200) -> list[QuestionOut]:
         """Return open questions, oldest first, or all questions, newest first."""
         conditions = ["closed is null"] if only_open else ["1"]
         arguments: list[Any] = []
@@ -384,7 +384,7 @@ class Store:
             arguments.append(campaign)
         order = "id" if only_open else "id desc"
         query = f"select * from question where {' and '.join(conditions)} order by {order} limit ?"
-        return [Question(**_read(row)) for row in self._db.execute(query, [*arguments, limit])]
+        return [QuestionOut(**_read(row)) for row in self._db.execute(query, [*arguments, limit])]
 
     # ---- flags and audit entries
 

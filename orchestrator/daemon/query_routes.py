@@ -25,7 +25,7 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.access_control import Daemon, Queue, Stops, Viewer
 from orchestrator.daemon.campaign_queue import CampaignQueue
-from orchestrator.daemon.daemon_store import ENDED, Question, QueueItem
+from orchestrator.daemon.daemon_store import ENDED, QuestionOut, QueueItem
 from orchestrator.daemon.emergency_stop import EmergencyStops
 from orchestrator.daemon.rig_worker import SharedServices
 from orchestrator.daemon.run_readout import REPORT, summary_of
@@ -152,7 +152,7 @@ async def questions(
     person: Viewer,
     answered: Annotated[bool, Query(description="All questions, newest first.")] = False,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
-) -> list[Question]:
+) -> list[QuestionOut]:
     """List questions to the operator: the open ones, oldest first."""
     return daemon.store.questions(only_open=not answered, limit=limit)
 

@@ -15,7 +15,7 @@ from typing import Any
 from actors.balance.readings import typed_weight
 from actors.interfaces import LaboratoryError
 from actors.interfaces import OperatorQuestion as BenchQuestion
-from orchestrator.daemon.daemon_store import Question, Store
+from orchestrator.daemon.daemon_store import QuestionOut, Store
 from orchestrator.runs.resume import parse_answer
 
 GIVE_UP = "give up"
@@ -54,7 +54,7 @@ class Asking:
         """Ask a question and await its answer, without a time limit.
 
         Args:
-            values: fields of `Question`.
+            values: fields of `QuestionOut`.
         """
         question = self._store.ask(**values)
         self._waiting[question.id] = asyncio.get_running_loop().create_future()
@@ -68,7 +68,7 @@ class Asking:
             if found is not None and found.answer is None:
                 self._publish("QuestionClosed", {"question": found.model_dump(mode="json")}, question.campaign)
 
-    def answer(self, key: int, answer: str, by: str) -> Question:
+    def answer(self, key: int, answer: str, by: str) -> QuestionOut:
         """Answer a question.
 
         Args:
@@ -93,7 +93,7 @@ class Asking:
         return found
 
 
-def understood(question: Question, answer: str) -> str:
+def understood(question: QuestionOut, answer: str) -> str:
     """Normalise an answer to its question.
 
     Raises:
