@@ -8,20 +8,22 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from orchestrator.campaigns.saved_table import read_saved_table
 from orchestrator.campaigns.table_columns import KnownColumn, columns_of
+from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.cli.console import RefusalError, print_note
 from sim_engine.settings.quantity import QuantityError, parse_quantity
+from sim_engine.vessel.mesh import UNITS, scale_of, to_z
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import LengthUnit, VesselError
+from sim_engine.vessel_acquisition.mesh_repair import Axis, likely_unit
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from sim_engine.vessel.shapes import LengthUnit
-    from sim_engine.vessel_acquisition.mesh_repair import Axis
-
-    Floats = NDArray[np.float64]
+Floats = NDArray[np.float64]
 
 LARGEST_FILE = 200_000_000
 """Largest file that is read [bytes]."""
@@ -55,8 +57,6 @@ def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
     Raises:
         RefusalError: a pair is invalid, or lies outside the vessel (exit code 2).
     """
-    import numpy as np
-
     heights, widths = [], []
     for pair in filter(None, (part.strip() for part in text.split(","))):
         at, colon, wide = pair.partition(":")
@@ -123,8 +123,6 @@ def _monotonic(
     path: Path, rows: list[tuple[int, float, float]], rule: str, sign: float, reading: float, balance: float
 ) -> tuple[Floats, Floats]:
     """Return the columns of sorted rows; masses must rise (sign 1) or fall (-1), within the errors of measurement."""
-    import numpy as np
-
     table = np.array([row[1:] for row in rows])
     values, masses = table[:, 0], table[:, 1]
     if (different := len(np.unique(values))) < FEWEST_ROWS:
@@ -150,9 +148,6 @@ def _monotonic(
 
 def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, float, float]]:
     """Read line number, value of a column and mass [g] of each row; see `read_fill_table`."""
-    from orchestrator.campaigns.saved_table import read_saved_table
-    from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
-
     wanted = (COLUMNS[column], COLUMNS["mass_g"])
     problems: list[Problem] = []
     table = read_saved_table(path, limit=LARGEST_TABLE)
@@ -200,13 +195,6 @@ def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str])
     Raises:
         RefusalError: they can't be read, or their unit is not clear (exit code 2).
     """
-    import numpy as np
-
-    from sim_engine.vessel.mesh import UNITS, scale_of, to_z
-    from sim_engine.vessel.mesh_shape import MeshShape
-    from sim_engine.vessel.shapes import VesselError
-    from sim_engine.vessel_acquisition.mesh_repair import likely_unit
-
     _check_size(path)
     try:
         points = _loaded(path)
@@ -233,8 +221,6 @@ def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str])
 
 
 def _loaded(path: Path) -> Any:
-    import numpy as np
-
     if path.suffix.lower() == ".ply":
         import trimesh
 
@@ -259,7 +245,6 @@ def read_photograph(path: Path) -> Floats:
     Raises:
         RefusalError: it is not a readable picture (exit code 2).
     """
-    import numpy as np
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     _check_size(path)
@@ -279,10 +264,7 @@ def read_depth(path: Path, unit: LengthUnit | None) -> Floats:
     Raises:
         RefusalError: it is not a depth image, or its unit is not clear (exit code 2).
     """
-    import numpy as np
     from PIL import Image, UnidentifiedImageError
-
-    from sim_engine.vessel.mesh import UNITS
 
     _check_size(path)
     try:

@@ -13,7 +13,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from types import TracebackType
-from typing import TYPE_CHECKING
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
 
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.requests import Pour
@@ -31,10 +36,6 @@ from orchestrator.records.events import (
 from orchestrator.records.run_clock import run_time
 from orchestrator.records.run_record import RecordedStage, RunPour
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
-
-if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-    from rich.live import Live
 
 INTERVAL = 2.0
 """Minimum time between two plain lines of progress [s]."""
@@ -61,8 +62,6 @@ class ProgressDisplay:
         quiet: bool = False,
     ) -> None:
         if console is None:
-            from rich.console import Console
-
             console = Console(stderr=True, highlight=False)
         self._console = console
         self._clock = clock
@@ -75,8 +74,6 @@ class ProgressDisplay:
 
     def __enter__(self) -> ProgressDisplay:
         if self._console.is_terminal and not self._quiet:
-            from rich.live import Live
-
             # Rich draws in its own thread, four times a second, at any rate of events.
             self._live = Live(console=self._console, get_renderable=self._render, refresh_per_second=4, transient=False)
             self._live.start()
@@ -160,8 +157,6 @@ class ProgressDisplay:
         self._print(f"{stage.name}: {stage.progress}  {pool}{self._progress_state.counts_line()}{eta}")
 
     def _print(self, text: str, look: str = "") -> None:
-        from rich.text import Text
-
         if self._quiet and not look:
             return
         if self._delayed is not None and not look:
@@ -170,9 +165,6 @@ class ProgressDisplay:
         self._console.print(Text(text, style=look), soft_wrap=True)
 
     def _render(self) -> RenderableType:
-        from rich.console import Group
-        from rich.text import Text
-
         with self._lock:
             state = self._progress_state
             rows: list[RenderableType] = [self._stages()]
@@ -185,10 +177,6 @@ class ProgressDisplay:
             return Group(*rows)
 
     def _stages(self) -> RenderableType:
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-        from rich.text import Text
-
         table = Table.grid(padding=(0, 2))
         for stage in self._progress_state.run.stages.values():
             progress = stage.progress
@@ -215,10 +203,6 @@ class ProgressDisplay:
         return f"{spent}, {about} left" if about else spent
 
     def _pour_bar(self, pour: RunPour) -> RenderableType:
-        from rich.progress_bar import ProgressBar
-        from rich.table import Table
-        from rich.text import Text
-
         progress = pour.progress
         fraction = 0.0 if progress is None else progress.fraction
         note = [f"{100 * fraction:3.0f} %", f"{max(run_time() - (pour.time or 0.0), 0.0):.1f} s"]

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
 
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.run_summary import Advice, RunSummary
 from orchestrator.reports.wording import ResultTable, receiver_table, score_table
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 PLAIN_WIDTH, LONGEST_LINE = 110, 1_000
 """Minimum and maximum number of columns of the table if stderr is not a terminal."""
@@ -18,9 +20,6 @@ PLAIN_WIDTH, LONGEST_LINE = 110, 1_000
 
 def summary_table(summary: RunSummary) -> RenderableType:
     """The document for the terminal: θ*, discrepancies, losses and best actions by receiver, files."""
-    from rich.console import Group
-    from rich.text import Text
-
     parts: list[RenderableType] = [Text(f"\n{summary.campaign}  seed {summary.seed}", style="bold")]
     learning, outcome, files = summary.learning, summary.outcome, summary.files
     if learning.calibrated_theta is not None:
@@ -42,8 +41,6 @@ def summary_table(summary: RunSummary) -> RenderableType:
 
 
 def _advice(one: Advice) -> list[RenderableType]:
-    from rich.text import Text
-
     action = ", ".join(f"{name} {value}" for name, value in one.action.items())
     lines = [f"  into {one.receiver}: {action}" if action else f"  into {one.receiver}", *one.sentences, one.window]
     shown: list[RenderableType] = [Text(line if i == 0 else f"    {line}") for i, line in enumerate(lines) if line]
@@ -62,10 +59,7 @@ def print_table(rows: Sequence[Mapping[str, str]], *, right: Sequence[str] = (),
         rows: head → cell, the same heads in each.
         right: heads of columns with numbers, which are right-aligned.
     """
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=title, title_justify="left", title_style="bold", box=_box(), pad_edge=False)
+    table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     shown = [head for head in rows[0] if any(row[head] for row in rows)] if rows else []
     for head in shown:
         table.add_column(Text(head), justify="right" if head in right else "left", overflow="fold")
@@ -75,10 +69,7 @@ def print_table(rows: Sequence[Mapping[str, str]], *, right: Sequence[str] = (),
 
 
 def _table(content: ResultTable) -> RenderableType:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=Text(content.caption), title_justify="left", box=_box())
+    table = Table(title=Text(content.caption), title_justify="left", box=box.SIMPLE_HEAD)
     for place, head in enumerate(content.header):
         table.add_column(Text(head), justify="right" if place in content.numbers else "left")
     for row in content.rows:
@@ -88,17 +79,8 @@ def _table(content: ResultTable) -> RenderableType:
 
 def _print(table: RenderableType, *, to_stderr: bool = False) -> None:
     """Print a table. If the output is not a terminal, lines are as long as names and paths need."""
-    from rich.console import Console
-    from rich.measure import Measurement
-
     console = Console(stderr=to_stderr)
     if not console.is_terminal:
         wanted = Measurement.get(console, console.options.update(max_width=LONGEST_LINE), table).maximum
         console.width = max(PLAIN_WIDTH, wanted)
     console.print(table)
-
-
-def _box() -> Any:
-    from rich import box
-
-    return box.SIMPLE_HEAD
