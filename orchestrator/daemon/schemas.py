@@ -168,7 +168,7 @@ class CampaignOut(ResponseModel):
     """URL of the live view."""
 
 
-class NightEventOut(_Out):
+class NightEventOut(ResponseModel):
     """An entry of the timeline of unattended pours."""
 
     time: float
