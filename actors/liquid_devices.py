@@ -407,6 +407,12 @@ class SimulatedSpillSensor:
             self._mass += mass
             self._see()
 
+    def wipe(self) -> None:
+        """The operator has wiped the table."""
+        with self._lock:
+            self._mass = 0.0
+            self._see()
+
     def _see(self) -> None:
         wet = self._mass > self._settings.smallest
         if wet != self._wet:
