@@ -292,8 +292,8 @@ class VesselHandling:
             await self._take("receiver", consent)
             await self._pour_back(consent, seed)
             self._mass["receiver"] = 0.0
+            back = await self._weigh()  # while the arm waits for the warning time after its release
             await self._put("receiver", self._layout.rest["receiver"].name)
-        back = await self._weigh()
         self._poured, self._pending = None, (poured, before, back)
         full = await self._topped_up(consent, back, empty, seed)
         self._mass["pourer"] = full.mass - empty.mass

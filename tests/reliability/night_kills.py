@@ -107,10 +107,10 @@ class KilledNight:
             if (self.state / "url").exists():
                 with contextlib.suppress(DaemonError, OSError), Client(state=self.state) as client:
                     self._attend(client)
-        return self._look(motion, [*wrong, *self._left()])
+        twice = [f"a pour was made twice: {seed}" for seed in self._twice()]
+        return self._look(motion, [*wrong, *twice, *self._left()])
 
-    def twice(self) -> list[str]:
-        """Pours that were made twice, as seeds of their liquid."""
+    def _twice(self) -> list[str]:
         poured = self.place / "poured"
         made = Counter(poured.read_text("utf-8").split()) if poured.exists() else Counter[str]()
         return [seed for seed, count in made.items() if count > 1]
@@ -283,8 +283,6 @@ def main() -> int:
                 out.write(json.dumps(asdict(found[-1])) + "\n")
                 out.flush()
                 print(found[-1], flush=True)
-        if twice := night.twice():
-            found[-1].wrong.append(f"made twice: {twice}")
     finally:
         shutil.rmtree(place, ignore_errors=True)
     return 1 if any(one.wrong for one in found) else 0
