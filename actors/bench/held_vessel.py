@@ -16,12 +16,11 @@ from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import replace
 from typing import Any, TypeVar
 
-import numpy as np
-
 from actors.arm.arm_device import DeviceArm, Follow, _ignore
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError, Executed, PlannedPour
 from actors.arm.arm_settings import ArmSettings
 from actors.arm.planned_pour import PlaceWay
+from actors.arm.planning.kinematics import transform_of
 from actors.balance.weighing_plan import GRIP
 from actors.grippers.gripper_interface import (
     SMALLEST_GAP,
@@ -68,10 +67,7 @@ def grip_height(spec: GripperSettings, arm: ArmSettings) -> float:
     grip = getattr(arm, "grip", None)
     if grip is None:
         raise LaboratoryError("the arm does not state where it holds the pourer; add 'height' to the gripper")
-    x, y, z, *turn = grip.as_list
-    from scipy.spatial.transform import Rotation  # slow import, not needed to check files
-
-    return float((Rotation.from_rotvec(turn).inv().apply(-np.array([x, y, z])))[2])
+    return float(transform_of(grip).inverse.position[2])
 
 
 def grip_limits(vessel: Vessel, spec: GripperSettings, arm: ArmSettings) -> GripLimits:

@@ -236,21 +236,28 @@ def standing_problems(
         others: what may stand there.
         own: place where the path ends. The gripper reaches around the vessel there, so that only the links count.
     """
-    pose = sampled.pourer
-    world = np.einsum("nij,vj->nvi", pose.rotation, points) + pose.position[:, None]
+    pose, reach = sampled.pourer, float(np.linalg.norm(points, axis=1).max())
     along = np.linspace(0.0, 1.0, 13)[:, None]
     for each in others:
-        if each.place != own:
+        near = np.flatnonzero(_distance(pose.position[:, None], each)[:, 0] < reach + each.clearance)
+        if each.place != own and near.size:
+            world = np.einsum("nij,vj->nvi", pose.rotation[near], points) + pose.position[near, None]
             apart = _distance(world, each).min(axis=1)
             if apart.min() < each.clearance:
-                yield _too_near("the carried vessel", float(apart.min()), each, sampled.when(int(np.argmin(apart))))
+                when = sampled.when(int(near[np.argmin(apart)]))
+                yield _too_near("the carried vessel", float(apart.min()), each, when)
         for name, first, second, radius in LINKS:
             if each.place == own and name in ("gripper", "wrist"):
                 continue
             a, b = sampled.links[:, first, None], sampled.links[:, second, None]
-            apart = _distance(a + (b - a) * along, each).min(axis=1) - radius - sampled.link_error
+            thick, length = radius + sampled.link_error, np.linalg.norm(b - a, axis=-1)
+            near = np.flatnonzero((_distance(a, each) - length)[:, 0] < thick + each.clearance)
+            if not near.size:
+                continue
+            apart = _distance(a[near] + (b[near] - a[near]) * along, each).min(axis=1) - thick
             if apart.min() < each.clearance:
-                yield _too_near(f"the {name}", float(apart.min()), each, sampled.when(int(np.argmin(apart))))
+                when = sampled.when(int(near[np.argmin(apart)]))
+                yield _too_near(f"the {name}", float(apart.min()), each, when)
                 break
 
 
