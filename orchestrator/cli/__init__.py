@@ -1,5 +1,6 @@
 """The command line interface."""
 
+import atexit
 import gc
 import os
 
@@ -10,5 +11,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Pydantic would read the metadata of every installed package to find observers of its own.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")
 
-# Imports and schemas are a million lasting objects, which the collector would search again after every 700 new ones.
-gc.set_threshold(50_000, 10, 10)
+# Imports and schemas are a hundred thousand lasting objects. The collector would search them again after every 700 new
+# ones, and at the end of the process.
+gc.set_threshold(100_000, 10, 10)
+atexit.register(gc.freeze)
