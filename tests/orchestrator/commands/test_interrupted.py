@@ -9,7 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.cli.foreground_run import file_trouble, given_up_pours, interruption
+from actors.interfaces import LaboratoryError
+from orchestrator.cli.console import RefusalError
+from orchestrator.cli.foreground_run import file_trouble, given_up_pours, interruption, run_in_front_of_people
+from orchestrator.learning.run_errors import RunError
+from orchestrator.runs.request_executor import PourNotMadeError
+from orchestrator.runs.run_service import RunRequest, RunResources, RunService
 from tests.support.scripted_strategy import Script, one_stage, pour, states
 from tests.support.toy_campaign import ToyBench, ToyLaboratory, run_toy, toy_plan
 from tests.support.waiting import wait_async
@@ -69,3 +74,24 @@ def test_a_full_disk_is_told_with_path_and_room(tmp_path: Path) -> None:
     assert "MB are free there. A run needs 40 MB to begin" in said
     other = OSError(errno.EACCES, "Permission denied", "some.file")
     assert file_trouble(other, tmp_path) == "some.file: Permission denied"
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (LaboratoryError("the balance is silent"), 1),
+        (RunError("no simulation is valid"), 1),
+        (PourNotMadeError("pour 3 may have been made"), 3),
+    ],
+)
+def test_the_exit_code_tells_a_failure_from_a_question(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int
+) -> None:
+    def fail(*args: object) -> None:
+        raise error
+
+    monkeypatch.setattr(RunService, "start", fail)
+    request = RunRequest(toy_plan(tmp_path), (), tmp_path / "run")
+    with pytest.raises(RefusalError, match=str(error)) as refused:
+        run_in_front_of_people(request, RunResources(), again="decant run toy.yaml --resume")
+    assert refused.value.exit_code == code
