@@ -16,7 +16,7 @@ This module does not read files and runs no strategy.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -392,10 +392,6 @@ class CalibrationPlan(StagePlan):
     def poured(self) -> tuple[Scene, ...]:
         """All scenes of calibration pours, including those that are used for scoring only."""
         return (*self.scenes, *self.tested)
-
-    def without_memory(self, groups: Collection[str]) -> CalibrationPlan:
-        """The same plan without the memory of some groups of parameters."""
-        return self if self.memory is None else replace(self, memory=self.memory.without(groups))
 
     @property
     def uncalibrated(self) -> SimulationParameters:

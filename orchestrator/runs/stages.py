@@ -205,7 +205,8 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
 
     def evaluation(results: Results, seed: int) -> Strategy:
         theta, remembered = calibrated_theta(results).theta, result_of(results, CALIBRATION, Calibrated).memory
-        plain = plan.without_memory(() if remembered is None else remembered.contradicted).uncalibrated
+        dropped = remembered is not None and remembered.contradicted
+        plain = (replace(plan, memory=None) if dropped else plan).uncalibrated
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
         drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from copy import deepcopy
+from dataclasses import replace
 
 from actors.optimizer.questions import (
     CalibrationQuery,
@@ -74,8 +75,8 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     simulations. With a memory, half of the space-filling θ lie where it expects them, and θ* has the highest posterior
     density. The uncalibrated θ is then the expected one, which has the highest prior density, so that the same holds.
 
-    As soon as a posterior contradicts the memory of a group, the calibration starts again without it, with all of its
-    simulations. It then makes the same requests as a campaign that never had this memory, and ends with the same θ*.
+    As soon as a posterior contradicts the memory of a group, the calibration starts again without any memory, with all
+    of its simulations. It then makes the same requests as a campaign without a memory, and ends with the same θ*.
 
     Source: candidates from the posterior on a surrogate: Wang & Li, Adaptive Gaussian process approximation for
     Bayesian inference with expensive likelihood functions, 2018.
@@ -90,20 +91,20 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
         self._kappa = kappa
         contexts = Contexts.of(plan)
         self._places = {seed: contexts.point(pour) for seed, pour in zip(self._seed_of_pour, self._usable, strict=True)}
-        self._earlier: list[Trials] = []
+        self._earlier = Trials()
         self._ended: str | None = None
         self._initial_seeds = deepcopy(self._seeds)
         self._begin()
 
     def _begin(self) -> None:
-        """Begin, or begin again, with the memory that is relied on."""
+        """Begin, or begin again after a contradiction, without a memory."""
         self._seeds = deepcopy(self._initial_seeds)
         self._questions = OptimizerQueries(self._seeds)
         self._trials = Trials(self._trials.width)
         self._posterior = None
         self._before, self._starts = 0, 0
         space = self._plan.parameters
-        self._plain = self._plan.without_memory(self._lost).uncalibrated
+        self._plain = (self._plan if self._memory else replace(self._plan, memory=None)).uncalibrated
         values = {axis.name: float(getattr(self._plain, axis.name)) for axis in space.axes}
         inside = all(axis.lower <= values[axis.name] <= axis.upper for axis in space.axes)
         self._plain_at: Point = tuple(map(float, space.encode(values))) if inside else ()
@@ -143,7 +144,7 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
             if suggestion.posterior is None:
                 raise self._no_discrepancies()
             if self._contradicts(suggestion.posterior):
-                self._earlier.append(self._trials)
+                self._earlier = self._trials
                 self._begin()
                 self.decisions.append(Decision(f"calibration starts again after {self._spent} simulations"))
                 return
@@ -248,7 +249,7 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     @property
     def _spent(self) -> int:
         """Number of simulations answered before the last beginning."""
-        return sum(trials.answered for trials in self._earlier)
+        return self._earlier.answered
 
     def progress(self) -> Progress:
         """As in the base class; no further simulations after the end."""
@@ -258,13 +259,13 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
     def result(self) -> Calibrated:
         """As in the base class, with the reason of the end and the seeds of the training pours."""
         found = super().result()
-        before = [trial for trials in self._earlier for trial in trials.all if trial.closed]
+        before = [trial for trial in self._earlier.all if trial.closed]
         return found.model_copy(
             update={
                 "ended": self._ended,
                 "pour_seeds": tuple(self._seed_of_pour),
                 "simulations": self._spent + found.simulations,
-                "lost": sum(trials.lost for trials in self._earlier) + found.lost,
+                "lost": self._earlier.lost + found.lost,
                 "trials": (*(self._row(i, trial) for i, trial in enumerate(before)), *found.trials),
             }
         )

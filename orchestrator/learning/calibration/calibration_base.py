@@ -18,7 +18,6 @@ from pydantic import Field
 from actors.optimizer.questions import Point, Posterior, Suggestion
 from orchestrator.learning.calibration.campaign_memory import (
     CONTRADICTED,
-    CampaignMemory,
     MemoryFound,
     memory_found,
     unit_memory,
@@ -278,34 +277,26 @@ class Calibration(ABC, Generic[S]):
     def _row(self, number: int, trial: Trial) -> TriedOnPours | TriedOnce:
         """Convert a trial to its row in the result."""
 
-    @property
-    def _lost(self) -> list[str]:
-        """Groups whose memory a posterior has contradicted."""
-        return [group for group, share in self._shares.items() if share < CONTRADICTED]
-
-    @property
-    def _relied(self) -> CampaignMemory:
-        """The rest of the memory."""
-        return (self._plan.memory or CampaignMemory(())).without(self._lost)
-
     def _contradicts(self, posterior: Posterior) -> bool:
-        """Whether a posterior contradicts the memory of further groups, which are then no longer relied on."""
-        shares = dict(zip(self._relied.groups, posterior.held or (), strict=True))
-        self._shares |= shares
-        lost = {group: share for group, share in shares.items() if share < CONTRADICTED}
-        if lost and self._plan.memory is not None:
+        """Whether a posterior contradicts the memory of a group; no memory is used from then on."""
+        if self._memory is None or self._plan.memory is None:
+            return False
+        self._shares = dict(zip(self._plan.memory.groups, posterior.held or (), strict=True))
+        lost = {group: share for group, share in self._shares.items() if share < CONTRADICTED}
+        if lost:
             self.decisions += verdicts(self._plan.memory, lost)
-            self._memory = unit_memory(self._relied, self._plan.parameters)
+            self._memory = None
         return bool(lost)
 
     def _remember(self, alone: Posterior | None) -> None:
-        """Record the posterior from the pours alone, and the groups whose memory agrees with the pours.
+        """Record the posterior from the pours alone, and the agreement of the memory with the pours.
 
         Args:
-            alone: None if no memory is relied on, because the posterior is then that of the pours alone.
+            alone: None if no memory is used, because the posterior is then that of the pours alone.
         """
         self._alone = self._posterior if alone is None else alone
-        self.decisions += verdicts(self._relied, {group: self._shares[group] for group in self._relied.groups})
+        if self._memory is not None and self._plan.memory is not None:
+            self.decisions += verdicts(self._plan.memory, self._shares)
 
     def _posterior_found(self) -> PosteriorFound | None:
         """Posterior of the θ that fit the pours, if the strategy has one."""

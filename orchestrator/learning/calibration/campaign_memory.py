@@ -5,14 +5,14 @@
 - `unit_memory` converts it for the optimiser; `MemoryFound` is its part of a calibration's result.
 
 Parameters of the liquid, of the vessels' walls and of the placement are three groups. Each keeps or loses its weight
-as a whole, independent of the others.
+as a whole; as soon as the pours contradict one, no memory is used any more.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -37,8 +37,9 @@ RELIANCE = 0.8
 """Prior probability that the memory of a group holds in a new campaign."""
 
 CONTRADICTED = 0.7
-"""Posterior probability below which the memory of a group is reported as contradicted, and no longer used: the pours
-make the searched range at least 1.7 times as likely as the memory. A wrong memory costs more than a missing one."""
+"""Posterior probability below which the memory of a group is reported as contradicted: the pours make the searched
+range at least 1.7 times as likely as the memory. From then on no group is used, because parameters compensate each
+other, and a wrong memory costs more than a missing one."""
 
 SPREAD, OTHER_VESSEL, OF_TOLERANCE = 0.05, 0.15, 0.5
 """Scale of the differences between campaigns before any were observed: fraction of a parameter's whole range, the same
@@ -131,10 +132,6 @@ class CampaignMemory:
         """The parameters by group."""
         found = {group: tuple(one for one in self.parameters if one.name in names) for group, names in GROUPS.items()}
         return {group: parameters for group, parameters in found.items() if parameters}
-
-    def without(self, groups: Collection[str]) -> CampaignMemory:
-        """The same without the parameters of some groups."""
-        return replace(self, parameters=tuple(one for one in self.parameters if group_of(one.name) not in groups))
 
     @property
     def means(self) -> dict[str, float]:
@@ -252,9 +249,9 @@ class MemoryFound(ResultPart):
     """The runs that the prior comes from, and what the pours say about it."""
 
     @property
-    def contradicted(self) -> tuple[str, ...]:
-        """Groups that the pours contradict."""
-        return tuple(one.group for one in self.groups if one.contradicted)
+    def contradicted(self) -> bool:
+        """Whether the pours contradict the memory of a group."""
+        return any(one.contradicted for one in self.groups)
 
 
 def verdicts(memory: CampaignMemory, shares: Mapping[str, float]) -> list[Decision]:
@@ -271,7 +268,7 @@ def verdicts(memory: CampaignMemory, shares: Mapping[str, float]) -> list[Decisi
         if share < CONTRADICTED:
             text = (
                 f"the pours contradict the memory of the {group} ({runs}; {', '.join(map(str, parameters))}): its "
-                f"probability falls from {100 * RELIANCE:.0f} to {100 * share:.0f} %, and it is no longer used"
+                f"probability falls from {100 * RELIANCE:.0f} to {100 * share:.0f} %; no memory is used any more"
             )
         else:
             text = f"the pours agree with the memory of the {group} ({runs}): probability {100 * share:.0f} %"
