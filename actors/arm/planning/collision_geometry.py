@@ -134,9 +134,42 @@ def nearest_links(sampled: SampledPath, receiver: Vessel | None) -> tuple[Neares
             cup.append(Nearest(np.inf, 0, name))
             continue
         inside = world.apply(line.reshape(-1, 3)).reshape(line.shape)
-        aside = np.hypot(inside[..., 0], inside[..., 1]) - receiver.outer_radius
-        over = np.maximum(inside[..., 2] - receiver.rim_height, -inside[..., 2])
-        outer = np.hypot(np.maximum(aside, 0.0), np.maximum(over, 0.0))
-        apart = (np.where(outer > 0.0, outer, np.maximum(aside, over)) - radius).min(axis=1)
+        apart = (from_cylinder(inside, receiver.outer_radius, receiver.rim_height) - radius).min(axis=1)
         cup.append(Nearest(float(apart.min()), int(np.argmin(apart)), name))
     return min(table, key=lambda n: n.distance), min(cup, key=lambda n: n.distance)
+
+
+def nearest_to_itself(sampled: SampledPath, points: FloatArray) -> tuple[str, Nearest]:
+    """Smallest distance of what the arm's end carries from the arm, and its name.
+
+    The carried vessel, as a cylinder, is compared with the upright part of the base, the upper arm and the forearm;
+    gripper and wrist, which are beside the forearm, with the other two.
+
+    Args:
+        sampled: the path.
+        points: outermost points of the carried vessel, shape (V, 3) [m].
+    """
+    radius, height = float(np.hypot(points[:, 0], points[:, 1]).max()), float(points[:, 2].max())
+    pose, base = sampled.pourer, cell_transforms(sampled.spec).base.position
+    ends = np.concatenate([np.broadcast_to(base, sampled.links[:, :1].shape), sampled.links], axis=1)
+    links = [(name, ends[:, first + 1, None], ends[:, second + 1, None], thick) for name, first, second, thick in LINKS]
+    column = ("base", ends[:, 0, None], ends[:, 1, None], LINKS[0][3])
+    along, coarse = (np.linspace(0.0, 1.0, count)[:, None] for count in (13, 4))
+    found = []
+    for name, a, b, thick in (column, *links[:2]):
+        line, drawn = a + (b - a) * along, thick + 2.0 * sampled.link_error
+        inside = np.einsum("nji,nkj->nki", pose.rotation, line - pose.position[:, None])
+        pairs = [("the carried vessel", from_cylinder(inside, radius, height).min(axis=1) - drawn)]
+        for end, c, d, slim in links[3:] if name != "forearm" else ():
+            apart = np.linalg.norm(line[:, :, None] - (c + (d - c) * coarse)[:, None], axis=-1)
+            pairs.append((f"the {end}", apart.min(axis=(1, 2)) - drawn - slim))
+        found += [(thing, Nearest(float(gap.min()), int(np.argmin(gap)), name)) for thing, gap in pairs]
+    return min(found, key=lambda each: each[1].distance)
+
+
+def from_cylinder(points: FloatArray, radius: float, height: float) -> FloatArray:
+    """Distance of points (..., 3) from an upright cylinder on the origin, negative inside, shape (...) [m]."""
+    aside = np.hypot(points[..., 0], points[..., 1]) - radius
+    over = np.maximum(points[..., 2] - height, -points[..., 2])
+    outer: FloatArray = np.hypot(np.maximum(aside, 0.0), np.maximum(over, 0.0))
+    return np.where(outer > 0.0, outer, np.maximum(aside, over))

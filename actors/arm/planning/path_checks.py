@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import PathReport
 from actors.arm.planned_pour import JointPath
-from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_receiver
+from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_itself, nearest_to_receiver
 from actors.arm.planning.kinematics import (
     beyond_reach,
     cell_transforms,
@@ -170,7 +170,13 @@ def check_stretch(sampled: SampledPath, pourer: Vessel, receiver: Vessel) -> lis
     problems = [*_tilts(sampled), *_places(sampled, points)]
     if sampled.unreached is not None:
         return [*_speeds(sampled, points), *problems]
-    problems = [*_ranges(sampled), *_singular(sampled), *problems, *_links(sampled, receiver)]
+    problems = [
+        *_ranges(sampled),
+        *_singular(sampled),
+        *problems,
+        *_links(sampled, receiver),
+        *_itself(sampled, points),
+    ]
     if sampled.margins.min() < THROUGH:
         return problems  # joints then move too fast, but that is not the cause
     return [*_joint_speeds(sampled), *_speeds(sampled, points), *problems]
@@ -191,6 +197,7 @@ def check_way_limits(sampled: SampledPath, points: FloatArray) -> list[str]:
             f"the {table.name} would come {-1e3 * table.distance:.0f} mm too near to the table, "
             f"{sampled.when(table.index)}"
         )
+    problems += _itself(sampled, points, cure)
     if sampled.margins.min() >= THROUGH:
         problems += [*_joint_speeds(sampled), *_speeds(sampled, points)]
     return problems
@@ -451,4 +458,17 @@ def _links(s: SampledPath, receiver: Vessel) -> Iterator[str]:
         yield (
             f"the {cup.name} would come within {1e3 * cup.distance:.0f} mm of the receiver, {s.when(cup.index)}; "
             f"{1e3 * s.spec.limits.clearance:.0f} mm have to stay free"
+        )
+
+
+def _itself(
+    s: SampledPath, points: FloatArray, cure: str = "turn 'direction', or wait at another 'home'"
+) -> Iterator[str]:
+    thing, nearest = nearest_to_itself(s, points)
+    if nearest.distance < s.spec.limits.clearance:
+        apart = 1e3 * nearest.distance
+        how = f"come within {apart:.0f} mm of" if apart > 0.0 else f"run {-apart:.0f} mm into"
+        yield (
+            f"{thing} would {how} the arm's {nearest.name}, {s.when(nearest.index)}; "
+            f"{1e3 * s.spec.limits.clearance:.0f} mm have to stay free: {cure}"
         )

@@ -8,8 +8,7 @@
 
 A vessel is carried upright, along straight lines: first to above the place, then straight down.
 
-Limitations: standing vessels count as cylinders, links of the arm as capsules with rough radii. The arm is not checked
-against itself.
+Limitations: standing vessels count as cylinders, links of the arm as capsules with rough radii.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.arm.planned_pour import JointPath, PlaceWay, PourPath
-from actors.arm.planning.collision_geometry import LINKS, hull
+from actors.arm.planning.collision_geometry import LINKS, from_cylinder, hull
 from actors.arm.planning.kinematics import Transforms, beyond_reach, cell_transforms, posture, quaternions, transform_of
 from actors.arm.planning.path_checks import UPRIGHT, check_way_limits, outside
 from actors.arm.planning.trajectory import (
@@ -263,11 +262,7 @@ def standing_problems(
 
 def _distance(points: FloatArray, standing: Standing) -> FloatArray:
     """Distance of points (N, V, 3) in the room from a cylinder, negative inside, shape (N, V) [m]."""
-    x, y, z = standing.foot
-    aside = np.hypot(points[..., 0] - x, points[..., 1] - y) - standing.radius
-    over = np.maximum(points[..., 2] - (z + standing.height), z - points[..., 2])
-    outer: FloatArray = np.hypot(np.maximum(aside, 0.0), np.maximum(over, 0.0))
-    return np.where(outer > 0.0, outer, np.maximum(aside, over))
+    return from_cylinder(points - np.array(standing.foot), standing.radius, standing.height)
 
 
 def _too_near(thing: str, apart: float, each: Standing, when: str) -> str:

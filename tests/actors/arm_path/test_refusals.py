@@ -177,6 +177,12 @@ def test_a_wrist_that_would_touch_the_table():
     assert "mm too near to the table, at the approach's end" in text
 
 
+def test_a_pourer_that_would_touch_the_arm_itself():
+    text = refusal(open_cell().with_values(tool=Pose(x=-0.2, z=-0.3)))  # a tool that reaches back along the forearm
+    assert "the carried vessel would run 39 mm into the arm's forearm, 1.86 s into the tilt" in text
+    assert "3 mm have to stay free: turn 'direction', or wait at another 'home'" in text
+
+
 def test_a_home_that_leans():
     assert "home: the pourer leans 10.0 deg there" in refusal(
         SPEC.with_values(home=JointAngles.of(*SPEC.home.angles[:5], 10 * DEG))
