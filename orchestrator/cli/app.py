@@ -6,6 +6,7 @@ that `--help` starts fast.
 
 from __future__ import annotations
 
+import copy
 import functools
 import sys
 from collections.abc import Callable
@@ -401,6 +402,7 @@ def main() -> None:
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     commands = [one for one in app.registered_commands if one.name == word]
     groups = [one for one in app.registered_groups if one.typer_instance and one.typer_instance.info.name == word]
+    named = copy.copy(app)
     if commands or groups:
-        app.registered_commands, app.registered_groups = commands, groups
-    app()
+        named.registered_commands, named.registered_groups = commands, groups
+    named()
