@@ -24,7 +24,6 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation.convergence import POURS, spillage
 
-VOLUME = 200e-6
 CONVERGED = 0.02
 
 

@@ -107,17 +107,11 @@ def day(found: Mapping[str, Any]) -> str:
 
 def _by_state(states: Mapping[str, int]) -> dict[str, int]:
     """Return the counts by the last word of their names."""
-    found: dict[str, int] = {}
-    for name, count in states.items():
-        state = name.rpartition(" ")[2]
-        found[state] = found.get(state, 0) + count
-    return found
+    words = [(name.rpartition(" ")[2], count) for name, count in states.items()]
+    return {word: sum(count for other, count in words if other == word) for word, _ in words}
 
 
-TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {
-    "stops": stops,
-    "day": day,
-}
+TABLES: dict[str, Callable[[Mapping[str, Any]], str]] = {"stops": stops, "day": day}
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

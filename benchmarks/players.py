@@ -23,19 +23,12 @@ from orchestrator.learning.requests import (
     Suggested,
 )
 from orchestrator.learning.strategy import Strategy
-from sim_engine.action import DEG
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.scene import Scene
-from sim_engine.search_space import Axis, Space
+from sim_engine.search_space import Space
 from sim_engine.vessel.shapes import cylinder
 
-AXES = (
-    Axis("angular_velocity", 15 * DEG, 120 * DEG),
-    Axis("x_offset", 0.08, 0.15),
-    Axis("height", 0.03, 0.1),
-    Axis("max_angle", 70 * DEG, 125 * DEG),
-)
 SCENE = Scene(
     "cup",
     cylinder("beaker", inner_radius=0.04, inner_height=0.1),
