@@ -86,7 +86,8 @@ class OperatorQuestions:
             after = time.monotonic() - begun
             self.log.append(AnsweredQuestion(question.about, answer, after, question.problem))
             reply = f"'{answer}' after {after:.1f} s" if answer else f"no answer within {after:.1f} s"
-            self._notify(Notice("note", f"operator ({question.about}): {question.text} → {reply}"))
+            text = f"operator ({question.about}): {question.text} → {reply}"
+            self._notify(Notice("note", text, about=question.about or None))
 
     async def announce(self, text: str, seconds: float) -> None:
         """Announce that something moves after the given time [s of the clock]."""

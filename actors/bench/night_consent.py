@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from datetime import datetime, timedelta
+from typing import Literal
 
 from actors.interfaces import Notice, OperatorQuestion
 from actors.places import PlaceSettings, UnattendedSettings
@@ -79,7 +80,8 @@ class NightConsent:
         self._until = until if until > now else until + timedelta(days=1)
         self._end_elapsed = self._elapsed() + (self._until - now).total_seconds()
         self._left = self._spec.pours
-        self._tell(Notice("info", f"unattended: agreed, up to {self._left} pours until {self._until:%Y-%m-%d %H:%M}"))
+        text = f"unattended: agreed, up to {self._left} pours until {self._until:%Y-%m-%d %H:%M}"
+        self._tell(Notice("info", text, about="consent"))
 
     def agrees(self, question: OperatorQuestion) -> bool:
         """Whether a question is answered with yes by this consent. Any other question ends it."""
@@ -88,16 +90,16 @@ class NightConsent:
         if question.about not in MOTIONS:
             self.end(f"a question: {question.problem or question.text}")
         elif self._now() >= self._until or self._elapsed() >= self._end_elapsed:
-            self.end(f"it is {self._spec.until}")
+            self.end(f"it is {self._spec.until}", about="end")
         elif question.about == "start" and self._left == 0:
-            self.end(f"{self._spec.pours} pours were made")
+            self.end(f"{self._spec.pours} pours were made", about="end")
         else:
             self._left -= question.about == "start"
             return True
         return False
 
-    def end(self, reason: str) -> None:
-        """End it; nothing if it is not in force."""
+    def end(self, reason: str, about: Literal["end", "fault"] = "fault") -> None:
+        """End it, as agreed or because of a fault; nothing if it is not in force."""
         if self._until is not None:
             self._until = None
-            self._tell(Notice("warning", f"unattended: the consent has ended. {reason}"))
+            self._tell(Notice("warning", f"unattended: the consent has ended. {reason}", about=about))

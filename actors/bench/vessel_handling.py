@@ -492,6 +492,7 @@ class VesselHandling:
                 f"poured back: {1e3 * left:.2f} g left the receiver, {1e3 * gained:.2f} g are in the pourer, missing "
                 f"{1e3 * missing:.2f} ± {1e3 * sigma:.2f} g; film in the receiver "
                 f"{self._cycle.get('film_g', 0.0):.2f} g",
+                about="accounted",
             )
         )
         if abs(missing) <= SURE * sigma:
@@ -534,8 +535,9 @@ class VesselHandling:
             weighed[key] for key in ("received", "pourer_full", "pourer_after", "pourer_empty")
         )
         self._poured = _Poured(received, after)
-        film = tuple(part for part in (self._gross, self._dry) if part is not None and self._gross is not self._dry)
-        left = film[0].mass - film[1].mass if len(film) == 2 else 0.0
+        gross, dry = self._gross, self._dry
+        film = () if gross is None or dry is None or gross is dry else (gross, dry)
+        left = film[0].mass - film[1].mass if film else 0.0
         self._mass = {"pourer": after.mass - empty.mass, "receiver": received.mass + left}
         for role, parts in (("pourer", (after, empty)), ("receiver", (received, *film))):
             self._enter(role, self._mass[role], math.hypot(*(part.uncertainty for part in parts)))  # type: ignore[index]

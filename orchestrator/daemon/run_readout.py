@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Sequence
@@ -74,9 +73,8 @@ class Pours:
             return pours, night(record, pours)
 
 
-_ANSWERED = re.compile(r"operator \((\w+)\): .* → (.*)", re.DOTALL)
-_CONSENT, _ENDED = "unattended: agreed", "unattended: the consent has ended. "
-_BACK = "poured back: "
+_OF_NIGHT = ("consent", "end", "fault", "accounted")
+"""What a note may be about besides a question, see `actors.interfaces.Notice`."""
 
 
 def night(record: RunState, pours: Sequence[PourSummary]) -> list[dict[str, Any]]:
@@ -89,22 +87,12 @@ def night(record: RunState, pours: Sequence[PourSummary]) -> list[dict[str, Any]
     Returns:
         Time [s since 1970], kind and text of each, in order; empty without a consent.
     """
-    begun = next((t for t, text in record.notes if text.startswith(_CONSENT)), math.inf)
-    found: list[tuple[float, str, str]] = []
-    for t, text in record.notes:
-        answered = _ANSWERED.fullmatch(text)
-        if t < begun:
-            continue
-        if text.startswith(_CONSENT):
-            found.append((t, "consent", text.partition(": ")[2]))
-        elif text.startswith(_ENDED):
-            reason = text.removeprefix(_ENDED)
-            planned = reason.startswith("it is ") or reason.endswith(" pours were made")
-            found.append((t, "end" if planned else "fault", reason.removeprefix("a question: ")))
-        elif text.startswith(_BACK):
-            found.append((t, "accounted", text))
-        elif answered is not None and answered[1] not in ("unattended", *MOTIONS):
-            found.append((t, "answer", f"{answered[1].replace('_', ' ')}: {answered[2]}"))
+    begun = next((t for t, _, about in record.notes if about == "consent"), math.inf)
+    found = [
+        (t, about if about in _OF_NIGHT else "answer", text)
+        for t, text, about in record.notes
+        if t >= begun and about not in (None, "unattended", *MOTIONS)
+    ]
     for pour in pours:
         if pour.time is not None and pour.time >= begun and pour.state not in ("asked", "under way"):
             found.append(

@@ -354,12 +354,14 @@ class LogLine(Event):
         level: a 'note' is only for the journal.
         asked: whether the operator already sees the text in a question at the terminal; a display can then omit it.
         kept: whether the journal has it.
+        about: see `actors.interfaces.Notice`.
     """
 
     level: Level = field(default="note", metadata=NOT_WRITTEN)
     text: str
     asked: bool = field(default=False, metadata=NOT_WRITTEN)
     kept: bool = field(default=False, metadata=NOT_WRITTEN | NOT_SENT)
+    about: str | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property
     def kind(self) -> Kind | None:

@@ -249,7 +249,7 @@ class RunState:
         cpu_s: CPU seconds of all simulations and suggestions.
         closed: the events that closed stages by name, in order, with their results.
         opened: the stage that was opened last.
-        notes: messages for the operator that the journal has: time and text.
+        notes: messages for the operator that the journal has: time, text, and what each is about.
         running: ids of running simulations.
         pour: the pour that was begun last.
         checkpoint: of the pour that is under way; '' without one.
@@ -269,7 +269,7 @@ class RunState:
     opened: StageOpened = field(default_factory=StageOpened)
     pours: list[RunPour] = field(default_factory=list)
     questions: list[RecordedQuestion] = field(default_factory=list)
-    notes: list[tuple[float, str]] = field(default_factory=list)
+    notes: list[tuple[float, str, str | None]] = field(default_factory=list)
     decisions: list[RecordedDecision] = field(default_factory=list)
     failures: Counter[str] = field(default_factory=Counter)
     running: set[int] = field(default_factory=set)
@@ -344,7 +344,7 @@ class RunState:
                 self.state = State(event.state)
             case LogLine():
                 if event.kept:
-                    self.notes.append((event.time, event.text))
+                    self.notes.append((event.time, event.text, event.about))
                 if event.asked:
                     self.question = event.text
             case SpeculationProgressed():

@@ -188,7 +188,7 @@ def _of_record(record: RunState, run: str, check: JournalCheck | None) -> dict[s
         "ended_at": record.ended or None,
         "standing": (*(() if check is None else _damage(check)), *standing),
         "log": RunLog(
-            notes=tuple(LogEntry(time=when, stage="", text=text) for when, text in record.notes),
+            notes=tuple(LogEntry(time=when, stage="", text=text) for when, text, _ in record.notes),
             decisions=tuple(LogEntry(time=one.time, stage=one.stage, text=one.text) for one in decisions),
         ),
     }

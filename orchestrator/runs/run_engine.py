@@ -320,7 +320,7 @@ class _RunEngine:
     def _on_notice(self, notice: Notice) -> None:
         """Write a notice of the laboratory to the journal and publish it."""
         try:
-            self._journal.append(LogLine(level=notice.level, text=notice.text, asked=notice.asked, kept=True))
+            self._journal.append(LogLine(**vars(notice), kept=True))
         except JournalError:  # the next important write ends the run; until then the display shows everything
             self._journal.log("error", f"can't be written down: {notice.text}")
 

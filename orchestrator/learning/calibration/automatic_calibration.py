@@ -228,10 +228,9 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
 
         The likelihood is that of independent errors of an unknown common scale.
         """
-        memory = self._memory
-        return (
-            score if memory is None else len(self._usable) * math.log(WEIGHED + score) - log_memory(trial.point, memory)
-        )
+        if self._memory is None:
+            return score
+        return len(self._usable) * math.log(WEIGHED + score) - log_memory(trial.point, self._memory)
 
     def _discrepancy(self, request: Simulate, simulated: float) -> float:
         """r_i − c_s(a_i, θ), with its sign."""

@@ -392,15 +392,23 @@ class NightLaboratory(HeldLaboratory):
     """Tells what a bench tells of pours without a person."""
 
     def listen(self, hear: Any) -> None:
-        for level, text in (
-            ("note", "operator (laid_out): Put the receiver on the place 'right'. → 'done' after 4.0 s"),
-            ("info", "unattended: agreed, up to 200 pours until 2026-11-27 07:00"),
-            ("note", "poured back: 163.62 g left the receiver, 163.58 g are in the pourer, missing 0.04 ± 0.05 g"),
-            ("warning", "unattended: the consent has ended. a question: protective stop during carry"),
-            ("note", "operator (recover): The arm was stopped. Shall it be made ready again? → 'yes' after 12.0 s"),
-            ("note", "operator (move): Hands out of the cell. May it? → 'yes' after 1.0 s"),
+        for level, about, text in (
+            ("note", "laid_out", "operator (laid_out): Put the receiver on the place 'right'. → 'done' after 4.0 s"),
+            ("info", "consent", "unattended: agreed, up to 200 pours until 2026-11-27 07:00"),
+            (
+                "note",
+                "accounted",
+                "poured back: 163.62 g left the receiver, 163.58 g are in the pourer, missing 0.04 ± 0.05 g",
+            ),
+            ("warning", "fault", "unattended: the consent has ended. a question: protective stop during carry"),
+            (
+                "note",
+                "recover",
+                "operator (recover): The arm was stopped. Shall it be made ready again? → 'yes' after 12.0 s",
+            ),
+            ("note", "move", "operator (move): Hands out of the cell. May it? → 'yes' after 1.0 s"),
         ):
-            hear(Notice(level, text))  # type: ignore[arg-type]
+            hear(Notice(level, text, about=about))  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
@@ -417,7 +425,7 @@ def test_a_night_is_one_timeline_of_pours_masses_faults_and_answers(page: Any, t
         assert "g spilled" in lines[0]
         assert "agreed, up to 200 pours" in lines[-1]
         assert "protective stop during carry" in page.locator("#night .fault").inner_text()
-        assert "recover: 'yes' after 12.0 s" in page.locator("#night .answer").inner_text()
+        assert "Shall it be made ready again? → 'yes' after 12.0 s" in page.locator("#night .answer").inner_text()
         if folder := os.environ.get("DECANT_PICTURES"):
             page.screenshot(path=f"{folder}/night.png", full_page=True)
 

@@ -185,7 +185,7 @@ def test_names_and_reasons_that_are_html_stay_text(made: Made) -> None:
     plan = replace(plan, deployment=replace(plan.deployment, scenes=tuple(scenes)))
     record = read_record(made.result.directory)
     record.pours[0].state, record.pours[0].outcome = "failed", Failed("pour_failed", SCRIPT)
-    record.notes.append((0.0, SCRIPT))
+    record.notes.append((0.0, SCRIPT, None))
     record.decisions.append(RecordedDecision(0.0, SCRIPT, SCRIPT, {}, 0))
     summary = summarise(
         plan,
