@@ -258,8 +258,7 @@ class Notice:
         level: importance; a 'note' is written into the journal and not displayed.
         text: whole sentences.
         asked: whether the operator's own screen shows it too, with a question.
-        about: what it records, for a timeline: the subject of an answered question, 'consent' for a night, its planned
-            'end', the 'fault' that ended it, or liquid that is 'accounted' for; None for all others.
+        about: what it records of a night, see `orchestrator.records.events.LogLine`; None for all else.
     """
 
     level: Literal["note", "info", "warning", "error"]
