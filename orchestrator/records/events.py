@@ -354,8 +354,8 @@ class LogLine(Event):
         level: a 'note' is only for the journal.
         asked: whether the operator already sees the text in a question at the terminal; a display can then omit it.
         kept: whether the journal has it.
-        about: what it records of a night: 'consent', its planned 'end', the 'fault' that ended it, 'accounted' masses, or
-            the subject of an answered question.
+        about: what it records of a night: 'consent', its planned 'end', the 'fault' that ended it, 'accounted' masses,
+            or the subject of an answered question.
     """
 
     level: Level = field(default="note", metadata=NOT_WRITTEN)
