@@ -56,7 +56,7 @@ from actors.simulators.local_worker import ThreadWorker
 from actors.simulators.pool import WorkerPool
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.calibration_base import Calibrated
-from orchestrator.learning.calibration.calibration_scores import CalibrationEvaluation, shift_left_over
+from orchestrator.learning.calibration.calibration_scores import CalibrationEvaluation, calibration_residual
 from orchestrator.learning.calibration.pour_design import stratified
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, MeasuredPour
 from orchestrator.learning.deployment import deployment_base
@@ -75,7 +75,7 @@ from orchestrator.runs.stages import (
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome, SimulatedPour, normalised_spillage
-from sim_engine.prediction_band import LEVEL, band
+from sim_engine.prediction_band import LEVEL, CalibrationResidual, band
 from sim_engine.scene import PoseError, PourTask, Scene
 
 GOOD, BAD = 0.01, 0.10
@@ -233,7 +233,7 @@ def fitted(seed: int, bench: str, laboratory: Path, into: Path) -> list[dict[str
             row["grid"] = asyncio.run(best_of_grid(plan, train, calibrated.pour_seeds, pool, row["errors"]))
         thetas = {"theta": calibrated.found.theta, "uncalibrated": plan.uncalibrated}
         drawn = posterior_draws(calibrated.found, DRAWN)
-        left = shift_left_over(scores, len(calibrated.found.searched))
+        left = calibration_residual(plan, scores, len(calibrated.found.searched))
         row["further"] = asyncio.run(further(campaign, seed, thetas, drawn, left, pool))
         rows.append(row)
     asyncio.run(pool.close())
@@ -290,7 +290,7 @@ async def further(
     seed: int,
     thetas: dict[str, SimulationParameters],
     drawn: Sequence[SimulationParameters],
-    left: float | None,
+    left: CalibrationResidual | None,
     pool: KeptPours,
 ) -> dict[str, Any]:
     """Return mean errors on further pours of new actions, and the number of pours in their 90 % intervals."""
@@ -307,7 +307,7 @@ async def further(
             errors[name].append(abs(truth - await spilled(pool, plan.scene, action, theta, own + 1)))
         values = [await spilled(pool, plan.scene, action, theta, own + 2 + k) for k, theta in enumerate(drawn)]
         errors["posterior"].append(abs(truth - sum(values) / len(values)))
-        inside += band(values, drawn[0].particles, left).holds(truth)
+        inside += band(values, drawn[0].particles, left, plan.scene).holds(truth)
     return {**{name: sum(values) / len(values) for name, values in errors.items()}, "inside": inside, "of": FURTHER}
 
 

@@ -27,7 +27,7 @@ from orchestrator.campaigns.shipped import shipped, starting_set
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.catalogue.catalogue import posterior_source
-from orchestrator.learning.calibration.calibration_scores import shift_left_over
+from orchestrator.learning.calibration.calibration_scores import calibration_residual
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.live_view.live_server import recorder_of
@@ -351,7 +351,7 @@ def _given(theta: SimulationParameters | Run | Path | str | None, campaign: Camp
     return GivenTheta(
         recommended,
         posterior_draws(found, POSTERIOR_DRAWS) if needed or recommended == found.theta else (),
-        None if scores is None else shift_left_over(scores, len(found.searched)),
+        None if scores is None else calibration_residual(theta.campaign.calibration, scores, len(found.searched)),
     )
 
 

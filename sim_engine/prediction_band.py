@@ -9,26 +9,34 @@ simulator's stream lands slightly off, its error is a shift of z. The shift chan
 stream hits or misses, and most if half of it does. Therefore errors of the simulator are stated as standard deviations
 of that shift.
 
-The calibration residual was measured with coarse particles, and contains their error in its own scene. It is not added
-to their error in other scenes; the larger of the two is used. A band is the interval of r that contains a single pour
-with probability `LEVEL`.
+The calibration residual was measured with coarse particles, and contains their error in its own scenes. There, the
+share of the resolution is left out, and the scatter s of the simulations, which the residual contains, is subtracted.
+In other scenes the larger of the residual and the error of coarse particles is used. With n simulations of a pour:
+
+    in a scene of the calibration:  width² = max(residual² − s², 0) + 2 s² / n
+    in another scene:               width² = max(resolution, residual)² + 2 s² / n
+
+This is the width of the normal distribution about each simulation; their mixture is the distribution of the pour. A
+band is the interval of r that contains a single pour with probability `LEVEL`.
 
 Source: derived here; measured in docs/evidence/validation.md (landing, convergence), and compared with unseen pours in
 docs/evidence/results.md.
 
-Limitations: the shift of one pour does not determine that of another, or the liquid that stays in the pourer. In the
-calibration's own scene bands are too wide: 98 % of the pours lie in them. The share of the resolution is meant for
-other scenes, and the residual of a calibration contains the scatter over seeds, which is added once more.
+Limitations: the shift of one pour does not determine that of another, or the liquid that stays in the pourer. The
+residual contains s² twice, of the simulation and of the pour that it was compared with. It is subtracted once only, as
+a residual of few pours is uncertain. A residual belongs to the number of particles it was measured with.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
 from sim_engine.outcome import PourOutcome, normalised_spillage
+from sim_engine.scene import Scene
 
 LEVEL = 0.9
 """Probability with which a single pour lies in its band."""
@@ -43,6 +51,44 @@ decreases with the spacing, as N^(−1/3)."""
 _NORMAL = NormalDist()
 _WIDEST = 8.0
 """Φ is 0 or 1 to the last bit beyond this."""
+_NARROWEST = 1e-6
+"""Least width of the normal distribution about a simulation."""
+
+
+@dataclass(frozen=True)
+class CalibrationResidual:
+    """What a calibration leaves of the difference between simulated and weighed pours.
+
+    Attributes:
+        shift: standard deviation of the shift, see `left_over`.
+        scenes: scenes of the weighed pours, see `scene_digest`; empty if unknown, so that every scene is another one.
+    """
+
+    shift: float
+    scenes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, shift: float, scenes: Iterable[Scene]) -> CalibrationResidual:
+        """The residual of pours in some scenes."""
+        return cls(shift, tuple(sorted({found for scene in scenes if (found := scene_digest(scene)) is not None})))
+
+    def belongs_to(self, scene: Scene | None) -> bool:
+        """Whether the residual was measured in a scene; not in an unknown one."""
+        return bool(self.scenes) and scene is not None and scene_digest(scene) in self.scenes
+
+
+def scene_digest(scene: Scene) -> str | None:
+    """Identity of a scene for a residual, in 16 digits; None if the mesh file of a vessel can't be read.
+
+    Scenes are the same if they have the same shapes of pourer and receiver and the same load of the same liquid. Names
+    don't matter, nor how the pourer is moved.
+    """
+    try:
+        vessels = scene.pourer.content_hash(), scene.receiver.content_hash()
+    except OSError:
+        return None
+    liquid = scene.liquid.model_dump_json(exclude={"name"})
+    return hashlib.sha256(" ".join((*vessels, liquid)).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
@@ -54,7 +100,9 @@ class PredictionInterval:
         level: probability with which a pour lies in it.
         simulations: standard deviation of r over the seeds, and over θ and the vessels' shapes if they varied.
         discrepancy: standard deviation due to the best θ's residual against weighed pours; None without calibration.
-        resolution: standard deviation due to the number of particles.
+            In a scene of the calibration, without the scatter of the simulations.
+        resolution: standard deviation due to the number of particles; 0 in a scene of the calibration, whose residual
+            contains it.
     """
 
     low: float
@@ -78,17 +126,18 @@ def resolution_shift(particles: int) -> float:
     return float(RESOLUTION * (RESOLUTION_AT / particles) ** (1.0 / 3.0))
 
 
-def lacking_shift(particles: int, discrepancy: float | None) -> float:
-    """Standard deviation of the shift between a pour and its simulations.
-
-    It is the larger of the shift from the number of particles and the calibration residual, because the residual was
-    measured with coarse particles too and contains their error.
+def lacking_shift(particles: int, residual: CalibrationResidual | None, scene: Scene | None, spread: float) -> float:
+    """Standard deviation of the shift between a pour and its simulations, beyond their scatter.
 
     Args:
         particles: of a simulation.
-        discrepancy: see `left_over`; None without calibration.
+        residual: of the calibration; None without calibration.
+        scene: of the pour; None if unknown.
+        spread: standard deviation of the shift over the simulations.
     """
-    return max(resolution_shift(particles), discrepancy or 0.0)
+    if residual is not None and residual.belongs_to(scene):
+        return math.sqrt(max(residual.shift**2 - spread**2, 0.0))
+    return max(resolution_shift(particles), 0.0 if residual is None else residual.shift)
 
 
 def shift_of(spillage: float, particles: int) -> float:
@@ -119,7 +168,11 @@ def left_over(pairs: Sequence[tuple[float, float]], fitted: int) -> float | None
 
 
 def band(
-    spillages: Sequence[float], particles: int, discrepancy: float | None = None, level: float = LEVEL
+    spillages: Sequence[float],
+    particles: int,
+    residual: CalibrationResidual | None = None,
+    scene: Scene | None = None,
+    level: float = LEVEL,
 ) -> PredictionInterval:
     """The interval of a single pour, given its simulations.
 
@@ -127,7 +180,8 @@ def band(
         spillages: r of simulations of the pour with fresh seeds, which may alternate between θ of a posterior and
             between possible shapes of the vessels; ≥ 1.
         particles: of a simulation.
-        discrepancy: residual shift of the calibration (standard deviation); None without calibration.
+        residual: of the calibration; None without calibration.
+        scene: of the pour, with the vessels as they are known; None: none of the calibration's.
         level: probability with which a pour lies in it.
 
     Raises:
@@ -139,10 +193,11 @@ def band(
     places = [shift_of(r, particles) for r in spillages]
     mean = math.fsum(places) / count
     spread = math.fsum((z - mean) ** 2 for z in places) / (count - 1) if count > 1 else 0.0
-    coarse, lacking = resolution_shift(particles), lacking_shift(particles, discrepancy)
+    own = residual is not None and residual.belongs_to(scene)
+    lacking = lacking_shift(particles, residual, scene, math.sqrt(spread))
     # The mixture of the simulations has a variance of s² (n − 1) / n; a further one differs from their mean by
     # s² (n + 1) / n.
-    width = math.sqrt(lacking**2 + 2.0 * spread / count)
+    width = max(math.sqrt(lacking**2 + 2.0 * spread / count), _NARROWEST)
     steep, half = _NORMAL.pdf(mean), 0.5 / (particles + 1)
     low, high = (_NORMAL.cdf(_quantile(places, width, 0.5 * (1.0 + side * level))) for side in (-1.0, 1.0))
     return PredictionInterval(
@@ -150,21 +205,23 @@ def band(
         high if high < 1.0 - half else 1.0,
         level,
         steep * math.sqrt(spread),
-        None if discrepancy is None else steep * discrepancy,
-        steep * coarse,
+        None if residual is None else steep * (lacking if own else residual.shift),
+        0.0 if own else steep * resolution_shift(particles),
     )
 
 
-def band_of(outcomes: Sequence[PourOutcome], discrepancy: float | None = None) -> PredictionInterval | None:
+def band_of(
+    outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None = None, scene: Scene | None = None
+) -> PredictionInterval | None:
     """The band of one pour's simulations; None if none of them has a spillage.
 
     Args:
         outcomes: of the same action, with fresh seeds, perhaps of several θ and shapes.
-        discrepancy: as in `band`.
+        residual, scene: as in `band`.
     """
     usable = [outcome for outcome in outcomes if outcome.invalid is None]
     spillages = [r for outcome in usable if (r := normalised_spillage(outcome.fractions)) is not None]
-    return band(spillages, usable[0].particles, discrepancy) if spillages else None
+    return band(spillages, usable[0].particles, residual, scene) if spillages else None
 
 
 def _quantile(places: Sequence[float], width: float, share: float) -> float:

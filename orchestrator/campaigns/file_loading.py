@@ -25,6 +25,7 @@ from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report, wro
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import CampaignPlan
 from sim_engine.liquids import Liquid, LiquidSettings, SimulationParameters
+from sim_engine.prediction_band import CalibrationResidual
 from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 from sim_engine.vessel.shapes import VesselSpec
@@ -189,7 +190,7 @@ _Theta = _theta_model()
 
 THETA_KEYS = ("theta", "parameters")
 POSTERIOR_KEY, RECOMMENDED_KEY = "posterior", "recommended"
-DISCREPANCY_KEY, SHIFT_KEY = "remaining_discrepancy", "shift"
+DISCREPANCY_KEY, SHIFT_KEY, SCENES_KEY = "remaining_discrepancy", "shift", "scenes"
 
 
 def predicts_with_posterior(path: Path) -> bool:
@@ -202,26 +203,26 @@ def predicts_with_posterior(path: Path) -> bool:
     return isinstance(data, dict) and POSTERIOR_KEY in data and data.get(RECOMMENDED_KEY) != "uncalibrated"
 
 
-def load_discrepancy(path: Path) -> float | None:
-    """The residual shift of a calibration (`sim_engine.prediction_band`), from a run's `theta.json`; None if it has
-    none.
+def load_discrepancy(path: Path) -> CalibrationResidual | None:
+    """The residual of a calibration, from a run's `theta.json`; None if it has none.
+
+    Files of earlier versions do not tell its scenes.
 
     Raises:
-        ConfigError: the value is not a number ≥ 0.
+        ConfigError: its shift is not a number ≥ 0, or its scenes are no digests.
     """
     document = Document.read(resolved(path))
     found = document.data.get(DISCREPANCY_KEY) if isinstance(document.data, dict) else None
     if found is None:
         return None
-    value = found.get(SHIFT_KEY) if isinstance(found, dict) else None
+    place, report = Place(document).at(DISCREPANCY_KEY), Report()
+    value, scenes = (found.get(SHIFT_KEY), found.get(SCENES_KEY, [])) if isinstance(found, dict) else (None, [])
     if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < math.inf:
-        report = Report()
-        report.add(
-            Place(document).at(DISCREPANCY_KEY), f"needs a '{SHIFT_KEY}' from 0 on, as decant calibrate writes it"
-        )
-        report.raise_if_any()
-        return None
-    return float(value)
+        report.add(place, f"needs a '{SHIFT_KEY}' from 0 on, as decant calibrate writes it")
+    if not isinstance(scenes, list) or not all(isinstance(scene, str) for scene in scenes):
+        report.add(place.at(SCENES_KEY), "should be a list of digests, as decant calibrate writes it")
+    report.raise_if_any()
+    return CalibrationResidual(float(value or 0.0), tuple(scenes))
 
 
 def load_posterior(

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sim_engine.liquids import SimulationParameters
     from sim_engine.model_validity import ModelValidity
     from sim_engine.outcome import PourOutcome, SimulatedPour
-    from sim_engine.prediction_band import PredictionInterval, SampleStatistics
+    from sim_engine.prediction_band import CalibrationResidual, PredictionInterval, SampleStatistics
     from sim_engine.scene import PourTask, Scene
     from sim_engine.search_space import Space
     from sim_engine.simulator import PourSimulator
@@ -141,7 +141,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     runs = _simulated_pour(simulator, tasks)
     outcomes = [run.outcome for run in runs]
     _show(tasks[0], runs[0], options)
-    over_seeds, where = spreads(outcomes), band_of(outcomes, known.discrepancy)
+    over_seeds, where = spreads(outcomes), band_of(outcomes, known.residual, scene)
     received = over_seeds.get("received")
     delivered = None if received is None else received.mean * scene.liquid.mass
     if options.as_json:
@@ -298,7 +298,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     print_note(f"{scene.name}: {len(pours)} pours, {len(tasks[0])} simulations each, {said}")
     outcomes = _simulated(simulator, tasks)
     rows = [
-        _row(row.line, pour, some, known.discrepancy)
+        _row(row.line, pour, some, known.residual, scene)
         for row, pour, some in zip(table.rows, pours, outcomes, strict=True)
     ]
     dimensions = [name for name in table.dimensions if name in table.varying()] or list(table.dimensions)
@@ -317,7 +317,9 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
         from orchestrator.cli.command_results import ScoresOutput, SimulateTableOutput
         from sim_engine.prediction_band import resolution_shift
 
-        shift = resolution_shift(known.theta.particles)
+        left, shift = known.residual, resolution_shift(known.theta.particles)
+        own = left is not None and left.belongs_to(scene)
+        left_shift = None if left is None else left.shift
         print_json(
             SimulateTableOutput(
                 scene=scene.name,
@@ -328,7 +330,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
                 thetas=len(known.thetas),
                 simulations=sum(map(len, outcomes)),
                 cpu_s=sum(outcome.cpu_s for some in outcomes for outcome in some),
-                bands={"discrepancy_shift": known.discrepancy, "resolution_shift": shift},
+                bands={"discrepancy_shift": left_shift, "resolution_shift": 0.0 if own else shift},
                 pours=[_scored(row, dimensions) for row in rows],
             )
         )
@@ -448,7 +450,9 @@ def _simulated(simulator: PourSimulator, tasks: Sequence[Sequence[PourTask]]) ->
     return found
 
 
-def _row(line: int, pour: RecordedPour, outcomes: Sequence[PourOutcome], discrepancy: float | None) -> ScoredRow:
+def _row(
+    line: int, pour: RecordedPour, outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None, scene: Scene
+) -> ScoredRow:
     from orchestrator.reports.prediction_scores import ScoredRow
     from sim_engine.outcome import normalised_spillage
     from sim_engine.prediction_band import SampleStatistics, band_of
@@ -461,7 +465,7 @@ def _row(line: int, pour: RecordedPour, outcomes: Sequence[PourOutcome], discrep
         pour.action,
         pour.normalised_spillage,
         SampleStatistics.of(values),
-        band_of(outcomes, discrepancy),
+        band_of(outcomes, residual, scene),
         len(outcomes) - len(values),
     )
 
@@ -496,12 +500,12 @@ class PredictionInputs:
     Attributes:
         theta: θ of the file, or the campaign's.
         drawn: draws of the posterior that simulations cycle through; empty: θ alone.
-        discrepancy: shift that remains after calibration (`sim_engine.prediction_band`); None if it is unknown.
+        residual: of the calibration; None if it is unknown.
     """
 
     theta: SimulationParameters
     drawn: tuple[SimulationParameters, ...] = ()
-    discrepancy: float | None = None
+    residual: CalibrationResidual | None = None
 
     @property
     def thetas(self) -> tuple[SimulationParameters, ...]:
@@ -528,10 +532,11 @@ class PredictionInputs:
     def said(self, scene: Scene) -> str:
         """Describe the sources of uncertainty in the prediction intervals of a scene's pours."""
         among = f"{len(self.drawn)} θ of the posterior" if self.drawn else "one θ"
-        parts = ["seeds", among, f"{self.theta.particles} particles' resolution"]
+        own = self.residual is not None and self.residual.belongs_to(scene)
+        parts = ["seeds", among, *([] if own else [f"{self.theta.particles} particles' resolution"])]
         if scene.uncertain:
             parts.insert(1, "shapes that the vessels may have")
-        if self.discrepancy is not None:
+        if self.residual is not None:
             parts.append("the residual of calibration")
             return f"intervals from {', '.join(parts[:-1])} and {parts[-1]}"
         return f"intervals from {', '.join(parts[:-1])} and {parts[-1]} alone (the residual of calibration is unknown)"

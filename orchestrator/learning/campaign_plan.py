@@ -28,6 +28,7 @@ from orchestrator.learning.deployment.objectives import Objectives
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import MINIMUM_POURED, Loss
+from sim_engine.prediction_band import CalibrationResidual
 from sim_engine.scene import PoseError, Scene
 from sim_engine.search_space import Space
 from sim_engine.settings.model import (
@@ -427,8 +428,7 @@ class DeploymentPlan(StagePlan):
         thetas: equally likely draws of a posterior, which simulations use in turn. They are given if no calibration of
             the same campaign provides them; without any, all simulations use θ*.
         bench: equally likely offsets of the bench from the simulator; empty if nothing is known about it.
-        left_over: residual shift of a calibration (`sim_engine.prediction_band`), given in the same case as `thetas`;
-            None if unknown.
+        left_over: residual of a calibration, given in the same case as `thetas`; None if unknown.
         memory: what earlier campaigns tell, if no calibration of the same campaign uses it.
     """
 
@@ -442,7 +442,7 @@ class DeploymentPlan(StagePlan):
     confirm: int = 0
     thetas: tuple[SimulationParameters, ...] = ()
     bench: tuple[BenchOffset, ...] = ()
-    left_over: float | None = None
+    left_over: CalibrationResidual | None = None
     memory: CampaignMemory | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property

@@ -33,7 +33,13 @@ from orchestrator.learning.trials import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome, normalised_spillage
-from sim_engine.prediction_band import PredictionInterval, SampleStatistics, band_of, spreads
+from sim_engine.prediction_band import (
+    CalibrationResidual,
+    PredictionInterval,
+    SampleStatistics,
+    band_of,
+    spreads,
+)
 from sim_engine.scene import PoseError, Scene
 
 
@@ -190,7 +196,7 @@ class RepeatedSimulation:
         seed: int,
         thetas: Sequence[SimulationParameters] = (),
         errors: Sequence[PoseError | None] = (),
-        discrepancy: float | None = None,
+        residual: CalibrationResidual | None = None,
     ) -> None:
         """Queue the simulations.
 
@@ -202,12 +208,12 @@ class RepeatedSimulation:
             thetas: draws of a posterior that the seeds cycle through instead of the single θ.
             errors: pose errors that the seeds cycle through. If the cups touch because of such an error, the simulation
                 has the worst loss; it does not count as lost.
-            discrepancy: residual shift of the calibration (`sim_engine.prediction_band`); None if unknown.
+            residual: of the calibration; None if unknown.
         """
         scene, parameters = costing.scene, costing.parameters
         seeds = SeedStream(seed, f"prediction {scene.name}")
         self._costing = costing
-        self._discrepancy = discrepancy
+        self._residual = residual
         self._unissued: list[Simulate] = []
         self._open: set[Simulate] = set()
         self._outcomes: list[PourOutcome] = []
@@ -277,7 +283,7 @@ class RepeatedSimulation:
             thetas=self._thetas,
             touching=self._touching,
             over_seeds=over_seeds,
-            interval=band_of(self._outcomes, self._discrepancy),
+            interval=band_of(self._outcomes, self._residual, self._costing.scene),
         )
 
 

@@ -14,10 +14,10 @@ from orchestrator.learning.calibration.calibration_base import CalibratedTheta
 from orchestrator.learning.calibration.calibration_scores import (
     UNCALIBRATED,
     Scores,
+    calibration_residual,
     recommended_theta,
-    shift_left_over,
 )
-from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import check_journal
 from orchestrator.records.run_record import CampaignResult, read_record, read_result
@@ -88,7 +88,7 @@ def publish(
     found = theta_of(result.results)
     theta = None if found is None else directory / THETA_FILE
     if theta is not None and found is not None:
-        written = theta_file(found, evaluation_of(result.results))
+        written = theta_file(found, evaluation_of(result.results), plan.calibration)
         theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
     report: Path | None = directory / REPORT_NAME
     try:
@@ -237,7 +237,9 @@ def _write_page(path: Path, page: str) -> Path:
     return path
 
 
-def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str, Any]:
+def theta_file(
+    found: CalibratedTheta, scored: Scores | None = None, plan: CalibrationPlan | None = None
+) -> dict[str, Any]:
     """What `theta.json` holds: the recommended θ, what it left over, and where it is known the posterior of θ.
 
     The posterior is a list of weighted θ, each complete. If the uncalibrated θ is recommended, `calibrated` has θ* and
@@ -246,6 +248,7 @@ def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str
     Args:
         found: by the calibration.
         scored: θ* on the weighed pours; None: the rest is unknown.
+        plan: of the calibration, whose scenes the residual belongs to.
     """
     theta = found.theta.model_dump()
     data: dict[str, Any] = {"theta": recommended_theta(found.theta, scored).model_dump()}
@@ -253,9 +256,9 @@ def theta_file(found: CalibratedTheta, scored: Scores | None = None) -> dict[str
         data |= {"recommended": scored.gain.recommended, "why": scored.gain.text}
         if scored.gain.recommended == UNCALIBRATED:
             data["calibrated"] = theta
-    left = None if scored is None else shift_left_over(scored, len(found.searched))
+    left = None if scored is None else calibration_residual(plan, scored, len(found.searched))
     if left is not None:
-        data["remaining_discrepancy"] = {"shift": left}
+        data["remaining_discrepancy"] = {"shift": left.shift, "scenes": list(left.scenes)}
     if found.posterior is not None:
         draws = found.posterior.thetas
         kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from orchestrator.learning.strategy import Strategy
     from sim_engine.action import Action
     from sim_engine.liquids import SimulationParameters
+    from sim_engine.prediction_band import CalibrationResidual
     from sim_engine.scene import Scene
     from sim_engine.vessel.shapes import VesselSpec
 
@@ -52,12 +53,12 @@ class GivenTheta:
         theta: the θ itself.
         draws: of its posterior, which the simulations use in turn; empty if it has none, or if the file recommends the
             uncalibrated θ.
-        left_over: shift that the calibration left (`sim_engine.prediction_band`); None where it is not known.
+        left_over: residual of the calibration; None where it is not known.
     """
 
     theta: SimulationParameters
     draws: tuple[SimulationParameters, ...] = ()
-    left_over: float | None = None
+    left_over: CalibrationResidual | None = None
 
 
 def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:

@@ -25,9 +25,9 @@ from orchestrator.learning.calibration.calibration_scores import (
     CalibrationEvaluation,
     ScoredPour,
     Scores,
+    calibration_residual,
     random_parameters,
     recommended_theta,
-    shift_left_over,
 )
 from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured
 from orchestrator.learning.campaign_plan import (
@@ -249,7 +249,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            known = with_left_over(with_posterior(deployment, results), results)
+            known = with_left_over(with_posterior(deployment, results), results, plan.calibration)
             known = with_offsets(known, results, _theta(plan, results))
             return known.settings.build(known, scene, _theta(plan, results), seed)
 
@@ -331,12 +331,13 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))
 
 
-def with_left_over(deployment: DeploymentPlan, results: Results) -> DeploymentPlan:
+def with_left_over(deployment: DeploymentPlan, results: Results, calibration: CalibrationPlan | None) -> DeploymentPlan:
     """The deployment with the residual of the preceding calibration, if the calibration was evaluated."""
     if deployment.left_over is not None or CALIBRATION not in results or EVALUATION not in results:
         return deployment
     scores = result_of(results, EVALUATION, Scores)
-    return replace(deployment, left_over=shift_left_over(scores, len(calibrated_theta(results).searched)))
+    left = calibration_residual(calibration, scores, len(calibrated_theta(results).searched))
+    return replace(deployment, left_over=left)
 
 
 def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParameters, ...]:

@@ -33,7 +33,7 @@ from orchestrator.runs.run_tasks import plan_task
 from orchestrator.runs.stages import deployment_stages, prediction_stages
 from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness
 from sim_engine.outcome import Loss
-from sim_engine.prediction_band import resolution_shift
+from sim_engine.prediction_band import CalibrationResidual, resolution_shift
 from sim_engine.vessel.shapes import VesselSpec
 from tests.support import example_run
 from tests.support.example_results import changed, shown
@@ -160,8 +160,8 @@ def test_a_plan_ends_with_fresh_simulations_of_what_it_recommends(tmp_path: Path
 
 def test_what_calibration_left_over_widens_the_band_of_a_planned_pour() -> None:
     bands = []
-    for discrepancy in (None, 0.6):
-        strategy = RepeatedSimulation(Costing(Loss(), SCENE, THETA), ACTION, 5, 3, discrepancy=discrepancy)
+    for residual in (None, CalibrationResidual(0.6)):
+        strategy = RepeatedSimulation(Costing(Loss(), SCENE, THETA), ACTION, 5, 3, residual=residual)
         StrategyHarness(narrow_cup).run(strategy)
         found = strategy.result().interval
         assert found is not None
@@ -202,11 +202,12 @@ def test_pours_are_predicted_with_how_well_the_mean_is_known_and_how_much_a_pour
     assert all(p is not None and p.scatter is not None and p.scatter > 0.0 for p in predictions)
 
 
-@pytest.mark.parametrize("left_over", [None, 0.1, 0.8])
-def test_d1_tells_how_far_a_single_pour_may_be_from_its_mean(left_over: float | None) -> None:
+@pytest.mark.parametrize(("left_over", "own"), [(None, False), (0.1, False), (0.8, False), (0.8, True)])
+def test_d1_tells_how_far_a_single_pour_may_be_from_its_mean(left_over: float | None, own: bool) -> None:
     """Means of four seeds scatter half as much as a single one; what the simulator lacks is a shift of the stream."""
     plan = deployment_plan(strategy="D1", simulations_per_iteration=4, iterations=8)
-    strategy = OneShotPlanning(replace(plan, left_over=left_over), SCENE, THETA, 1)
+    residual = None if left_over is None else CalibrationResidual.of(left_over, [SCENE] if own else [])
+    strategy = OneShotPlanning(replace(plan, left_over=residual), SCENE, THETA, 1)
     StrategyHarness(narrow_cup).run(strategy)
     result: Any = strategy.result()
     seeds, z = (
@@ -215,7 +216,8 @@ def test_d1_tells_how_far_a_single_pour_may_be_from_its_mean(left_over: float | 
     )
     shift = max(left_over or 0.0, resolution_shift(THETA.particles))
     lacking = NormalDist().cdf(z + 0.01 * shift) - NormalDist().cdf(z)
-    assert result.recommended.predicted_scatter == pytest.approx(math.hypot(seeds, 100 * lacking), rel=0.02)
+    expected = 100 * lacking if own else math.hypot(seeds, 100 * lacking)  # the residual contains the seeds' scatter
+    assert result.recommended.predicted_scatter == pytest.approx(expected, rel=0.02)
     assert result.recommended.predicted_spillage_deviation > 0.0
     assert result.pours[0].predicted_scatter == result.recommended.predicted_scatter
 

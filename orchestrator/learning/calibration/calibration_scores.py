@@ -23,14 +23,14 @@ from pydantic import Field
 
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.pointwise_calibration import LEAST_DEFINED
-from orchestrator.learning.campaign_plan import MeasuredPour
+from orchestrator.learning.campaign_plan import CalibrationPlan, MeasuredPour
 from orchestrator.learning.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
 from orchestrator.learning.stage_result import ResultPart, StageResult
 from orchestrator.learning.strategy import Progress, is_sound
 from orchestrator.learning.trials import SeedStream
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import normalised_spillage
-from sim_engine.prediction_band import left_over
+from sim_engine.prediction_band import CalibrationResidual, left_over
 from sim_engine.search_space import Space
 
 
@@ -405,22 +405,27 @@ def recommended_theta(theta: SimulationParameters, scores: Scores | None) -> Sim
     return scores.thetas.get(UNCALIBRATED, theta) if plain and scores is not None else theta
 
 
-def shift_left_over(scores: Scores, fitted: int) -> float | None:
-    """Residual of the recommended θ on the training pours, as a shift (`sim_engine.prediction_band`).
+def calibration_residual(plan: CalibrationPlan | None, scores: Scores, fitted: int) -> CalibrationResidual | None:
+    """Residual of the recommended θ on the training pours, all scenes together; None if there are too few pours.
 
     Args:
+        plan: of the calibration; None: the scenes of the pours are unknown.
         scores: result of an evaluation.
         fitted: number of parameters that were searched.
     """
     plain = scores.gain is not None and scores.gain.recommended == UNCALIBRATED
     used = UNCALIBRATED if plain and UNCALIBRATED in scores.thetas else CALIBRATED
-    pairs = [
-        (pair.measured, pair.simulated)
-        for pair in scores.pairs
-        if pair.theta == used and pair.split == "train"
+    train = [pair for pair in scores.pairs if pair.theta == used and pair.split == "train"]
+    both = [
+        (pair.scene, (pair.measured, pair.simulated))
+        for pair in train
         if pair.measured is not None and pair.simulated is not None
     ]
-    return left_over(pairs, 0 if plain else fitted)
+    shift = left_over([pair for _, pair in both], 0 if plain else fitted)
+    if shift is None:
+        return None
+    poured = () if plan is None else (*plan.poured, *([plan.records.scene] if plan.records else ()))
+    return CalibrationResidual.of(shift, [scene for scene in poured if scene.name in {name for name, _ in both}])
 
 
 class CalibrationEvaluation:

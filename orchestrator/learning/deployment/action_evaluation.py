@@ -101,17 +101,18 @@ class SeedMean:
         of_means = observed_scatter(suggestion, noise)
         if of_means is None or suggestion.best_mean is None:
             return None
-        return math.hypot(of_means * math.sqrt(self._repeats), self._inaccuracy(suggestion.best_mean))
+        return self._of_a_pour(suggestion.best_mean, of_means * math.sqrt(self._repeats))
 
-    def _inaccuracy(self, loss: float) -> float:
-        """Deviation of a pour from its simulations caused by the simulator's inaccuracy, in the unit of the loss. The
-        loss is treated as spilled liquid whose stream is shifted (`sim_engine.prediction_band`)."""
+    def _of_a_pour(self, loss: float, simulated: float) -> float:
+        """Scatter of a pour, given that of its simulations, in the unit of the loss: with the simulator's inaccuracy.
+        The loss is treated as spilled liquid whose stream is shifted (`sim_engine.prediction_band`)."""
         if self._plan.objectives is not None:
-            return 0.0  # objectives are not a loss
+            return simulated  # objectives are not a loss
         costing = self._ledger.costing
         worst, particles = costing.everything_spilled, costing.parameters.particles
-        shift = lacking_shift(particles, self._plan.left_over)
-        return worst * NormalDist().pdf(shift_of(loss / worst, particles)) * shift
+        steep = worst * NormalDist().pdf(shift_of(loss / worst, particles))
+        lacking = lacking_shift(particles, self._plan.left_over, costing.scene, simulated / steep)
+        return math.hypot(simulated, steep * lacking)
 
     def risk_found(self, final: Suggestion) -> RiskFound | None:
         """Effect of execution errors on the recommended action, if it was planned under them."""
@@ -241,7 +242,7 @@ class RiskMeasure(SeedMean):
         of_seeds, known = observed_scatter(suggestion, noise), self._answer(suggestion)
         if of_seeds is None or known is None:
             return None
-        return math.hypot(of_seeds, known[1], self._inaccuracy(known[0]))
+        return self._of_a_pour(known[0], math.hypot(of_seeds, known[1]))
 
     def _answer(self, suggestion: Suggestion) -> tuple[float, float] | None:
         """Mean and standard deviation over the disturbances for the recommended action."""

@@ -21,6 +21,7 @@ from orchestrator.daemon.run_readout import Pours
 from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.runs.run_service import RunHandle, RunRequest
+from sim_engine.prediction_band import CalibrationResidual
 from tests.support.small_campaign import NARROW, write_campaign
 from tests.support.toy_daemon import CAMPAIGN, HeldLaboratory, campaign_in, held, run, serving
 from tests.support.waiting import wait_async
@@ -276,7 +277,7 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
     assert planned.parameters.friction == 0.2
     assert planned.deployment is not None
     assert {one.friction for one in planned.deployment.thetas} == {0.1, 0.3}
-    assert planned.deployment.left_over == 0.25
+    assert planned.deployment.left_over == CalibrationResidual(0.25)
 
 
 def test_warnings_of_the_check_and_a_missing_recording_are_reported_as_the_run_begins(

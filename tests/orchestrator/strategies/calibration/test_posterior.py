@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -212,13 +213,15 @@ def test_theta_file_says_what_calibration_left_over_of_its_training_pours(determ
     others = [pair("test", 0.2, 0.9), pair("train", 0.2, 0.9, "uncalibrated")]
     wrong = [pair("train", 0.2 + 0.01 * i, 0.1 + 0.01 * i) for i in range(20)]
     found = []
-    for pairs in ([*near, *others], wrong):
+    for pairs, plan in (([*near, *others], calibration_plan()), (wrong, None)):
         scores = Scores(simulations=20, undefined={}, discrepancy={}, random_median={}, thetas={}, pairs=tuple(pairs))
         path = tmp_path / "theta.json"
-        path.write_text(json.dumps(theta_file(determined.found, scores)), encoding="utf-8")
-        found.append(load_discrepancy(path))
-    assert found[0] is not None
-    assert found[1] is not None
+        path.write_text(json.dumps(theta_file(determined.found, scores, plan)), encoding="utf-8")
+        left = load_discrepancy(path)
+        assert left is not None
+        assert left.belongs_to(SCENE) == (plan is not None)
+        assert not left.belongs_to(replace(SCENE, receiver=SCENE.pourer))
+        found.append(left.shift)
     assert 0.02 < found[0] < 0.05  # 0.01 of spillage where the stream's density is 0.28 to 0.4
     assert 0.3 < found[1] < 0.5
     path.write_text('{"theta": {"cohesion": 0.02}}', encoding="utf-8")
