@@ -258,9 +258,10 @@ def test_intervals_become_as_wide_as_the_earlier_pours_deviated() -> None:
     assert scaled_interval(predicted, poured(*[0.9] * 9), 0.5) == (pytest.approx(0.02, abs=0.02), 0.5)
 
 
-def test_an_interval_that_begins_at_nothing_still_does() -> None:
-    predicted = Prediction(0.02, 0.01, 0.01, (0.0, 0.06))
-    assert scaled_interval(predicted, poured(*[0.2] * 6), 1.0) == (0.0, pytest.approx(0.04))
+def test_an_interval_that_begins_at_nothing_or_ends_with_everything_still_does() -> None:
+    little, much = (Prediction(mean, 0.01, 0.01, band) for mean, band in ((0.02, (0.0, 0.06)), (0.7, (0.4, 1.0))))
+    assert scaled_interval(little, poured(*[0.2] * 6), 1.0) == (0.0, pytest.approx(0.04))
+    assert scaled_interval(much, poured(*[0.2] * 6), 1.0) == (pytest.approx(0.55), 1.0)
 
 
 def test_d3_reports_intervals_scaled_by_its_earlier_pours(monkeypatch: pytest.MonkeyPatch) -> None:

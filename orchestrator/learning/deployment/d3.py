@@ -13,6 +13,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from actors.optimizer.questions import (
+    FOUND,
     Data,
     Limit,
     MinimumQuery,
@@ -56,7 +57,8 @@ class D3Settings(SearchSettings):
     """Real pours with a simulated prior."""
 
     prior_simulations: SimulationCount = 37
-    """Simulations before the first pour; with 'simulations_per_pour: free', the largest number."""
+    """Simulations before the first pour; with 'simulations_per_pour: free', the largest number. With 'model: adaptive'
+    and a fixed number between pours: up to eight times as many while none of them is good."""
 
     simulations_per_pour: CountOrFree = 2
     """Simulations told between two pours; 'free': for as long as they are worth it."""
@@ -113,8 +115,10 @@ class D3Settings(SearchSettings):
     @property
     def spending(self) -> str:
         """The budget per receiver, as text."""
-        beside = self.simulations_per_pour
-        return f"{self.prior_simulations} simulations, then {self.pours} pours with {beside} beside each"
+        beside, more = self.simulations_per_pour, ""
+        if self.adaptive and self.beside is not None:
+            more = f" (up to {MOST_PRIOR * self.prior_simulations} while none is good)"
+        return f"{self.prior_simulations} simulations{more}, then {self.pours} pours with {beside} beside each"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
         """Check that each key belongs to the selected model and number of simulations."""
@@ -156,14 +160,19 @@ AIMED, TOGETHER = 3, 4
 """One prior simulation in this many is made for the decision about the first pour, once a good action was found; and
 how many of them at once."""
 
+MOST_PRIOR = 8
+"""Factor on the number of prior simulations up to which they go on while none is good: a pour that is likely to be lost
+costs more than simulations."""
+
 
 class Hybrid(Deployment[D3Settings]):
     """D3: as D2, but the surrogate's prior mean comes from m2 simulations, and from further ones between pours.
 
     First, Bayesian optimisation in simulation chooses m2 actions; with 'adaptive', the last third are chosen for the
-    decision about the first pour, once a good action was simulated. Their surrogate becomes the prior of the real
-    cost, f_r(a) = f_s(a) + δ(a): its posterior mean is the prior mean, its posterior covariance adds to δ's. The first
-    pour is the minimiser of the prior mean; every further one minimises m(a) − κ s(a) given the weighed pours.
+    decision about the first pour, once a good action was simulated; until then they go on. Their surrogate becomes the
+    prior of the real cost, f_r(a) = f_s(a) + δ(a): its posterior mean is the prior mean, its posterior covariance adds
+    to δ's. The first pour is the minimiser of the prior mean; every further one minimises m(a) − κ s(a) given the
+    weighed pours.
 
     With `simulations_per_pour = k`, one query returns the next pour and the k most informative actions. These are
     simulated during the pour and enter the prior: learning from real trials interleaved with planning in a model
@@ -181,9 +190,13 @@ class Hybrid(Deployment[D3Settings]):
         simulated = partial(self._ledger.simulated, everything=True)
         rules = self._settings.rules(self._ledger.costing.worst)
         self._choice = PourChoice(self._requests, simulated, rules, self._ask_operator)
+        self._before = self._settings.prior_simulations
+        self._found_at: int | None = None
 
     def _next(self) -> None:
-        if self._ledger.spent < self._settings.prior_simulations and not self._ledger.pours:
+        if not self._ledger.pours:
+            self._before = self._simulations_before()
+        if self._ledger.spent < self._before and not self._ledger.pours:
             self._next_prior()
         elif self._pouring is not None or not self._trials.idle:
             return
@@ -191,6 +204,22 @@ class Hybrid(Deployment[D3Settings]):
             self._next_pour()
         else:
             self._questions.put(self._choice.query(count=0, map_resolution=MAP_RESOLUTION), "conclude", self._conclude)
+
+    def _simulations_before(self) -> int:
+        """Number of simulations before the first pour, as far as known: with 'adaptive', one third of the usual number
+        follows the first good one."""
+        fixed, spent = self._settings.prior_simulations, self._ledger.spent
+        costs = self._ledger.simulated().costs
+        if not self._settings.adaptive or not costs:
+            return fixed
+        if self._found_at is None and (found_good(costs) or min(costs) < FOUND * self._ledger.costing.worst):
+            self._found_at = spent
+        begun = spent if self._found_at is None else self._found_at
+        needed = max(fixed, min(begun + fixed // AIMED, MOST_PRIOR * fixed))
+        if self._before == fixed < needed:
+            text = f"no simulation is good so far: they go on, up to {MOST_PRIOR * fixed} instead of {fixed}"
+            self._ledger.decisions.append(Decision(text))
+        return needed
 
     def _next_prior(self) -> None:
         settings, choice = self._settings, self._choice
@@ -205,7 +234,7 @@ class Hybrid(Deployment[D3Settings]):
             self._scalarization.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
             known, pending, plain = self._ledger.simulated(), self._trials.pending(), not settings.adaptive
-            left = settings.prior_simulations - self._ledger.spent
+            left = self._before - self._ledger.spent
             aimed = choice.acquisition == "least_loss" and left <= settings.prior_simulations // AIMED
             if aimed and found_good(known.costs):
                 # those for the first pour: where it may be made, and where it tells the hypotheses apart
@@ -246,7 +275,7 @@ class Hybrid(Deployment[D3Settings]):
 
     def progress(self) -> Progress:
         """Simulations and pours done, and their totals."""
-        simulations = self._settings.prior_simulations + self._plan.pours * self._settings.simulations_beside
+        simulations = self._before + self._plan.pours * self._settings.simulations_beside
         done = self._trials.answered - self._ledger.unspent
         ended = self._choice.ended is not None  # no further ones will be made
         pours = self._ledger.counted if ended else self._plan.pours

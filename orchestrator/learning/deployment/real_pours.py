@@ -214,7 +214,8 @@ def scaled_interval(prediction: Prediction, earlier: Sequence[PourTrial], worst:
     """The prediction interval of a pour, scaled by the deviations of the campaign's earlier pours.
 
     The factor is the root mean square of their z, (loss − predicted mean) / predicted standard deviation (of a single
-    pour). It begins at 1 and tends to the measured value as pours are made. An interval that begins at 0 still does.
+    pour). It begins at 1 and tends to the measured value as pours are made. An interval that begins at 0 or ends at the
+    largest loss still does: a pour may lose nothing, or everything, with a probability of its own.
 
     Args:
         prediction: prediction of the pour, with its interval.
@@ -226,7 +227,7 @@ def scaled_interval(prediction: Prediction, earlier: Sequence[PourTrial], worst:
     factor = math.sqrt((PRIOR_POURS + sum(squares)) / (PRIOR_POURS + len(squares)))
     mean = min(max(prediction.mean, low), high)
     begin = 0.0 if low <= 0.0 else max(mean - factor * (mean - low), 0.0)
-    return begin, min(mean + factor * (high - mean), worst)
+    return begin, worst if high >= worst else min(mean + factor * (high - mean), worst)
 
 
 def _z_scores(pours: Sequence[PourTrial]) -> list[float]:

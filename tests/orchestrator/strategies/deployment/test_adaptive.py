@@ -107,6 +107,26 @@ def test_the_last_prior_simulations_are_made_for_the_first_pour() -> None:
     assert losses(strategy)[0] < 0.05
 
 
+@pytest.mark.parametrize(
+    ("model", "good_from", "expected"),
+    [("adaptive", 1, 9), ("adaptive", 14, 18), ("adaptive", 999, 72), ("residual", 14, 9)],
+)
+def test_simulations_go_on_while_none_is_good(model: str, good_from: int, expected: int) -> None:
+    made = 0
+
+    def found_late(action: Any, theta: Any, rng: Any) -> float:
+        nonlocal made
+        made += 1
+        return 0.95 if made < good_from else 0.02
+
+    strategy = adaptive(1, pours=1, prior_simulations=9, simulations_per_pour=0, model=model)
+    StrategyHarness(found_late, narrow_cup).run(strategy)
+    assert len(strategy.result().simulated) == expected
+    assert strategy.progress().of_simulations == expected
+    told = [one.text for one in strategy.decisions if "they go on, up to 72 instead of 9" in one.text]
+    assert len(told) == (expected > 9)
+
+
 @pytest.mark.slow
 def test_a_bench_that_changes_is_noticed_and_said() -> None:
     poured = 0
