@@ -1,6 +1,6 @@
 """Measure a laboratory that remembers: sequences of campaigns with the same arm and liquid, and new cups.
 
-    python benchmarks/memory.py [--laboratories 10] [--first 61001] [--campaigns 5] [--into build/memory]
+    python benchmarks/memory.py [--laboratories 10] [--first 61001] [--campaigns 5] [--question 1] [--into build/memory]
 
 Each laboratory has a hidden place of the receiver, hidden walls and a hidden liquid, drawn with its seed. Each of its
 campaigns has a new pourer and receiver; the receiver is put down anew within 1 mm, and the walls differ a little. The
@@ -32,7 +32,7 @@ import asyncio
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -49,7 +49,10 @@ CONTROL = ", no memory"
 WRONG = ("moved", "other liquid")
 """Ways in which a memory is wrong."""
 
-ARMS = ("12 pours", "4 pours", "memory", *WRONG, *(f"{arm}{CONTROL}" for arm in WRONG))
+RIGHT = ("12 pours", "4 pours", "memory")
+"""Arms of question 1."""
+
+ARMS = (*RIGHT, *WRONG, *(f"{arm}{CONTROL}" for arm in WRONG))
 
 
 def campaign_content(seed: int, number: int, arm: str, runs: Path) -> dict[str, Any]:
@@ -122,25 +125,26 @@ def calibrated(seed: int, number: int, arm: str, into: Path) -> dict[str, Any]:
     }
 
 
-def wanted(seed: int, campaigns: int) -> Iterator[tuple[int, int, str]]:
+def wanted(seed: int, campaigns: int, arms: Sequence[str]) -> Iterator[tuple[int, int, str]]:
     """The campaigns of a laboratory, in order: number and arm."""
     last = campaigns - 1
     yield seed, 0, "12 pours"
     for number in range(1, campaigns):
         yield seed, number, "memory"
-    yield from ((seed, last, arm) for arm in ARMS if arm != "memory")
+    yield from ((seed, last, arm) for arm in arms if arm != "memory")
 
 
 def write(rows: list[dict[str, Any]], last: int) -> None:
-    """Store the table of the last campaigns of the laboratories that have all arms."""
+    """Store the table of the last campaigns of the laboratories that have all arms of question 1."""
     found = {(row["seed"], row["arm"]): row for row in rows if row["number"] == last}
-    seeds = [seed for seed in sorted({seed for seed, _ in found}) if all((seed, arm) in found for arm in ARMS)]
+    seeds = [seed for seed in sorted({seed for seed, _ in found}) if all((seed, arm) in found for arm in RIGHT)]
     table = []
     for arm in ARMS:
-        errors = [100.0 * found[seed, arm]["error"] for seed in seeds]
-        told = "" if not _remembers(arm) else sum(bool(found[seed, arm]["contradicted"]) for seed in seeds)
-        table.append([arm, *(f"{error:.2f}" for error in errors), f"{mean(errors):.2f}", str(told)])
-    head = ["fifth campaign", *(f"laboratory {seed}" for seed in seeds), "mean", "contradicted in"]
+        made = {seed: found[seed, arm] for seed in seeds if (seed, arm) in found}
+        told = "" if not _remembers(arm) else sum(bool(row["contradicted"]) for row in made.values())
+        cells = [f"{100.0 * made[seed]['error']:.2f}" if seed in made else "" for seed in seeds]
+        table.append([arm, *cells, f"{100.0 * mean(row['error'] for row in made.values()):.2f}", str(told)])
+    head = ["fifth campaign", *map(str, seeds), "mean", "contradicted in"]
     command = f"python benchmarks/memory.py --laboratories {len(seeds)} --first {seeds[0]}"
     write_table("memory", head, table, command, "mean error of θ\\* on 12 further pours of new actions, in points")
 
@@ -151,6 +155,7 @@ def main() -> None:
     parser.add_argument("--laboratories", type=int, default=10)
     parser.add_argument("--first", type=int, default=61001)
     parser.add_argument("--campaigns", type=int, default=5)
+    parser.add_argument("--question", type=int, choices=(1, 2), default=2, help="1: without the arms of question 2")
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "memory")
     parser.add_argument("--write", action="store_true", help="write the table of the finished laboratories")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # runs one campaign in this process
@@ -164,7 +169,7 @@ def main() -> None:
     file = into / "campaigns.jsonl"
     rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()] if file.exists() else []
     for seed in () if asked.write else range(asked.first, asked.first + asked.laboratories):
-        for one in wanted(seed, asked.campaigns):
+        for one in wanted(seed, asked.campaigns, RIGHT if asked.question == 1 else ARMS):
             if any((row["seed"], row["number"], row["arm"]) == one for row in rows):
                 continue
             row = run_self(__file__, f"--one={','.join(map(str, one))}", f"--into={into}")

@@ -40,6 +40,12 @@ question 10:
 11. Is the mean of 15 pours at `cliff, four axes` and `milder, four axes` lower with that search than without? It was
     not (-0.003 ± 0.003 and 0.000 ± 0.010), so the search was left out (docs/notes/deployment-tried.md).
 
+Simulating on while no simulation is good, and intervals that end with a total loss, were tuned on seeds 12000 to 12127.
+Seeds 20001 to 20048 were used once for this question, which was fixed before, on all levels with steep walls:
+
+12. Is the mean of 15 pours at `cliff, large` at most 0.18, at `cliff, moderate` at most 0.06? Are 85 to 95 % of the
+    pours after the first one in their 90 % intervals there? Is no other level worse than without?
+
 Seeds 9000 to 9059 are for tuning changes of the hypotheses. Seeds 8400 to 8419 were used once, for the answer about one
 of them at `cliff, large` and `four axes`. The question was fixed before: is the mean of 15 pours at `cliff, large`
 lower by 0.04 or more, and higher at no other level? It was not lower, so the change was left out and no other level
@@ -282,11 +288,10 @@ def write_steep(runs: list[dict[str, Any]]) -> None:
     kept.write_text(json.dumps({"machine": describe(), "runs": rounded(runs)}) + "\n")
     head = ["simulator", "seeds", "first pour", "mean of 15 pours", "pours 9 to 15"]
     settings = (
-        "37 simulations, 15 pours, two simulations next to each; loss without scatter, ± standard error; a campaign "
-        "ends after three pours below 0.5 %; seeds not used for tuning"
+        "37 simulations (more while none is good), 15 pours, two simulations next to each; loss without scatter, "
+        "± standard error; a campaign ends after three pours below 0.5 %; seeds not used for tuning"
     )
-    cliffs = _steep_command(CLIFFS, "--first 8120 --seeds 20")
-    milder = _steep_command(MILDER, "--first 8500 --seeds 24 and --first 8600 --seeds 24")
+    cliffs, milder = (_steep_command(levels, "--first 20001 --seeds 48") for levels in (CLIFFS, MILDER))
     write_table("cliffs", head, steep_rows(CLIFFS, runs), cliffs, settings)
     write_table("milder", head, steep_rows(MILDER, runs), milder, settings)
     head = ["pours", "number", *(f"in {100 * share:.0f} % (interval score)" for share in SHARES)]
