@@ -47,6 +47,7 @@ def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], t
         "posterior",
         "spillage against pours",
         "loss map narrow",
+        "uncertainty of the loss narrow",
     }
     assert all(is_picture(path) for path in drawn.values())
 
@@ -55,7 +56,7 @@ def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], t
 def test_unfinished_run_gets_the_figures_it_can(results: dict[str, Any], tmp_path: Path) -> None:
     assert draw_figures(tmp_path, example_run.campaign(), {}) == {}
     only_pours = draw_figures(tmp_path, example_run.campaign(), {"narrow cup": results["narrow cup"]})
-    assert set(only_pours) == {"spillage against pours", "loss map narrow"}
+    assert set(only_pours) == {"spillage against pours", "loss map narrow", "uncertainty of the loss narrow"}
 
 
 @pytest.mark.slow
@@ -65,7 +66,7 @@ def test_a_figure_that_fails_does_not_take_the_others_with_it(
     (tmp_path / "spillage-against-pours.png").mkdir()
     drawn = draw_figures(tmp_path, example_run.campaign(), results)
     assert "spillage against pours" not in drawn
-    assert len(drawn) == 4
+    assert len(drawn) == 5
     assert "figure 'spillage against pours' was not drawn" in caplog.text
 
 
