@@ -234,6 +234,7 @@ def fitted(seed: int, bench: str, laboratory: Path, into: Path) -> list[dict[str
         thetas = {"theta": calibrated.found.theta, "uncalibrated": plan.uncalibrated}
         drawn = posterior_draws(calibrated.found, DRAWN)
         left = calibration_residual(plan, scores, len(calibrated.found.searched))
+        left = None if left is None else left.at(plan.scene)
         row["further"] = asyncio.run(further(campaign, seed, thetas, drawn, left, pool))
         rows.append(row)
     asyncio.run(pool.close())
@@ -307,7 +308,7 @@ async def further(
             errors[name].append(abs(truth - await spilled(pool, plan.scene, action, theta, own + 1)))
         values = [await spilled(pool, plan.scene, action, theta, own + 2 + k) for k, theta in enumerate(drawn)]
         errors["posterior"].append(abs(truth - sum(values) / len(values)))
-        inside += band(values, drawn[0].particles, left, plan.scene).holds(truth)
+        inside += band(values, drawn[0].particles, left).holds(truth)
     return {**{name: sum(values) / len(values) for name, values in errors.items()}, "inside": inside, "of": FURTHER}
 
 

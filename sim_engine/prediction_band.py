@@ -32,7 +32,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 
 from sim_engine.outcome import PourOutcome, normalised_spillage
@@ -62,19 +62,21 @@ class CalibrationResidual:
     Attributes:
         shift: standard deviation of the shift, see `left_over`.
         scenes: scenes of the weighed pours, see `scene_digest`; empty if unknown, so that every scene is another one.
+        here: whether one of them is the scene of the pours that are predicted, see `at`.
     """
 
     shift: float
     scenes: tuple[str, ...] = ()
+    here: bool = False
 
     @classmethod
     def of(cls, shift: float, scenes: Iterable[Scene]) -> CalibrationResidual:
         """The residual of pours in some scenes."""
         return cls(shift, tuple(sorted({found for scene in scenes if (found := scene_digest(scene)) is not None})))
 
-    def belongs_to(self, scene: Scene | None) -> bool:
-        """Whether the residual was measured in a scene; not in an unknown one."""
-        return bool(self.scenes) and scene is not None and scene_digest(scene) in self.scenes
+    def at(self, scene: Scene) -> CalibrationResidual:
+        """The residual for predictions of pours in a scene. It reads the mesh files of the vessels."""
+        return replace(self, here=bool(self.scenes) and scene_digest(scene) in self.scenes)
 
 
 def scene_digest(scene: Scene) -> str | None:
@@ -126,16 +128,15 @@ def resolution_shift(particles: int) -> float:
     return float(RESOLUTION * (RESOLUTION_AT / particles) ** (1.0 / 3.0))
 
 
-def lacking_shift(particles: int, residual: CalibrationResidual | None, scene: Scene | None, spread: float) -> float:
+def lacking_shift(particles: int, residual: CalibrationResidual | None, spread: float) -> float:
     """Standard deviation of the shift between a pour and its simulations, beyond their scatter.
 
     Args:
         particles: of a simulation.
-        residual: of the calibration; None without calibration.
-        scene: of the pour; None if unknown.
+        residual: of the calibration, for the scene of the pour; None without calibration.
         spread: standard deviation of the shift over the simulations.
     """
-    if residual is not None and residual.belongs_to(scene):
+    if residual is not None and residual.here:
         return math.sqrt(max(residual.shift**2 - spread**2, 0.0))
     return max(resolution_shift(particles), 0.0 if residual is None else residual.shift)
 
@@ -171,7 +172,6 @@ def band(
     spillages: Sequence[float],
     particles: int,
     residual: CalibrationResidual | None = None,
-    scene: Scene | None = None,
     level: float = LEVEL,
 ) -> PredictionInterval:
     """The interval of a single pour, given its simulations.
@@ -180,8 +180,8 @@ def band(
         spillages: r of simulations of the pour with fresh seeds, which may alternate between θ of a posterior and
             between possible shapes of the vessels; ≥ 1.
         particles: of a simulation.
-        residual: of the calibration; None without calibration.
-        scene: of the pour, with the vessels as they are known; None: none of the calibration's.
+        residual: of the calibration, for the scene of the pour with the vessels as they are known; None without
+            calibration.
         level: probability with which a pour lies in it.
 
     Raises:
@@ -193,8 +193,8 @@ def band(
     places = [shift_of(r, particles) for r in spillages]
     mean = math.fsum(places) / count
     spread = math.fsum((z - mean) ** 2 for z in places) / (count - 1) if count > 1 else 0.0
-    own = residual is not None and residual.belongs_to(scene)
-    lacking = lacking_shift(particles, residual, scene, math.sqrt(spread))
+    here = residual is not None and residual.here
+    lacking = lacking_shift(particles, residual, math.sqrt(spread))
     # The mixture of the simulations has a variance of s² (n − 1) / n; a further one differs from their mean by
     # s² (n + 1) / n.
     width = max(math.sqrt(lacking**2 + 2.0 * spread / count), _NARROWEST)
@@ -205,23 +205,21 @@ def band(
         high if high < 1.0 - half else 1.0,
         level,
         steep * math.sqrt(spread),
-        None if residual is None else steep * (lacking if own else residual.shift),
-        0.0 if own else steep * resolution_shift(particles),
+        None if residual is None else steep * (lacking if here else residual.shift),
+        0.0 if here else steep * resolution_shift(particles),
     )
 
 
-def band_of(
-    outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None = None, scene: Scene | None = None
-) -> PredictionInterval | None:
+def band_of(outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None = None) -> PredictionInterval | None:
     """The band of one pour's simulations; None if none of them has a spillage.
 
     Args:
         outcomes: of the same action, with fresh seeds, perhaps of several θ and shapes.
-        residual, scene: as in `band`.
+        residual: as in `band`.
     """
     usable = [outcome for outcome in outcomes if outcome.invalid is None]
     spillages = [r for outcome in usable if (r := normalised_spillage(outcome.fractions)) is not None]
-    return band(spillages, usable[0].particles, residual, scene) if spillages else None
+    return band(spillages, usable[0].particles, residual) if spillages else None
 
 
 def _quantile(places: Sequence[float], width: float, share: float) -> float:

@@ -125,6 +125,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
         scene = dataclasses.replace(scene, name=f"{scene.pourer.name} into {vessel.name}", receiver=vessel)
     with Refused(ValueError, at="--set: "):
         action = assigned_action(options.assignments or [], fixed=scene.fixed, space=space)
+    known = known.at(scene)
     check_output(options.rrd, "--rrd", ".rrd")
     check_output(options.png, "--png", ".png")
     wanted = wanted_in(plan, scene, options.scene)
@@ -141,7 +142,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     runs = _simulated_pour(simulator, tasks)
     outcomes = [run.outcome for run in runs]
     _show(tasks[0], runs[0], options)
-    over_seeds, where = spreads(outcomes), band_of(outcomes, known.residual, scene)
+    over_seeds, where = spreads(outcomes), band_of(outcomes, known.residual)
     received = over_seeds.get("received")
     delivered = None if received is None else received.mean * scene.liquid.mass
     if options.as_json:
@@ -288,6 +289,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     plan = read_campaign(path)
     known = prediction_inputs(plan, options.parameters, options.thetas, options.seeds)
     scene, records = _scene(plan, options, source)
+    known = known.at(scene)
     table, pours = _pours(scene, records, source)
     check_output(options.csv, "--csv", ".csv")
     check_output(options.png, "--png", ".png")
@@ -298,8 +300,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     print_note(f"{scene.name}: {len(pours)} pours, {len(tasks[0])} simulations each, {said}")
     outcomes = _simulated(simulator, tasks)
     rows = [
-        _row(row.line, pour, some, known.residual, scene)
-        for row, pour, some in zip(table.rows, pours, outcomes, strict=True)
+        _row(row.line, pour, some, known.residual) for row, pour, some in zip(table.rows, pours, outcomes, strict=True)
     ]
     dimensions = [name for name in table.dimensions if name in table.varying()] or list(table.dimensions)
     found = scores(rows)
@@ -318,7 +319,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
         from sim_engine.prediction_band import resolution_shift
 
         left, shift = known.residual, resolution_shift(known.theta.particles)
-        own = left is not None and left.belongs_to(scene)
+        own = left is not None and left.here
         left_shift = None if left is None else left.shift
         print_json(
             SimulateTableOutput(
@@ -451,7 +452,7 @@ def _simulated(simulator: PourSimulator, tasks: Sequence[Sequence[PourTask]]) ->
 
 
 def _row(
-    line: int, pour: RecordedPour, outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None, scene: Scene
+    line: int, pour: RecordedPour, outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None
 ) -> ScoredRow:
     from orchestrator.reports.prediction_scores import ScoredRow
     from sim_engine.outcome import normalised_spillage
@@ -465,7 +466,7 @@ def _row(
         pour.action,
         pour.normalised_spillage,
         SampleStatistics.of(values),
-        band_of(outcomes, residual, scene),
+        band_of(outcomes, residual),
         len(outcomes) - len(values),
     )
 
@@ -500,7 +501,7 @@ class PredictionInputs:
     Attributes:
         theta: θ of the file, or the campaign's.
         drawn: draws of the posterior that simulations cycle through; empty: θ alone.
-        residual: of the calibration; None if it is unknown.
+        residual: of the calibration, for the scene (`at`); None if it is unknown.
     """
 
     theta: SimulationParameters
@@ -511,6 +512,10 @@ class PredictionInputs:
     def thetas(self) -> tuple[SimulationParameters, ...]:
         """All θ that simulations cycle through."""
         return self.drawn or (self.theta,)
+
+    def at(self, scene: Scene) -> PredictionInputs:
+        """The same for pours in a scene."""
+        return self if self.residual is None else dataclasses.replace(self, residual=self.residual.at(scene))
 
     def tasks(self, scene: Scene, action: Action, seed: int, seeds: int, frame_rate: float = 0.0) -> list[PourTask]:
         """Return the simulations of one pour. They cycle through θ; uncertain vessel shapes are drawn for each
@@ -532,7 +537,7 @@ class PredictionInputs:
     def said(self, scene: Scene) -> str:
         """Describe the sources of uncertainty in the prediction intervals of a scene's pours."""
         among = f"{len(self.drawn)} θ of the posterior" if self.drawn else "one θ"
-        own = self.residual is not None and self.residual.belongs_to(scene)
+        own = self.residual is not None and self.residual.here
         parts = ["seeds", among, *([] if own else [f"{self.theta.particles} particles' resolution"])]
         if scene.uncertain:
             parts.insert(1, "shapes that the vessels may have")

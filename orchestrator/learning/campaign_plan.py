@@ -428,7 +428,8 @@ class DeploymentPlan(StagePlan):
         thetas: equally likely draws of a posterior, which simulations use in turn. They are given if no calibration of
             the same campaign provides them; without any, all simulations use θ*.
         bench: equally likely offsets of the bench from the simulator; empty if nothing is known about it.
-        left_over: residual of a calibration, given in the same case as `thetas`; None if unknown.
+        left_over: residual of a calibration, given in the same case as `thetas`; None if unknown. A strategy
+            gets it for its scene.
         memory: what earlier campaigns tell, if no calibration of the same campaign uses it.
     """
 

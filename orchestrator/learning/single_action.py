@@ -208,7 +208,7 @@ class RepeatedSimulation:
             thetas: draws of a posterior that the seeds cycle through instead of the single θ.
             errors: pose errors that the seeds cycle through. If the cups touch because of such an error, the simulation
                 has the worst loss; it does not count as lost.
-            residual: of the calibration; None if unknown.
+            residual: of the calibration, for the scene; None if unknown.
         """
         scene, parameters = costing.scene, costing.parameters
         seeds = SeedStream(seed, f"prediction {scene.name}")
@@ -283,7 +283,7 @@ class RepeatedSimulation:
             thetas=self._thetas,
             touching=self._touching,
             over_seeds=over_seeds,
-            interval=band_of(self._outcomes, self._residual, self._costing.scene),
+            interval=band_of(self._outcomes, self._residual),
         )
 
 

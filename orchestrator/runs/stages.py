@@ -249,7 +249,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
     def build_for(scene: Scene) -> Callable[[Results, int], Strategy]:
         def build(results: Results, seed: int) -> Strategy:
-            known = with_left_over(with_posterior(deployment, results), results, plan.calibration)
+            known = with_left_over(with_posterior(deployment, results), results, plan.calibration, scene)
             known = with_offsets(known, results, _theta(plan, results))
             return known.settings.build(known, scene, _theta(plan, results), seed)
 
@@ -294,7 +294,8 @@ def prediction_stages(
             draws = known.settings.draws(known, theta, seeds, seed)
             drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
             errors = [draw.error for draw in draws]
-            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, deployment.left_over)
+            left = None if deployment.left_over is None else deployment.left_over.at(scene)
+            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, left)
 
         return build
 
@@ -331,13 +332,15 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))
 
 
-def with_left_over(deployment: DeploymentPlan, results: Results, calibration: CalibrationPlan | None) -> DeploymentPlan:
-    """The deployment with the residual of the preceding calibration, if the calibration was evaluated."""
-    if deployment.left_over is not None or CALIBRATION not in results or EVALUATION not in results:
-        return deployment
-    scores = result_of(results, EVALUATION, Scores)
-    left = calibration_residual(calibration, scores, len(calibrated_theta(results).searched))
-    return replace(deployment, left_over=left)
+def with_left_over(
+    deployment: DeploymentPlan, results: Results, calibration: CalibrationPlan | None, scene: Scene
+) -> DeploymentPlan:
+    """The deployment with its residual for a scene: the given one, or that of an evaluated preceding calibration."""
+    left = deployment.left_over
+    if left is None and CALIBRATION in results and EVALUATION in results:
+        scores = result_of(results, EVALUATION, Scores)
+        left = calibration_residual(calibration, scores, len(calibrated_theta(results).searched))
+    return replace(deployment, left_over=None if left is None else left.at(scene))
 
 
 def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParameters, ...]:

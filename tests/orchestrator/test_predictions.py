@@ -30,7 +30,7 @@ from orchestrator.reports.progress_state import ProgressState
 from orchestrator.reports.summarise import summarise
 from orchestrator.runs.request_executor import Deadlines, RequestExecutor
 from orchestrator.runs.run_tasks import plan_task
-from orchestrator.runs.stages import deployment_stages, prediction_stages
+from orchestrator.runs.stages import deployment_stages, prediction_stages, with_left_over
 from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness
 from sim_engine.outcome import Loss
 from sim_engine.prediction_band import CalibrationResidual, resolution_shift
@@ -206,7 +206,7 @@ def test_pours_are_predicted_with_how_well_the_mean_is_known_and_how_much_a_pour
 def test_d1_tells_how_far_a_single_pour_may_be_from_its_mean(left_over: float | None, own: bool) -> None:
     """Means of four seeds scatter half as much as a single one; what the simulator lacks is a shift of the stream."""
     plan = deployment_plan(strategy="D1", simulations_per_iteration=4, iterations=8)
-    residual = None if left_over is None else CalibrationResidual.of(left_over, [SCENE] if own else [])
+    residual = None if left_over is None else CalibrationResidual.of(left_over, [SCENE] if own else []).at(SCENE)
     strategy = OneShotPlanning(replace(plan, left_over=residual), SCENE, THETA, 1)
     StrategyHarness(narrow_cup).run(strategy)
     result: Any = strategy.result()
@@ -220,6 +220,13 @@ def test_d1_tells_how_far_a_single_pour_may_be_from_its_mean(left_over: float | 
     assert result.recommended.predicted_scatter == pytest.approx(expected, rel=0.02)
     assert result.recommended.predicted_spillage_deviation > 0.0
     assert result.pours[0].predicted_scatter == result.recommended.predicted_scatter
+
+
+def test_a_strategy_gets_the_residual_for_its_scene() -> None:
+    plan = replace(deployment_plan(), left_over=CalibrationResidual.of(0.5, [SCENE]))
+    scenes = SCENE, replace(SCENE, receiver=SCENE.pourer)
+    left = [with_left_over(plan, {}, None, scene).left_over for scene in scenes]
+    assert [one is not None and one.here for one in left] == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ def test_nine_pours_in_ten_lie_in_a_band_of_the_scene_that_the_calibration_was_w
         left = CalibrationResidual.of(left_over(pairs, 0) or 0.0, [OWN])
         for _ in range(20):
             simulated, measured = poured(float(true), 6, rng, 0.15, scatter)
-            held["own"] += band(simulated, 600, left, OWN).holds(measured)
+            held["own"] += band(simulated, 600, left.at(OWN)).holds(measured)
             held["other"] += band(simulated, 600, left).holds(measured)
             bands += 1
     assert 0.85 < held["own"] / bands < 0.95
@@ -82,7 +82,10 @@ def test_other_vessels_or_another_load_are_another_scene_with_the_share_of_the_r
     changes: dict[str, Any], same: bool
 ) -> None:
     seeds, residual = [0.19, 0.2, 0.21], CalibrationResidual.of(0.1, [OWN])
-    found, other = band(seeds, 600, residual, replace(OWN, **changes)), band(seeds, 600, CalibrationResidual(0.1), OWN)
+    found, other = (
+        band(seeds, 600, residual.at(replace(OWN, **changes))),
+        band(seeds, 600, CalibrationResidual(0.1).at(OWN)),
+    )
     assert (found == other) == (not same)
     assert found.resolution == (0.0 if same else other.resolution)
 

@@ -111,7 +111,7 @@ class SeedMean:
         costing = self._ledger.costing
         worst, particles = costing.everything_spilled, costing.parameters.particles
         steep = worst * NormalDist().pdf(shift_of(loss / worst, particles))
-        lacking = lacking_shift(particles, self._plan.left_over, costing.scene, simulated / steep)
+        lacking = lacking_shift(particles, self._plan.left_over, simulated / steep)
         return math.hypot(simulated, steep * lacking)
 
     def risk_found(self, final: Suggestion) -> RiskFound | None:

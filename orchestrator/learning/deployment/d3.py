@@ -210,13 +210,13 @@ class Hybrid(Deployment[D3Settings]):
         follows the first good one."""
         fixed, spent = self._settings.prior_simulations, self._ledger.spent
         costs = self._ledger.simulated().costs
-        if not self._settings.adaptive or not costs:
+        if not self._settings.adaptive or self._plan.objectives is not None or not costs:
             return fixed
         if self._found_at is None and (found_good(costs) or min(costs) < FOUND * self._ledger.costing.worst):
             self._found_at = spent
         begun = spent if self._found_at is None else self._found_at
         needed = max(fixed, min(begun + fixed // AIMED, MOST_PRIOR * fixed))
-        if self._before == fixed < needed:
+        if self._found_at is None and self._before == fixed < needed:
             text = f"no simulation is good so far: they go on, up to {MOST_PRIOR * fixed} instead of {fixed}"
             self._ledger.decisions.append(Decision(text))
         return needed

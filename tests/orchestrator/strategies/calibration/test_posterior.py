@@ -219,8 +219,8 @@ def test_theta_file_says_what_calibration_left_over_of_its_training_pours(determ
         path.write_text(json.dumps(theta_file(determined.found, scores, plan)), encoding="utf-8")
         left = load_discrepancy(path)
         assert left is not None
-        assert left.belongs_to(SCENE) == (plan is not None)
-        assert not left.belongs_to(replace(SCENE, receiver=SCENE.pourer))
+        assert left.at(SCENE).here == (plan is not None)
+        assert not left.at(replace(SCENE, receiver=SCENE.pourer)).here
         found.append(left.shift)
     assert 0.02 < found[0] < 0.05  # 0.01 of spillage where the stream's density is 0.28 to 0.4
     assert 0.3 < found[1] < 0.5

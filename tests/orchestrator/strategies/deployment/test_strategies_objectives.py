@@ -123,6 +123,15 @@ def cost(judge: Costing, action: Action) -> float:
 # -- each objective ------------------------------------------------------------------------------------------------
 
 
+def test_objectives_have_no_good_action_that_simulations_go_on_for() -> None:
+    def all_spilled(request: Request) -> Outcome | None:
+        return Simulated(outcome_of(0.95, seed=request.seed)) if isinstance(request, Simulate) else answers(request)
+
+    strategy = make("D3", (SPILLAGE,), pours=1, prior_simulations=9, simulations_per_pour=0, model="adaptive")
+    StrategyHarness(lambda *_: 0.0, answer=all_spilled).run(strategy)
+    assert len(strategy.result().simulated) == 9
+
+
 def test_the_duration_of_an_action_is_that_of_the_motion_which_is_made() -> None:
     rng = np.random.default_rng(0)
     pourer, receiver = build_vessel(SCENE.pourer), build_vessel(SCENE.receiver)
