@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,12 +119,16 @@ def _maps(picture: SurrogatePicture) -> Figure:
     for place, (name, grid) in enumerate(shown):
         _map_panel(figure, axes[0, place], picture, name, grid)
     marked = {name: h for h, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
-    if marked:
-        where: Literal["outside lower center", "outside upper right"]
-        where = "outside lower center" if alone else "outside upper right"
-        figure.legend(marked.values(), marked.keys(), loc=where, ncols=3, fontsize=9, frameon=False)
-    if notes := _notes(picture):
-        figure.supxlabel("\n".join(notes), fontsize=8.5, color=style.INK, x=0.02, ha="left")
+    notes, size = "\n".join(_notes(picture)), 8.5
+    if marked and alone:  # the notes are in the legend: both below the map would overlap
+        below = {"title": notes or None, "title_fontsize": size, "alignment": "left"}
+        figure.legend(
+            marked.values(), marked.keys(), loc="outside lower center", ncols=3, frameon=False, fontsize=9, **below
+        )
+    elif marked:
+        figure.legend(marked.values(), marked.keys(), loc="outside upper right", ncols=3, frameon=False, fontsize=9)
+    if notes and not (marked and alone):
+        figure.supxlabel(notes, fontsize=size, color=style.INK, x=0.02, ha="left")
     return figure
 
 

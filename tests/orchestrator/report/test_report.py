@@ -110,6 +110,19 @@ def test_map_of_three_parameters_says_where_the_third_was_held_and_marks_theta(r
     assert dots.get_offsets()[0].tolist() == pytest.approx([picture.points[0]["particles"], 0.1])
 
 
+def test_the_notes_of_a_single_map_are_not_on_its_legend(results: dict[str, Any]) -> None:
+    picture = calibration_picture(*in_three_axes(results))
+    assert picture is not None
+    figure = draw_surrogate(replace(picture, deviation=None))
+    figure.draw_without_rendering()
+    notes = [text for text in figure.findobj(Text) if text.get_text().startswith("others at θ*")]
+    (legend,) = figure.legends
+    for note in notes:
+        assert not any(note.get_window_extent().overlaps(one.get_window_extent()) for one in legend.get_texts())
+    assert notes
+    assert strays(figure) == []
+
+
 @pytest.mark.slow
 def test_three_parameters_get_their_trials_against_each_of_them_as_well(
     results: dict[str, Any], tmp_path: Path
