@@ -13,7 +13,8 @@ campaign is the calibration of quickstart.yaml on the bench of twin.yaml. Compar
   20 mm, or its bench pours another liquid, since then;
 - `moved, no memory`, `other liquid, no memory`: the same without a memory.
 
-The catalogue of each laboratory is a folder of its own. Finished campaigns are kept under `--into`.
+Campaigns with a memory choose their pours by information, as is the default with a `prior`; the others spread them
+evenly. The catalogue of each laboratory is a folder of its own. Finished campaigns are kept under `--into`.
 
 Questions, fixed before the first run; seeds from 61001 on were used for nothing else:
 

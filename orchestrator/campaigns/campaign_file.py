@@ -17,6 +17,7 @@ from actors.places import UnattendedSettings
 from orchestrator.campaigns.campaign_prior import AnyPrior
 from orchestrator.campaigns.search_ranges import Actions, Motion, Parameters
 from orchestrator.campaigns.vessel_file import VesselFile
+from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import (
     CalibrationSettings,
     DeploymentSettings,
@@ -88,8 +89,9 @@ class PoursSettings(PoursFromFile):
     holdout: PourCount | None = None
     """Number of these pours that are kept for testing; an eighth unless given."""
 
-    design: Design = "stratified"
-    """stratified: spread evenly over the actions; active: each chosen by its information about the deployment."""
+    design: Design | None = None
+    """stratified: spread evenly over the actions; active: each chosen by its information about the deployment. Unless
+    given, stratified; active with a `prior` that knows something, so that the pours can contradict it."""
 
     simulations: PositiveSimulationCount | None = None
     """active: simulations to estimate that information; 64 unless given."""
@@ -131,10 +133,12 @@ class PoursSettings(PoursFromFile):
         count = self.count or 0
         return max(1, count // 8) if self.holdout is None and count > 1 else self.holdout or 0
 
-    @property
-    def design_simulations(self) -> int:
-        """Number of simulations that an active design spends on its choice."""
-        return (self.simulations or 64) if self.design == "active" and self.count else 0
+    def designed(self, memory: CampaignMemory | None) -> tuple[Design, int]:
+        """How the pours are chosen, and the number of simulations that an active design spends on its choice."""
+        told = memory is not None and bool(memory.parameters)
+        if not self.count or (self.design or ("active" if told else "stratified")) == "stratified":
+            return "stratified", 0
+        return "active", self.simulations or 64
 
 
 class StageSettings(Settings):

@@ -250,8 +250,6 @@ def resolve_calibration(
         parameter_prior=known,
         further=others,
         tested=unseen,
-        design=pours.design,
-        design_simulations=pours.design_simulations if made else 0,
     )
 
 
@@ -366,8 +364,9 @@ def resolve_campaign(
         memory = _memory(
             file, parameters, calibration, deployment, laboratory, root.at("prior"), references, posteriors
         )
-    if memory is not None and calibration is not None:
-        calibration = replace(calibration, memory=memory)
+    if file.calibration is not None and calibration is not None:
+        design, simulations = file.calibration.pours.designed(memory)
+        calibration = replace(calibration, memory=memory, design=design, design_simulations=simulations)
     elif memory is not None and deployment is not None:
         deployment, in_force = replace(deployment, memory=memory), in_force | memory.means
     broken = any(report.is_broken(root.at(key)) for key in ("calibration", "deployment"))

@@ -41,6 +41,10 @@ CONTRADICTED = 0.7
 range at least 1.7 times as likely as the memory. From then on no group is used, because parameters compensate each
 other, and a wrong memory costs more than a missing one."""
 
+CONFIRMED = 0.87
+"""Posterior probability above which the pours confirm a memory: they make it about 1.7 times as likely as the
+searched range. Between the two limits they say little about it."""
+
 SPREAD, OTHER_VESSEL, OF_TOLERANCE = 0.05, 0.15, 0.5
 """Scale of the differences between campaigns before any were observed: fraction of a parameter's whole range, the same
 for the walls of another vessel, and fraction of the tolerance of a placement."""
@@ -271,7 +275,8 @@ def verdicts(memory: CampaignMemory, shares: Mapping[str, float]) -> list[Decisi
                 f"probability falls from {100 * RELIANCE:.0f} to {100 * share:.0f} %; no memory is used any more"
             )
         else:
-            text = f"the pours agree with the memory of the {group} ({runs}): probability {100 * share:.0f} %"
+            found = "confirm" if share > CONFIRMED else "neither confirm nor contradict"
+            text = f"the pours {found} the memory of the {group} ({runs}): probability {100 * share:.0f} %"
         decisions.append(Decision(text, {"probability": share}, urgent=share < CONTRADICTED))
     return decisions
 

@@ -21,7 +21,9 @@ from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.known_posteriors import import_posterior, posterior_text
 from orchestrator.cli.app import app
 from orchestrator.cli.json_output import KnownOutput
+from orchestrator.learning.calibration.active_design import ActivePours
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
+from orchestrator.learning.calibration.pour_design import DesignedPours
 from orchestrator.learning.campaign_plan import MeasuredPour
 from orchestrator.records.run_registry import VARIABLE
 from orchestrator.runs.run_folder import simulator_version
@@ -115,6 +117,7 @@ def test_a_memory_that_is_right_keeps_its_weight_and_names_its_run() -> None:
     assert (group.group, group.runs, group.contradicted) == ("placement", ("earlier-1",), False)
     assert group.probability > 0.8
     assert "earlier-1" in strategy.decisions[0].text
+    assert "the pours confirm the memory of the placement (earlier-1)" in found.text
     assert abs(strategy.theta.receiver_x - 0.008) < 0.002
     assert abs(found.alone["receiver_x"].mean - 0.008) < 0.004  # later campaigns get what these pours alone tell
 
@@ -142,6 +145,24 @@ def test_a_contradicted_memory_does_not_pull_at_the_result_of_a_fixed_number_of_
 
 def test_without_a_memory_the_result_is_as_it_was() -> None:
     assert "memory" not in calibrated(None).result().model_dump(mode="json")
+
+
+@pytest.mark.parametrize(("design", "contradicted"), [("active", True), ("stratified", False)])
+def test_pours_that_are_chosen_with_a_memory_can_contradict_it(design: str, contradicted: bool) -> None:
+    # Where nothing is spilled, pours agree with every place of the receiver: a wrong memory would stay unnoticed.
+    wide = Space((Axis("x_offset", 0.0, 0.3),))
+    wrong = CampaignMemory((RememberedParameter("receiver_x", -0.012, 0.001, ("earlier-1",)),))
+    searched: dict[str, Any] = {"actions": wide, "parameters": SEARCHED, "fixed_parameters": {}, "memory": wrong}
+    plan = calibration_plan(**searched, scene=SLOW, simulations="auto", pour_count=3, holdout=0, design_simulations=40)
+    made = ActivePours(plan, None, 1) if design == "active" else DesignedPours((SLOW,), wide, 3, 0, 1)
+    truth = SimulationParameters(receiver_x=0.008)
+    StrategyHarness(spilled, lambda action, _, rng: spilled(action, truth, rng)).run(made)
+    strategy = plan.settings.build(plan, made.measured, 1)
+    StrategyHarness(spilled).run(strategy)
+    found = strategy.result().memory
+    assert found.contradicted is contradicted
+    told = "contradict the memory" if contradicted else "neither confirm nor contradict the memory"
+    assert any(f"the pours {told} of the placement" in decision.text for decision in strategy.decisions)
 
 
 # -- the campaign file -------------------------------------------------------------------------------------------------
@@ -186,6 +207,29 @@ def test_the_catalogue_is_a_prior_and_a_run_keeps_it_when_the_catalogue_grows(st
     again = build_campaign(plan.resolved, tmp_path)  # as the run's record has it
     assert fingerprint(again) == fingerprint(plan)
     assert fingerprint(load_campaign(path, memory=plan.memory)) == fingerprint(plan)  # as `--resume` does
+
+
+@pytest.mark.parametrize(
+    ("prior", "pours", "design"),
+    [
+        ("catalogue", "{count: 12, holdout: 4}", ("active", 64)),
+        ("catalogue", "{count: 12, holdout: 4, design: stratified}", ("stratified", 0)),
+        ("catalogue", "{count: 12, holdout: 4, design: active, simulations: 30}", ("active", 30)),
+        (None, "{count: 12, holdout: 4}", ("stratified", 0)),
+        ("nothing known", "{count: 12, holdout: 4}", ("stratified", 0)),
+    ],
+)
+def test_with_a_prior_each_pour_is_chosen_by_its_information_unless_the_file_says_otherwise(
+    state: Path, tmp_path: Path, prior: str | None, pours: str, design: tuple[str, int]
+) -> None:
+    if prior == "catalogue":
+        import_posterior(known("first-1"))
+    path = with_prior(tmp_path, "catalogue")
+    text = path.read_text("utf-8").replace("{count: 12, holdout: 4}", pours)
+    path.write_text(text if prior else text.replace("prior: catalogue\n", ""), "utf-8")
+    plan = load_campaign(path).calibration
+    assert plan is not None
+    assert (plan.design, plan.design_simulations) == design
 
 
 def test_an_empty_catalogue_is_stated_and_the_prior_is_uniform(state: Path, tmp_path: Path) -> None:
