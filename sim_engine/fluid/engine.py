@@ -248,7 +248,8 @@ class _Pool(Generic[T]):
 def start() -> None:
     """Start the compiler of the kernels on one thread of the CPU.
 
-    There is no option for a GPU: one scene is one thread there, and no device was shown to give the right outcomes.
+    There is no option for a GPU: one scene is one thread there, and simulators pour one scene at a time. See GPU in
+    docs/evidence/performance.md.
     """
     look_up_quickly(NAME)
     # It prints its architecture on stdout, which is reserved for results.

@@ -309,7 +309,10 @@ def memory_found(
         for group, parameters in memory.groups.items()
     )
     rows = [space.decode(point) for point in alone.points]
-    text = "; ".join([memory.text, *(one.text for one in verdicts(memory, {g: shares[g] for g in memory.groups}))])
+    parts = [memory.text, *(one.text for one in verdicts(memory, {g: shares[g] for g in memory.groups}))]
+    if not any(one.contradicted for one in groups):
+        parts.append("the uncalibrated parameters are those of this prior")
+    text = "; ".join(parts)
     return MemoryFound(groups=groups, alone=estimates(rows), left_out=memory.left_out, text=text)
 
 

@@ -118,6 +118,7 @@ def test_a_memory_that_is_right_keeps_its_weight_and_names_its_run() -> None:
     assert group.probability > 0.8
     assert "earlier-1" in strategy.decisions[0].text
     assert "the pours confirm the memory of the placement (earlier-1)" in found.text
+    assert "the uncalibrated parameters are those of this prior" in found.text
     assert abs(strategy.theta.receiver_x - 0.008) < 0.002
     assert abs(found.alone["receiver_x"].mean - 0.008) < 0.004  # later campaigns get what these pours alone tell
 
@@ -127,6 +128,7 @@ def test_a_memory_that_the_pours_contradict_loses_its_weight_and_the_run_says_so
     strategy = calibrated(remembered, pours)
     (group,) = strategy.result().memory.groups
     assert group.contradicted
+    assert "uncalibrated" not in strategy.result().memory.text
     assert any(
         "contradict the memory of the placement (earlier-1" in one.text and one.urgent for one in strategy.decisions
     )
