@@ -105,7 +105,7 @@ def summarise(
         record,
         advice=advised,
         without_advice=() if advised else tuple(wording.without_advice(plan, record, calibrated=calibrated)),
-        open_questions=tuple(wording.open_questions(plan, record, learning, files.dropped_events)),
+        open_questions=(*_of_memory(results), *wording.open_questions(plan, record, learning, files.dropped_events)),
         loss=None if plan.deployment is None else plan.deployment.loss_name,
         loss_label="" if plan.deployment is None else deployment_unit(plan.deployment).label,
         receivers=receivers,
@@ -320,6 +320,12 @@ def _learning(plan: CampaignPlan, results: Results) -> RunLearning:
     )
     said = wording.theta_sentences(learning, plan.calibration, calibration.ended)
     return learning.model_copy(update={"theta_sentences": (*memory, *said)})
+
+
+def _of_memory(results: Results) -> tuple[str, ...]:
+    """What a person should check about the prior from earlier campaigns."""
+    calibration = calibration_of(results)
+    return () if calibration is None or calibration.memory is None else calibration.memory.questions
 
 
 def _discrepancies(evaluation: Scores | None) -> dict[str, dict[str, float | None]]:

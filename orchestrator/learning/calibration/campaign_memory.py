@@ -53,6 +53,14 @@ GRID = 121
 """Number of between-campaign deviations that are averaged over, up to six times their scale."""
 
 
+CHECKS = {
+    LIQUID: "is it the same liquid?",
+    WALLS: "do these cups have the same surface?",
+    PLACEMENT: "was the receiver or the arm moved?",
+}
+"""What a person should check if the memory of a group does not hold."""
+
+
 def group_of(name: str) -> str | None:
     """The group of a parameter; None if it is not transferred."""
     return next((group for group, names in GROUPS.items() if name in names), None)
@@ -256,6 +264,20 @@ class MemoryFound(ResultPart):
     def contradicted(self) -> bool:
         """Whether the pours contradict the memory of a group."""
         return any(one.contradicted for one in self.groups)
+
+    @property
+    def questions(self) -> tuple[str, ...]:
+        """What a person should check: contradictions, and a placement that the pours do not confirm, because a moved
+        receiver costs most."""
+        said = []
+        for one in self.groups:
+            runs, check = ", ".join(one.runs), CHECKS[one.group]
+            if one.contradicted:
+                said.append(f"The pours contradict what {runs} found about the {one.group}: {check}")
+            elif one.group == PLACEMENT and one.probability <= CONFIRMED and not self.contradicted:
+                text = f"The pours say little about the placement, which is that of {runs}: {check}"
+                said.append(f"{text} If so, repeat the campaign without 'prior'.")
+        return tuple(said)
 
 
 def verdicts(memory: CampaignMemory, shares: Mapping[str, float]) -> list[Decision]:

@@ -9,6 +9,7 @@ from typing import Any
 import jsonschema
 import pytest
 
+from orchestrator.learning.calibration.campaign_memory import MemoryFound, MemoryGroup
 from orchestrator.learning.deployment.model_monitoring import Belief, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
 from orchestrator.learning.single_action import PredictedPour
@@ -66,6 +67,20 @@ def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dic
     assert f"{100 * min(losses):.2f} % (pour {receiver.best.number})" in text
     assert display_values(deployed.recommended.action_si) in text
     assert "campaign.rrd" in text
+
+
+def test_a_memory_that_the_pours_contradict_is_an_open_question_of_the_run(results: dict[str, Any]) -> None:
+    group = MemoryGroup(
+        group="placement",
+        parameters={"receiver_x": (0.014, 0.003)},
+        runs=("first-1",),
+        probability=0.03,
+        contradicted=True,
+    )
+    memory = MemoryFound(groups=(group,), alone={}, left_out=(), text="prior from the run first-1")
+    results = {**results, "calibration": changed(results["calibration"], memory=memory)}
+    (first, *_) = summarise(example_run.campaign(), results).outcome.open_questions
+    assert first == "The pours contradict what first-1 found about the placement: was the receiver or the arm moved?"
 
 
 def test_summary_file_has_what_was_summarised_and_the_results_read_back(

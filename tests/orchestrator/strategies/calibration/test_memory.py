@@ -119,6 +119,7 @@ def test_a_memory_that_is_right_keeps_its_weight_and_names_its_run() -> None:
     assert "earlier-1" in strategy.decisions[0].text
     assert "the pours confirm the memory of the placement (earlier-1)" in found.text
     assert "the uncalibrated parameters are those of this prior" in found.text
+    assert not found.questions
     assert abs(strategy.theta.receiver_x - 0.008) < 0.002
     assert abs(found.alone["receiver_x"].mean - 0.008) < 0.004  # later campaigns get what these pours alone tell
 
@@ -163,6 +164,9 @@ def test_pours_that_are_chosen_with_a_memory_can_contradict_it(design: str, cont
     StrategyHarness(spilled).run(strategy)
     found = strategy.result().memory
     assert found.contradicted is contradicted
+    (question,) = found.questions
+    assert "was the receiver or the arm moved?" in question
+    assert question.startswith("The pours contradict" if contradicted else "The pours say little about the placement")
     told = "contradict the memory" if contradicted else "neither confirm nor contradict the memory"
     assert any(f"the pours {told} of the placement" in decision.text for decision in strategy.decisions)
 
