@@ -101,7 +101,7 @@ class KnownPosterior(Settings):
     """Name of the run."""
 
     simulator: Annotated[Text, Example("85955227f3491c5b")]
-    """Version of the solver's code; '' if the run does not state it."""
+    """Version of the solver's code; 'unknown' if the run does not state it."""
 
     laboratory: Annotated[Text, Example("virtual")]
     """Name of the laboratory."""
@@ -132,6 +132,9 @@ class KnownPosterior(Settings):
 
     parameters: Annotated[AnyEstimates, Example("{friction: {mean: 0.2, deviation: 0.1}}")]
     """Parameters that the pours determine better than the searched range does."""
+
+    contradicts: list[Text] = Field(default_factory=list)
+    """Earlier runs whose placement its pours contradict: the receiver or the arm was moved since."""
 
     @property
     def estimates(self) -> dict[str, tuple[float, float]]:
@@ -303,8 +306,8 @@ def _unfit(known: KnownPosterior, needs: PriorNeeds, source: PosteriorSource) ->
     reasons = []
     laboratory = needs.laboratory
     if known.simulator != source.simulator:
-        theirs = f"version {known.simulator}" if known.simulator else "an unknown version"
-        reasons.append(f"it is of another simulator ({theirs}, here {source.simulator}); calibrate again")
+        theirs = f"it is of another simulator (version {known.simulator}, here {source.simulator})"
+        reasons.append(f"{theirs}; calibrate again")
     if known.mode != laboratory.mode:
         reasons.append(f"it is of a {known.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
     if known.arm != (arm := arm_of(deciding(laboratory))):
@@ -338,6 +341,12 @@ def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: Poster
         if known.laboratory != needs.laboratory.name and any(group_of(n) == PLACEMENT for n in known.estimates):
             text = f"it is of laboratory '{known.laboratory}', here it is '{needs.laboratory.name}'"
             left_out.append(f"{known.posterior}: its {PLACEMENT} is not transferred, {text}")
+    here = [known for known in usable if known.laboratory == needs.laboratory.name]
+    moved = {name: known.posterior for known in here for name in known.contradicts}
+    for known in here:
+        if known.posterior in moved and any(group_of(n) == PLACEMENT for n in known.estimates):
+            text = f"the pours of {moved[known.posterior]} contradict it"
+            left_out.append(f"{known.posterior}: its {PLACEMENT} is not transferred, {text}")
     remembered = []
     for name, (lower, upper) in needs.wanted.items():
         group = group_of(name)
@@ -346,6 +355,7 @@ def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: Poster
             told = [known for known in told if not _liquid_differs(known, needs.scene)]
         elif group == PLACEMENT:
             told = [known for known in told if known.laboratory == needs.laboratory.name]
+            told = [known for known in told if known.posterior not in moved]
         same_vessel = [known for known in told if known.shape == shape]
         if group == WALLS and same_vessel:
             told = same_vessel

@@ -17,7 +17,7 @@ from typing import Any
 
 from orchestrator.campaigns.campaign_prior import KnownPosterior, arm_of, shape_digest
 from orchestrator.campaigns.run_snapshot import written
-from orchestrator.learning.calibration.campaign_memory import estimates, group_of
+from orchestrator.learning.calibration.campaign_memory import PLACEMENT, estimates, group_of
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.codec import from_json
 from orchestrator.records.run_record import RunState, read_record
@@ -77,7 +77,7 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
     return KnownPosterior.model_validate(
         {
             "posterior": name,
-            "simulator": str(read_versions(directory).get(SIMULATOR, "")),
+            "simulator": str(read_versions(directory).get(SIMULATOR) or "unknown"),
             "laboratory": str(laboratory.get("name", "")),
             "mode": laboratory.get("mode", "virtual"),
             "arm": arm_of(laboratory),
@@ -93,6 +93,12 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
             "pours": int(encoded.get("training_pours", 0)),
             "fixed": {key: float(value) for key, value in calibration["fixed_parameters"].items()},
             "parameters": parameters,
+            "contradicts": [
+                run
+                for group in memory.get("groups", ())
+                if group["group"] == PLACEMENT and group["contradicted"]
+                for run in group["runs"]
+            ],
         }
     )
 

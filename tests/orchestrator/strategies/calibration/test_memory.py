@@ -18,13 +18,15 @@ from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.catalogue.catalogue import Catalogue
-from orchestrator.catalogue.known_posteriors import import_posterior, posterior_text
+from orchestrator.catalogue.known_posteriors import import_posterior, posterior_of, posterior_text
 from orchestrator.cli.app import app
 from orchestrator.cli.json_output import KnownOutput
 from orchestrator.learning.calibration.active_design import ActivePours
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
 from orchestrator.learning.calibration.pour_design import DesignedPours
 from orchestrator.learning.campaign_plan import MeasuredPour
+from orchestrator.records.events import StageClosed
+from orchestrator.records.run_record import Header, RunState
 from orchestrator.records.run_registry import VARIABLE
 from orchestrator.runs.run_folder import simulator_version
 from orchestrator.runs.strategy_harness import SCENE, StrategyHarness
@@ -284,6 +286,30 @@ def test_another_liquid_keeps_walls_and_placement(state: Path, tmp_path: Path) -
     assert memory is not None
     assert list(memory.means) == ["friction"]  # the placement is that of another laboratory
     assert "its placement is not transferred" in " ".join(memory.left_out)
+
+
+def test_after_a_move_the_placement_comes_from_the_runs_since_then(state: Path, tmp_path: Path) -> None:
+    import_posterior(known("first-1"))
+    there = {"friction": {"mean": 0.2, "deviation": 0.1}, "receiver_x": {"mean": -0.006, "deviation": 0.001}}
+    import_posterior(known("second-1", parameters=there, contradicts=["first-1"]))
+    memory = load_campaign(with_prior(tmp_path, "catalogue")).memory
+    assert memory is not None
+    runs = {one.name: one.runs for one in memory.parameters}
+    assert runs == {"friction": ("first-1", "second-1"), "receiver_x": ("second-1",)}
+    assert memory.means["receiver_x"] == pytest.approx(-0.006)
+    assert "first-1: its placement is not transferred, the pours of second-1 contradict it" in memory.left_out
+
+
+@pytest.mark.parametrize(("remembered", "contradicts"), [(-0.012, ["earlier-1"]), (0.0075, [])])
+def test_a_posterior_names_the_runs_whose_placement_its_pours_contradict(
+    tmp_path: Path, remembered: float, contradicts: list[str]
+) -> None:
+    header = fingerprint(load_campaign(shipped("campaigns/quickstart.yaml")))
+    axes = header["calibration"]["parameters"]["axes"]
+    header["calibration"]["parameters"]["axes"] = [axis for axis in axes if axis["name"] == "receiver_x"]
+    record = RunState(Header("second", header))
+    record.closed["calibration"] = StageClosed(stage="calibration", result=calibrated(remembered).result())
+    assert posterior_of(tmp_path, record).contradicts == contradicts
 
 
 def test_a_posterior_is_exported_and_imported_with_its_units(state: Path, tmp_path: Path) -> None:
