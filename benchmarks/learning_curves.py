@@ -85,7 +85,7 @@ def run(arm: str, seed: int) -> list[float]:
     return without_choice(arm, valley, seed)
 
 
-SIMULATED = {"D1": "30", "D3": f"{PRIOR}, and {BESIDE} a pour"}
+SIMULATED = {"D1": "30", "D3": f"{PRIOR} (more while none is good), and {BESIDE} a pour"}
 
 
 def rows(kept: dict[str, Any], seeds: list[str]) -> list[list[str]]:

@@ -6,6 +6,7 @@ in `actors.optimizer.theta_posterior`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,7 +27,7 @@ from orchestrator.learning.campaign_plan import CalibrationPlan, DeploymentPlan,
 from orchestrator.learning.requests import Decision, Failed, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.learning.strategy import Progress, is_sound
 from orchestrator.learning.trials import OptimizerQueries, Trial, Trials
-from sim_engine.action import ACTION_DIMENSIONS, Action
+from sim_engine.action import ACTION_DIMENSIONS, Action, described
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import normalised_spillage
 from sim_engine.scene import Scene
@@ -40,6 +41,13 @@ DRAWS = 128
 
 WEIGHED = 0.02
 """Standard deviation of a weighed pour around the bench's mean, as a fraction of the poured liquid."""
+
+CHECKED = 8
+"""Number of simulations of a chosen pour with likely θ, if θ moves the bench. In none of them the cups may touch: in
+the pour the vessels stand as they truly do, and it would be lost, or damage them."""
+
+CLOSE = 0.2
+"""Distance in the unit cube of actions within which candidates are left out after a failed pour."""
 
 LEAST_SIMULATED = 8
 """Minimum number of usable simulations for a surrogate. With fewer, the pours are taken from the candidates in
@@ -65,9 +73,12 @@ class ActivePours(DesignedPours):
 
     Each pour is the candidate with the largest expected reduction of the variance of the predicted spillage. The
     variance is averaged over the actions and receivers of deployment, or over calibration's own without a deployment.
-    Simulations at candidates also serve C4. Pours that are kept for testing follow an even design.
+    If θ moves the bench (`receiver_x`, …), the candidate is first simulated with likely θ, and the next best one is
+    taken if the cups touch. Simulations at candidates also serve C4. Pours that are kept for testing follow an even
+    design.
 
-    A candidate whose pour fails is removed. A failed pour yields no data, and the design loses one point.
+    A candidate whose pour fails is removed with those close to it. A failed pour yields no data, and the design loses
+    one point.
 
     Source: as `actors.optimizer.theta_posterior`; Kennedy & O'Hagan 2001 for the model.
     Limitations: the surrogate is not improved between pours; the order of magnitude of a pour's scatter is assumed.
@@ -92,6 +103,12 @@ class ActivePours(DesignedPours):
         self._candidates = self._places(own, CANDIDATES, plan.constraints, plan.prior)
         self._targets = self._places(wanted, TARGETS, (deployment or plan).constraints)
         self._aim: ContextPlace | None = None
+        self._ranked: list[int] = []
+        self._likely: list[Point] = []
+        self._checks: list[Trial] = []
+        self._variance: float = 0.0
+        self._gains: tuple[float, ...] = ()
+        self._moves = not set(plan.parameters.names).isdisjoint(SimulationParameters.nuisances())
         self._simulate()
         receivers = ", ".join(dict.fromkeys(scene.receiver.name for scene, _ in wanted))
         text = f"{len(self._trials)} simulations to see which pours tell most about pours into {receivers}"
@@ -118,16 +135,23 @@ class ActivePours(DesignedPours):
         space = self._plan.parameters
         for i, theta in enumerate(actions_of_prior(space, self._plan.design_simulations, self._seeds.next())):
             among = self._candidates if i % 2 else self._targets
-            place = among[(i // 2) % len(among)]
-            parameters = SimulationParameters.from_values({**self._plan.fixed_parameters, **space.decode(theta)})
-            request = Simulate(place.scene.name, place.action, parameters, self._seeds.next(), "design")
-            self._trials.add(Trial(theta, (request,), place.point))
+            self._try(theta, among[(i // 2) % len(among)])
+
+    def _try(self, theta: Point, place: ContextPlace) -> Trial:
+        values = {**self._plan.fixed_parameters, **self._plan.parameters.decode(theta)}
+        parameters = SimulationParameters.from_values(values)
+        request = Simulate(place.scene.name, place.action, parameters, self._seeds.next(), "design")
+        trial = Trial(theta, (request,), place.point)
+        self._trials.add(trial)
+        return trial
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
     def ask(self, slots: Slots) -> list[Request]:
         """Return simulations first, then a query, and then the pour that its answer selects."""
         if not self._trials.idle:
+            return list(self._trials.issue(slots.simulations))
+        if self._checks and not self._passed():
             return list(self._trials.issue(slots.simulations))
         if self.finished or self._pouring is not None:
             return []
@@ -168,14 +192,38 @@ class ActivePours(DesignedPours):
         self._questions.put(query, "design", self._choose)
 
     def _choose(self, suggestion: Suggestion) -> None:
-        best = max(range(len(self._candidates)), key=lambda i: suggestion.gains[i])
-        self._aim = self._candidates[best]
-        before, gain = suggestion.uncertainty or 0.0, suggestion.gains[best]
+        self._variance, self._gains = suggestion.uncertainty or 0.0, suggestion.gains
+        self._ranked = sorted(range(len(self._candidates)), key=lambda i: -self._gains[i])
+        draws = () if suggestion.posterior is None else suggestion.posterior.points
+        self._likely = [draws[k * len(draws) // CHECKED] for k in range(CHECKED)] if self._moves and draws else []
+        self._take_next()
+
+    def _take_next(self) -> None:
+        """Take the best candidate that is left, and simulate it with likely θ."""
+        best = self._ranked.pop(0)
+        self._aim = aim = self._candidates[best]
+        self._checks = [self._try(theta, aim) for theta in self._likely]
+        before, gain = self._variance, self._gains[best]
         text = (
             f"what pours to be deployed spill is known to ± {100 * before**0.5:.1f} % of what is poured, after "
-            f"the next pour into {self._aim.scene.receiver.name} to ± {100 * max(before - gain, 0.0) ** 0.5:.1f} %"
+            f"the next pour into {aim.scene.receiver.name} to ± {100 * max(before - gain, 0.0) ** 0.5:.1f} %"
         )
         self.decisions.append(Decision(text, {"variance": before, "gain": gain}))
+
+    def _passed(self) -> bool:
+        """Whether the cups stay apart in the pour to be made; otherwise the next candidate is taken."""
+        touching = sum(trial.refused for trial in self._checks)
+        self._checks = []
+        if not touching or not self._ranked:
+            return True
+        assert self._aim is not None
+        values = {name: getattr(self._aim.action, name) for name in self._plan.actions.names}
+        text = (
+            f"with likely θ the cups touch in {touching} of {CHECKED} simulations of {described(values)}: another pour"
+        )
+        self.decisions.append(Decision(text))
+        self._take_next()
+        return False
 
     # -- outcomes --------------------------------------------------------------------------------------------------
 
@@ -184,12 +232,22 @@ class ActivePours(DesignedPours):
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
-            self._trials.settle(request, _spillage(outcome))
+            refused = isinstance(outcome, Failed) and outcome.kind == "invalid_action"
+            self._trials.settle(request, _spillage(outcome), refused=refused)
         else:
             super().tell(request, outcome)
-            if self._aim is not None and isinstance(outcome, Failed) and len(self._candidates) > 1:
-                self._candidates.remove(self._aim)
+            if self._aim is not None and isinstance(outcome, Failed):
+                self._leave_out(self._aim)
             self._aim = None
+
+    def _leave_out(self, failed: ContextPlace) -> None:
+        """Remove a candidate whose pour failed, and those close to it, while others are left."""
+        others = [
+            place
+            for place in self._candidates
+            if place.scene.name != failed.scene.name or math.dist(place.chosen, failed.chosen) > CLOSE
+        ]
+        self._candidates = others or [place for place in self._candidates if place is not failed] or self._candidates
 
     def result(self) -> DesignPoured:
         """The pours so far in the order made, and the simulations that calibration can also use."""

@@ -70,11 +70,11 @@ def test_it_simulates_what_is_to_be_deployed_and_then_pours_what_it_chose(
     strategy, play = played
     kinds = [type(request) for request in play.asked]
     assert kinds[:40] == [Simulate] * 40
-    assert {request.scene for request in play.simulations} == {SCENE.name, NARROW.name}
+    assert {request.scene for request in play.simulations[:40]} == {SCENE.name, NARROW.name}
     splits = [pour.split for pour in strategy.measured]
     assert (splits.count("train"), splits.count("test")) == (5, 1)
     chosen = {pour.action for pour in strategy.measured if pour.split == "train"}
-    assert len(chosen) >= 4
+    assert len(chosen) >= 3
     known = [decision.values["variance"] for decision in strategy.decisions if "variance" in decision.values]
     assert known[-1] < 0.5 * known[0]
 
@@ -85,7 +85,7 @@ def test_what_it_simulated_is_not_thrown_away(played: tuple[ActivePours, Strateg
     plan, _ = plans()
     results = {POURS: strategy.result()}
     plan = replace(plan, known=known_simulations(plan, results))
-    assert len(plan.known) == 20
+    assert len(plan.known) == 20 + 5 * 8  # at candidates, and of each chosen pour
     measured = [scored.pour for scored in measured_pours(plan, results)]
     calibration = ContinuousBayesianCalibration(plan, measured, 1)
     play = StrategyHarness(spilled).run(calibration)
@@ -121,6 +121,30 @@ def test_it_pours_even_where_no_simulation_comes_to_anything() -> None:
     StrategyHarness(lambda *_: float("nan"), truth).run(strategy)
     assert len(strategy.measured) == 3
     assert "too few simulations" in " ".join(decision.text for decision in strategy.decisions)
+
+
+@pytest.mark.parametrize("searched", [SEARCHED, Space((Axis("friction", 0.0, 0.6),))])
+def test_no_pour_is_chosen_in_which_the_cups_may_touch_as_they_stand(searched: Space) -> None:
+    # The weighed pours show that the receiver stands nearer than the arm assumes; then near actions are no longer safe.
+    truth_at, near = -0.012, 0.085
+
+    def answer(request: Any) -> Any:
+        if isinstance(request, Simulate) and request.action.x_offset + request.parameters.receiver_x < near:
+            return Failed("invalid_action", "cups touch")
+        return Failed("pour_failed", "cups touch") if isinstance(request, Pour) and touches(request.action) else None
+
+    def touches(action: Action) -> bool:
+        return action.x_offset + truth_at < near
+
+    nearer = SimulationParameters(receiver_x=truth_at)
+    strategy = ActivePours(*plans(holdout=0, pour_count=5, parameters=searched), 3)
+    play = StrategyHarness(spilled, lambda a, _, rng: spilled(a, nearer, rng), answer=answer).run(strategy)
+    lost = [touches(request.action) for request in play.asked if isinstance(request, Pour)]
+    if searched is SEARCHED:
+        assert not any(lost[1:])
+        assert any("the cups touch in" in decision.text for decision in strategy.decisions)
+    else:  # nothing that is searched moves the bench: nothing can be known, and nothing more is simulated
+        assert len(play.simulations) == 40
 
 
 def test_dimensions_that_differ_between_scenes_are_the_surrogates() -> None:
