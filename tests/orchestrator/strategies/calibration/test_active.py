@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from actors.optimizer.questions import CalibrationQuery, Data, DesignQuestion, P
 from actors.optimizer.suggest import propose
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.learning.calibration.active_design import ActivePours, joint_contexts
+from orchestrator.learning.calibration.active_design import CLOSE, ActivePours, joint_contexts
 from orchestrator.learning.calibration.continuous_calibration import ContinuousBayesianCalibration
 from orchestrator.learning.requests import Failed, Pour, Simulate, Slots
 from orchestrator.runs.stages import POURS, known_simulations, measured_pours, stages_of
@@ -145,6 +147,9 @@ def test_no_pour_is_chosen_in_which_the_cups_may_touch_as_they_stand(searched: S
         assert any("the cups touch in" in decision.text for decision in strategy.decisions)
     else:  # nothing that is searched moves the bench: nothing can be known, and nothing more is simulated
         assert len(play.simulations) == 40
+    failed = [a for a in (r.action for r in play.asked if isinstance(r, Pour)) if touches(a)]
+    points = [ACTIONS.encode({name: getattr(action, name) for name in ACTIONS.names}) for action in failed]
+    assert all(math.dist(a, b) > CLOSE for a, b in itertools.combinations(points, 2))
 
 
 def test_dimensions_that_differ_between_scenes_are_the_surrogates() -> None:
