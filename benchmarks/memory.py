@@ -23,7 +23,10 @@ Questions, fixed before the first run; seeds from 61001 on were used for nothing
    contradiction?
 
 Question 2 was fixed with `4 pours` as its comparison, which is another bench. The two arms without a memory on the same
-bench were added when the first laboratory had been seen; the page gives both comparisons.
+bench were added when the first laboratory had been seen. Laboratories 61003 to 61010 had evenly spread pours in all
+arms, and showed that these can miss a moved receiver; they served to choose the design. The same questions were then
+asked of 61011 to 61016. In 61013 the cups touched in two chosen pours; the fifth campaigns with a memory were made
+again after such pours were left out.
 """
 
 from __future__ import annotations

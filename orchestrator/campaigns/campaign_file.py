@@ -94,7 +94,8 @@ class PoursSettings(PoursFromFile):
     given, stratified; active with a `prior` that knows something, so that the pours can contradict it."""
 
     simulations: PositiveSimulationCount | None = None
-    """active: simulations to estimate that information; 64 unless given."""
+    """active: simulations to estimate that information; 64 unless given. If the parameters move the bench, eight more
+    check each pour."""
 
     holdout_receivers: list[PathOr[VesselFile]] | None = None
     """Receivers for the test pours, used in turn: they measure how well calibration transfers to other vessels."""
