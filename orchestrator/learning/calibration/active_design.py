@@ -106,6 +106,7 @@ class ActivePours(DesignedPours):
         self._ranked: list[int] = []
         self._likely: list[Point] = []
         self._checks: list[Trial] = []
+        self._touching: list[tuple[int, ContextPlace]] = []
         self._variance: float = 0.0
         self._gains: tuple[float, ...] = ()
         self._moves = not set(plan.parameters.names).isdisjoint(SimulationParameters.nuisances())
@@ -196,6 +197,7 @@ class ActivePours(DesignedPours):
         self._ranked = sorted(range(len(self._candidates)), key=lambda i: -self._gains[i])
         draws = () if suggestion.posterior is None else suggestion.posterior.points
         self._likely = [draws[k * len(draws) // CHECKED] for k in range(CHECKED)] if self._moves and draws else []
+        self._touching = []
         self._take_next()
 
     def _take_next(self) -> None:
@@ -211,12 +213,17 @@ class ActivePours(DesignedPours):
         self.decisions.append(Decision(text, {"variance": before, "gain": gain}))
 
     def _passed(self) -> bool:
-        """Whether the cups stay apart in the pour to be made; otherwise the next candidate is taken."""
+        """Whether the cups stay apart in the pour to be made; otherwise the next candidate is taken. If they touch in
+        all, it is the one in which they touch least often."""
+        assert self._aim is not None
         touching = sum(trial.refused for trial in self._checks)
         self._checks = []
-        if not touching or not self._ranked:
+        if not touching:
             return True
-        assert self._aim is not None
+        self._touching.append((touching, self._aim))
+        if not self._ranked:
+            self._aim = min(self._touching, key=lambda one: one[0])[1]
+            return True
         values = {name: getattr(self._aim.action, name) for name in self._plan.actions.names}
         text = (
             f"with likely θ the cups touch in {touching} of {CHECKED} simulations of {described(values)}: another pour"

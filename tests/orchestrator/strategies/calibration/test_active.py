@@ -175,3 +175,15 @@ def test_a_campaign_asks_for_it_with_one_key(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace("design: active, ", ""))
     with pytest.raises(ConfigError, match="belongs to 'design: active'"):
         load_campaign(path)
+
+
+def test_if_the_cups_may_touch_in_all_pours_it_makes_those_in_which_they_touch_least() -> None:
+    def answer(request: Any) -> Any:
+        if isinstance(request, Simulate) and (request.action.x_offset < 0.115 or request.parameters.receiver_x < 0.0):
+            return Failed("invalid_action", "cups touch")
+        return None
+
+    strategy = ActivePours(*plans(holdout=0, pour_count=3), 3)
+    StrategyHarness(spilled, truth, answer=answer).run(strategy)
+    assert len(strategy.measured) == 3
+    assert all(pour.action.x_offset > 0.115 for pour in strategy.measured)
