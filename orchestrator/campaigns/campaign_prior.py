@@ -354,8 +354,7 @@ def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: Poster
         if group == LIQUID:
             told = [known for known in told if not _liquid_differs(known, needs.scene)]
         elif group == PLACEMENT:
-            told = [known for known in told if known.laboratory == needs.laboratory.name]
-            told = [known for known in told if known.posterior not in moved]
+            told = [known for known in here if name in known.estimates and known.posterior not in moved]
         same_vessel = [known for known in told if known.shape == shape]
         if group == WALLS and same_vessel:
             told = same_vessel

@@ -81,7 +81,8 @@ class ActivePours(DesignedPours):
     one point.
 
     Source: as `actors.optimizer.theta_posterior`; Kennedy & O'Hagan 2001 for the model.
-    Limitations: the surrogate is not improved between pours; the order of magnitude of a pour's scatter is assumed.
+    Limitations: between pours, only the simulations that check them improve the surrogate; the order of magnitude of a
+    pour's scatter is assumed.
     """
 
     def __init__(self, plan: CalibrationPlan, deployment: DeploymentPlan | None, seed: int) -> None:
@@ -103,12 +104,10 @@ class ActivePours(DesignedPours):
         self._candidates = self._places(own, CANDIDATES, plan.constraints, plan.prior)
         self._targets = self._places(wanted, TARGETS, (deployment or plan).constraints)
         self._aim: ContextPlace | None = None
-        self._ranked: list[int] = []
         self._likely: list[Point] = []
+        self._next_best: list[tuple[ContextPlace, Decision]] = []
         self._checks: list[Trial] = []
         self._touching: list[tuple[int, ContextPlace]] = []
-        self._variance: float = 0.0
-        self._gains: tuple[float, ...] = ()
         self._moves = not set(plan.parameters.names).isdisjoint(SimulationParameters.nuisances())
         self._simulate()
         receivers = ", ".join(dict.fromkeys(scene.receiver.name for scene, _ in wanted))
@@ -193,24 +192,24 @@ class ActivePours(DesignedPours):
         self._questions.put(query, "design", self._choose)
 
     def _choose(self, suggestion: Suggestion) -> None:
-        self._variance, self._gains = suggestion.uncertainty or 0.0, suggestion.gains
-        self._ranked = sorted(range(len(self._candidates)), key=lambda i: -self._gains[i])
+        before, gains = suggestion.uncertainty or 0.0, suggestion.gains
+        self._next_best, self._touching = [], []
+        for i in sorted(range(len(gains)), key=lambda i: -gains[i]):
+            place, left = self._candidates[i], max(before - gains[i], 0.0)
+            text = (
+                f"what pours to be deployed spill is known to ± {100 * before**0.5:.1f} % of what is poured, after "
+                f"the next pour into {place.scene.receiver.name} to ± {100 * left**0.5:.1f} %"
+            )
+            self._next_best.append((place, Decision(text, {"variance": before, "gain": gains[i]})))
         draws = () if suggestion.posterior is None else suggestion.posterior.points
         self._likely = [draws[k * len(draws) // CHECKED] for k in range(CHECKED)] if self._moves and draws else []
-        self._touching = []
         self._take_next()
 
     def _take_next(self) -> None:
         """Take the best candidate that is left, and simulate it with likely θ."""
-        best = self._ranked.pop(0)
-        self._aim = aim = self._candidates[best]
-        self._checks = [self._try(theta, aim) for theta in self._likely]
-        before, gain = self._variance, self._gains[best]
-        text = (
-            f"what pours to be deployed spill is known to ± {100 * before**0.5:.1f} % of what is poured, after "
-            f"the next pour into {aim.scene.receiver.name} to ± {100 * max(before - gain, 0.0) ** 0.5:.1f} %"
-        )
-        self.decisions.append(Decision(text, {"variance": before, "gain": gain}))
+        self._aim, decision = self._next_best.pop(0)
+        self._checks = [self._try(theta, self._aim) for theta in self._likely]
+        self.decisions.append(decision)
 
     def _passed(self) -> bool:
         """Whether the cups stay apart in the pour to be made; otherwise the next candidate is taken. If they touch in
@@ -221,7 +220,7 @@ class ActivePours(DesignedPours):
         if not touching:
             return True
         self._touching.append((touching, self._aim))
-        if not self._ranked:
+        if not self._next_best:
             self._aim = min(self._touching, key=lambda one: one[0])[1]
             return True
         values = {name: getattr(self._aim.action, name) for name in self._plan.actions.names}
