@@ -1,7 +1,7 @@
 """What the lines of a balance are: why a line is not a weight, and which dialect fits the lines of a capture.
 
-`explain_line` returns the sentence for a message about one line. `explain_lines` decodes all lines of a capture in
-every installed dialect; the `DialectFit`s are ordered by how well they fit. Line settings can't be known from lines.
+`explain_line` returns the sentence for a message about one line. `explain_capture` decodes all lines of a capture in
+every installed dialect and explains them in the best. Line settings can't be known from lines.
 """
 
 from __future__ import annotations
@@ -13,9 +13,13 @@ from dataclasses import dataclass, field
 
 from actors.balance.dialect_registry import dialects
 from actors.balance.dialects.dialect import Dialect
+from actors.balance.line_recording import Capture
 from actors.balance.readings import LineError, OtherQuantityError, Reading, ReadingStatus, WeightMark
 
 _LONGEST = 60
+_MOST = 4
+"""Weights and other lines that are printed of a capture."""
+
 _COUNTED = re.compile(r"(?i)(?:%|\b(?:pcs?|stk|lb:oz|pcs/\w+)\b|\blb +[0-9.]+ *oz\b)")
 _TEXT = frozenset((*range(0x20, 0x7F), 0x0A, 0x0D))
 
@@ -75,8 +79,8 @@ def _remedy(line: bytes, allowed: Sequence[Dialect]) -> str:
     if _COUNTED.search(line.decode("ascii", "replace")):
         return "Set its display to weighing in g"
     return (
-        "Set its display and its print-out to the weight in g alone, with its unit; 'decant balance record' and "
-        "'decant balance explain' show which protocol fits"
+        "Set its display and its print-out to the weight in g alone, with its unit; 'decant balance record' shows "
+        "which protocol fits"
     )
 
 
@@ -86,46 +90,35 @@ class DialectFit:
 
     Attributes:
         dialect: the dialect.
-        total: number of lines.
         weights: number of lines with a mass, stable or not.
         understood: number of all lines that are valid in this dialect.
         reads: the stable masses, each as long as it stays.
         marks: whether lines are marked as net or gross.
-        states: status without a weight ('over range'), or a number that is no mass ('12 pcs') → number of lines.
-        others: other quantity → number of lines.
-        refused: invalid line → reason and number of lines.
+        others: what other lines hold ('over range', a tare, '12 pcs', an invalid line and the reason) → their number.
     """
 
     dialect: Dialect
-    total: int = 0
     weights: int = 0
     understood: int = 0
     reads: list[str] = field(default_factory=list)
     marks: set[WeightMark] = field(default_factory=set)
-    states: Counter[str] = field(default_factory=Counter)
     others: Counter[str] = field(default_factory=Counter)
-    refused: dict[bytes, tuple[str, int]] = field(default_factory=dict)
-    _replies: dict[bytes, object] = field(default_factory=dict, repr=False)
 
-    def add(self, line: bytes) -> None:
-        """Decode a line."""
-        self.total += 1
-        if line not in self._replies:  # most lines of a long capture are repeated
-            self._replies[line] = _decoded(self.dialect, line)
-        reply = self._replies[line]
+    def add(self, line: bytes, reply: object) -> None:
+        """Count a line and its decoded reply."""
         if isinstance(reply, LineError) and not isinstance(reply, OtherQuantityError):
-            self.refused[line] = (str(reply), self.refused.get(line, ("", 0))[1] + 1)
+            self.others[f"invalid: {shown_bytes(line)}: {reply}"] += 1
             return
         self.understood += 1
         if isinstance(reply, OtherQuantityError):
-            self.others[reply.what] += 1
+            self.others[f"{reply.what}, not a weight"] += 1
         elif isinstance(reply, Reading):
             self._add_reading(reply)
 
     def _add_reading(self, reading: Reading) -> None:
         moving = reading.status is ReadingStatus.UNSTABLE and not reading.unit  # some leave the unit out meanwhile
         if reading.value is None or (reading.mass() is None and not moving):
-            self.states[str(reading)] += 1
+            self.others[str(reading)] += 1
             return
         self.weights += 1
         self.marks |= {reading.mark} - {None}  # type: ignore[arg-type]
@@ -134,27 +127,67 @@ class DialectFit:
             self.reads.append(shown)
 
 
-def explain_lines(lines: Iterable[bytes]) -> list[DialectFit]:
-    """Decode lines in every installed dialect; the best fit is the first.
+def best_fits(lines: Sequence[bytes]) -> list[DialectFit]:
+    """Decode lines in every installed dialect; return those that read the most weights and understand the most lines.
 
     Args:
         lines: as they came, without their ends.
+
+    Returns:
+        Fits of equal quality; none if no dialect reads a weight.
     """
-    fits = [DialectFit(dialect) for dialect in dialects().values()]
-    for line in lines:
-        for fit in fits:
-            fit.add(line)
-    return sorted(fits, key=lambda fit: (-fit.weights, -fit.understood, fit.dialect.name))
+    fits = []
+    for dialect in dialects().values():
+        fit = DialectFit(dialect)
+        replies = {line: _decoded(dialect, line) for line in dict.fromkeys(lines)}  # most are repeated
+        for line in lines:
+            fit.add(line, replies[line])
+        fits.append(fit)
+    best = max((fit.weights, fit.understood) for fit in fits)
+    return [fit for fit in fits if (fit.weights, fit.understood) == best and fit.weights]
 
 
-def best_fits(fits: Sequence[DialectFit]) -> list[DialectFit]:
-    """The dialects that read the most weights and understand the most lines; none if no dialect reads a weight.
+def explain_capture(capture: Capture) -> tuple[list[str], str | None]:
+    """Explain the lines of a capture.
 
     Args:
-        fits: from `explain_lines`.
+        capture: the lines, from a recording or a file of another program.
+
+    Returns:
+        Lines of text for the user (the best dialect, what it reads, what else came), and the problem if no dialect
+        reads a weight.
     """
-    best = (fits[0].weights, fits[0].understood) if fits else (0, 0)
-    return [fit for fit in fits if (fit.weights, fit.understood) == best and fit.weights]
+    lines = capture.lines
+    text = [f"number of lines {len(lines)}, of different lines {len(set(lines))}"]
+    text += [f"note: {note}" for note in capture.notes]
+    if not lines:
+        return text, "the balance sent nothing: is it switched on, and is it the right port and cable?"
+    fits = best_fits(lines)
+    if not fits:
+        line = most_telling(lines, list(dialects().values())) or lines[0]
+        problem = f"no dialect reads a weight in these lines, such as {shown_bytes(line)}. "
+        if not is_text(b"".join(lines)):
+            problem += "They are not text: speed or parity differ; set 'baud' and 'format' as in the balance's menu"
+        else:
+            problem += "Set the balance to print the weight in g with its unit, or choose another protocol in its menu"
+            if not capture.about:
+                problem += ". A program that cuts blanks at the ends of lines off damages them"
+        return text, problem
+    fit = fits[0]
+    reads = ", ".join(fit.reads[:_MOST]) + (f", … ({len(fit.reads)})" if len(fit.reads) > _MOST else "")
+    alike = "; 'dialect: auto' tells them apart by their replies" if len(fits) > 1 else ""
+    names = " or ".join(fit.dialect.name for fit in fits)
+    text.append(f"best fit: {names} ({fit.weights} weights in {len(lines)} lines){alike}")
+    text.append(f"  stable weights: {reads or 'none'}")
+    text += [f"  {count} × {other}" for other, count in fit.others.most_common(_MOST)]
+    if (hidden := len(fit.others) - _MOST) > 0:
+        text.append(f"  and {hidden} other lines without a weight")
+    line_settings = capture.about.get("line")
+    origin = f"recorded with {line_settings}" if line_settings else "baud and format: see its menu"
+    text.append(f"  dialect: {fit.dialect.name}   # {origin}")
+    if len(fit.marks) > 1:
+        text.append("  weight: net   # or gross; it sends both")
+    return text, None
 
 
 def _decoded(dialect: Dialect, line: bytes) -> object:

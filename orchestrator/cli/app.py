@@ -274,11 +274,8 @@ _balance(
 _balance(
     balance_commands.record,
     "decant balance record rig.yaml --to kern.jsonl --remarks 'Kern PCB 3500-2; 200 g put on after 10 s'",
-)
-_balance(
-    balance_commands.explain,
-    "decant balance explain kern.jsonl      # a recording",
-    "decant balance explain terminal.log    # the lines as another program saved them",
+    "decant balance record --from kern.jsonl      # explain a recording",
+    "decant balance record --from terminal.log    # explain the lines as another program saved them",
 )
 
 _recording = _group(

@@ -1,8 +1,8 @@
-"""The commands `decant balance check`, `record` and `explain`: commission a balance, record and explain its traffic.
+"""The commands `decant balance check` and `record`: commission a balance, record and explain its traffic.
 
 A balance is named by a laboratory's file, or by its port alone on the first day. The check itself is in
-`actors.balance.balance_check`, the file format of recordings in `actors.balance.line_recording`, and the comparison of
-dialects in `actors.balance.line_explanation`.
+`actors.balance.balance_check`, the file format of recordings in `actors.balance.line_recording`, and the explanation
+of lines in `actors.balance.line_explanation`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import contextlib
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -24,11 +24,9 @@ from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, 
 if TYPE_CHECKING:
     from actors.balance.balance_check import CheckOperator
     from actors.balance.balance_settings import BalanceEmulator, SerialBalanceSettings
-    from actors.balance.line_explanation import DialectFit
-    from actors.balance.line_recording import Capture, Recorder
+    from actors.balance.line_recording import Recorder
     from actors.balance.scale_model import Load
     from actors.interfaces import DeviceCheck
-    from orchestrator.cli.command_results import ExplainedDialectOutput
 
 CHECK_SCALE = 4.0
 """Bench seconds per second of the clock while a virtual balance is checked: its lag must stay longer than this
@@ -98,8 +96,18 @@ def check(
 
 
 def record(
-    balance: Balance,
-    to: Annotated[Path, typer.Option(help="File to write (.jsonl); must not exist yet.")],
+    balance: Annotated[
+        str | None, typer.Argument(help="Laboratory file (YAML), or the port of a balance.", metavar="BALANCE")
+    ] = None,
+    to: Annotated[Path | None, typer.Option(help="File to write (.jsonl); must not exist yet.")] = None,
+    file: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            help="Record nothing; explain this recording, or any file with the lines as they came: the log of a "
+            "terminal program, hexadecimal digits, printed Python bytes.",
+        ),
+    ] = None,
     seconds: Annotated[float, typer.Option(min=0.1, help="Duration [s].")] = 60.0,
     listen: Annotated[bool, typer.Option("--listen", help="Request nothing after connecting, only listen.")] = False,
     remarks: Annotated[str, typer.Option(help="Make and model, and what is put on it and when.")] = "",
@@ -108,22 +116,32 @@ def record(
 ) -> None:
     """Record the raw traffic of a balance: every byte with its time. A test can replay the file through the driver.
 
-    Put loads on and take them off during the recording. Ctrl-C ends it. If no balance is recognised, the file holds
-    what came meanwhile; 'decant balance explain' shows what it is.
+    Put loads on and take them off during the recording. Ctrl-C ends it. The file is explained at the end, also if no
+    balance is recognised: which protocol fits its lines best, what it reads, and what else came. With --from, exit
+    code 1 if no protocol reads a weight. Speed and parity can't be known from the lines.
     """
     from actors.interfaces import LaboratoryError
 
+    if file is not None:
+        if balance is not None or to is not None:
+            raise RefusalError("--from FILE explains a file; give it without BALANCE and --to")
+        if (problem := _print_explanation(file)) is not None:
+            raise RefusalError(problem, FAILED)
+        return
+    if balance is None or to is None:
+        raise RefusalError("give the balance and a file to write: BALANCE --to FILE; or a file to explain: --from FILE")
     with (
         _settings(balance, given) as (spec, emulator),
         _tap(to, balance, virtual or emulator is not None, remarks) as tap,
     ):
+        assert tap is not None, "a file is given"
         driver = _driver(spec, tap)
         try:
             try:
                 print_message(driver.connect())
             except LaboratoryError:
-                if tap is not None and tap.count:
-                    print_message(f"{to} holds what was sent and received; 'decant balance explain {to}' shows it")
+                if tap.count and (problem := _print_explanation(to)) is not None:
+                    print_message(problem)
                 raise
             end = time.monotonic() + seconds
             with contextlib.suppress(KeyboardInterrupt):
@@ -139,137 +157,20 @@ def record(
         finally:
             driver.close()
         counts = ", ".join(f"{count} {name}" for name, count in driver.statistics().items())
-        print_message(f"{to}: {0 if tap is None else tap.count} bytes; {counts}")
+        print_message(f"{to}: {tap.count} bytes; {counts}")
+        if (problem := _print_explanation(to)) is not None:
+            print_message(problem)
 
 
-def explain(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            help="Recording of 'decant balance record', or any file with the lines as they came: the log of a terminal "
-            "program, hexadecimal digits, printed Python bytes.",
-            metavar="FILE",
-        ),
-    ],
-    as_json: Json = False,
-) -> None:
-    """Explain the lines of a balance: which protocols understand them, what each reads, what each refuses and why.
-
-    Needs no balance. Exit code 1 if no protocol reads a weight, 2 if the file can't be read. Speed and parity can't be
-    known from the lines.
-    """
-    from actors.balance.line_explanation import best_fits, explain_lines, is_text
+def _print_explanation(path: Path) -> str | None:
+    """Print which protocol fits the lines of a file, and what it reads; return the problem if none reads a weight."""
+    from actors.balance.line_explanation import explain_capture
     from actors.balance.line_recording import Capture
 
     with Refused(ValueError):
-        capture = Capture.load(file)
-    fits = explain_lines(capture.lines)
-    best = best_fits(fits)
-    if as_json:
-        from orchestrator.cli.command_results import BalanceExplainOutput
-
-        print_json(
-            BalanceExplainOutput(
-                file=file,
-                lines=len(capture.lines),
-                recorded=dict(capture.about),
-                notes=list(capture.notes),
-                best=[fit.dialect.name for fit in best],
-                dialects=[_explained(fit) for fit in fits],
-            )
-        )
-    else:
-        _print_fits(file, capture, fits)
-    if not capture.lines:
-        raise RefusalError("the balance sent nothing: is it switched on, and is it the right port and cable?", FAILED)
-    if not best:
-        text = "no dialect reads a weight in these lines. "
-        if not is_text(b"".join(capture.lines)):
-            text += "They are not text: speed or parity differ; set 'baud' and 'format' as in the balance's menu"
-        else:
-            text += "Set the balance to print the weight in g with its unit, or choose another protocol in its menu"
-            if not capture.about:
-                text += ". A program that cuts blanks at the ends of lines off damages them"
-        raise RefusalError(text, FAILED)
-    if not as_json:
-        _print_settings(capture, best)
-
-
-_MOST = 4
-"""Weights and refused lines that are printed for a dialect; --json has all."""
-
-
-def _print_fits(file: Path, capture: Capture, fits: Sequence[DialectFit]) -> None:
-    """Print a table of the dialects, and the lines that each does not read as a weight."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    different = len(set(capture.lines))
-    print(f"{file}: number of lines {len(capture.lines)}, of different lines {different}")
-    for note in capture.notes:
-        print(f"note: {note}")
-    table = Table(box=None, pad_edge=False, header_style="", padding=(0, 2, 0, 0))
-    for title in ("dialect", "understood", "weights", "stable weights as read"):
-        table.add_column(title)
-    for fit in fits:
-        more = f", … ({len(fit.reads)})" if len(fit.reads) > _MOST else ""
-        cells = (fit.dialect.name, str(fit.understood), str(fit.weights), ", ".join(fit.reads[:_MOST]) + more)
-        table.add_row(*(Text(cell) for cell in cells))
-    console = Console(highlight=False)
-    (console if console.is_terminal else Console(highlight=False, width=1000)).print(table)
-    for fit in fits:
-        for line in _not_weights(fit):
-            print(f"{fit.dialect.name}: {line}")
-
-
-def _not_weights(fit: DialectFit) -> list[str]:
-    """What a dialect does not read as a weight, and why."""
-    from actors.balance.line_explanation import shown_bytes
-
-    if not fit.understood and fit.refused:
-        line, (reason, _) = next(iter(fit.refused.items()))
-        return [f"refuses all {fit.total} lines, the first {shown_bytes(line)}: {reason}"]
-    found = [f"{count} × {what}" for what, count in fit.states.items()]
-    found += [f"{count} × {what}, not a weight" for what, count in fit.others.items()]
-    refused = [f"refuses {count} × {shown_bytes(line)}: {reason}" for line, (reason, count) in fit.refused.items()]
-    more = [f"refuses {len(refused) - _MOST} other lines (--json shows all)"] if len(refused) > _MOST else []
-    return found + refused[:_MOST] + more
-
-
-def _print_settings(capture: Capture, best: Sequence[DialectFit]) -> None:
-    """Print the settings that fit best."""
-    fit = best[0]
-    names = " or ".join(one.dialect.name for one in best)
-    alike = "; 'dialect: auto' tells them apart by their replies" if len(best) > 1 else ""
-    print(f"best fit: {names} ({fit.weights} weights in {fit.total} lines){alike}")
-    line = capture.about.get("line")
-    print(
-        f"  dialect: {fit.dialect.name}"
-        + (f"   # recorded with {line}" if line else "   # baud and format: see its menu")
-    )
-    if len(fit.marks) > 1:
-        print("  weight: net   # or gross; it sends both")
-
-
-def _explained(fit: DialectFit) -> ExplainedDialectOutput:
-    from actors.balance.line_explanation import shown_bytes
-    from orchestrator.cli.command_results import ExplainedDialectOutput, RefusedLinesOutput
-
-    return ExplainedDialectOutput(
-        dialect=fit.dialect.name,
-        title=fit.dialect.title,
-        understood=fit.understood,
-        weights=fit.weights,
-        reads=list(fit.reads),
-        marks=sorted(fit.marks),
-        states=dict(fit.states),
-        others=dict(fit.others),
-        refused=[
-            RefusedLinesOutput(line=shown_bytes(line), count=count, reason=reason)
-            for line, (reason, count) in fit.refused.items()
-        ],
-    )
+        text, problem = explain_capture(Capture.load(path))
+    print("\n".join([f"{path}: {text[0]}", *text[1:]]))
+    return problem
 
 
 def _put(emulator: BalanceEmulator, load: Load) -> None:

@@ -248,57 +248,6 @@ class BalanceCheckOutput(CommandOutput):
     checks: list[DeviceCheck]
 
 
-class RefusedLinesOutput(CommandOutput):
-    """A line that a dialect does not understand."""
-
-    line: str
-    """Its bytes, with escapes for those that are no text."""
-
-    count: int
-    reason: str
-
-
-class ExplainedDialectOutput(CommandOutput):
-    """What one dialect reads in the lines of a balance."""
-
-    dialect: str
-    title: str
-    understood: int
-    """Lines that it understands."""
-
-    weights: int
-    """Lines that it reads as a weight."""
-
-    reads: list[str]
-    """The stable weights as read, without repetition."""
-
-    marks: list[str]
-    """Marks of the weights: net, gross."""
-
-    states: dict[str, int]
-    """A state without a weight (an overload), or a number that is no mass (`12 pcs`), and its lines."""
-
-    others: dict[str, int]
-    """Another quantity than the weight, such as a tare, and its lines."""
-
-    refused: list[RefusedLinesOutput]
-
-
-class BalanceExplainOutput(CommandOutput):
-    """The lines of a balance as the dialects read them."""
-
-    file: Path
-    lines: int
-    recorded: dict[str, Any]
-    """What the recording says of itself; empty for a plain file of lines."""
-
-    notes: list[str]
-    best: list[str]
-    """Dialects that read most weights."""
-
-    dialects: list[ExplainedDialectOutput]
-
-
 class ArchiveOutput(CommandOutput):
     """Replay of the recordings of a commissioning day."""
 

@@ -17,7 +17,6 @@ from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, Previo
 from orchestrator.cli.command_results import (
     ArchiveOutput,
     BalanceCheckOutput,
-    BalanceExplainOutput,
     CalibrateOutput,
     CheckOutput,
     CommandOutput,
@@ -211,7 +210,6 @@ OUTPUTS: dict[str, Any] = {
     "robot check": CheckOutput,
     "robot archive": ArchiveOutput,
     "balance check": BalanceCheckOutput,
-    "balance explain": BalanceExplainOutput,
     "recording export": RecordingExportOutput,
     "recording replay": RecordingReplaysOutput,
     "recording fit": RecordingFitOutput,

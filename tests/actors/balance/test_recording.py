@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import itertools
-import json
 import time
 from pathlib import Path
 
@@ -185,6 +184,8 @@ def test_a_session_with_a_balance_is_recorded_and_played_back_to_the_driver(virt
     assert recording.about["dialect"] == "mt-sics"
     assert recording.about["weights"] == ["12.3 g"]
     assert {event.data for event in recording.events if event.direction == "out"} == {b"SI\r\n"}
+    assert "best fit: " in result.stdout
+    assert "stable weights: 12.3 g\n" in result.stdout, "the recording is explained at its end"
     player = RecordedBalance.start(path, speed=20.0)
     try:
         driver = SerialBalance(spec_for(player, "mt-sics"))
@@ -216,8 +217,9 @@ def test_what_came_from_an_unknown_balance_is_kept_and_explained(virtual, tmp_pa
     path = tmp_path / "unknown.jsonl"
     result = record(far.port, path, "--set", "dialect=ohaus", "--set", "baud=2400")
     assert result.exit_code == 1
-    assert f"'decant balance explain {path}' shows it" in result.stderr
-    assert "ES" in explain(path).stdout
+    assert f"{path}: number of lines" in result.stdout
+    assert "no dialect reads a weight in these lines, such as 'ES'" in result.stderr
+    assert explain(path).stdout == result.stdout
 
 
 def test_an_existing_recording_is_not_overwritten(tmp_path):
@@ -228,26 +230,33 @@ def test_an_existing_recording_is_not_overwritten(tmp_path):
 
 
 def explain(path: Path, *options: str) -> Result:
-    """Run `decant balance explain`."""
-    return CliRunner().invoke(app, ["balance", "explain", str(path), *options])
+    """Run `decant balance record --from`."""
+    return CliRunner().invoke(app, ["balance", "record", "--from", str(path), *options])
 
 
-def test_a_recording_is_explained_in_all_dialects(tmp_path):
+def test_a_recording_is_explained_in_the_dialect_that_fits_best(tmp_path):
     path = tmp_path / "kern.jsonl"
     KERN_TYPED.save(path)
     result = explain(path)
     assert result.exit_code == 0
-    rows = {row.split()[0]: row.split()[1:] for row in result.stdout.splitlines() if row.strip()}
-    assert rows["kern-swt"] == ["3", "3", "12.34", "g,", "0.00", "g"]
-    assert "best fit: kern-swt (3 weights in 3 lines)" in result.stdout
-    assert (
-        "a-and-d: refuses all 3 lines, the first '        12.30    ': neither a weight nor an answer" in result.stdout
-    )
-    found = json.loads(explain(path, "--json").stdout.splitlines()[-1])
-    assert found["best"] == ["kern-swt"]
-    assert found["recorded"] == KERN_TYPED.about
-    assert {one["dialect"] for one in found["dialects"]} == set(dialects())
-    assert next(one for one in found["dialects"] if one["dialect"] == "kern-swt")["reads"] == ["12.34 g", "0.00 g"]
+    assert "number of lines 3, of different lines 3" in result.stdout
+    assert "best fit: kern-swt (3 weights in 3 lines)\n  stable weights: 12.34 g, 0.00 g" in result.stdout
+    assert "  dialect: kern-swt   # baud and format: see its menu" in result.stdout
+
+
+def test_a_line_that_the_best_dialect_refuses_is_shown_with_the_reason(tmp_path):
+    path = tmp_path / "damaged.txt"
+    path.write_bytes(b"N     +   123.56 g  \r\n" * 3 + b"N     +   12")
+    assert "1 × invalid: 'N     +   12': " in explain(path).stdout
+
+
+def test_a_file_is_explained_without_a_balance(tmp_path):
+    path = tmp_path / "kern.jsonl"
+    KERN_TYPED.save(path)
+    for arguments in (["/dev/balance", "--from", str(path)], ["--from", str(path), "--to", "new.jsonl"], []):
+        result = CliRunner().invoke(app, ["balance", "record", *arguments])
+        assert result.exit_code == 2
+        assert "--from FILE" in result.stderr
 
 
 SARTORIUS = b"G#    +   213.56 g  \r\nT     +    90.00 g  \r\nN     +   123.56 g  \r\nStat     ERR 054    \r\n"
@@ -272,8 +281,8 @@ def test_the_files_of_other_programs_are_explained(tmp_path, content, note):
     result = explain(path)
     assert result.exit_code == 0, result.stderr
     assert "best fit: sbi (2 weights in " in result.stdout
-    assert "sbi: 1 × the application tare memory 1 ('T'), not a weight" in result.stdout
-    assert "sbi: 1 × error, error 054" in result.stdout
+    assert "  1 × the application tare memory 1 ('T'), not a weight" in result.stdout
+    assert "  1 × error, error 054" in result.stdout
     assert "weight: net   # or gross; it sends both" in result.stdout
     assert note is None or note in result.stdout
 
