@@ -13,13 +13,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from actors.arm.arm_geometry import RobotCell
 from actors.arm.arm_interface import ArmFigure, PlannedPour
 from actors.arm.arm_settings import ArmDiagnostics, ArmEmulator, ArmKind
 from actors.arm.planned_pour import MotionPath, PlaceWay, PourPath
 from actors.arm.simulated_arm import APPROACH_TIME, SimulatedArm, SimulatedArmSettings
 from actors.arm.ur.robot_models import MODELS, same_robot
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import RobotCell
 from actors.balance.balance_settings import BalanceEmulator, BalanceKind, SerialBalanceSettings
 from actors.balance.serial_port import look_at_port
 from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBalance

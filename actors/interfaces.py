@@ -3,6 +3,7 @@
 - `SimulatorPool`, `Bench` and `Optimizer` are the parts of a `Laboratory`. Hardware, the virtual bench and in-process
   replacements for tests implement them. All are asynchronous.
 - `Operator` answers an `OperatorQuestion` at the bench; `OperatorSettings` are its settings.
+- `RaySettings` name an existing Ray cluster.
 - `Notice` is a message from a laboratory, `DeviceCheck` one line of `decant robot check`.
 
 None of these depends on strategies.
@@ -10,15 +11,19 @@ None of these depends on strategies.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
+
+from pydantic import AfterValidator, Strict
+from pydantic_core import PydanticCustomError
 
 from actors.optimizer.questions import Suggestion, SuggestionQuery
 from sim_engine.errors import DecantError
 from sim_engine.outcome import PourMeasurement, RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
-from sim_engine.settings.model import Problems, Settings
+from sim_engine.settings.model import Example, Name, Problems, Settings
 from sim_engine.settings.quantity import Quantity
 
 
@@ -376,6 +381,30 @@ class OperatorSettings(Settings):
             )
         if "time" in self.model_fields_set:
             problems.add("is a virtual operator's; a person takes the time that it takes; remove the key", "time")
+
+
+def _address(text: str) -> str:
+    host, colon, port = text.rpartition(":")
+    if colon and re.fullmatch(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]", host) and port.isdigit() and 0 < int(port) < 65536:
+        return text
+    raise PydanticCustomError(
+        "ray_address",
+        "{text} should be host:port of the cluster's head as 'ray start --head' prints it, e.g. 10.0.0.1:6379",
+        {"text": repr(text)},
+    )
+
+
+RayAddress = Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
+
+
+class RaySettings(Settings):
+    """An existing Ray cluster; Decant connects to it and does not stop it."""
+
+    address: RayAddress
+    """Address of its head node, host:port."""
+
+    bench_resource: Name = "decant_bench"
+    """Custom resource of the node that runs arm, balance and bench; set it with 'ray start --resources'."""
 
 
 class Operator(Protocol):

@@ -30,13 +30,14 @@ from actors.interfaces import (
     Notice,
     Operator,
     Optimizer,
+    RaySettings,
     SimulatorPool,
 )
-from actors.laboratory_settings import MODE_LABELS, LaboratorySettings, RaySettings
-from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
+from actors.laboratory_settings import MODE_LABELS, LaboratorySettings
+from actors.optimizer_actor import DeviceOptimizer, Proposer
 from actors.places import PlaceRecord
 from actors.runtime.ray_cluster import JoinedCluster, check_cluster, versions
-from actors.runtime.ray_runtime import forget_ray_logs, open_ray, ray_lost, stop_ray, watch_ray
+from actors.runtime.ray_runtime import RayStart, forget_ray_logs, open_ray, ray_lost, stop_ray, watch_ray
 from actors.runtime.remote_object import Device, LocalDevice, RayDevice
 from actors.simulators.job_runner import Simulator, give_back, pour_simulator
 from actors.simulators.local_worker import process_pool, thread_pool
@@ -363,7 +364,9 @@ class RayLaboratory(_OpenLaboratory):
     _monitoring: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> RayLaboratory:
-        await open_ray(self._spec)
+        spec = self._spec
+        address = None if spec.ray is None else spec.ray.address
+        await open_ray(RayStart(address, spec.simulator_count, spec.object_store))
         try:
             if self._spec.ray is not None:
                 self._cluster = JoinedCluster(self._spec.ray, self._report, self._lose_bench, self._lose_all)

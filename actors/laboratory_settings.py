@@ -1,27 +1,25 @@
 """Settings of a laboratory: the pool of simulators, the Ray cluster, arm, balance and operator, and the virtual bench.
 
-`LaboratorySettings` is the whole file. `RaySettings` and `BenchSettings` are sections of it; the settings of arm,
-balance and operator are in their own modules. The ground truth of a virtual bench is part of the file; calibration
+`LaboratorySettings` is the whole file. `BenchSettings` is a section of it; the settings of Ray, arm, balance and
+operator are in their own modules. The ground truth of a virtual bench is part of the file; calibration
 never reads it.
 """
 
 from __future__ import annotations
 
 import os
-import re
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, Strict, create_model, field_validator
-from pydantic_core import PydanticCustomError
+from pydantic import AfterValidator, Field, create_model, field_validator
 
-from actors.arm.arm_geometry import RobotCell
 from actors.arm.arm_settings import ArmSettings, arm_kind, arm_settings
+from actors.arm_geometry import RobotCell
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.dialect_registry import kinds
 from actors.balance.scale_model import Drift
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.grippers.gripper_interface import GRIPPERS, GripperSettings
-from actors.interfaces import OperatorSettings
+from actors.interfaces import OperatorSettings, RaySettings
 from actors.liquid_devices import (
     PUMPS,
     SPILL_SENSORS,
@@ -47,32 +45,8 @@ from sim_engine.settings.model import (
 )
 from sim_engine.settings.quantity import Quantity
 
-
-def _address(text: str) -> str:
-    host, colon, port = text.rpartition(":")
-    if colon and re.fullmatch(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]", host) and port.isdigit() and 0 < int(port) < 65536:
-        return text
-    raise PydanticCustomError(
-        "ray_address",
-        "{text} should be host:port of the cluster's head as 'ray start --head' prints it, e.g. 10.0.0.1:6379",
-        {"text": repr(text)},
-    )
-
-
-RayAddress = Annotated[str, Strict(), AfterValidator(_address), Example("10.0.0.1:6379")]
-
 MODE_LABELS = {"virtual": "VIRTUAL", "hardware": "REAL", "external": "EXTERNAL"}
 """How reports, lists and the live view write a laboratory's mode."""
-
-
-class RaySettings(Settings):
-    """An existing Ray cluster; Decant connects to it and does not stop it."""
-
-    address: RayAddress
-    """Address of its head node, host:port."""
-
-    bench_resource: Name = "decant_bench"
-    """Custom resource of the node that runs arm, balance and bench; set it with 'ray start --resources'."""
 
 
 Duration = Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)]

@@ -21,9 +21,9 @@ import numpy as np
 
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.dialect_registry import kinds
-from actors.bench.bench_clock import Pace
 from actors.grippers.gripper_interface import Gripper, GripperSettings
 from actors.interfaces import DeviceCheck, LaboratoryError
+from actors.runtime.bench_clock import Pace
 from sim_engine.settings.model import SET_BY_PROGRAM, OneOf, Problems, Settings, Text
 from sim_engine.settings.plugin_registry import PluginRegistry, settings_kind
 from sim_engine.settings.quantity import Quantity

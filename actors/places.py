@@ -18,7 +18,7 @@ from typing import Annotated, Literal, Protocol
 from pydantic import AfterValidator, Field, Strict
 from pydantic_core import PydanticCustomError
 
-from actors.arm.arm_geometry import Pose
+from actors.arm_geometry import Pose
 from actors.interfaces import InvalidActionError
 from sim_engine.settings.model import Example, Name, PositiveCount, Problems, Settings
 from sim_engine.settings.quantity import Quantity

@@ -27,8 +27,8 @@ from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseOrder, fine_flow
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
-from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
+from actors.dosing_settings import DosingSettings
 from sim_engine.liquids import Liquid
 from sim_engine.vessel import profile
 from sim_engine.vessel.mesh_shape import MeshShape

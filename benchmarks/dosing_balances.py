@@ -29,8 +29,8 @@ import numpy as np
 from actors.balance.display_behaviour import IDEAL, DisplayBehaviour
 from actors.dosing.dose_controller import DoseOrder
 from actors.dosing.dose_series import DoseSeries, SourceContent
-from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import TrueScale, VirtualDosingBench
+from actors.dosing_settings import DosingSettings
 from sim_engine.liquids import Liquid
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -22,8 +22,8 @@ import numpy as np
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseOrder
 from actors.dosing.dose_series import DoseSeries, SourceContent
-from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
+from actors.dosing_settings import DosingSettings
 from orchestrator.reports.recording_file import PourRecording, load_recording, write_recording
 from orchestrator.reports.time_series import read_series
 from sim_engine.liquids import Liquid

@@ -23,17 +23,17 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from actors import laboratory_settings as laboratory
-from actors.arm.arm_geometry import ArmLimits, RobotCell
 from actors.arm.arm_settings import arm_settings
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import ArmLimits, RobotCell
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.balance.display_behaviour import DisplayBehaviour
 from actors.balance.scale_model import ScaleSettings
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.grippers.digital_gripper import DigitalSettings
 from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
-from actors.interfaces import OperatorSettings
+from actors.interfaces import OperatorSettings, RaySettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
 from actors.places import PlaceSettings, UnattendedSettings
 from orchestrator.campaigns import campaign_file as campaign
@@ -100,7 +100,7 @@ SECTIONS: dict[str, type[Settings]] = {
     "recorded-balance": recording.RecordedBalance,
     "origin": recording.RecordedOrigin,
     "laboratory": laboratory.LaboratorySettings,
-    "ray": laboratory.RaySettings,
+    "ray": RaySettings,
     "arm": UrArmSettings,
     "limits": ArmLimits,
     "cell": RobotCell,

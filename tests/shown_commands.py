@@ -113,7 +113,7 @@ def write_scratch(folder: Path) -> str:
 
 async def _played(plan: Any, directory: Path, pours: int | None) -> Any:
     """The campaign in a world whose spillage is a formula; paused after so many pours."""
-    from actors.optimizer.optimizer_actor import Proposer
+    from actors.optimizer_actor import Proposer
     from orchestrator.runs.run_engine import run_campaign
     from tests.support.toy_campaign import ToyBench, ToyLaboratory
 

@@ -7,7 +7,7 @@
 
 A driver is a plain, blocking class. `actors.runtime.remote_object` runs it in a thread or a process;
 `actors.arm.arm_device` awaits its calls. This module contains no driver.
-`actors.arm.arm_geometry` describes the surroundings of an arm.
+`actors.arm_geometry` describes the surroundings of an arm.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import Pose
+from actors.arm_geometry import Pose
 from actors.interfaces import LaboratoryError
 
 FloatArray = NDArray[np.float64]

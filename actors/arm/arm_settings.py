@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Protocol, Self, TypeVar
 
-from actors.arm.arm_geometry import RobotCell
+from actors.arm_geometry import RobotCell
 from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
 from actors.places import PlaceSettings, Role
 from sim_engine.action import Action

@@ -14,11 +14,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import Pose
 from actors.arm.arm_interface import ArmFacts, ArmNotReleasedError, ArmPose, ArmRefusedError, ArmState, ArmStoppedError
 from actors.arm.arm_settings import ArmSettings
 from actors.arm.planned_pour import ExecutedMotion, MotionPath
-from actors.bench.bench_clock import Pace
+from actors.arm_geometry import Pose
+from actors.runtime.bench_clock import Pace
 from sim_engine.motion import PourMotion
 
 FloatArray = NDArray[np.float64]

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, Strict
 
-from actors.arm.arm_geometry import ArmLimits, Centre, JointAngles, Mount, Pose, RobotCell, Speed
 from actors.arm.arm_settings import ArmSettings
 from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel
+from actors.arm_geometry import ArmLimits, Centre, JointAngles, Mount, Pose, RobotCell, Speed
 from sim_engine.settings.model import NOT_IN_FINGERPRINT, SET_BY_PROGRAM, Choice, Example, FilePath, Text
 from sim_engine.settings.quantity import Quantity
 

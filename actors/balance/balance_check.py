@@ -20,7 +20,7 @@ from actors.balance.balance_interface import BalanceDriver, Weight
 from actors.balance.display_quality import arrivals, dose_tolerance, repeated_readings, smallest_change
 from actors.balance.scale_model import Load
 from actors.balance.step_response import StepResponse, step_response
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import DeviceCheck, LaboratoryError, State
 
 REST_TIME = 20.0

@@ -18,8 +18,8 @@ from actors.balance.balance_settings import BalanceSettings, check_step
 from actors.balance.display_behaviour import IDEAL, DisplayBehaviour, DisplayModel
 from actors.balance.scale_model import SETTLED, Duration, Error, Load, PositiveMass
 from actors.balance.weighing_plan import Placement
-from actors.bench.bench_clock import Pace
 from actors.interfaces import LaboratoryError
+from actors.runtime.bench_clock import Pace
 from sim_engine.settings.model import SET_BY_PROGRAM, Problems
 
 INTERVAL = 0.1

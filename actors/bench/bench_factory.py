@@ -33,7 +33,7 @@ from actors.bench.pump_bench import PumpBench
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.vessel_handling import VesselHandling
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import (
     DoseTarget,

@@ -34,7 +34,7 @@ from actors.bench.pour_procedure import PourReport
 from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import (
     DoseTarget,
     InvalidActionError,

@@ -28,7 +28,7 @@ from actors.bench.bench_operators import Hands, OperatorQuestions
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.dosing.dose_controller import DoseEnd
 from actors.dosing.dose_series import DoseForecast, check_dose, source_of
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import (
     DoseKnowledge,
     DoseProgress,

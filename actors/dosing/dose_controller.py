@@ -26,7 +26,7 @@ import numpy as np
 
 from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseProgress, DoseTarget
 
 

@@ -22,7 +22,7 @@ from actors.dosing.cup_flow import CupFlow
 from actors.dosing.display_belief import IDEAL_DISPLAY, DisplayBelief
 from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DoseResult, fine_flow
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget, InvalidActionError
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import VesselError

@@ -24,16 +24,13 @@ import socket
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from actors.interfaces import LaboratoryError, Notice
+from actors.interfaces import LaboratoryError, Notice, RaySettings
 from actors.runtime.child_process import python_module, run
 from sim_engine.engine_package import engine_version
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 from sim_engine.solver_fingerprint import ROOT, folder_digest
-
-if TYPE_CHECKING:
-    from actors.laboratory_settings import RaySettings
 
 LOOK_INTERVAL = 2.0
 """Time between two polls of the nodes [s]."""

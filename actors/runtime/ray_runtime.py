@@ -40,7 +40,6 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import LaboratorySettings
 from actors.runtime.child_process import ChildProcess, own_environment, python_module
 from actors.runtime.ray_cleanup import GOODBYE, MARK, end_cluster
 
@@ -145,12 +144,27 @@ class _Session:
         return [name for name, process in processes.items() if not _runs(process)]
 
 
+@dataclass(frozen=True)
+class RayStart:
+    """How Ray starts.
+
+    Attributes:
+        address: host:port of a cluster to join; None for a private Ray on this machine.
+        cpus: number of simulators that a private Ray runs at once.
+        object_store: shared memory of a private Ray [MB].
+    """
+
+    address: str | None = None
+    cpus: int = 1
+    object_store: float = 160.0
+
+
 _session: _Session | None = None
 _guard = threading.RLock()
 
 
-def start_ray(spec: LaboratorySettings) -> None:
-    """Start Ray for a laboratory, join its cluster, or use the Ray that this process has already started.
+def start_ray(start: RayStart) -> None:
+    """Start a private Ray, join a cluster, or use the Ray that this process has already started.
 
     Blocks for some seconds. From a running event loop, use `open_ray`.
 
@@ -158,19 +172,18 @@ def start_ray(spec: LaboratorySettings) -> None:
         LaboratoryError: Ray does not start, or this process has another Ray.
     """
     global _session
-    address = None if spec.ray is None else spec.ray.address
     with _guard:
         if _session is not None:
-            if _session.address != address:
+            if _session.address != start.address:
                 raise LaboratoryError(
                     f"this process already uses {_session.address or 'a Ray of its own'}; end it first"
                 )
             _session.uses += 1
             return
         _refuse_foreign_ray()
-        session = _Session(_open_private() if address is None else None, address)
+        session = _Session(_open_private() if start.address is None else None, start.address)
         try:
-            _start_keeper(session, spec)
+            _start_keeper(session, start)
         except BaseException:
             _close(session)
             raise
@@ -179,13 +192,13 @@ def start_ray(spec: LaboratorySettings) -> None:
     keep_signals()
 
 
-async def open_ray(spec: LaboratorySettings) -> None:
+async def open_ray(start: RayStart) -> None:
     """`start_ray` from an event loop, in its main thread if there are signal handlers to keep. May be cancelled.
 
     Raises:
         LaboratoryError: as for `start_ray`.
     """
-    starting = asyncio.ensure_future(asyncio.to_thread(start_ray, spec))
+    starting = asyncio.ensure_future(asyncio.to_thread(start_ray, start))
     try:
         await asyncio.shield(starting)
     except asyncio.CancelledError:
@@ -304,13 +317,13 @@ def _close(session: _Session) -> None:
         session.private.cleanup.close(15.0)
 
 
-def _start_keeper(session: _Session, spec: LaboratorySettings) -> None:
+def _start_keeper(session: _Session, start: RayStart) -> None:
     """Start Ray in a thread that lives as long as Ray does.
 
     Linux ends Ray's processes when the *thread* that started them ends. If a thread of an executor started Ray, or a
     main thread that ends early, Ray would end with it.
     """
-    session.keeper = threading.Thread(target=_keep, args=(session, spec), name="ray-keeper", daemon=True)
+    session.keeper = threading.Thread(target=_keep, args=(session, start), name="ray-keeper", daemon=True)
     session.keeper.start()
     if not session.ready.wait(START_DEADLINE):
         set_here = [] if session.private else [name for name in _CONNECTION_SETTINGS if os.environ.get(name)]
@@ -323,7 +336,7 @@ def _start_keeper(session: _Session, spec: LaboratorySettings) -> None:
         raise session.failure
 
 
-def _keep(session: _Session, spec: LaboratorySettings) -> None:
+def _keep(session: _Session, start: RayStart) -> None:
     exit_message: ChildProcess | None = None
     settings: dict[str, str | None] = {**_JOIN_SETTINGS}
     if (private := session.private) is not None:
@@ -338,7 +351,7 @@ def _keep(session: _Session, spec: LaboratorySettings) -> None:
             with _ray_internals(helpers=private is None):
                 if private is not None:
                     with own_environment(**{MARK: str(private.folder)}):
-                        _start_private(private, spec)
+                        _start_private(private, start)
                 else:
                     _join(str(session.address))
                     command = python_module("actors.runtime.ray_cleanup", "message", str(session.address))
@@ -430,7 +443,7 @@ def _open_private() -> _PrivateRay:
     return _PrivateRay(folder, lock, ChildProcess(command, output=False, errors="dropped"))
 
 
-def _start_private(private: _PrivateRay, spec: LaboratorySettings) -> None:
+def _start_private(private: _PrivateRay, start: RayStart) -> None:
     """Start Ray's processes and connect to them; its settings must be in the environment. Linux ends them with this
     thread.
 
@@ -445,10 +458,10 @@ def _start_private(private: _PrivateRay, spec: LaboratorySettings) -> None:
         try:
             ray.init(
                 address="local",
-                num_cpus=spec.simulator_count,
+                num_cpus=start.cpus,
                 num_gpus=0,
                 resources={_PROGRAM: 1},
-                object_store_memory=round(max(spec.object_store, 80.0)) * 1024 * 1024,
+                object_store_memory=round(max(start.object_store, 80.0)) * 1024 * 1024,
                 include_dashboard=False,
                 logging_level=logging.ERROR,
                 log_to_driver=False,

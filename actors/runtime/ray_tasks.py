@@ -16,10 +16,9 @@ import time
 from collections.abc import Callable
 from typing import Any, Self
 
-from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import LaboratorySettings, RaySettings
+from actors.interfaces import LaboratoryError, RaySettings
 from actors.runtime.ray_cluster import living_nodes
-from actors.runtime.ray_runtime import start_ray, stop_ray
+from actors.runtime.ray_runtime import RayStart, start_ray, stop_ray
 
 RETRIES = 5
 """Number of repetitions of a task after its process or its node has died."""
@@ -66,11 +65,11 @@ class ClusterTasks:
     """
 
     def __init__(self, settings: RaySettings) -> None:
-        self._laboratory = LaboratorySettings(name="tasks", ray=settings)
+        self._start = RayStart(settings.address)
         self._cpus, self._counted = 0, 0.0
 
     def __enter__(self) -> Self:
-        start_ray(self._laboratory)
+        start_ray(self._start)
         return self
 
     def __exit__(self, *exc: object) -> None:

@@ -17,8 +17,6 @@ from typing import TYPE_CHECKING, Any
 from decant.lazy_names import import_name, names_for_type_checkers
 
 if TYPE_CHECKING:
-    from actors.arm.arm_geometry import Pose as Pose
-    from actors.arm.arm_geometry import RobotCell as RobotCell
     from actors.arm.arm_interface import Arm as Arm
     from actors.arm.arm_interface import ArmFacts as ArmFacts
     from actors.arm.arm_interface import ArmFigure as ArmFigure
@@ -38,6 +36,8 @@ if TYPE_CHECKING:
     from actors.arm.arm_settings import History as History
     from actors.arm.planned_pour import ExecutedMotion as ExecutedMotion
     from actors.arm.planned_pour import MotionPath as MotionPath
+    from actors.arm_geometry import Pose as Pose
+    from actors.arm_geometry import RobotCell as RobotCell
     from actors.balance.balance_interface import BalanceDriver as BalanceDriver
     from actors.balance.balance_interface import ReferenceLostError as ReferenceLostError
     from actors.balance.balance_interface import Weight as Weight

@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
 
-from actors.arm.arm_geometry import Pose
+from actors.arm_geometry import Pose
 from actors.places import PlaceSettings
 from sim_engine.errors import DecantError
 

@@ -16,7 +16,7 @@ from orchestrator.cli.console import FAILED, INTERRUPTED, RefusalError, Refused,
 from orchestrator.cli.shell_completion import files_of
 
 if TYPE_CHECKING:
-    from actors.laboratory_settings import RaySettings
+    from actors.interfaces import RaySettings
     from orchestrator.study.study_plan import StudyCell, StudyPlan
     from orchestrator.study.study_runner import CellStatus, CellWorkers
 
@@ -71,8 +71,7 @@ def run_study(
 def _checked_cluster(address: str) -> RaySettings:
     from pydantic import ValidationError
 
-    from actors.interfaces import LaboratoryError
-    from actors.laboratory_settings import RaySettings
+    from actors.interfaces import LaboratoryError, RaySettings
     from actors.runtime.ray_cluster import check_cluster
 
     try:

@@ -16,7 +16,8 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
-from actors.laboratory_settings import LaboratorySettings, RayAddress, RaySettings
+from actors.interfaces import RayAddress, RaySettings
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.campaigns.yaml.file_access import missing_file, resolved
 from orchestrator.campaigns.yaml.section_validation import validate

@@ -22,8 +22,8 @@ from actors.balance.display_behaviour import DisplayBehaviour
 from actors.dosing.dose_controller import DoseOrder, TiltCommand
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
-from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
+from actors.dosing_settings import DosingSettings
 from orchestrator.reports.recording_file import PourRecording, load_recording, write_recording
 from orchestrator.reports.recording_replay import flow_of
 from sim_engine.errors import InvalidArgumentError

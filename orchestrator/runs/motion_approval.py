@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import PathReport
 from actors.arm.arm_settings import ArmSettings, SafetyRecord, arm_kind
+from actors.arm_geometry import JOINT_NAMES
 from actors.interfaces import InvalidActionError
 from actors.optimizer.questions import Linear
 from orchestrator.learning.calibration.action_prior import actions_all_over

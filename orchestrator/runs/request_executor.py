@@ -220,7 +220,7 @@ class Deadlines:
         simulate: includes the time in the pool's queue. A pour of 50 000 particles takes minutes on one core; after
             half an hour the pool is dead, not slow.
         suggest: for one answer; a fit to some hundred points takes seconds. It is longer than the optimiser's own
-            deadline (`actors.optimizer.optimizer_actor`), because only that deadline replaces a process that hangs.
+            deadline (`actors.optimizer_actor`), because only that deadline replaces a process that hangs.
         pour: a pour takes 90 s in a laboratory, but the operator may be needed for each of its steps, which have
             deadlines of their own. After this time the outcome is unknown, and the operator must report it.
         pour_grace: how long a pause waits for a pour that has begun.

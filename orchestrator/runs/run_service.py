@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, Protocol
 
-from actors.interfaces import Laboratory, Operator, Optimizer, Stoppable
-from actors.laboratory_settings import LaboratorySettings, RaySettings
+from actors.interfaces import Laboratory, Operator, Optimizer, RaySettings, Stoppable
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.materials.vessel_account import LaboratoryPlaces, VesselAccount

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from actors.laboratory_settings import BenchSettings, LaboratorySettings
+from actors.laboratory_settings import BenchSettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise, PourTask, Scene
@@ -50,9 +50,9 @@ def bench_spec() -> BenchSettings:
 @pytest.fixture(scope="session")
 def ray_running() -> Iterator[None]:
     """Ray, started once; laboratories of tests join it."""
-    from actors.runtime.ray_runtime import start_ray, stop_ray
+    from actors.runtime.ray_runtime import RayStart, start_ray, stop_ray
 
-    start_ray(LaboratorySettings(name="tests", simulators=4))
+    start_ray(RayStart(cpus=4))
     import ray
 
     # Workers can't import test modules by name.

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from actors.arm.arm_geometry import Point
 from actors.arm.arm_settings import arm_kind
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Point
 from orchestrator.campaigns.file_loading import load_laboratory
 
 FILE = Path(__file__).parents[2] / "configs" / "laboratories" / "virtual.yaml"

@@ -26,7 +26,8 @@ PROGRAM = """
 import asyncio, json, sys
 from pathlib import Path
 from actors.laboratory import open_laboratory
-from actors.laboratory_settings import LaboratorySettings, RaySettings
+from actors.interfaces import RaySettings
+from actors.laboratory_settings import LaboratorySettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask

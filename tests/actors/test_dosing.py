@@ -16,8 +16,8 @@ from actors.dosing.display_belief import REPEATS, DisplayBelief, Repeats
 from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DoseResult, TiltCommand
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, calibrated_knowledge, draw_lags
 from actors.dosing.dose_series import DoseSeries, SourceContent
-from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
+from actors.dosing_settings import DosingSettings
 from sim_engine.hydrostatics import level, tilting_cup_outflow
 from sim_engine.liquids import Liquid
 from sim_engine.vessel.shapes import cylinder

@@ -16,7 +16,6 @@ import psutil
 import pytest
 
 from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import LaboratorySettings
 from actors.runtime import ray_runtime
 from actors.runtime.child_process import child_environment
 from tests.support.waiting import PATIENCE
@@ -26,7 +25,7 @@ pytestmark = pytest.mark.ray
 PROGRAM = """
 import asyncio, json, os, signal, sys, time
 import psutil
-from actors.runtime.ray_runtime import keep_signals, ray_folder, start_ray, stop_ray
+from actors.runtime.ray_runtime import RayStart, keep_signals, ray_folder, start_ray, stop_ray
 from actors.laboratory_settings import LaboratorySettings
 
 class Spinner:
@@ -43,7 +42,7 @@ async def main(how, patience):
     caught = asyncio.Event()
     if how == "own handler":
         asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, caught.set)
-    await asyncio.to_thread(start_ray, LaboratorySettings(name="test", simulators=1))
+    await asyncio.to_thread(start_ray, RayStart())
     keep_signals()
     import ray
     actor = ray.remote(Spinner).remote()
@@ -189,7 +188,7 @@ def test_a_ray_of_somebody_else_in_this_process_is_neither_taken_over_nor_ended(
 
     monkeypatch.setattr(ray_runtime, "_session", None)
     with pytest.raises(LaboratoryError, match="Ray of its own"):
-        ray_runtime.start_ray(LaboratorySettings(name="late"))
+        ray_runtime.start_ray(ray_runtime.RayStart())
     assert ray.is_initialized()
 
 

@@ -187,8 +187,7 @@ def test_a_program_that_loses_its_own_node_ends_with_a_word_whether_ray_lets_it_
 CHECK = """
 import sys
 from actors.runtime.ray_cluster import check_cluster
-from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import RaySettings
+from actors.interfaces import LaboratoryError, RaySettings
 try:
     check_cluster(RaySettings(address=sys.argv[1]), need_bench=False)
 except LaboratoryError as error:
@@ -223,7 +222,8 @@ MUG_POURS = """
 import asyncio, sys
 from pathlib import Path
 from actors.laboratory import open_laboratory
-from actors.laboratory_settings import LaboratorySettings, RaySettings
+from actors.interfaces import RaySettings
+from actors.laboratory_settings import LaboratorySettings
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene

@@ -17,8 +17,8 @@ from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_controller import DoseController, DoseOrder, TiltCommand
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
-from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseProgress, PourProgress
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.learning.dispense import Dispense, Dispensed

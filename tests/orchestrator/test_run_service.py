@@ -13,8 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 import decant
-from actors.interfaces import LaboratoryError
-from actors.laboratory_settings import RaySettings
+from actors.interfaces import LaboratoryError, RaySettings
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
 from orchestrator.records.events import CampaignOpened, Event

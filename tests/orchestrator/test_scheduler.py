@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from actors import optimizer_actor as optimizer
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
-from actors.optimizer import optimizer_actor as optimizer
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Slots
 from orchestrator.records.events import Event, LogLine, PourProgressed, RequestFinished

@@ -12,8 +12,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
-from actors.laboratory_settings import LaboratorySettings
-from actors.optimizer.optimizer_actor import DeviceOptimizer, Proposer
+from actors.optimizer_actor import DeviceOptimizer, Proposer
 from actors.runtime.remote_object import DeviceLostError, RayDevice
 from actors.simulators.ray_worker import ray_pool
 from tests.reliability import strikes
@@ -33,10 +32,10 @@ class PooledRig(Rig):
     """Of the processes that are struck."""
 
     def __init__(self, folder: Path) -> None:
-        from actors.runtime.ray_runtime import start_ray
+        from actors.runtime.ray_runtime import RayStart, start_ray
 
         os.environ[WORK] = "0.02"
-        start_ray(LaboratorySettings(name="matrix", simulators=SIMULATORS))
+        start_ray(RayStart(cpus=SIMULATORS))
         self._loop = asyncio.new_event_loop()
         self._pool: Any = None
         self._device: Any = None

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from typing import Any
 
-from actors.optimizer.optimizer_actor import Proposer
+from actors.optimizer_actor import Proposer
 from sim_engine.outcome import PourMeasurement
 from tests.reliability.case import AHEAD, BACK, FULL, KILLED, KILLED_AFTER, STOPPED, Case, every
 from tests.reliability.rig import Life, Rig

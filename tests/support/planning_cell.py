@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell
 from actors.arm.planning.kinematics import flange_poses, inverse, posture
 from actors.arm.planning.trajectory import follow
 from actors.arm.ur.robot_models import MODELS
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell
 from orchestrator.campaigns.file_loading import load_vessel
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from actors.arm.arm_geometry import ArmLimits, Box, Centre, JointAngles, Point, Pose, RobotCell
 from actors.arm.arm_interface import PathReport
 from actors.arm.planned_pour import JointPath, PourPath
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import ArmLimits, Box, Centre, JointAngles, Point, Pose, RobotCell
 
 HOME = tuple(math.radians(v) for v in (0.0, -90.0, 90.0, -90.0, -90.0, 0.0))
 START = tuple(math.radians(v) for v in (12.0, -85.0, 88.0, -93.0, -90.0, 3.0))

@@ -22,9 +22,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import Pose
 from actors.arm.ur.robot_models import MODELS, Calibration, RobotModel
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Pose
 from sim_engine.collision import rotations
 from sim_engine.scene import SampledMotion
 

@@ -13,7 +13,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import PathReport
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.collision_geometry import Nearest, hull, nearest_links, nearest_to_itself, nearest_to_receiver
@@ -29,6 +28,7 @@ from actors.arm.planning.kinematics import (
 )
 from actors.arm.planning.trajectory import RacingJointError, SampledPath
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import JOINT_NAMES
 from actors.interfaces import InvalidActionError
 from sim_engine.vessel.distance_grid import MARGIN
 from sim_engine.vessel.vessel import Vessel

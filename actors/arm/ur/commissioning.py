@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from actors.arm.arm_geometry import JOINT_NAMES, Pose
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord
 from actors.arm.ur import primary_interface as primary
 from actors.arm.ur.controller_readout import (
@@ -32,6 +31,7 @@ from actors.arm.ur.robot_comparison import payload_check, robot_checks
 from actors.arm.ur.robot_models import same_robot
 from actors.arm.ur.worker_messages import SAFETY_MODES, safety_mode, why_not_ready
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import JOINT_NAMES, Pose
 from actors.interfaces import DeviceCheck, State
 
 TOOL_TOLERANCE, TURN_TOLERANCE = 1e-3, math.radians(0.5)

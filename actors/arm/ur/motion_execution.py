@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.arm_interface import FULL_SPEED
 from actors.arm.ur.dashboard import Dashboard, DashboardError, stop_program
 from actors.arm.ur.primary_interface import Primary, PrimaryError
@@ -39,6 +38,7 @@ from actors.arm.ur.worker_messages import (
     safety_mode,
     why_not_ready,
 )
+from actors.arm_geometry import JOINT_NAMES
 
 AT_START = 0.01
 """Largest distance of the joints from a path's first point [rad]; the program first removes it slowly."""

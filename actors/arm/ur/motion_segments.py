@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actors.arm.arm_geometry import JOINT_NAMES, Joints
 from actors.arm.arm_interface import ArmRefusedError, ArmStoppedError
 from actors.arm.planned_pour import ExecutedPath, FloatArray, JointPath, PlaceWay, PourPath
 from actors.arm.planning.kinematics import (
@@ -28,6 +27,7 @@ from actors.arm.planning.path_checks import outside
 from actors.arm.ur.urscript_writer import checked
 from actors.arm.ur.worker_messages import MotionOutcome
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import JOINT_NAMES, Joints
 
 OFF_PATH = 0.1
 """Joints farther than this from every point of a path are not on it [rad]; the arm was moved by other means."""

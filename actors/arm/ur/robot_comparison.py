@@ -11,12 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from actors.arm.arm_geometry import JOINT_NAMES, Pose
 from actors.arm.planning.kinematics import forward, transform_of
 from actors.arm.planning.trajectory import STEEPEST
 from actors.arm.ur.primary_interface import RobotState
 from actors.arm.ur.robot_models import SAME_ANGLE, SAME_PLACE, model_named, same_robot
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import JOINT_NAMES, Pose
 from actors.interfaces import DeviceCheck
 
 PAYLOAD_TOLERANCE, CENTRE_TOLERANCE = 0.1, 0.02

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from actors.arm.arm_geometry import Joints, Pose
 from actors.arm.arm_interface import (
     ArmError,
     ArmLostError,
@@ -40,6 +39,7 @@ from actors.arm.ur.ur_session import ANSWER_TIME, Session, UrFacts
 from actors.arm.ur.urscript_writer import TiltLimits, path_program, tilt_program
 from actors.arm.ur.worker_messages import REDUCED, DataPackage, MotionOrder, MotionOutcome, MotionSettings
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Joints, Pose
 from actors.interfaces import LaboratoryError
 
 RECOVERY_TIME = 90.0

@@ -19,7 +19,6 @@ from concurrent.futures import TimeoutError as FutureTimeoutError
 from dataclasses import dataclass, field
 from typing import Any
 
-from actors.arm.arm_geometry import Joints, Pose, Vector
 from actors.arm.arm_interface import ArmError, ArmFacts, ArmLostError, ArmRefusedError
 from actors.arm.ur.robot_comparison import robot_problems
 from actors.arm.ur.robot_models import Calibration
@@ -33,6 +32,7 @@ from actors.arm.ur.worker_messages import (
     why_not_ready,
 )
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Joints, Pose, Vector
 from actors.runtime.child_process import ConnectedProcess
 
 

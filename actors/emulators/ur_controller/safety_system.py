@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from enum import IntEnum
 from math import degrees
 
-from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.ur.robot_models import Joints, RobotModel
+from actors.arm_geometry import JOINT_NAMES
 from actors.emulators.ur_controller.robot_kinematics import Vector
 
 UNLOCK_DELAY = 5.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.arm.arm_geometry import Box, JointAngles, Mount, Point, RobotCell
 from actors.arm.planning.kinematics import (
     MODELS,
     cell_transforms,
@@ -18,6 +17,7 @@ from actors.arm.planning.kinematics import (
 from actors.arm.planning.path_checks import check_limits
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Box, JointAngles, Mount, Point, RobotCell
 from actors.interfaces import InvalidActionError
 from sim_engine.action import DEG
 from tests.support.planning_cell import SPEC, motion, vessel

@@ -9,13 +9,13 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from actors.arm.arm_geometry import Plane, Point
 from actors.arm.planned_pour import JointPath, PourPath
 from actors.arm.planning.kinematics import MODELS, cell_transforms, forward, pourer_motion, pourer_transforms
 from actors.arm.planning.path_checks import recheck
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.planning.trajectory import STEEPEST, TOOL_ACCELERATION
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Plane, Point
 from actors.interfaces import InvalidActionError
 from orchestrator.campaigns.file_loading import load_campaign
 from sim_engine.action import DEG

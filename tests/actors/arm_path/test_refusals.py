@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from actors.arm.arm_geometry import Box, JointAngles, Plane, Point, Pose
 from actors.arm.planned_pour import JointPath
 from actors.arm.planning.path_checks import recheck
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Box, JointAngles, Plane, Point, Pose
 from actors.interfaces import InvalidActionError
 from sim_engine.action import DEG, Action
 from sim_engine.scene import Pivot

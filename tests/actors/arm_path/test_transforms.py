@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.arm.arm_geometry import Pose
 from actors.arm.planning.kinematics import MODELS, flange_poses, inverse, pourer_motion, pourer_transforms, quaternions
 from actors.arm.planning.pour_planner import plan_path
+from actors.arm_geometry import Pose
 from sim_engine.action import DEG
 from sim_engine.collision import rotations
 from tests.support.hypothesis_examples import examples

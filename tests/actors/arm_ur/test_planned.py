@@ -9,13 +9,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from actors.arm.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell
 from actors.arm.arm_interface import ArmStoppedError
 from actors.arm.planning.kinematics import pourer_motion
 from actors.arm.planning.pour_planner import plan_path
 from actors.arm.ur.motion_segments import leans
 from actors.arm.ur.ur_driver import UrArm
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import ArmLimits, Box, JointAngles, Point, Pose, RobotCell
 from actors.emulators.ur_controller import VirtualController
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid

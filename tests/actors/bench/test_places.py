@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from actors.arm.arm_geometry import Pose
+from actors.arm_geometry import Pose
 from actors.balance.weighing_plan import Placement
 from actors.bench.night_consent import NightConsent
 from actors.grippers.gripper_interface import GRIPPERS

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.bench.bench_operators import VirtualOperator
 from actors.bench.pump_bench import PortionPlanner, PumpBench
-from actors.dosing.dosing_settings import DosingSettings
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import (
     DoseKnowledge,
     DoseSource,

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from actors.arm.arm_geometry import Pose
 from actors.arm.arm_interface import ArmPose
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Pose
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import LaboratoryError
 from orchestrator.campaigns.file_loading import load_laboratory

@@ -8,9 +8,9 @@ from textwrap import dedent
 
 import pytest
 
-from actors.arm.arm_geometry import Plane, Pose, RobotCell
 from actors.arm.arm_settings import arm_kind
 from actors.arm.ur_settings import UrArmSettings
+from actors.arm_geometry import Plane, Pose, RobotCell
 from orchestrator.campaigns.yaml.section_validation import PlacedProblems, validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report

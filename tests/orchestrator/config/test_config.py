@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.laboratory_settings import RaySettings
+from actors.interfaces import RaySettings
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_vessel
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError

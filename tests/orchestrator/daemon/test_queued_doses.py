@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from actors.dosing.dosing_settings import DosingSettings
 from actors.dosing.simulated_dose import simulated_dose
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseProgress, PourProgress, ProgressCallback
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene

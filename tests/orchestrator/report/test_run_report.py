@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 from actors.interfaces import LaboratoryError
-from actors.optimizer.optimizer_actor import Proposer
+from actors.optimizer_actor import Proposer
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
 from orchestrator.cli.foreground_run import report_of_what_stands

@@ -23,8 +23,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import degrees
 
-from actors.arm.arm_geometry import JOINT_NAMES
 from actors.arm.ur.robot_models import Joints, RobotModel
+from actors.arm_geometry import JOINT_NAMES
 from actors.emulators.ur_controller.motion.motion_actions import STILL, JointSpeed, MotionAction, Path, Servo, ToolSpeed
 from actors.emulators.ur_controller.motion.motion_lines import KinematicArm, Line, UnreachableError
 
