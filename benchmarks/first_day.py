@@ -14,8 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from orchestrator.reports.first_day import WRONG, practice_day
-from orchestrator.reports.rig_diagnosis import diagnose
+from orchestrator.recordings.first_day import WRONG, practice_day
+from orchestrator.recordings.rig_diagnosis import diagnose
 
 FIRST_SEED = 52_000
 

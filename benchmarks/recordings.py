@@ -24,8 +24,8 @@ from actors.dosing.dose_controller import DoseOrder
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.virtual_dosing_bench import TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
-from orchestrator.reports.recording_file import PourRecording, load_recording, write_recording
-from orchestrator.reports.time_series import read_series
+from orchestrator.recordings.recording_file import PourRecording, load_recording, write_recording
+from orchestrator.recordings.time_series import read_series
 from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
@@ -112,7 +112,7 @@ def recorded(seed: int, folder: Path, grip: float = 0.0) -> tuple[Bench, list[Po
 
 def fits(count: int, first: int) -> None:
     """Fit three doses of each bench, predict the fourth, and print the coverage of the intervals."""
-    from orchestrator.reports.recording_fit import fit_recordings, judge_recording
+    from orchestrator.recordings.recording_fit import fit_recordings, judge_recording
 
     inside = {"grip": 0, "lag": 0, "final": 0}
     error: dict[str, list[float]] = {"grip": [], "lag": [], "final": []}
@@ -148,7 +148,7 @@ def fits(count: int, first: int) -> None:
 
 def cost(particles: int) -> None:
     """Print the cost of loading, estimating and simulating."""
-    from orchestrator.reports.recording_replay import estimate, simulate
+    from orchestrator.recordings.recording_replay import estimate, simulate
     from sim_engine.liquids import SimulationParameters
     from sim_engine.simulator import PourSimulator
 

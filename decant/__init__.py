@@ -41,21 +41,21 @@ if TYPE_CHECKING:
     from orchestrator.learning.run_errors import RunError as RunError
     from orchestrator.materials.vessel_account import VesselAccount as VesselAccount
     from orchestrator.materials.vessel_account import VesselContent as VesselContent
+    from orchestrator.recordings.recording_export import export_recordings as export_recordings
+    from orchestrator.recordings.recording_figures import replay_figure as replay_figure
+    from orchestrator.recordings.recording_file import PourRecording as PourRecording
+    from orchestrator.recordings.recording_file import load_recording as load_recording
+    from orchestrator.recordings.recording_file import load_recordings as load_recordings
+    from orchestrator.recordings.recording_fit import Fit as Fit
+    from orchestrator.recordings.recording_fit import Judgement as Judgement
+    from orchestrator.recordings.recording_fit import fit_recordings as fit_recordings
+    from orchestrator.recordings.recording_fit import judge_recording as judge_recording
+    from orchestrator.recordings.recording_replay import PourReplay as PourReplay
+    from orchestrator.recordings.recording_replay import ReplayValues as ReplayValues
+    from orchestrator.recordings.recording_replay import replay_recording as replay_recording
     from orchestrator.records import events as events
     from orchestrator.records.events import Event as Event
     from orchestrator.reports.publishing import Published as Published
-    from orchestrator.reports.recording_export import export_recordings as export_recordings
-    from orchestrator.reports.recording_figures import replay_figure as replay_figure
-    from orchestrator.reports.recording_file import PourRecording as PourRecording
-    from orchestrator.reports.recording_file import load_recording as load_recording
-    from orchestrator.reports.recording_file import load_recordings as load_recordings
-    from orchestrator.reports.recording_fit import Fit as Fit
-    from orchestrator.reports.recording_fit import Judgement as Judgement
-    from orchestrator.reports.recording_fit import fit_recordings as fit_recordings
-    from orchestrator.reports.recording_fit import judge_recording as judge_recording
-    from orchestrator.reports.recording_replay import PourReplay as PourReplay
-    from orchestrator.reports.recording_replay import ReplayValues as ReplayValues
-    from orchestrator.reports.recording_replay import replay_recording as replay_recording
     from orchestrator.runs.added_pours import add_pour as add_pour
     from orchestrator.runs.bench_check import BenchReport as BenchReport
     from orchestrator.runs.run_service import CheckReport as CheckReport

@@ -56,8 +56,8 @@ from orchestrator.learning.deployment.model_monitoring import (
 from orchestrator.learning.deployment.objectives import Objective
 from orchestrator.learning.deployment.safe_window import WindowSettings
 from orchestrator.learning.strategy_registry import OBJECTIVES, STRATEGIES
+from orchestrator.recordings import recording_file as recording
 from orchestrator.records.states import State
-from orchestrator.reports import recording_file as recording
 from orchestrator.study import study_file as study
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.liquids import KNOWN, ROOM, LiquidSettings, SimulationParameters

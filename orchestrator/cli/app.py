@@ -19,12 +19,10 @@ from orchestrator.cli import (
     campaign_commands,
     dose_command,
     file_commands,
-    first_day_command,
     materials_commands,
     physics_command,
     pour_command,
     queue_commands,
-    recording_commands,
     report_command,
     robot_commands,
     run_commands,
@@ -35,6 +33,7 @@ from orchestrator.cli import (
     view_command,
 )
 from orchestrator.cli.command_options import command, examples
+from sim_engine.resources import optional_module
 
 app = typer.Typer(
     name="decant",
@@ -278,31 +277,8 @@ _balance(
     "decant balance record --from terminal.log    # explain the lines as another program saved them",
 )
 
-_recording = _group(
-    "recording",
-    "Recorded pours: export them from runs, replay them, fit unknown quantities, and record a first day.",
-    "decant recording replay configs/recordings/dose-1.yaml",
-    "decant recording export runs/dispense-20300131-1",
-    quiet=True,
-)
-_recording(recording_commands.export, "decant recording export dispense-20300131-1   # a run in the folder runs/")
-_recording(
-    recording_commands.replay,
-    "decant recording replay configs/recordings/dose-1.yaml --png pictures",
-    "decant recording replay day-one/ --fitted fit.json",
-)
-_recording(
-    recording_commands.fit,
-    "decant recording fit day-one/ --unknown grip --unknown lag --judge day-two/ --output fit.json",
-    "decant recording fit configs/recordings/dose-1.yaml --until '5 s'   # judged on the rest",
-)
-_recording(
-    first_day_command.first_day,
-    "decant recording first-day day-one --campaign configs/campaigns/first-day.yaml",
-    "decant recording first-day practice --practise --wrong grip   # in minutes, without a laboratory",
-    "decant recording first-day day-one   # explain the recordings of a folder again",
-    name="first-day",
-)
+if (recordings := optional_module("orchestrator.recordings.recording_commands")) is not None:
+    recordings.add_commands(_group)
 
 _server = _group(
     "server",

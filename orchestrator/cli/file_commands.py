@@ -25,6 +25,7 @@ from orchestrator.cli.console import (
     print_note,
     print_warning,
 )
+from sim_engine.resources import optional_module
 
 
 def validate(
@@ -76,9 +77,10 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
         case "laboratory":
             return f"laboratory, {load_laboratory(path).mode}", []
         case "recording":
-            from orchestrator.reports.recording_file import load_recording
-
-            recording = load_recording(path)
+            recordings = optional_module("orchestrator.recordings.recording_file")
+            if recordings is None:
+                return "", [f"{path}: is a recorded pour; this installation has no package orchestrator.recordings"]
+            recording = recordings.load_recording(path)
             for warning in recording.warnings:
                 print_warning(warning)
             return f"recorded pour, {len(recording.readings)} readings, {1e3 * recording.gain:.4g} g", []

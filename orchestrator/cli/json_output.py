@@ -24,11 +24,7 @@ from orchestrator.cli.command_results import (
     DryRunOutput,
     EmptyPourOutput,
     ExportOutput,
-    FirstDayOutput,
     PluginsOutput,
-    RecordingExportOutput,
-    RecordingFitOutput,
-    RecordingReplaysOutput,
     ReportOutput,
     RunCheckOutput,
     SimulateOutput,
@@ -45,6 +41,7 @@ from orchestrator.learning.dispense import Dose
 from orchestrator.learning.single_action import WeighedPour
 from orchestrator.reports.run_summary import PLANNED, ReceiverSummary, RunSummary
 from sim_engine.liquids import SimulationParameters
+from sim_engine.resources import optional_module
 from sim_engine.settings.model import DescribedSchema, meanings
 
 
@@ -210,10 +207,7 @@ OUTPUTS: dict[str, Any] = {
     "robot check": CheckOutput,
     "robot archive": ArchiveOutput,
     "balance check": BalanceCheckOutput,
-    "recording export": RecordingExportOutput,
-    "recording replay": RecordingReplaysOutput,
-    "recording fit": RecordingFitOutput,
-    "recording first-day": FirstDayOutput,
+    **getattr(optional_module("orchestrator.recordings.recording_outputs"), "OUTPUTS", {}),
     "queue submit": CampaignOut,
     "queue list": QueueOutput,
     "queue show": CampaignDetailOut,

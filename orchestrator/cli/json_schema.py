@@ -11,7 +11,10 @@ from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.campaign_file import CampaignFile
 from orchestrator.campaigns.vessel_file import VesselFile
 from orchestrator.study.study_file import StudyFile
+from sim_engine.resources import optional_module
 from sim_engine.settings.model import SchemaGenerator, Settings
+
+RECORDINGS = optional_module("orchestrator.recordings.recording_file")
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -45,9 +48,8 @@ def daemon_schema() -> dict[str, Any]:
 
 def recording_schema() -> dict[str, Any]:
     """Schema of the YAML file of a recorded pour."""
-    from orchestrator.reports.recording_file import RecordingFile
-
-    return _schema(RecordingFile, "Recording")
+    assert RECORDINGS is not None, "without the package there is no such schema"
+    return _schema(RECORDINGS.RecordingFile, "Recording")
 
 
 def result_schema() -> dict[str, Any]:
@@ -70,7 +72,7 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "laboratory": laboratory_schema,
     "study": study_schema,
     "daemon": daemon_schema,
-    "recording": recording_schema,
+    **({"recording": recording_schema} if RECORDINGS else {}),
     "result": result_schema,
     "output": output_schema,
 }

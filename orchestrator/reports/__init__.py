@@ -1,1 +1,1 @@
-"""Results for people: progress, summary, tables, figures, HTML report, and recorded pours with their fits."""
+"""Results for people: progress, summary, tables, figures and HTML report."""

@@ -24,12 +24,12 @@ from orchestrator.records.run_record import CampaignResult, read_record, read_re
 from orchestrator.records.states import State
 from orchestrator.reports import validity_warnings as regimes
 from orchestrator.reports.html_report import REPORT_NAME, run_page
-from orchestrator.reports.recording_export import export_recordings
 from orchestrator.reports.run_figures import draw_figures
 from orchestrator.reports.run_summary import SUMMARY_NAME, RunFiles, RunSummary, Totals, write_summary
 from orchestrator.reports.stage_views import evaluation_of, theta_of
 from orchestrator.reports.summarise import pool_use, summarise, summarise_record
 from orchestrator.runs.run_folder import FIGURES, read_versions
+from sim_engine.resources import optional_module
 
 if TYPE_CHECKING:
     from orchestrator.runs.run_service import RunHandle, RunRequest
@@ -81,7 +81,9 @@ def publish(
     directory = result.directory
     figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
     if plan.outputs.pour_recordings:
-        for reason in export_recordings(directory, plan=plan)[1]:
+        recordings = optional_module("orchestrator.recordings.recording_export")
+        missing = ["this installation has no package orchestrator.recordings"]
+        for reason in missing if recordings is None else recordings.export_recordings(directory, plan=plan)[1]:
             _log.warning("not recorded: %s", reason)
     summary = summary_of(plan, result, RunFiles(figures=figures, recording=recording, dropped_events=dropped_events))
     write_summary(directory, summary)

@@ -21,8 +21,8 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
+from orchestrator.recordings.recording_file import write_recording
 from orchestrator.records.run_record import RunPour, read_record
-from orchestrator.reports.recording_file import write_recording
 from orchestrator.runs.run_folder import RESOLVED
 from orchestrator.runs.stages import scenes_of
 from sim_engine.scene import Scene

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from orchestrator.recordings.recording_fit import Judgement
+from orchestrator.recordings.recording_replay import QUANTILE, PourReplay
+from orchestrator.recordings.rig_diagnosis import RigDiagnosis
 from orchestrator.reports.figure_style import BEST, GREY, INK, MEASURED, PREDICTED, dress, entitle, new_figure
-from orchestrator.reports.recording_fit import Judgement
-from orchestrator.reports.recording_replay import QUANTILE, PourReplay
-from orchestrator.reports.rig_diagnosis import RigDiagnosis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing.pour_response import displayed, fall_time
-from orchestrator.reports.recording_file import PourRecording
+from orchestrator.recordings.recording_file import PourRecording
 from sim_engine.action import DEG, Action
 from sim_engine.errors import InvalidSceneError
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -55,7 +55,7 @@ the simulation ends then. The surface is about 7 mm lower at the lip, more than 
 
 @dataclass(frozen=True)
 class ReplayValues:
-    """Values that differ from a recording's file, for example fitted ones (`orchestrator.reports.recording_fit`).
+    """Values that differ from a recording's file, for example fitted ones (`orchestrator.recordings.recording_fit`).
 
     Attributes:
         grip: further tilt of the vessel [rad].

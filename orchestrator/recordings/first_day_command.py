@@ -24,9 +24,9 @@ from orchestrator.cli.console import (
 
 if TYPE_CHECKING:
     from orchestrator.learning.campaign_plan import CampaignPlan
-    from orchestrator.reports.first_day import DayStep
-    from orchestrator.reports.recording_file import PourRecording
-    from orchestrator.reports.rig_diagnosis import RigDiagnosis
+    from orchestrator.recordings.first_day import DayStep
+    from orchestrator.recordings.recording_file import PourRecording
+    from orchestrator.recordings.rig_diagnosis import RigDiagnosis
     from sim_engine.scene import Scene
 
 DOSE_LIMIT = 1e-3
@@ -61,9 +61,9 @@ def first_day(
     With a campaign, its bench makes the steps that the folder lacks, one after the other; run the command again after
     an interruption. Without one, the recordings of the folder are explained. Writes first-day.html and first-day.json.
     """
-    from orchestrator.reports.first_day import practice_day
-    from orchestrator.reports.recording_replay import replay_recording
-    from orchestrator.reports.rig_diagnosis import diagnose
+    from orchestrator.recordings.first_day import practice_day
+    from orchestrator.recordings.recording_replay import replay_recording
+    from orchestrator.recordings.rig_diagnosis import diagnose
     from sim_engine.errors import DecantError
     from sim_engine.liquids import SimulationParameters
     from sim_engine.settings.quantity import QuantityError, parse_quantity
@@ -105,7 +105,7 @@ def first_day(
         (folder / PAGE).write_text(_page(folder, found, replays, words), encoding="utf-8")
     print_message(f"page: {folder / PAGE}")
     if as_json:
-        from orchestrator.cli.command_results import FirstDayOutput
+        from orchestrator.recordings.recording_outputs import FirstDayOutput
 
         print_json(FirstDayOutput(**document))
 
@@ -116,7 +116,7 @@ def _day_of(folder: Path) -> list[PourRecording]:
     Raises:
         RefusalError: there are none, or one is invalid (exit code 2).
     """
-    from orchestrator.reports.recording_file import load_recordings
+    from orchestrator.recordings.recording_file import load_recordings
 
     if not folder.is_dir() or not any(folder.glob("*.yaml")):
         text = f"{folder}: has no recorded pour; name a --campaign whose bench pours, or --practise"
@@ -137,7 +137,7 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
     from orchestrator.cli.foreground_run import read_campaign
     from orchestrator.cli.motion_control import require_flag
     from orchestrator.cli.simulate_command import scene_to_simulate
-    from orchestrator.reports.first_day import first_day as steps_of
+    from orchestrator.recordings.first_day import first_day as steps_of
 
     plan = read_campaign(path, laboratory)
     bench = plan.laboratory
@@ -178,7 +178,7 @@ def _pour_step(
     from orchestrator.cli.dose_command import pour_doses
     from orchestrator.cli.foreground_run import check_campaign_can_run
     from orchestrator.cli.pour_command import chosen_pour, pour_weighed
-    from orchestrator.reports.recording_export import export_recordings
+    from orchestrator.recordings.recording_export import export_recordings
     from orchestrator.runs.run_tasks import dose_task
 
     def filled(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
@@ -240,7 +240,7 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
         found: the explanation.
         replays: documents of the replays.
     """
-    from orchestrator.reports.rig_diagnosis import ADVICE
+    from orchestrator.recordings.rig_diagnosis import ADVICE
 
     inside = sum(one.inside for one in found.doses)
     words = []
@@ -288,10 +288,10 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
     Raises:
         OSError: the picture can't be written.
     """
+    from orchestrator.recordings.recording_figures import diagnosis_figure
+    from orchestrator.recordings.rig_diagnosis import STANDS_OUT
     from orchestrator.reports.figure_style import save
     from orchestrator.reports.html_report import Picture, render
-    from orchestrator.reports.recording_figures import diagnosis_figure
-    from orchestrator.reports.rig_diagnosis import STANDS_OUT
     from orchestrator.reports.wording import ResultRow, ResultTable
 
     pictures = (

@@ -31,10 +31,10 @@ from scipy.special import betaln, logsumexp, xlog1py, xlogy
 
 from actors.dosing.dose_estimator import LAG_RANGE, SHAPE_RANGE
 from actors.dosing.pour_response import displayed
-from orchestrator.reports.first_day import MISS
-from orchestrator.reports.recording_file import PourRecording
-from orchestrator.reports.recording_fit import SHAPE, UNKNOWNS, FittedReadings, Unknown, held_share, lag_before
-from orchestrator.reports.recording_replay import QUANTILE, arrivals, flow_of
+from orchestrator.recordings.first_day import MISS
+from orchestrator.recordings.recording_file import PourRecording
+from orchestrator.recordings.recording_fit import SHAPE, UNKNOWNS, FittedReadings, Unknown, held_share, lag_before
+from orchestrator.recordings.recording_replay import QUANTILE, arrivals, flow_of
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 
@@ -210,7 +210,7 @@ def diagnose(recordings: Sequence[PourRecording], lag: float = NOMINAL_LAG) -> R
     """Explain the recordings of a first day.
 
     Args:
-        recordings: with the names of `orchestrator.reports.first_day.first_day`.
+        recordings: with the names of `orchestrator.recordings.first_day.first_day`.
         lag: of the balance that the rig's plan assumes [s].
 
     Raises:

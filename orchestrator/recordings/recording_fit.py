@@ -34,8 +34,8 @@ from scipy.optimize import least_squares
 
 from actors.dosing.dose_estimator import FACTOR_RANGE, LAG_RANGE, ONSET, SHAPE_RANGE, draw_lags
 from actors.dosing.pour_response import PourHypotheses, respond
-from orchestrator.reports.recording_file import PourRecording
-from orchestrator.reports.recording_replay import (
+from orchestrator.recordings.recording_file import PourRecording
+from orchestrator.recordings.recording_replay import (
     QUANTILE,
     SEEN,
     Onset,
@@ -167,7 +167,7 @@ class Fit:
 
     @property
     def replay_values(self) -> ReplayValues:
-        """For `orchestrator.reports.recording_replay`; the flow has no counterpart in the particle simulation."""
+        """For `orchestrator.recordings.recording_replay`; the flow has no counterpart in the particle simulation."""
         found = {one.name: one.value for one in self.values if one.name != "flow"}
         return ReplayValues(**found, fitted_on=self.fitted_on)
 

@@ -1,6 +1,6 @@
 """Recorded pours: one YAML file for each, with the vessels, the liquid, the placement and the origin, and a CSV file.
 
-- `RecordingFile` declares the YAML file, `orchestrator.reports.time_series` the CSV file next to it.
+- `RecordingFile` declares the YAML file, `orchestrator.recordings.time_series` the CSV file next to it.
 - `load_recording` checks both and returns a `PourRecording`; `load_recordings` reads files and folders.
 - `write_recording` writes both files.
 
@@ -27,7 +27,7 @@ from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.section_validation import validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report, wrong_kind
-from orchestrator.reports.time_series import TimeSeries, gaps, read_series, write_series
+from orchestrator.recordings.time_series import TimeSeries, gaps, read_series, write_series
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquids import Liquid, LiquidSettings
 from sim_engine.scene import Pivot, Scene
@@ -391,7 +391,7 @@ def write_recording(
     Args:
         path: of the new YAML file.
         scene: pourer, receiver, and liquid with its mass before the pour.
-        columns: see `orchestrator.reports.time_series.write_series`.
+        columns: see `orchestrator.recordings.time_series.write_series`.
         recorded, placement, balance: these sections as they are written.
         fill_deviation: standard deviation of the mass in the pourer [kg].
 

@@ -3,7 +3,7 @@
 - `first_day` lists the steps for a pourer: `DayStep` with fill, action or amount, and its purpose.
 - `practice_day` records the day on the virtual dosing bench in seconds, with one quantity wrong if wanted.
 
-`orchestrator.reports.rig_diagnosis` explains the recordings.
+`orchestrator.recordings.rig_diagnosis` explains the recordings.
 
 Limitations: the practice bench has a cylindrical cup of its own; the deliberate miss loses its whole stream.
 """
@@ -24,8 +24,8 @@ from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
-from orchestrator.reports.recording_file import PourRecording, load_recording, write_recording
-from orchestrator.reports.recording_replay import flow_of
+from orchestrator.recordings.recording_file import PourRecording, load_recording, write_recording
+from orchestrator.recordings.recording_replay import flow_of
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.hydrostatics import retained_volume
 from sim_engine.liquids import Liquid

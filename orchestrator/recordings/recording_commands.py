@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,13 +23,48 @@ from orchestrator.cli.console import (
 from orchestrator.cli.shell_completion import RUNS, local_runs
 
 if TYPE_CHECKING:
-    from orchestrator.reports.recording_file import PourRecording
-    from orchestrator.reports.recording_fit import Fit, Judgement
-    from orchestrator.reports.recording_replay import PourReplay
+    from orchestrator.recordings.recording_file import PourRecording
+    from orchestrator.recordings.recording_fit import Fit, Judgement
+    from orchestrator.recordings.recording_replay import PourReplay
 
 Recordings = Annotated[
     list[Path], typer.Argument(help="Recorded pours (YAML), or folders of them.", metavar="RECORDING")
 ]
+
+
+def add_commands(add_group: Callable[..., Callable[..., None]]) -> None:
+    """Add the group `decant recording` to the command line.
+
+    Args:
+        add_group: adds a group, and returns the function that adds its commands (`orchestrator.cli.app`).
+    """
+    from orchestrator.recordings.first_day_command import first_day
+
+    add = add_group(
+        "recording",
+        "Recorded pours: export them from runs, replay them, fit unknown quantities, and record a first day.",
+        "decant recording replay configs/recordings/dose-1.yaml",
+        "decant recording export runs/dispense-20300131-1",
+        quiet=True,
+    )
+    add(export, "decant recording export dispense-20300131-1   # a run in the folder runs/")
+    add(
+        replay,
+        "decant recording replay configs/recordings/dose-1.yaml --png pictures",
+        "decant recording replay day-one/ --fitted fit.json",
+    )
+    add(
+        fit,
+        "decant recording fit day-one/ --unknown grip --unknown lag --judge day-two/ --output fit.json",
+        "decant recording fit configs/recordings/dose-1.yaml --until '5 s'   # judged on the rest",
+    )
+    add(
+        first_day,
+        "decant recording first-day day-one --campaign configs/campaigns/first-day.yaml",
+        "decant recording first-day practice --practise --wrong grip   # in minutes, without a laboratory",
+        "decant recording first-day day-one   # explain the recordings of a folder again",
+        name="first-day",
+    )
 
 
 def export(
@@ -46,10 +81,10 @@ def export(
     Files that exist are kept. To write them at the end of every run, set 'outputs: {pour_recordings: true}' in the
     campaign.
     """
-    from orchestrator.cli.command_results import RecordingExportOutput
     from orchestrator.learning.run_errors import RunError
+    from orchestrator.recordings.recording_export import export_recordings
+    from orchestrator.recordings.recording_outputs import RecordingExportOutput
     from orchestrator.records.journal import JOURNAL_NAME
-    from orchestrator.reports.recording_export import export_recordings
 
     folder = run if run.exists() or len(run.parts) > 1 else RUNS / run
     if not (folder / JOURNAL_NAME).is_file():
@@ -85,10 +120,10 @@ def replay(
     if a file is invalid.
     """
     from orchestrator.campaigns.file_loading import load_parameters
+    from orchestrator.recordings.recording_figures import replay_figure
+    from orchestrator.recordings.recording_fit import read_values
+    from orchestrator.recordings.recording_replay import ReplayValues, replay_recording
     from orchestrator.reports.figure_style import save
-    from orchestrator.reports.recording_figures import replay_figure
-    from orchestrator.reports.recording_fit import read_values
-    from orchestrator.reports.recording_replay import ReplayValues, replay_recording
     from sim_engine.errors import DecantError
     from sim_engine.liquids import SimulationParameters
     from sim_engine.simulator import PourSimulator
@@ -116,7 +151,7 @@ def replay(
         if simulator is not None:
             simulator.close()
     if as_json:
-        from orchestrator.cli.command_results import RecordingReplaysOutput
+        from orchestrator.recordings.recording_outputs import RecordingReplaysOutput
 
         print_json(RecordingReplaysOutput.model_validate({"replays": documents}))
 
@@ -145,7 +180,7 @@ def fit(
     The model is the tilting cup with the lag of the balance, not the particles; its flow is always fitted. Judged are
     the recordings of '--judge', and with '--until' the later readings of the fitted ones.
     """
-    from orchestrator.reports.recording_fit import fit_recordings, judge_recording
+    from orchestrator.recordings.recording_fit import fit_recordings, judge_recording
     from sim_engine.settings.quantity import QuantityError, parse_quantity
 
     with Refused(QuantityError, at="--until: "):
@@ -166,14 +201,14 @@ def fit(
         with Refused(OSError, at="--output: "):
             output.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
     if as_json:
-        from orchestrator.cli.command_results import RecordingFitOutput
+        from orchestrator.recordings.recording_outputs import RecordingFitOutput
 
         print_json(RecordingFitOutput(**document))
 
 
 def _loaded(paths: Sequence[Path]) -> list[PourRecording]:
     """Recorded pours; their warnings are printed."""
-    from orchestrator.reports.recording_file import load_recordings
+    from orchestrator.recordings.recording_file import load_recordings
 
     found = load_recordings(paths)
     for one in found:

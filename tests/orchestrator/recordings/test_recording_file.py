@@ -20,12 +20,12 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.app import app
+from orchestrator.recordings.recording_export import export_recordings
+from orchestrator.recordings.recording_file import PourRecording, load_recording, load_recordings
+from orchestrator.recordings.recording_fit import Fit, fit_recordings, judge_recording, read_values
+from orchestrator.recordings.recording_replay import ReplayValues, arrivals, replay_recording
+from orchestrator.recordings.time_series import read_series
 from orchestrator.reports.publishing import publish_run
-from orchestrator.reports.recording_export import export_recordings
-from orchestrator.reports.recording_file import PourRecording, load_recording, load_recordings
-from orchestrator.reports.recording_fit import Fit, fit_recordings, judge_recording, read_values
-from orchestrator.reports.recording_replay import ReplayValues, arrivals, replay_recording
-from orchestrator.reports.time_series import read_series
 from orchestrator.runs.run_service import RunResources, RunService
 from orchestrator.runs.run_tasks import run_task
 from sim_engine.hydrostatics import tilting_cup_outflow
@@ -36,7 +36,7 @@ from tests.support.output_schema import validated
 from tests.support.small_campaign import write_campaign
 
 SAMPLES = shipped("recordings/dose-1.yaml").parent
-ARRIVALS = Path(__file__).parents[1] / "data" / "balance-arrivals"
+ARRIVALS = Path(__file__).parents[2] / "data" / "balance-arrivals"
 
 HEAD = """\
 recorded: {how: test}
