@@ -46,7 +46,6 @@ from orchestrator.cli.physics_command import kept_records
 from orchestrator.daemon import daemon_settings as daemon
 from orchestrator.daemon.notifications import NotifySettings
 from orchestrator.learning.campaign_plan import OutputSettings
-from orchestrator.learning.deployment.costing import CostSettings
 from orchestrator.learning.deployment.disturbances import RiskSettings
 from orchestrator.learning.deployment.model_monitoring import (
     DiscrepancyPolicySettings,
@@ -80,7 +79,6 @@ SECTIONS: dict[str, type[Settings]] = {
     "deployment": campaign.DeploymentSection,
     "risk": RiskSettings,
     "window": WindowSettings,
-    "costs": CostSettings,
     "discrepancy_policy": DiscrepancyPolicySettings,
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
@@ -170,7 +168,6 @@ OF_SECTIONS = {
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "RiskSettings": "[risk](#risk)",
     "WindowSettings": "[window](#window)",
-    "CostSettings": "[costs](#costs)",
     "DiscrepancyPolicySettings": "[discrepancy policy](#discrepancy-policy)",
     "RiskLimitSettings": "[risk limit](#risk-limit)",
     "StopSettings": "[stop](#stop)",

@@ -1,11 +1,10 @@
-"""Prior covariance of real and simulated observations, with the gradients that a fit needs.
+"""Prior covariance of observations, with the gradients that a fit needs.
 
-    f_s ~ GP(0, σ² M_ℓ)                     the simulated cost
-    f_r = ρ f_s + β + δ                     the real one: β ~ N(0, τ²), δ ~ GP(0, σ_δ² M_ℓδ)
-    y_i = f + ε_i,  ε_i ~ N(0, n_i²)        n_i: one per source, and it may depend on the action
+    f ~ GP(0, σ² M_ℓ + k)                   the cost; k: a known covariance, if there is one
+    y_i = f + ε_i,  ε_i ~ N(0, n_i²)        n_i may depend on the action
 
-M is the Matérn 5/2 correlation. Without simulations only σ, ℓ and n are left: ordinary regression. With a prior for
-shears, M_ℓ is a function of T x instead of x; T has ones on its diagonal, and its other elements are fitted.
+M is the Matérn 5/2 correlation. With a prior for shears, M_ℓ is a function of T x instead of x; T has ones on its
+diagonal, and its other elements are fitted.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Pullback = Callable[[Array], Array]
 
 
@@ -28,7 +26,7 @@ Pullback = Callable[[Array], Array]
 class HyperPrior:
     """Priors over the hyperparameters, in units of the cube (lengths) and of the cost's scale (the others).
 
-    Each pair is (median, standard deviation of the logarithm), except for ρ and the noise's growth (mean, standard
+    Each pair is (median, standard deviation of the logarithm), except for shears and the noise's growth (mean, standard
     deviation). With few observations the maximum of the likelihood alone is unreliable: on a plateau the lengthscales
     grow without bound, and the model becomes overconfident.
 
@@ -37,11 +35,6 @@ class HyperPrior:
         shear: of the elements of T beside its diagonal (mean, standard deviation); None: T = 1.
         signal: of the signal's standard deviation.
         noise: of the observations' standard deviation.
-        simulated_noise: of the simulations' standard deviation, discrepancy included.
-        offset: of the standard deviation of a constant between simulated and real cost.
-        rho: of the scale between simulated and real cost.
-        delta_signal: of the standard deviation of the simulation's discrepancy δ.
-        delta_length: of the discrepancy's lengthscale, one for all axes.
         noise_growth: of the coefficients of the noise's logarithm.
     """
 
@@ -49,11 +42,6 @@ class HyperPrior:
     shear: tuple[float, float] | None = None
     signal: tuple[float, float] = (1.0, 0.5)
     noise: tuple[float, float] = (0.1, 1.0)
-    simulated_noise: tuple[float, float] = (0.1, 1.0)
-    offset: tuple[float, float] = (0.2, 1.0)
-    rho: tuple[float, float] = (1.0, 0.5)
-    delta_signal: tuple[float, float] = (0.4, 0.7)
-    delta_length: tuple[float, float] = (0.4, 0.7)
     noise_growth: tuple[float, float] = (0.0, 1.5)
 
 
@@ -61,8 +49,6 @@ LENGTH_BOUNDS = (0.03, 5.0)
 SHEAR_BOUNDS = (-3.0, 3.0)
 SIGNAL_BOUNDS = (0.05, 6.0)
 NOISE_BOUNDS = (1e-3, 3.0)
-OFFSET_BOUNDS = (1e-3, 3.0)
-RHO_BOUNDS = (-1.0, 2.5)
 GROWTH_BOUNDS = (0.0, 4.0)
 
 
@@ -129,7 +115,8 @@ def _distances(first: Array, second: Array, lengths: Array) -> tuple[Array, Arra
 
 
 class Covariance:
-    """The covariance of the module docstring. Hyperparameters θ are logarithms, except for ρ and the noise's growth.
+    """The covariance of the module docstring. Hyperparameters θ are logarithms, except for shears and the
+    noise's growth.
 
     Attributes:
         points: (n, dimension) of all observations.
@@ -144,7 +131,6 @@ class Covariance:
         points: Array,
         prior: HyperPrior,
         *,
-        real: Mask | None = None,
         growth: Array | None = None,
         known: PriorCovariance | None = None,
         unit: float = 1.0,
@@ -154,15 +140,11 @@ class Covariance:
         Args:
             points: (n, dimension).
             prior: over the hyperparameters.
-            real: (n,), which observations are real; None: all, and the model has no simulation.
             growth: (n, q): log n_i grows with these features; None: constant noise.
-            known: further covariance of the real cost.
+            known: further covariance of the cost.
             unit: of the costs here, for `known`.
         """
         self.points = points
-        self._real = real
-        self._loads = np.ones(len(points)) if real is None else real.astype(np.float64)
-        self._mask = self._loads > 0.5
         self._growth, self._known, self._unit = growth, known, unit
         self._constant = None if known is None else known.covariance(points, points) / unit**2
         dimension = points.shape[1]
@@ -173,14 +155,6 @@ class Covariance:
         ]
         if prior.shear is not None:
             rows += [("shear", prior.shear, SHEAR_BOUNDS, False)] * (dimension * (dimension - 1))
-        if real is not None:
-            rows += [
-                ("simulated_noise", prior.simulated_noise, NOISE_BOUNDS, True),
-                ("offset", prior.offset, OFFSET_BOUNDS, True),
-                ("rho", prior.rho, RHO_BOUNDS, False),
-                ("delta_signal", prior.delta_signal, SIGNAL_BOUNDS, True),
-                ("delta_length", prior.delta_length, LENGTH_BOUNDS, True),
-            ]
         if growth is not None:
             rows += [("noise_growth", prior.noise_growth, GROWTH_BOUNDS, False)] * growth.shape[1]
         self.names = tuple(row[0] for row in rows)
@@ -200,11 +174,8 @@ class Covariance:
         return other
 
     def value(self, theta: Array, name: str) -> float:
-        """One hyperparameter as it enters the model (not its logarithm); for an absent one, its neutral value."""
-        if name not in self.names:
-            return {"rho": 1.0}.get(name, 0.0)
-        found = float(theta[self.names.index(name)])
-        return found if name in ("rho", "noise_growth") else float(np.exp(found))
+        """The signal's or the noise's standard deviation as it enters the model (not its logarithm)."""
+        return float(np.exp(theta[self.names.index(name)]))
 
     def lengths(self, theta: Array) -> Array:
         """(dimension,) lengthscales of the signal."""
@@ -225,50 +196,29 @@ class Covariance:
     def noises(self, theta: Array) -> Array:
         """(n,) standard deviations of the observations."""
         noise = np.full(len(self.points), self.value(theta, "noise"))
-        if self._real is not None:
-            noise[~self._mask] = self.value(theta, "simulated_noise")
         return noise if self._growth is None else noise * np.exp(self._growth @ self.growth(theta))
 
     def observed(self, theta: Array) -> tuple[Array, Pullback]:
         """Covariance of the observations (n, n), and its pullback: symmetric W (n, n) → Σ W_ij ∂K_ij/∂θ (p,)."""
-        d, mask, real = self.points.shape[1], self._mask, self._loads
-        lengths, rho = self.lengths(theta), self.value(theta, "rho")
+        lengths = self.lengths(theta)
         points = self.sheared(theta, self.points)
         correlation, slope = matern(points, points, lengths)
         variance = self.value(theta, "signal") ** 2
         base = variance * correlation
-        a = np.where(mask, rho, 1.0)
-        joint = self._real is not None
-        K = base * np.outer(a, a) if joint else base.copy()
-        offset = self.value(theta, "offset") ** 2
-        if joint:
-            K += offset * np.outer(real, real)
-            own = self.points[mask]
-            delta_length = self.value(theta, "delta_length")
-            delta, delta_slope = matern(own, own, np.full(d, delta_length))
-            delta_variance = self.value(theta, "delta_signal") ** 2
-            K[np.ix_(mask, mask)] += delta_variance * delta
+        K = base.copy()
         if self._constant is not None:
             K += self._constant
         noise = self.noises(theta) ** 2
         K[np.diag_indices_from(K)] += noise + 1e-8
 
         def pullback(W: Array) -> Array:
-            weighted = W * np.outer(a, a) if joint else W
             diagonal = 2.0 * np.diagonal(W) * noise
-            gradient = [2.0 * float(np.vdot(weighted, base))]
-            gradient += list(variance * _by_length(points, weighted * slope) / lengths**2)
-            gradient.append(float(diagonal[mask].sum()))
+            gradient = [2.0 * float(np.vdot(W, base))]
+            gradient += list(variance * _by_length(points, W * slope) / lengths**2)
+            gradient.append(float(diagonal.sum()))
             if self._shears:
-                by_shear = _by_shear(points, self.points, weighted * slope) / lengths[:, None] ** 2
+                by_shear = _by_shear(points, self.points, W * slope) / lengths[:, None] ** 2
                 gradient += list(-variance * by_shear[self._beside_diagonal])
-            if joint:
-                gradient += [float(diagonal[~mask].sum()), 2.0 * offset * float(real @ W @ real)]
-                block = W[np.ix_(mask, mask)]
-                gradient.append(2.0 * float(real @ (W * base) @ a))
-                gradient.append(2.0 * delta_variance * float(np.vdot(block, delta)))
-                by_length = _by_length(self.points[mask], block * delta_slope).sum()
-                gradient.append(delta_variance * float(by_length) / delta_length**2)
             if self._growth is not None:
                 gradient += list(self._growth.T @ diagonal)
             return np.array(gradient)
@@ -276,54 +226,20 @@ class Covariance:
         return K, pullback
 
     def cross(self, theta: Array, points: Array) -> Array:
-        """Covariance of the noise-free real cost at points (m, d) with the observations: (m, n)."""
-        rho = self.value(theta, "rho")
-        K = self._correlation(theta, points, self.points)
-        if self._real is None and self._known is None:
-            K *= self.value(theta, "signal") ** 2
-            return K
-        K = self.value(theta, "signal") ** 2 * rho * K * np.where(self._mask, rho, 1.0)
-        K += self._remainder(theta, points, self.points) * self._loads
-        return K if self._known is None else K + self._known.covariance(points, self.points) / self._unit**2
+        """Covariance of the noise-free cost at points (m, d) with the observations: (m, n)."""
+        return self.between(theta, points, self.points)
 
     def between(self, theta: Array, first: Array, second: Array) -> Array:
-        """Covariance of the noise-free real cost at points (m, d) and (k, d): (m, k)."""
-        K = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2 * self._correlation(theta, first, second)
-        K += self._remainder(theta, first, second)
+        """Covariance of the noise-free cost at points (m, d) and (k, d): (m, k)."""
+        K = matern_correlation(self.sheared(theta, first), self.sheared(theta, second), self.lengths(theta))
+        K *= self.value(theta, "signal") ** 2
         return K if self._known is None else K + self._known.covariance(first, second) / self._unit**2
 
-    def cross_simulated(self, theta: Array, points: Array) -> Array:
-        """Covariance of the noise-free simulated cost at points (m, d) with the observations: (m, n)."""
-        if self._known is not None:
-            return self._known.covariance(points, self.points) / self._unit**2
-        K = self.value(theta, "signal") ** 2 * self._correlation(theta, points, self.points)
-        return K * np.where(self._mask, self.value(theta, "rho"), 1.0)
-
-    def between_simulated(self, theta: Array, first: Array, second: Array, *, real: bool) -> Array:
-        """Covariance of the noise-free simulated cost at points (m, d) with either cost at (k, d): (m, k)."""
-        if self._known is not None:
-            return self._known.covariance(first, second) / self._unit**2
-        rho = self.value(theta, "rho") if real else 1.0
-        return self.value(theta, "signal") ** 2 * rho * self._correlation(theta, first, second)
-
     def variance(self, theta: Array, points: Array) -> Array:
-        """Variance of the noise-free real cost at points (m, d): (m,)."""
-        value = (self.value(theta, "signal") * self.value(theta, "rho")) ** 2
-        value += self.value(theta, "offset") ** 2 + self.value(theta, "delta_signal") ** 2
+        """Variance of the noise-free cost at points (m, d): (m,)."""
+        value = self.value(theta, "signal") ** 2
         known = 0.0 if self._known is None else (self._known.predict(points)[1] / self._unit) ** 2
         return np.full(len(points), value) + known
-
-    def _correlation(self, theta: Array, first: Array, second: Array) -> Array:
-        """Correlation of the signal between points (m, d) and (k, d): (m, k)."""
-        return matern_correlation(self.sheared(theta, first), self.sheared(theta, second), self.lengths(theta))
-
-    def _remainder(self, theta: Array, first: Array, second: Array) -> Array | float:
-        """Covariance of β + δ."""
-        offset = self.value(theta, "offset") ** 2
-        if self._real is None:
-            return offset
-        lengths = np.full(first.shape[1], self.value(theta, "delta_length"))
-        return offset + self.value(theta, "delta_signal") ** 2 * matern_correlation(first, second, lengths)
 
 
 def _by_length(points: Array, G: Array) -> Array:

@@ -42,16 +42,13 @@ class Fitted:
     log_likelihood: float
 
 
-def maximum_a_posteriori(
-    covariance: Covariance, residuals: Array, starts: Sequence[Array], iterations: int = ITERATIONS
-) -> Fitted:
+def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Sequence[Array]) -> Fitted:
     """Fit the hyperparameters.
 
     Args:
         covariance: of the observations.
         residuals: (n,), costs less their prior mean, in units of the scale.
         starts: of the search, (p,) each, at least one.
-        iterations: of the search from each; 0 uses the first start unchanged.
 
     Raises:
         ValueError: no start gave a covariance that can be factorised.
@@ -65,15 +62,15 @@ def maximum_a_posteriori(
         value, gradient = negative_log_likelihood(covariance, residuals, theta)
         return value + 0.5 * float(z @ z), gradient + z / covariance.deviation
 
-    best, lowest = np.clip(starts[0] if iterations == 0 else covariance.centre, bounds[:, 0], bounds[:, 1]), math.inf
-    for start in starts if iterations else ():
+    best, lowest = np.clip(covariance.centre, bounds[:, 0], bounds[:, 1]), math.inf
+    for start in starts:
         found: Any = minimize(
             loss,
             np.clip(start, bounds[:, 0], bounds[:, 1]),
             jac=True,
             bounds=bounds,
             method="L-BFGS-B",
-            options={"maxiter": iterations, "ftol": 1e-6, "gtol": 1e-3},
+            options={"maxiter": ITERATIONS, "ftol": 1e-6, "gtol": 1e-3},
         )
         if math.isfinite(found.fun) and found.fun < lowest:
             best, lowest = found.x, float(found.fun)
@@ -130,9 +127,6 @@ alone, the valley would be known only next to the simulations in it."""
 RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
 """Prior of the difference between reality and simulation: smaller than the cost itself, but free to be as large."""
 
-SCALED_PRIOR = HyperPrior(rho=(1.0, 1.0), delta_signal=(0.6, 0.7))
-"""Wide, so that a simulation with the opposite trend can be detected."""
-
 SMALLEST_SCALE = 1e-60
 """Smallest unit of costs; fourth powers of a smaller one (products of covariances) leave the range of floats."""
 
@@ -147,11 +141,9 @@ class GaussianProcess:
         points: (n, dimension) of the observations.
         lengths: (dimension,) fitted lengthscales.
         signal: fitted standard deviation of the signal, in the cost's unit.
-        noise: fitted standard deviation of the real observations, in the cost's unit; if it varies, its value at zero
+        noise: fitted standard deviation of the observations, in the cost's unit; if it varies, its value at zero
             growth features.
-        simulated_noise: the same for simulations; with one kind of observation only, equal to `noise`.
         evidence: difference of the log-likelihood to that of pure noise around the prior mean.
-        hyperparameters: the other fitted values, by name.
         residuals: (n,) costs less their prior mean, in units of `scale`.
         covariance_terms: prior covariance, as a function of the hyperparameters.
         estimated_mean: whether the prior mean is an estimate from the same costs.
@@ -168,7 +160,6 @@ class GaussianProcess:
         scale: float,
         growth: NoiseGrowth | None = None,
         start: Array | None = None,
-        iterations: int = ITERATIONS,
         estimated_mean: bool = False,
     ) -> None:
         """Fit.
@@ -181,16 +172,10 @@ class GaussianProcess:
             growth: features of the covariance's varying noise.
             start: initial hyperparameters; None: the centre of their priors, and a second start with longer
                 lengthscales and more noise.
-            iterations: of the search for better ones.
             estimated_mean: see the attribute.
-
-        Raises:
-            ValueError: the start has another number of hyperparameters.
         """
         self.points, self.mean, self.scale, self.growth = covariance.points, mean, scale, growth
-        starts = [start]
-        if start is not None and len(start) != len(covariance.names):
-            raise ValueError(f"a start of {len(start)} hyperparameters for a model of {len(covariance.names)}")
+        starts = [] if start is None else [start]
         if start is None:
             noisy = covariance.centre.copy()
             noisy[[i for i, name in enumerate(covariance.names) if name in ("length", "noise")]] += 0.5
@@ -198,7 +183,7 @@ class GaussianProcess:
             starts = [covariance.centre, noisy]
         residuals = (costs - mean(self.points)) / scale
         self.residuals, self.estimated_mean = residuals, estimated_mean
-        fitted = maximum_a_posteriori(covariance, residuals, [s for s in starts if s is not None], iterations)
+        fitted = maximum_a_posteriori(covariance, residuals, starts)
         self.covariance_terms, self._fitted = covariance, fitted
         theta = fitted.theta
         self.lengths: Array = covariance.lengths(theta)
@@ -207,14 +192,6 @@ class GaussianProcess:
         self.log_likelihood = fitted.log_likelihood
         self.evidence = fitted.log_likelihood - _of_noise_alone(residuals)
         self.theta = theta
-        self.simulated_noise = self.noise
-        if "simulated_noise" in covariance.names:
-            self.simulated_noise = covariance.value(theta, "simulated_noise") * scale
-        self.hyperparameters: dict[str, float] = {
-            name: covariance.value(theta, name) * (1.0 if name in ("rho", "delta_length") else scale)
-            for name in ("simulated_noise", "offset", "rho", "delta_signal", "delta_length")
-            if name in covariance.names
-        }
 
     def predict(self, points: Array) -> tuple[Array, Array]:
         """See `Surrogate.predict`. The deviation excludes the observations' noise."""
@@ -249,18 +226,6 @@ class GaussianProcess:
     def prior_covariance(self, points: Array) -> Array:
         """Covariance of the noise-free cost between points (m, d): (m, m), in its unit squared."""
         return np.asarray(self.scale**2 * self.covariance_terms.between(self._fitted.theta, points, points))
-
-    def joint_covariance(self, simulated: Array, real: Array) -> Array:
-        """Posterior covariance of the noise-free simulated cost at points (a, d) and the real one at points (m, d): (a
-        + m, a + m), in the cost's unit squared.
-        """
-        theta, covariance = self._fitted.theta, self.covariance_terms
-        K = np.concatenate([covariance.cross_simulated(theta, simulated), covariance.cross(theta, real)])
-        V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
-        mixed = covariance.between_simulated(theta, simulated, real, real=True)
-        own = covariance.between_simulated(theta, simulated, simulated, real=False)
-        prior = np.block([[own, mixed], [mixed.T, covariance.between(theta, real, real)]])
-        return np.asarray(self.scale**2 * (prior - V.T @ V))
 
     def noise_at(self, points: Array) -> Array:
         """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
@@ -317,15 +282,12 @@ def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior
     Source: Kersting et al., Most likely heteroscedastic Gaussian process regression, ICML 2007; Schwarz, Estimating the
     dimension of a model, 1978.
     """
-    real = terms.get("real")
-    mask = np.ones(len(costs), dtype=np.bool_) if real is None else real
-    count = int(mask.sum())
+    count = len(costs)
     if count < VARYING_FROM:
         return process
-    means = process.predict(process.points[mask])[0]
+    means = process.predict(process.points)[0]
     growth = NoiseGrowth(process, float(means.min()), float(means.max()))
     features = growth.features(process.points)
-    features[~mask] = 0.0
     covariance = Covariance(process.points, prior, growth=features, **terms)
     start = np.concatenate([process.theta, np.zeros(features.shape[1])])
     varied = GaussianProcess(
@@ -341,40 +303,26 @@ def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior
     return varied if varied.log_likelihood > process.log_likelihood + charge else process
 
 
-@dataclass(frozen=True)
-class HyperparameterSearch:
-    """Start and length of the hyperparameter search; see `GaussianProcess`."""
-
-    start: Array | None = None
-    iterations: int = ITERATIONS
-
-
-AFRESH = HyperparameterSearch()
-
-
 def constant_mean_process(
     points: Array,
     costs: Array,
     *,
     varying: bool = False,
     prior: HyperPrior = CONSTANT_PRIOR,
-    search: HyperparameterSearch = AFRESH,
 ) -> GaussianProcess:
     """GP whose prior mean is the mean of the data: (n, dimension), (n,)."""
     centre = float(costs.mean())
     mean, scale = _constant(centre), _scale(costs - centre, costs)
-    return _fitted(points, costs, mean, scale, varying, prior, search, estimated_mean=True)
+    return _fitted(points, costs, mean, scale, varying, prior, estimated_mean=True)
 
 
-def zero_mean_process(
-    points: Array, costs: Array, *, varying: bool = False, search: HyperparameterSearch = AFRESH
-) -> GaussianProcess:
+def zero_mean_process(points: Array, costs: Array, *, varying: bool = False) -> GaussianProcess:
     """GP with prior mean zero, as in the paper: unexplored regions are expected to spill nothing.
 
     Limitations: for a cost in [0, 1] that is minimised by a lower confidence bound, it explores corners indefinitely
     and is worse than random search. For replication.
     """
-    return _fitted(points, costs, _constant(0.0), _scale(costs, costs), varying, search=search)
+    return _fitted(points, costs, _constant(0.0), _scale(costs, costs), varying)
 
 
 def simulated_mean_process(
@@ -383,7 +331,6 @@ def simulated_mean_process(
     costs: Array,
     *,
     varying: bool = False,
-    search: HyperparameterSearch = AFRESH,
 ) -> GaussianProcess:
     """GP of the real cost around a surrogate of the simulated one: f_r = f_s + δ, f_s ~ `simulated`'s posterior.
 
@@ -394,36 +341,8 @@ def simulated_mean_process(
     """
     scale = max(simulated.scale, 1e-9)
     terms: dict[str, Any] = {"known": simulated, "unit": scale}
-    process = _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, search, **terms)
-    process.simulated_noise = simulated.noise
+    process = _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, **terms)
     return process
-
-
-def joint_process(
-    simulated: Array,
-    simulated_costs: Array,
-    points: Array,
-    costs: Array,
-    *,
-    varying: bool = False,
-    search: HyperparameterSearch = AFRESH,
-) -> GaussianProcess:
-    """GP of the real cost from simulations and real observations together: f_r = ρ f_s + β + δ. See `covariance.py`.
-
-    Args:
-        simulated: (k, dimension), k ≥ 1, and their costs (k,).
-        points: (n, dimension), n ≥ 0, and their costs (n,).
-        varying: whether the noise of real observations may vary.
-        search: for the hyperparameters.
-
-    Source: Kennedy & O'Hagan, Predicting the output from a complex computer code when fast approximations are
-    available, Biometrika 2000.
-    """
-    both, values = np.concatenate([simulated, points]), np.concatenate([simulated_costs, costs])
-    centre = float(simulated_costs.mean())
-    real = np.arange(len(both)) >= len(simulated)
-    scale = _scale(values - centre, values)
-    return _fitted(both, values, _constant(centre), scale, varying, SCALED_PRIOR, search, real=real)
 
 
 def _fitted(
@@ -433,7 +352,6 @@ def _fitted(
     scale: float,
     varying: bool,
     prior: HyperPrior = CONSTANT_PRIOR,
-    search: HyperparameterSearch = AFRESH,
     *,
     estimated_mean: bool = False,
     **terms: Any,
@@ -443,8 +361,6 @@ def _fitted(
         Covariance(points, prior, **terms),
         mean=mean,
         scale=scale,
-        start=search.start,
-        iterations=search.iterations,
         estimated_mean=estimated_mean,
     )
     return with_varying_noise(process, costs, prior, **terms) if varying else process

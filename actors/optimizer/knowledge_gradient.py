@@ -1,31 +1,7 @@
-"""The value of the next simulation or pour: knowledge gradient, and decisions with a fixed budget of pours.
+"""The value of the next pour and of simulations: knowledge gradient, and decisions with a fixed budget of pours.
 
-`most_instructive` chooses simulations for a Gaussian process. `proposals` chooses the next pour and simulations for a
-`ModelAveragedProcess`, with `least_loss`, `looked_ahead` and `instructive`; `found` describes the result.
-
-**Value of a simulation** (`most_instructive`). Let x̂ be the minimiser of the posterior mean m of the real cost f_r,
-and x another place that may be better. Perfect knowledge of their difference is worth the expected improvement
-
-    EI(x) = E max(f_r(x̂) − f_r(x), 0) = s φ(u) + (m(x̂) − m(x)) Φ(u)
-    s² = Var(f_r(x) − f_r(x̂)),    u = (m(x̂) − m(x)) / s
-
-A simulation at a, with noise n_s, reduces this variance, independent of its outcome, to
-
-    s′² = s² − Cov(f_s(a), f_r(x) − f_r(x̂))² / (Var f_s(a) + n_s²)
-
-Its value is the largest part of an improvement that it removes:
-
-    v(a) = max_x EI(x) (1 − s′/s)        0 ≤ v ≤ max EI, in the cost's unit
-
-The value of a real observation is the same expression with f_r and n_r instead of f_s and n_s. Uncertainty that cannot
-change the decision has no value. Uncertainty about the simulator's discrepancy has no value for simulations either,
-because only pours reduce it. Pending observations enter through their effect on the covariance; the mean is unchanged.
-
-Source: expected improvement, Jones, Schonlau & Welch, Efficient global optimization of expensive black-box functions,
-    J. Global Optim. 1998; several sources by value over cost, Poloczek, Wang & Frazier, NeurIPS 2017. Their knowledge
-    gradient measures whether *one* observation changes the decision, and is zero if two are needed. With a narrow
-    valley and an uncertain corner it ended simulations after 27, and a real pour explored that corner.
-Limitations: alternatives are compared with x̂ one by one.
+`proposals` chooses the next pour and simulations for a `ModelAveragedProcess`, with `least_loss`, `looked_ahead` and
+`instructive`; `found` describes the result.
 
 **Loss of a pour** (`least_loss`). Let H be the number of pours to follow (4 at most), b the least expected cost of a
 poured action, and f the cost by `ModelAveragedProcess`. The next pour minimises its expected loss minus the expected
@@ -66,7 +42,6 @@ hypothesis maps these places to other places of the simulator.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,116 +49,18 @@ from scipy.special import ndtr
 
 from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
-from actors.optimizer.gaussian_process import GaussianProcess
 from actors.optimizer.model_discrepancy import ModelAveragedProcess, clipped_mean, shortfall
 from actors.optimizer.questions import (
     BenchOffset,
     DiscrepancyFound,
     ModelDiscrepancy,
     PourQuery,
-    SimulationQuery,
     found_good,
 )
 from actors.optimizer.surrogate_models import QueryArrays, tuples
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int_]
-
-LEADERS = 32
-"""Number of places that may be the minimiser: this many with the lowest bounds, and as many with the lowest means."""
-ELSEWHERE = 96
-"""Number of further places at which a simulation is considered."""
-
-
-@dataclass(frozen=True)
-class KnowledgeGradient:
-    """Values of simulations.
-
-    Attributes:
-        points: (count, dimension), the most valuable next ones, each given those before it.
-        values: (count,), value of each of them, ≥ 0.
-        pour_value: value of the most valuable real observation, ≥ 0.
-    """
-
-    points: Array
-    values: Array
-    pour_value: float
-
-
-def most_instructive(
-    query: SimulationQuery,
-    process: GaussianProcess,
-    candidates: Array,
-    busy: Array,
-    pouring: Array,
-    feasibility: Feasibility | None,
-) -> KnowledgeGradient:
-    """Choose `query.count` places for simulations.
-
-    Args:
-        query: for its count and κ.
-        process: of the real cost, from simulations.
-        candidates: (m, dimension), m ≥ 1, places to consider.
-        busy: (b, dimension), pending simulations.
-        pouring: (p, dimension), pending real observations.
-        feasibility: of requests; it reduces the value of places with likely refusals.
-    """
-    mean, deviation = process.predict(candidates)
-    by_bound = np.argsort(mean - query.kappa * deviation, kind="stable")
-    leaders = np.array(list(dict.fromkeys([*by_bound[:LEADERS], *np.argsort(mean, kind="stable")[:LEADERS]])))
-    others = by_bound[LEADERS : LEADERS + ELSEWHERE]
-    places = candidates[np.concatenate([leaders, others])]
-    joint = _JointCovariance(process, np.concatenate([places, busy]), np.concatenate([candidates[leaders], pouring]))
-    reals = len(places) + len(busy)
-    here, targets = np.arange(len(places)), reals + np.arange(len(leaders))
-    for index in range(len(places), reals):
-        joint.observe(index, process.simulated_noise)
-    for index in range(reals + len(leaders), reals + len(leaders) + len(pouring)):
-        joint.observe(index, process.noise)
-
-    m = mean[leaders]
-    pours = joint.values(targets, targets, m, process.noise)
-    allowed = np.ones(len(places)) if feasibility is None else np.exp(feasibility.log_probability(places))
-    chosen, values = [], []
-    for _ in range(query.count):
-        gains = joint.values(here, targets, m, process.simulated_noise) * allowed
-        best = int(np.argmax(gains))
-        chosen.append(places[best])
-        values.append(float(gains[best]))
-        joint.observe(best, process.simulated_noise)
-    points = np.array(chosen).reshape(query.count, candidates.shape[1])
-    return KnowledgeGradient(points, np.array(values), float(pours.max()))
-
-
-class _JointCovariance:
-    """Joint covariance of the simulated cost at some places and the real one at others, updated by observations."""
-
-    def __init__(self, process: GaussianProcess, simulated: Array, real: Array) -> None:
-        self._covariance = process.joint_covariance(simulated, real)
-        self._least = (1e-6 * process.scale) ** 2
-
-    def observe(self, index: int, noise: float) -> None:
-        """Condition on an observation of one of the quantities, independent of its value."""
-        column = self._covariance[:, index].copy()
-        self._covariance -= np.outer(column, column) / self._variance(np.array([index]), noise)[0]
-
-    def values(self, observed: Indices, targets: Indices, mean: Array, noise: float) -> Array:
-        """Value of observing each of some quantities (k,), for competing targets (m,) with means (m,): (k,)."""
-        G, best = self._covariance, int(targets[np.argmin(mean)])
-        doubt = G[targets, targets] + G[best, best] - 2.0 * G[targets, best]
-        doubt = np.sqrt(np.maximum(doubt, self._least))
-        gain = mean.min() - mean
-        u = gain / doubt
-        improvement = np.maximum(doubt * np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi) + gain * ndtr(u), 0.0)
-        improvement[targets == best] = 0.0
-        covariances = G[np.ix_(observed, targets)] - G[observed, best][:, None]
-        removed = np.minimum(covariances**2 / self._variance(observed, noise)[:, None] / doubt**2, 1.0)
-        return np.asarray((improvement * (1.0 - np.sqrt(1.0 - removed))).max(axis=1))
-
-    def _variance(self, indices: Indices, noise: float) -> Array:
-        """Variance of an observation; bounded below, because rounding may make it negative."""
-        return np.maximum(self._covariance[indices, indices], 0.0) + noise**2 + self._least
-
 
 SHOWN = np.array([0.0, 0.02, 0.06, 0.14, 0.28, 0.46, 0.66, 0.84, 1.0])
 """Discretised outcomes of a pour, in units of the largest cost: denser at small losses, where decisions are made."""

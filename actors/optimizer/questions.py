@@ -309,20 +309,6 @@ class RiskAnswer:
 
 
 @dataclass(frozen=True)
-class SearchEffort:
-    """Limit of the effort of a fit. Without it, a fit starts from its priors and takes the time it needs.
-
-    Attributes:
-        start: initial hyperparameters of each process in the order of fitting: `Suggestion.fitted` of an earlier
-            answer. A process without an entry starts from its priors.
-        iterations: of the search for better ones, for processes with a start; 0 uses them unchanged.
-    """
-
-    start: tuple[tuple[float, ...], ...] = ()
-    iterations: int = 0
-
-
-@dataclass(frozen=True)
 class SpaceFillingQuery:
     """Points that fill the space evenly, far from known ones: the start of a search, without a surrogate.
 
@@ -369,7 +355,6 @@ class SurrogateQuery:
             among `data` too, with the cost of the failure. Proposals avoid places with a likely failure, and the best
             point is one that is likely to succeed.
         noise: of real observations: 'constant', or 'varying' with the expected cost if the observations support it.
-        effort: limits the fit, and includes the fitted hyperparameters in the answer.
     """
 
     space: Space
@@ -385,7 +370,6 @@ class SurrogateQuery:
     refused: tuple[Point, ...] = ()
     failed: tuple[Point, ...] = ()
     noise: NoiseName = "constant"
-    effort: SearchEffort | None = None
 
     @property
     def context_dimension(self) -> int:
@@ -499,25 +483,7 @@ class PourQuery(ProposalQuery):
     discrepancy: ModelDiscrepancy | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class SimulationQuery(ProposalQuery):
-    """Choose the simulations that are most informative about the best real pour, by their knowledge gradient.
-
-    Attributes:
-        simulated: cheap observations.
-        pouring: places of pending real observations; `pending` are simulations.
-        coupling: of real and simulated cost. 'residual': see `PourQuery.discrepancy`. 'scaled': real cost = ρ ·
-            simulated cost + remainder, fitted together.
-    """
-
-    simulated: Data
-    pouring: tuple[Point, ...] = ()
-    coupling: Literal["residual", "scaled"] = "residual"
-
-
-SuggestionQuery = (
-    SpaceFillingQuery | RegressionQuery | MinimumQuery | RiskQuery | CalibrationQuery | PourQuery | SimulationQuery
-)
+SuggestionQuery = SpaceFillingQuery | RegressionQuery | MinimumQuery | RiskQuery | CalibrationQuery | PourQuery
 """A question to the optimiser; journals tag it with the name of its type."""
 
 
@@ -580,14 +546,10 @@ class Suggestion:
         posterior: answer to `CalibrationQuery.posterior`; None without a surrogate.
         best_noise: standard deviation of a single real observation at `best_point`; None without a surrogate.
         risk: with a risk: further results at `SurrogateQuery.predict_at`.
-        values: for a `SimulationQuery`: value of a simulation at each point, given those before it; in the cost's unit,
-            ≥ 0.
-        pour_value: for a `SimulationQuery`: the same for the most valuable real observation.
         gains: with a `DesignQuestion`: expected reduction of the variance of predictions by weighing a pour at each
             candidate, averaged over the targets; in the cost's unit, squared.
         uncertainty: with a `DesignQuestion`: the current variance, averaged over the targets.
         discrepancy: with a `ModelDiscrepancy`: the conclusions about the simulator.
-        fitted: with `SurrogateQuery.effort`: hyperparameters of each process, to start the next fit with.
     """
 
     points: tuple[Point, ...]
@@ -607,9 +569,6 @@ class Suggestion:
     posterior: Posterior | None = None
     best_noise: float | None = None
     risk: RiskAnswer | None = None
-    values: tuple[float, ...] = ()
-    pour_value: float | None = None
-    fitted: tuple[tuple[float, ...], ...] = ()
     gains: tuple[float, ...] = ()
     uncertainty: float | None = None
     discrepancy: DiscrepancyFound | None = None

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
-from actors.optimizer.knowledge_gradient import found, most_instructive, proposals
+from actors.optimizer.knowledge_gradient import found, proposals
 from actors.optimizer.prediction_intervals import observation_intervals
 from actors.optimizer.questions import (
     CalibrationQuery,
@@ -33,7 +33,6 @@ from actors.optimizer.questions import (
     PourQuery,
     ProposalQuery,
     RiskQuery,
-    SimulationQuery,
     SpaceFillingQuery,
     Suggestion,
     SuggestionQuery,
@@ -92,7 +91,6 @@ def describe(
         "hyperparameters": {
             "signal": process.signal,
             "noise": process.noise,
-            **process.hyperparameters,
             **({} if model.averaged is None else model.averaged.hyperparameters),
             **dict(zip((f"length.{name}" for name in _axis_names(query)), map(float, process.lengths), strict=True)),
         },
@@ -234,11 +232,6 @@ def _answer(query: SurrogateQuery) -> Suggestion:
     points = np.empty((0, query.space.dimension))
     if isinstance(query, ProposalQuery) and model is None:
         points = acquisition.spread_out(query.count, arrays.taken, arrays.region, rng, feasibility)
-    elif isinstance(query, SimulationQuery) and model is not None:
-        candidates = _candidates(arrays, model, rng)
-        knowledge = most_instructive(query, model.process, candidates, arrays.busy, arrays.pouring, feasibility)
-        points = knowledge.points
-        answer = {"values": tuple(map(float, knowledge.values)), "pour_value": knowledge.pour_value}
     elif isinstance(query, PourQuery) and query.acquisition == "least_loss" and model is not None and model.averaged:
         points = proposals(query, arrays, model.averaged, _candidates(arrays, model, rng), feasibility, rng)
     elif isinstance(query, ProposalQuery) and model is not None:
@@ -251,8 +244,6 @@ def _answer(query: SurrogateQuery) -> Suggestion:
             answer["posterior"] = posterior
             if query.design is not None:
                 answer |= design_of(query, query.design, query.posterior, model, posterior)
-        if query.effort is not None:
-            answer["fitted"] = tuples([process.theta for process in model.fitted])
         if isinstance(query, PourQuery) and model.averaged is not None:
             answer["discrepancy"] = found(query, arrays, model.averaged, points, feasibility, rng)
     answer["feasibilities"] = _feasibilities(feasibility, points)
@@ -398,8 +389,6 @@ def check(query: SuggestionQuery) -> None:
         counts.append(("map_resolution", query.map_resolution, MAX_RESOLUTION))
         counts.append(("len(predict_at)", len(query.predict_at), MAX_PREDICTIONS))
         _check_surrogate(query)
-    if isinstance(query, SimulationQuery):
-        places["pouring"] = query.pouring
     for name, points in places.items():
         _check_points(name, points, query.space.dimension)
     for name, value, limit in counts:
@@ -411,7 +400,7 @@ def check(query: SuggestionQuery) -> None:
 def _check_surrogate(query: SurrogateQuery) -> None:
     dimension = query.space.dimension
     observed = {"data": query.data}
-    if isinstance(query, PourQuery | SimulationQuery):
+    if isinstance(query, PourQuery):
         observed["simulated"] = query.simulated
         _check_points("simulated", query.simulated.points, dimension)
     if isinstance(query, CalibrationQuery):
@@ -433,7 +422,6 @@ def _check_surrogate(query: SurrogateQuery) -> None:
         raise ValueError(f"{observations} observations and refusals, but at most {MAX_OBSERVATIONS} can be fitted")
     if not (math.isfinite(query.kappa) and 0.0 <= query.kappa <= 100.0):
         raise ValueError(f"kappa = {query.kappa} is outside 0 … 100")
-    _check_effort(query)
 
 
 def _check_calibration(query: CalibrationQuery) -> None:
@@ -469,18 +457,6 @@ def _check_discrepancy(discrepancy: ModelDiscrepancy, dimension: int) -> None:
     valid = 0.0 < discrepancy.uninformative < 1.0 and 0.0 < discrepancy.worst < math.inf
     if not valid or discrepancy.pours_left < 0:
         raise ValueError("discrepancy: 0 < uninformative < 1, worst > 0 and pours_left ≥ 0 are required")
-
-
-def _check_effort(query: SurrogateQuery) -> None:
-    effort = query.effort
-    if effort is None:
-        return
-    if query.noise == "varying" and effort.start:
-        raise ValueError("effort: a start is for noise='constant' only")
-    if not 0 <= effort.iterations <= 1000:
-        raise ValueError(f"effort: iterations = {effort.iterations} is outside 0 … 1000")
-    if not all(math.isfinite(value) for start in effort.start for value in start):
-        raise ValueError("effort: the start must be finite")
 
 
 def _check_posterior(query: CalibrationQuery) -> None:

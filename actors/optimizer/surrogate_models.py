@@ -16,14 +16,11 @@ from scipy.special import ndtr
 
 from actors.optimizer.feasible_region import Feasibility, Kind, Region
 from actors.optimizer.gaussian_process import (
-    AFRESH,
     CONSTANT_PRIOR,
     OBLIQUE_PRIOR,
     GaussianProcess,
-    HyperparameterSearch,
     Surrogate,
     constant_mean_process,
-    joint_process,
     simulated_mean_process,
     zero_mean_process,
 )
@@ -37,7 +34,6 @@ from actors.optimizer.questions import (
     ProposalQuery,
     RegressionQuery,
     RiskQuery,
-    SimulationQuery,
     SurrogateQuery,
 )
 from actors.optimizer.risk_measures import RiskProcess
@@ -58,7 +54,6 @@ class QueryArrays:
         infeasible: (i, dimension), refused for any kind of request.
         really_refused: (r, dimension), refused real requests.
         failed: (f, dimension), real requests that failed during execution.
-        pouring: (p, dimension).
     """
 
     region: Region
@@ -71,7 +66,6 @@ class QueryArrays:
     infeasible: Array
     really_refused: Array
     failed: Array
-    pouring: Array
 
     @classmethod
     def of(cls, query: SurrogateQuery) -> QueryArrays:
@@ -80,7 +74,7 @@ class QueryArrays:
         region = Region(query.space, query.constraints)
         ordered = isinstance(query, PourQuery) and query.discrepancy is not None
         points, costs = (_arrays if ordered else _sorted)(query.data, dimension + query.context_dimension)
-        simulations = query.simulated if isinstance(query, PourQuery | SimulationQuery) else Data()
+        simulations = query.simulated if isinstance(query, PourQuery) else Data()
         simulated, simulated_costs = _sorted(simulations, dimension)
         points = region.snap(points)
 
@@ -98,7 +92,6 @@ class QueryArrays:
             snapped(query.infeasible),
             snapped(query.refused),
             snapped(query.failed),
-            snapped(query.pouring if isinstance(query, SimulationQuery) else ()),
         )
 
     @property
@@ -181,13 +174,11 @@ class Model:
         process: with the observations in it; for an average over hypotheses, of the simulations only.
         lengths: (dimension,) lengthscales of the searched axes. Around a simulated mean they are the simulations',
             because a few pours do not determine those of the remainder.
-        fitted: all fitted processes, in order.
     """
 
     surrogate: Surrogate
     process: GaussianProcess
     lengths: Array
-    fitted: tuple[GaussianProcess, ...]
     averaged: ModelAveragedProcess | None = None
 
     def noise_at(self, points: Array) -> Array:
@@ -197,47 +188,29 @@ class Model:
 
 def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
     """Fit the surrogate of a query; None with too few observations."""
-    points, costs = arrays.points, arrays.costs
-    varying, first = query.noise == "varying", _search_for(query, 0)
+    points, costs, varying = arrays.points, arrays.costs, query.noise == "varying"
     describes = isinstance(query, MinimumQuery) and not query.replicates
     averages = isinstance(query, PourQuery) and query.discrepancy is not None
     prior = OBLIQUE_PRIOR if describes or averages else CONSTANT_PRIOR
-    if averages and first.start is not None and len(first.start) < 2 + query.space.dimension**2:
-        first = AFRESH  # of a run begun with an earlier version, without shears
-    if isinstance(query, PourQuery | SimulationQuery) and len(arrays.simulated) >= 2:
-        if isinstance(query, SimulationQuery) and query.coupling == "scaled":
-            process = joint_process(
-                arrays.simulated, arrays.simulated_costs, points, costs, varying=varying, search=first
-            )
-            return Model(process, process, process.lengths, (process,))
-        simulated = constant_mean_process(arrays.simulated, arrays.simulated_costs, prior=prior, search=first)
-        if isinstance(query, PourQuery) and query.discrepancy is not None:
+    if isinstance(query, PourQuery) and len(arrays.simulated) >= 2:
+        simulated = constant_mean_process(arrays.simulated, arrays.simulated_costs, prior=prior)
+        if query.discrepancy is not None:
             averaged = ModelAveragedProcess(simulated, points, costs, query.discrepancy)
-            return Model(averaged, simulated, simulated.lengths, (simulated,), averaged)
+            return Model(averaged, simulated, simulated.lengths, averaged)
         if not len(points):
-            return Model(simulated, simulated, simulated.lengths, (simulated,))
-        second = _search_for(query, 1)
-        process = simulated_mean_process(simulated, points, costs, varying=varying, search=second)
-        return Model(process, process, simulated.lengths, (simulated, process))
+            return Model(simulated, simulated, simulated.lengths)
+        process = simulated_mean_process(simulated, points, costs, varying=varying)
+        return Model(process, process, simulated.lengths)
     if len(points) < 2:
         return None
-    zero = isinstance(query, RegressionQuery | MinimumQuery) and query.mean == "zero"
-    if zero:
-        process = zero_mean_process(points, costs, varying=varying, search=first)
+    if isinstance(query, RegressionQuery | MinimumQuery) and query.mean == "zero":
+        process = zero_mean_process(points, costs, varying=varying)
     else:
-        process = constant_mean_process(points, costs, varying=varying, prior=prior, search=first)
+        process = constant_mean_process(points, costs, varying=varying, prior=prior)
     lengths = process.lengths[: query.space.dimension]
     if isinstance(query, RiskQuery):
-        return Model(RiskProcess.of(process, query.risk), process, lengths, (process,))
+        return Model(RiskProcess.of(process, query.risk), process, lengths)
     if isinstance(query, CalibrationQuery):
         context = array(query.contexts, query.context_dimension)
-        return Model(AbsoluteProcess(process, context), process, lengths, (process,))
-    return Model(process, process, process.lengths, (process,))
-
-
-def _search_for(query: SurrogateQuery, number: int) -> HyperparameterSearch:
-    """Hyperparameter search of the `number`-th process."""
-    effort = query.effort
-    if effort is None or number >= len(effort.start):
-        return AFRESH
-    return HyperparameterSearch(np.array(effort.start[number], dtype=np.float64), effort.iterations)
+        return Model(AbsoluteProcess(process, context), process, lengths)
+    return Model(process, process, process.lengths)

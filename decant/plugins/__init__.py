@@ -77,7 +77,6 @@ if TYPE_CHECKING:
     from actors.optimizer.questions import PourQuery as PourQuery
     from actors.optimizer.questions import RegressionQuery as RegressionQuery
     from actors.optimizer.questions import RiskQuery as RiskQuery
-    from actors.optimizer.questions import SimulationQuery as SimulationQuery
     from actors.optimizer.questions import SpaceFillingQuery as SpaceFillingQuery
     from actors.optimizer.questions import Suggestion as Suggestion
     from actors.optimizer.questions import SuggestionQuery as SuggestionQuery

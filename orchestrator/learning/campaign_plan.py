@@ -45,7 +45,6 @@ from sim_engine.settings.quantity import Quantity
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from orchestrator.learning.requests import Order
     from orchestrator.learning.strategy import Strategy
 
 
@@ -144,12 +143,6 @@ class DeploymentSettings(StrategySettings):
             )
         elif self.pours == 0:
             complaints.add(f"{self.strategy} learns on real pours; at least 1 (D1 plans without any)", "pours")
-
-    @property
-    def order(self) -> Order:
-        """Order in which outcomes are reported; 'completion' only for a strategy whose decisions depend on wall-clock
-        time."""
-        return "logical"
 
     @property
     def needs_posterior(self) -> bool:

@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from statistics import NormalDist
-from typing import Literal
 
 from actors.interfaces import DoseTarget
 from actors.optimizer.questions import WRITTEN_IF_SET, Suggestion, SuggestionQuery
@@ -200,7 +199,3 @@ class Decision:
     text: str
     values: dict[str, float] = field(default_factory=dict)
     urgent: bool = False
-
-
-Order = Literal["logical", "completion"]
-"""The order in which outcomes are delivered; see `orchestrator.runs.stage_scheduler`."""

@@ -109,17 +109,6 @@ class Trials:
         """Whether simulations are queued."""
         return bool(self._unissued)
 
-    @property
-    def waiting(self) -> int:
-        """Number of queued simulations."""
-        return len(self._unissued)
-
-    def withdraw(self) -> None:
-        """Remove the latest trials of which no simulation has been requested yet."""
-        while self.all and len(self.all[-1].requests) == sum(t == len(self.all) - 1 for t, _ in self._unissued):
-            for _ in self.all.pop().requests:
-                self._unissued.pop()
-
     def abandon(self, trial: Trial) -> int:
         """Remove the simulations of a trial that have not been requested yet, and return their number."""
         number = next(i for i, one in enumerate(self.all) if one is trial)
@@ -156,17 +145,6 @@ class Trials:
     def answered(self) -> int:
         """Number of simulations answered."""
         return sum(len(trial.costs) for trial in self.all)
-
-    @property
-    def lost_in_a_row(self) -> int:
-        """Number of consecutive latest closed trials without a cost."""
-        count = 0
-        for trial in reversed(self.all):
-            if trial.closed:
-                if trial.cost is not None:
-                    break
-                count += 1
-        return count
 
     @property
     def lost(self) -> int:

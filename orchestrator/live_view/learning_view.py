@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from actors.optimizer.questions import (
     Point,
     PourQuery,
-    SimulationQuery,
     SpaceFillingQuery,
     Suggestion,
     SurrogateQuery,
@@ -217,7 +216,7 @@ _DPI = 80
 
 def simulated_points(query: SurrogateQuery) -> tuple[Point, ...]:
     """Simulated observations of a query; empty if its type has none."""
-    return query.simulated.points if isinstance(query, PourQuery | SimulationQuery) else ()
+    return query.simulated.points if isinstance(query, PourQuery) else ()
 
 
 def png(figure: Figure) -> bytes:

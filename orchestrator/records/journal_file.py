@@ -28,7 +28,7 @@ from typing import IO, Any
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.codec import canonical
 
-FORMAT = 3
+FORMAT = 4
 """Version of the tables and of the entries' bodies. A journal of another version is refused."""
 
 _CHAIN = """

@@ -52,9 +52,6 @@ Row = dict[str, Any]
 
 PourState = Literal["asked", "under way", "unknown", "weighed", "failed"]
 
-POOL_RESTS = "pool_rests"
-"""Key in a decision's values with which a strategy reports that no simulation is worthwhile now."""
-
 
 NOT_REPORTED = Progress()
 """Progress of a stage whose strategy has not reported any."""
@@ -120,41 +117,33 @@ class RunPour:
 class Occupancy:
     """Use of the simulator pool over one stage in which the arm pours. Times are seconds of any clock.
 
-    The time counts from the first request to the end of the last pour. It excludes periods in which the strategy has
-    reported that the pool may rest and no simulation has started since.
+    The time counts from the first request to the end of the last pour.
 
     Attributes:
         slots: maximum number of simulations at a time.
-        busy, useful, total: slot seconds: used by simulations while the pool was useful; of useful time; of all time.
+        busy, total: slot seconds: used by simulations; of all time.
         waits: waiting times of the arm, from a pour's outcome to the beginning of the next pour.
     """
 
     slots: int
     busy: float = 0.0
-    useful: float = 0.0
     total: float = 0.0
     waits: list[float] = field(default_factory=list)
 
     _now: float | None = None
     _running: int = 0
-    _resting: bool = False
     _poured_at: float | None = None
-    _last_pour: tuple[float, float, float] | None = None
+    _last_pour: tuple[float, float] | None = None
 
     def simulation_started(self, time: float) -> None:
         """A simulation was handed to the pool."""
         self._pass(time)
-        self._running, self._resting = self._running + 1, False
+        self._running += 1
 
     def simulation_finished(self, time: float) -> None:
         """A simulation finished."""
         self._pass(time)
         self._running = max(self._running - 1, 0)
-
-    def rests(self, time: float) -> None:
-        """No simulation is worthwhile for now."""
-        self._pass(time)
-        self._resting = True
 
     def pour_started(self, time: float) -> None:
         """A pour began."""
@@ -167,7 +156,7 @@ class Occupancy:
         """A pour was weighed."""
         self._pass(time)
         self._poured_at = time
-        self._last_pour = (self.busy, self.useful, self.total)
+        self._last_pour = (self.busy, self.total)
 
     def interrupted(self) -> None:
         """The run was paused or killed: nothing runs, and counting restarts with the next event."""
@@ -176,19 +165,17 @@ class Occupancy:
     def finish(self) -> None:
         """The stage is finished. The time after its last pour is not counted."""
         if self._last_pour is not None:
-            self.busy, self.useful, self.total = self._last_pour
+            self.busy, self.total = self._last_pour
 
     @property
     def fraction(self) -> float | None:
-        """Busy share of the useful time; None if nothing was simulated during pours."""
-        return self.busy / self.useful if self.useful > 0.0 else None
+        """Busy share of the time; None if nothing was simulated during pours."""
+        return self.busy / self.total if self.total > 0.0 else None
 
     def _pass(self, time: float) -> None:
         seconds = 0.0 if self._now is None else time - self._now
         self.total += self.slots * seconds
-        if not (self._resting and self._running < self.slots):
-            self.busy += min(self._running, self.slots) * seconds
-            self.useful += self.slots * seconds
+        self.busy += min(self._running, self.slots) * seconds
         self._now = time
 
 
@@ -328,7 +315,7 @@ class RunState:
     def occupancies(self) -> dict[str, Occupancy]:
         """Use of the pool in every stage with both simulations and pours."""
         both = (one for one in self.stages.values() if one.simulations_asked and one.pours_asked)
-        return {one.name: one.occupancy for one in both if one.occupancy.useful > 0.0}
+        return {one.name: one.occupancy for one in both if one.occupancy.total > 0.0}
 
     def take(self, event: Event) -> None:
         """Count an event."""
@@ -407,8 +394,6 @@ class RunState:
                     if known is not None:
                         known.answer = event.answer
             case DecisionMade(decision=decision):
-                if POOL_RESTS in decision.values:
-                    stage.occupancy.rests(event.time)
                 self.decisions.append(
                     RecordedDecision(event.time, event.stage, decision.text, decision.values, stage.simulations_asked)
                 )

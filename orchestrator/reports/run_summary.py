@@ -36,10 +36,7 @@ class PoolUse(ResultPart):
     """Use of the simulator pool in a stage with pours."""
 
     pool_busy: float | None
-    """Busy share of the pool while it had useful work."""
-
-    pool_useful: float | None
-    """Share of the time in which the pool had useful work."""
+    """Busy share of the pool."""
 
     arm_longest_wait_s: float | None
     """Longest wait of the arm for a decision between two pours."""

@@ -445,13 +445,12 @@ def pool_use(occupancies: Mapping[str, Occupancy]) -> dict[str, PoolUse]:
     """Use of the pool by stage."""
     found = {}
     for stage, one in occupancies.items():
-        useful, longest = one.useful / one.total if one.total > 0.0 else None, max(one.waits, default=None)
+        longest = max(one.waits, default=None)
         found[stage] = PoolUse(
             pool_busy=one.fraction,
-            pool_useful=useful,
             arm_longest_wait_s=longest,
             arm_mean_wait_s=sum(one.waits) / len(one.waits) if one.waits else None,
-            text=wording.pool_line(one.fraction, useful, longest),
+            text=wording.pool_line(one.fraction, longest),
         )
     return found
 

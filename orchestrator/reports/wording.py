@@ -196,13 +196,11 @@ def band_line(band: PredictionInterval) -> str:
     return f"nine single pours in ten spill {band.percent(2)} of what is poured ({said}{lacking})"
 
 
-def pool_line(busy: float | None, useful: float | None, longest_wait: float | None) -> str:
-    """'97 % busy while there was work (41 % of the time); between two pours the arm waited 0.06 s at most'."""
+def pool_line(busy: float | None, longest_wait: float | None) -> str:
+    """'97 % busy; between two pours the arm waited 0.06 s at most'."""
     if busy is None:
         return ""
     text = f"{100 * busy:.0f} % busy"
-    if useful is not None and useful < 0.995:
-        text += f" while there was work ({100 * useful:.0f} % of the time)"
     return text + ("" if longest_wait is None else f"; between two pours the arm waited {longest_wait:.2g} s at most")
 
 

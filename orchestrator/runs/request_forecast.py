@@ -63,7 +63,7 @@ class RequestForecast:
             strategy = self._built(stage, results)
             if strategy is None:
                 continue
-            if guessed or stage.order == "completion":
+            if guessed:
                 await self._first(strategy, unknown)
             else:
                 await self._until_a_pour(strategy)

@@ -220,7 +220,6 @@ class _RunEngine:
             journal=self._journal,
             executor=executor,
             capacity=self._plan.parallel_simulations,
-            order=stage.order,
             recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.frame_rate > 0.0 else 0,
             on_pausing=lambda reason: self._enter(State.PAUSING, reason),
             on_stopping=lambda reason: self._enter(State.STOPPING, reason),

@@ -1,17 +1,14 @@
 """Runs one stage: takes requests from a strategy, executes them, writes the journal, and returns the outcomes.
 
 `StageScheduler` calls `ask` once at the start and once after every `tell`. A `PendingRequest` is a request whose
-outcome was not delivered yet. There are two orders of delivery:
+outcome was not delivered yet.
 
-- *logical*: suggestions first, then simulations, then the pour; within a kind, in the order of the requests. The
-  sequence of asks and tells then depends on plan and outcomes only, not on speed. Neither the optimiser nor the pool is
-  idle while the arm pours. A strategy that wants k simulations next to each pour requests k, and no more until the next
-  `tell`.
-- *completion*: in the order in which requests finish. Time then affects the decisions, and only the journal can replay
-  them.
+Outcomes are delivered in a fixed order: suggestions first, then simulations, then the pour; within a kind, in the order
+of the requests. The sequence of asks and tells then depends on plan and outcomes only, not on speed. Neither the
+optimiser nor the pool is idle while the arm pours. A strategy that wants k simulations next to each pour requests k,
+and no more until the next `tell`. The slots that a strategy receives are the capacity minus the pending requests.
 
-In both orders, the slots that a strategy receives are the capacity minus the pending requests. The scheduler does not
-know how a request is executed (`orchestrator.runs.request_executor`).
+The scheduler does not know how a request is executed (`orchestrator.runs.request_executor`).
 """
 
 from __future__ import annotations
@@ -22,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from actors.interfaces import PourProgress
-from orchestrator.learning.requests import Ask, Order, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.learning.requests import Ask, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import Strategy
@@ -46,7 +43,7 @@ from orchestrator.runs.request_executor import RequestExecutor
 from orchestrator.runs.resume import StageHistory, needs_answer, replay, weighed_by_hand
 from sim_engine.outcome import RecordedFrames
 
-_LOGICAL_ORDER: dict[type[Request], int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
+_DELIVERY_ORDER: dict[type[Request], int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
 """Order of delivery of pending requests: fast kinds first, so that a free slot does not wait for `ask`."""
 
 
@@ -58,7 +55,6 @@ class PendingRequest:
         record: whether a simulation keeps its frames.
         attempt: how often a pour was begun, including this attempt.
         started: whether execution has begun, so that it may have had an effect.
-        finished: place in the order of finishing, from 1; 0 while there is no outcome.
         task: the task that runs it; None if its outcome was read from the journal.
     """
 
@@ -67,7 +63,6 @@ class PendingRequest:
     record: bool = False
     attempt: int = 1
     started: bool = False
-    finished: int = 0
     outcome: Outcome | None = None
     task: asyncio.Task[None] | None = None
 
@@ -93,11 +88,9 @@ def free_slots(pending_requests: Sequence[PendingRequest], capacity: int) -> Slo
     return Slots(max(capacity - simulations, 0), max(1 - pours, 0))
 
 
-def next_to_tell(pending_requests: Sequence[PendingRequest], order: Order) -> PendingRequest | None:
+def next_to_tell(pending_requests: Sequence[PendingRequest]) -> PendingRequest | None:
     """The pending request whose outcome is delivered next; None if it has no outcome yet."""
-    if order == "completion":
-        return min((f for f in pending_requests if f.outcome is not None), key=lambda f: f.finished, default=None)
-    first = min(pending_requests, key=lambda f: (_LOGICAL_ORDER[type(f.request)], f.id), default=None)
+    first = min(pending_requests, key=lambda f: (_DELIVERY_ORDER[type(f.request)], f.id), default=None)
     return first if first is not None and first.outcome is not None else None
 
 
@@ -120,7 +113,6 @@ class StageScheduler:
         journal: Journal,
         executor: RequestExecutor,
         capacity: int,
-        order: Order,
         recordings: int = 0,
         on_pausing: Callable[[str], None] = lambda reason: None,
         on_stopping: Callable[[str], None] = lambda reason: None,
@@ -138,14 +130,12 @@ class StageScheduler:
         self._journal = journal
         self._executor = executor
         self._capacity = capacity
-        self._order = order
         self._recordings = recordings
         self._on_pausing = on_pausing
         self._on_stopping = on_stopping
         self._pending: dict[int, PendingRequest] = {}
         self._next_id = journal.last_id() + 1
         self._simulations = 0
-        self._finished = 0
         self._decisions = 0
         self._ask_is_due = True
         self._reported = 0.0
@@ -164,15 +154,13 @@ class StageScheduler:
         undelivered = replay(self._strategy, history, self._stage)
         simulations = [key for key, request in history.requests.items() if isinstance(request, Simulate)]
         numbers = {key: number for number, key in enumerate(simulations, start=1)}
-        order = {key: place for place, key in enumerate(history.outcomes, start=1)}
-        self._simulations, self._finished = len(numbers), len(order)
+        self._simulations = len(numbers)
         for key, request in undelivered.items():
             self._pending[key] = PendingRequest(
                 key,
                 request,
                 record=is_recorded(numbers.get(key, 0), self._recordings),
                 attempt=history.pour_attempts.get(key, 0) + 1,
-                finished=order.get(key, 0),
                 outcome=history.outcomes.get(key),
             )
         self._decisions = history.decisions
@@ -300,14 +288,12 @@ class StageScheduler:
                 raise JournalError(f"{error}. {weighed_by_hand(pending.request, outcome.measurement)}") from error
             raise
         pending.outcome = same
-        self._finished += 1
-        pending.finished = self._finished
 
     async def _next(self) -> PendingRequest:
         """Wait until the next request to deliver has an outcome, and return it."""
         while True:
             self._raise_failures()
-            pending = next_to_tell(list(self._pending.values()), self._order)
+            pending = next_to_tell(list(self._pending.values()))
             if pending is not None:
                 return pending
             running = [f.task for f in self._pending.values() if f.task is not None and f.running]

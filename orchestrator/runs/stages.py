@@ -43,7 +43,7 @@ from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import displacement
 from orchestrator.learning.dispense import Dispense, ReadSources, SourcesRead
-from orchestrator.learning.requests import Order, Simulate
+from orchestrator.learning.requests import Simulate
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.single_action import Confirmation, RepeatedSimulation
 from orchestrator.learning.strategy import Strategy
@@ -71,14 +71,12 @@ class StageDefinition:
     Attributes:
         name: unique in the campaign; part of the stage's seed.
         build: makes the strategy from the earlier stages' results and the stage's seed.
-        order: order in which outcomes are delivered.
         pours: whether it needs a bench.
         stand_in: placeholder for its result in speculative execution (`orchestrator.runs.request_forecast`).
     """
 
     name: str
     build: Callable[[Results, int], Strategy]
-    order: Order = "logical"
     pours: bool = False
     stand_in: Calibrated | None = None
 
@@ -265,8 +263,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
     stages = []
     for name, scene in by_receiver(deployment).items():
-        order, pours = deployment.settings.order, deployment.pours > 0
-        stages.append(StageDefinition(DEPLOYMENT + name, build_for(scene), order=order, pours=pours))
+        stages.append(StageDefinition(DEPLOYMENT + name, build_for(scene), pours=deployment.pours > 0))
         if deployment.confirm:
             stages.append(StageDefinition(CONFIRMATION + name, confirm_for(name, scene), pours=True))
     return stages

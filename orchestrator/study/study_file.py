@@ -102,6 +102,7 @@ C2Arm: Any = _arm(C2Settings, samples="18")
 C3Arm: Any = _arm(C3Settings, "initial_samples", "kappa", iterations="59")
 C4Arm: Any = _arm(C4Settings, "initial_samples", "kappa", simulations="108")
 D2Arm: Any = _arm(D2Settings, "mean", "initial_samples", "kappa", pours="15")
+D3Arm: Any = _arm(D3Settings, "prior_simulations", "simulations_per_pour", "initial_samples", "kappa", pours="15")
 
 
 class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial_samples", "kappa")):  # type: ignore[misc]
@@ -109,13 +110,6 @@ class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial_sampl
 
     iterations: list[PositiveSimulationCount] = Field(default=[15], min_length=1)
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
-
-
-class D3ArmSettings(_arm(D3Settings, "prior_simulations", "initial_samples", "kappa", pours="15")):  # type: ignore[misc]
-    """A compared strategy: its number of repetitions and its budget."""
-
-    simulations_per_pour: SimulationCount | None = None
-    """Simulations between two pours; not 'free', because the requests would then depend on the clock."""
 
 
 class C4ActiveArmSettings(_arm(C4Settings, "initial_samples", "kappa", simulations="108")):  # type: ignore[misc]
@@ -170,10 +164,10 @@ class DeploymentsBase(Settings):
     D2_paper: D2Arm | None = None
     """D2 as in the paper: a surrogate with a zero mean."""
 
-    D3: D3ArmSettings | None = None
+    D3: D3Arm | None = None
     """Real pours with a simulated prior; the campaign selects the model of the prior."""
 
-    D3_paper: D3ArmSettings | None = None
+    D3_paper: D3Arm | None = None
     """D3 as in the paper: a GP of the residual around the simulations' mean, without a check."""
 
 
@@ -429,7 +423,7 @@ HARDWARE = (
 
 BUDGETS = (
     *("grid", "points_per_axis", "samples", "simulations"),
-    *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "simulations_per_pour", "costs", "mean"),
+    *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "simulations_per_pour", "mean"),
     *("risk_limit", "stop", "good_enough"),
 )
 """Settings that an arm does not take from the base campaign, because the study defines each budget."""

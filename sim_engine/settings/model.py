@@ -151,16 +151,6 @@ def _number_or(word: str) -> Callable[[Any], str | None]:
     return form
 
 
-CountOrFree = Annotated[
-    Annotated[SimulationCount, Tag("number")] | Annotated[Literal["free"], Tag("word")],
-    Discriminator(
-        _number_or("free"),
-        custom_error_type="count_or_free",
-        custom_error_message="should be a whole number, or 'free'",
-    ),
-]
-"""A whole number, 0 or more, or 'free'."""
-
 CountOrAuto = Annotated[
     Annotated[PositiveSimulationCount, Tag("number")] | Annotated[Literal["auto"], Tag("word")],
     Discriminator(

@@ -16,7 +16,6 @@ from actors.optimizer.questions import (
     MinimumQuery,
     PourQuery,
     RegressionQuery,
-    SimulationQuery,
 )
 from actors.optimizer.suggest import propose
 from orchestrator.records.codec import canonical, from_json, to_json
@@ -40,13 +39,12 @@ def cup(points):
     return 1.0 - np.exp(-((3.0 * np.maximum(radius - 0.15, 0.0)) ** 1.5))
 
 
-def asked(coupling, simulated_costs, *, pours=6, **changes):
+def asked(simulated_costs, *, pours=6, **changes):
     """A query after 40 simulations and a few pours; the pours are `cup`'s."""
     simulated, real = points_of(40, 1), points_of(pours, 2)
-    return SimulationQuery(
+    return PourQuery(
         PLANE,
         data_of(real, cup(real)),
-        coupling=coupling,
         simulated=data_of(simulated, simulated_costs(simulated)),
         **{"count": 0, "predict_at": ASK, **changes},
     )
@@ -56,12 +54,10 @@ def error(answer):
     return float(np.sqrt(np.mean((np.array(answer.predictions) - cup(ASK)) ** 2)))
 
 
-@pytest.mark.parametrize("kind", [{}, {"joint": 1}, {"growth": 1}, {"shear": (0.0, 0.5)}])
+@pytest.mark.parametrize("kind", [{}, {"growth": 1}, {"shear": (0.0, 0.5)}])
 def test_the_likelihoods_gradient_is_that_of_the_likelihood(kind):
     points, costs = points_of(20, 3, 3), np.random.default_rng(4).standard_normal(20)
     terms = {}
-    if "joint" in kind:
-        terms["real"] = np.arange(20) >= 13
     if "growth" in kind:
         terms["growth"] = points_of(20, 5) - 0.5
     covariance = Covariance(points, HyperPrior(shear=kind.get("shear")), **terms)
@@ -84,39 +80,15 @@ def test_a_valley_oblique_to_the_axes_is_known_between_the_simulations_in_it():
     assert abs(oblique) < 0.1 < 0.3 < axes
 
 
-@pytest.mark.parametrize("coupling", ["residual", "scaled"])
-def test_a_right_simulation_makes_a_few_pours_worth_many(coupling):
-    query = asked(coupling, cup)
+def test_a_right_simulation_makes_a_few_pours_worth_many():
+    query = asked(cup)
     alone = error(propose(RegressionQuery(PLANE, query.data, predict_at=ASK)))
     assert error(propose(query)) < 0.6 * alone
 
 
-@pytest.mark.parametrize("coupling", ["residual", "scaled"])
-def test_a_simulation_that_is_off_by_a_constant_is_corrected(coupling):
-    answer = propose(asked(coupling, lambda p: cup(p) + 0.4))
+def test_a_simulation_that_is_off_by_a_constant_is_corrected():
+    answer = propose(asked(lambda p: cup(p) + 0.4))
     assert error(answer) < 0.15
-    if coupling == "scaled":
-        assert answer.hyperparameters["offset"] > 0.15
-
-
-def test_a_simulation_that_spills_half_as_much_is_scaled():
-    answer = propose(asked("scaled", lambda p: 0.4 * cup(p), pours=10))
-    assert answer.hyperparameters["rho"] > 1.6
-    assert error(answer) < 0.12
-
-
-def test_a_simulation_that_is_the_wrong_way_round_gets_a_negative_scale():
-    answer = propose(asked("scaled", lambda p: 1.0 - cup(p), pours=14))
-    assert answer.hyperparameters["rho"] < 0.0
-    assert error(answer) < error(propose(asked("residual", lambda p: 1.0 - cup(p), pours=14)))
-
-
-def test_before_the_first_pour_simulations_alone_are_believed_with_more_doubt():
-    question = replace(asked("scaled", cup), data=Data())
-    joint, alone = propose(question), propose(replace(question, coupling="residual"))
-    assert joint.predictions == pytest.approx(alone.predictions, abs=0.15)
-    assert min(joint.prediction_deviations) > max(0.05, min(alone.prediction_deviations))
-    assert propose(replace(question, simulated=Data())).predictions == ()
 
 
 @pytest.mark.parametrize(("simulated", "pours"), [(2, 0), (2, 1), (3, 5), (0, 2), (1, 3), (0, 0)])
@@ -128,9 +100,8 @@ def test_any_few_simulations_and_pours_are_enough_for_an_answer(simulated, pours
     assert all(map(math.isfinite, (*answer.means, *answer.deviations, *answer.noises)))
 
 
-@pytest.mark.parametrize("coupling", ["residual", "scaled"])
-def test_the_best_point_is_one_that_was_poured(coupling):
-    query = asked(coupling, cup)
+def test_the_best_point_is_one_that_was_poured():
+    query = asked(cup)
     assert propose(query).best_point in query.data.points
 
 
@@ -170,10 +141,9 @@ def test_a_few_pours_cannot_tell_and_noise_stays_constant():
 def test_around_simulations_the_pours_noise_may_vary_too():
     data = scattered(60, lambda cost: 0.01 + 0.3 * cost, 5)
     simulated = data_of(points_of(30, 9), cup(points_of(30, 9)))
-    for coupling in ("residual", "scaled"):
-        query = SimulationQuery(PLANE, data, simulated=simulated, coupling=coupling)
-        varying, constant = propose(replace(query, noise="varying")), propose(query)
-        assert varying.best_noise < 0.6 * constant.best_noise, coupling
+    query = PourQuery(PLANE, data, simulated=simulated)
+    varying, constant = propose(replace(query, noise="varying")), propose(query)
+    assert varying.best_noise < 0.6 * constant.best_noise
 
 
 # -- travelling ----------------------------------------------------------------------------------------------------

@@ -49,7 +49,7 @@ def played(plan: CampaignPlan) -> Iterator[dict[str, Any]]:
     results: dict[str, StageResult] = {}
     for stage in stages:
         seed = stage_seed(plan.seed, stage.name)
-        yield {"stage": stage.name, "seed": seed, "order": stage.order, "pours": stage.pours}
+        yield {"stage": stage.name, "seed": seed, "pours": stage.pours}
         strategy = stage.build(results, seed)
         yield from _stage(strategy, plan.parallel_simulations)
         results[stage.name] = strategy.result()

@@ -36,8 +36,6 @@ from actors.optimizer.questions import (
     RegressionQuery,
     Risk,
     RiskQuery,
-    SearchEffort,
-    SimulationQuery,
     SpaceFillingQuery,
     Suggestion,
     SuggestionQuery,
@@ -125,8 +123,6 @@ PLAIN = MinimumQuery(PLANE, POURED, seed=11, predict_at=ASKED)
 
 INFORMED = PourQuery(PLANE, POURED, seed=11, predict_at=ASKED, simulated=SIMULATED)
 
-SIMULATING = SimulationQuery(PLANE, POURED, seed=11, predict_at=ASKED, simulated=SIMULATED)
-
 DISCREPANCY = ModelDiscrepancy((OffsetPrior(shift=0.14), OffsetPrior(factor=0.05, origin=0.2)), pours_left=4)
 
 ADAPTIVE = replace(INFORMED, discrepancy=DISCREPANCY)
@@ -141,12 +137,9 @@ QUERIES: dict[str, SuggestionQuery] = {
     "lcb, zero mean, plain": replace(PLAIN, mean="zero", plain=True, kappa=1.5),
     "lcb, simulated mean": INFORMED,
     "lcb, varying noise": replace(PLAIN, data=data(20, 8), noise="varying"),
-    "posterior minimum": replace(PLAIN, acquisition="posterior_minimum", count=2, effort=SearchEffort()),
-    "a fit that goes on": replace(PLAIN, effort=SearchEffort(((-1.0, -0.5, -0.5, -3.0),), 3)),
+    "posterior minimum": replace(PLAIN, acquisition="posterior_minimum", count=2),
     "refusals and failures": replace(PLAIN, infeasible=points(3, 9), refused=points(2, 10), failed=POURED.points[:1]),
     "a constraint": replace(PLAIN, constraints=(Linear((("x_offset", 1.0), ("angular_velocity", 0.05)), 0.17),)),
-    "knowledge, simulated mean": replace(SIMULATING, count=2),
-    "knowledge, scaled mean": replace(SIMULATING, coupling="scaled"),
     "least loss, adaptive mean": replace(ADAPTIVE, acquisition="least_loss", count=3),
     "least loss within a limit": replace(
         ADAPTIVE,

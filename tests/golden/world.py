@@ -17,7 +17,6 @@ from actors.optimizer.questions import (
     PourQuery,
     RiskAnswer,
     RiskQuery,
-    SimulationQuery,
     SpaceFillingQuery,
     Suggestion,
     SuggestionQuery,
@@ -116,7 +115,7 @@ def answer(query: SuggestionQuery) -> Suggestion:
     """Everything that may be asked, answered from the question by arithmetic."""
     dimension = query.space.dimension
     data = Data(query.known, (0.0,) * len(query.known)) if isinstance(query, SpaceFillingQuery) else query.data
-    simulated = query.simulated if isinstance(query, PourQuery | SimulationQuery) else Data()
+    simulated = query.simulated if isinstance(query, PourQuery) else Data()
     name = (query.seed, len(data), *_words(query))
     cost = [*data.costs, *simulated.costs]
     places = [point[:dimension] for point in (*data.points, *simulated.points)]
@@ -139,7 +138,7 @@ def answer(query: SuggestionQuery) -> Suggestion:
     row = tuple(0.1 + 0.01 * i for i in range(size))
     grid = SurrogateMap((row,) * size, (row,) * size, query.space.names[:2], tuple(centre)) if size else None
     adaptive = isinstance(query, PourQuery) and query.discrepancy is not None
-    valued, calibration = isinstance(query, SimulationQuery), isinstance(query, CalibrationQuery)
+    calibration = isinstance(query, CalibrationQuery)
     thetas = tuple(tuple(noise(name, "theta", i, axis) for axis in range(dimension)) for i in range(20))
     asked = len(query.predict_at)
     return Suggestion(
@@ -159,13 +158,10 @@ def answer(query: SuggestionQuery) -> Suggestion:
         posterior=Posterior(thetas, (0.02,) * len(thetas), 15.0) if calibration and query.posterior else None,
         best_noise=0.01,
         risk=_risk(query) if isinstance(query, RiskQuery) else None,
-        values=(0.004 / (1 + len(simulated)),) * len(points) if valued else (),
-        pour_value=0.01 / (1 + len(data)) if valued else None,
         gains=tuple(noise(name, "gain", i) for i in range(len(query.design.candidates)))
         if calibration and query.design
         else (),
         uncertainty=1.0 / (1 + len(data)) if calibration and query.design else None,
-        fitted=((0.1, 0.2, 0.3),) if query.effort is not None else (),
         discrepancy=_discrepancy(query, dimension) if isinstance(query, PourQuery) and adaptive else None,
     )  # fmt: skip
 
@@ -177,8 +173,6 @@ def _words(query: SuggestionQuery) -> tuple[str, str]:
             return "constant", "sobol"
         case PourQuery():
             return "simulated" if query.discrepancy is None else "adaptive", query.acquisition
-        case SimulationQuery():
-            return "simulated" if query.coupling == "residual" else "scaled", "knowledge"
     return getattr(query, "mean", "constant"), getattr(query, "acquisition", "lcb")
 
 

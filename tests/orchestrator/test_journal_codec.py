@@ -23,7 +23,6 @@ from actors.optimizer.questions import (
     RegressionQuery,
     Risk,
     RiskQuery,
-    SimulationQuery,
     SpaceFillingQuery,
     Suggestion,
     SurrogateMap,
@@ -87,7 +86,6 @@ queries = st.one_of(
     st.builds(RiskQuery, **proposed, risk=st.just(Risk((Disturbance((1.0, 1.0), (0.1, 0.0)),), 0.5))),
     st.builds(CalibrationQuery, **proposed, contexts=points),
     st.builds(PourQuery, **proposed, simulated=data(), discrepancy=st.none() | st.just(DISCREPANCY)),
-    st.builds(SimulationQuery, **proposed, simulated=data(), coupling=st.sampled_from(["residual", "scaled"])),
 )
 rows = st.lists(st.lists(number, max_size=3).map(tuple), max_size=3).map(tuple)
 suggestions = st.builds(

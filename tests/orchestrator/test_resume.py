@@ -187,29 +187,6 @@ def test_a_resumed_run_shows_watchers_what_went_before(tmp_path: Path) -> None:
     assert {e.stage: e.result for e in events if isinstance(e, StageClosed)} == result.results
 
 
-def test_completion_order_is_replayed_exactly(tmp_path: Path) -> None:
-    """Where the clock decides, only the journal knows; what it holds comes back to the letter."""
-    free = tuple(replace(stage, order="completion") for stage in toy_stages())
-    for entries in (40, 120):
-        directory = tmp_path / str(entries)
-        laboratory = toy_campaign.slow_laboratory(0.01, random.Random(entries))
-        written: list[Any] = []
-
-        def stop(event: Event, directory: Path = directory, limit: int = entries, written: Any = written) -> None:
-            if entries_written(directory) > limit and not written:
-                written.append(True)
-                for task in asyncio.all_tasks():
-                    if task.get_coro().__name__ == "run_toy":  # type: ignore[union-attr]
-                        task.cancel()
-
-        with pytest.raises(asyncio.CancelledError):
-            run(directory, laboratory, stages=free, subscribers=[stop])
-        before = logical_record(directory)
-        run(directory, toy_campaign.slow_laboratory(0.01), stages=free, resume=True)
-        assert logical_record(directory)[: len(before)] == before
-        assert set(finished_times(directory).values()) == {1}
-
-
 def test_drafts_of_a_dead_process_leave_no_half_answers(tmp_path: Path) -> None:
     """An ask and the requests it brought are one entry: a replay never meets one without the other."""
     directory = tmp_path / "run"

@@ -18,7 +18,6 @@ from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simula
 from orchestrator.records.events import Event, LogLine, PourProgressed, RequestFinished
 from orchestrator.runs.request_executor import Deadlines, PourUnknownError, RequestExecutorError
 from orchestrator.runs.stage_scheduler import StrategyError
-from sim_engine.scene import PourTask
 from tests.support.scripted_strategy import Script, one_stage, pour, run, simulate, states
 from tests.support.toy_campaign import (
     ToyBench,
@@ -62,21 +61,6 @@ def test_never_more_runs_than_there_are_slots(tmp_path: Path) -> None:
     laboratory = slow_laboratory(0.004, random.Random(1))
     run(tmp_path / "run", laboratory, plan=toy_plan(tmp_path, parallel_simulations=3))
     assert laboratory.simulators.most_running == 3
-
-
-def test_completion_order_tells_what_comes_first(tmp_path: Path) -> None:
-    waits = {0: 0.08, 1: 0.01}
-    laboratory = ToyLaboratory(ToySimulators())
-
-    async def paced(task: PourTask) -> Any:
-        await asyncio.sleep(waits[task.seed])
-        return await ToySimulators().simulate(task)
-
-    laboratory.simulators.simulate = paced  # type: ignore[method-assign]
-    for order, expected in (("completion", [1, 0]), ("logical", [0, 1])):
-        strategy = Script(simulate(0), simulate(1))
-        run(tmp_path / order, laboratory, stages=one_stage(strategy, order))
-        assert [request.seed for request, _ in strategy.told if isinstance(request, Simulate)] == expected
 
 
 def test_strategies_are_told_what_the_journal_holds(tmp_path: Path) -> None:

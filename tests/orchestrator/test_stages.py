@@ -18,12 +18,9 @@ from orchestrator.campaigns.file_loading import predicts_with_posterior
 from orchestrator.learning.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
-    DeploymentSettings,
     RecordedPour,
     RecordSet,
 )
-from orchestrator.learning.deployment.d2 import D2Settings
-from orchestrator.learning.deployment.d3 import D3Settings
 from orchestrator.learning.requests import Pour, Simulate
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.codec import canonical
@@ -265,44 +262,6 @@ def test_the_calibrated_and_the_random_meet_the_same_seeds(tmp_path: Path) -> No
                 seeds.setdefault(theta, set()).add((request.action, request.seed))
     assert len(seeds) == 5  # θ*, the uncalibrated θ and three random ones
     assert len({frozenset(of_theta) for of_theta in seeds.values()}) == 1
-
-
-@pytest.mark.parametrize(
-    ("settings", "order"),
-    [
-        (D3Settings(pours=2), "logical"),
-        (D3Settings(pours=2, simulations_per_pour=0), "logical"),
-        (D3Settings(pours=2, simulations_per_pour="free"), "completion"),
-        (D2Settings(pours=2), "logical"),
-    ],
-)
-def test_only_free_simulation_beside_pours_lets_the_clock_decide(
-    tmp_path: Path, settings: DeploymentSettings, order: str
-) -> None:
-    plan = campaign(tmp_path)
-    assert plan.deployment is not None
-    plan = replace(plan, deployment=replace(plan.deployment, settings=settings))
-    assert {stage.order for stage in stages_of(plan) if stage.name.startswith("deployment")} == {order}
-    assert all(stage.order == "logical" for stage in stages_of(plan) if not stage.name.startswith("deployment"))
-
-
-def test_free_simulations_fill_the_time_of_a_pour(tmp_path: Path) -> None:
-    plan = campaign(tmp_path, calibration=None)
-    assert plan.deployment is not None
-    plan = replace(
-        plan,
-        deployment=replace(
-            plan.deployment.with_settings(simulations_per_pour="free", prior_simulations=3), scenes=(SCENE,)
-        ),
-    )
-    room = laboratory()
-    assert room.bench is not None
-    room.bench.pauses = lambda: 0.3
-    events: list[Event] = []
-    asyncio.run(run_toy(tmp_path / "run", room, plan=plan, stages=None, subscribers=[events.append]))
-    finished = [e.request for e in events if isinstance(e, RequestFinished)]
-    first = next(i for i, request in enumerate(finished) if isinstance(request, Pour))
-    assert sum(isinstance(request, Simulate) for request in finished[:first]) > 3
 
 
 def test_two_scenes_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -27,8 +27,8 @@ def states(directory: Path) -> list[str]:
     return [body["after"] for body in entries]
 
 
-def one_stage(strategy: Any, order: Any = "logical") -> tuple[StageDefinition, ...]:
-    return (StageDefinition("only", lambda results, seed: strategy, order=order, pours=True),)
+def one_stage(strategy: Any) -> tuple[StageDefinition, ...]:
+    return (StageDefinition("only", lambda results, seed: strategy, pours=True),)
 
 
 class Scripted(StageResult):

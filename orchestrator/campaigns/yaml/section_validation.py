@@ -241,8 +241,16 @@ def _bound(number: float) -> str:
     return f"{number:,}" if isinstance(number, int) and number >= 10_000 else f"{number:g}"
 
 
+REMOVED = {
+    "costs": "simulations run while the arm pours, 'simulations_per_pour' of them; remove it",
+}
+"""Remedies for keys of earlier versions."""
+
+
 def _unknown_key(model: type[Settings], loc: Loc, data: Any) -> str:
     key = str(loc[-1])
+    if key in REMOVED:
+        return f"unknown key; {REMOVED[key]}"
     guess = _meant(model, loc, data)
     if guess is not None:
         return f"unknown key; did you mean '{guess}'?"

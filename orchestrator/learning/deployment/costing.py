@@ -1,18 +1,9 @@
-"""Costs of outcomes: the minimised loss, and the time that pours and simulations take.
-
-- `Costing` converts outcomes to the number that deployment minimises.
-- `Costs` compares pours and simulations by their value per second.
-
-The module has no clock; durations come from settings and outcomes.
-"""
+"""`Costing` converts outcomes of pours and simulations to the number that deployment minimises."""
 
 from __future__ import annotations
 
-import statistics
-from collections import deque
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated
 
 from orchestrator.learning.campaign_plan import DeploymentPlan
 from orchestrator.learning.deployment.objectives import Objectives, Vector
@@ -23,8 +14,6 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Fractions, Loss, PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
-from sim_engine.settings.model import Settings
-from sim_engine.settings.quantity import Quantity
 
 
 @dataclass(frozen=True)
@@ -109,55 +98,3 @@ class Costing:
 
     def _loss(self, fractions: Fractions) -> float | None:
         return self.loss(fractions, loaded_mass=self.scene.liquid.mass, particles=self.parameters.particles)
-
-
-MEDIAN_OF = 25
-"""Number of latest simulations whose median is the cost of a simulation; the median ignores single slow ones."""
-
-WITHOUT_OUTCOME = 2.0
-"""CPU seconds of a simulation while no outcome has any."""
-
-
-class CostSettings(Settings):
-    """D3 with `simulations_per_pour: free`: costs by which simulations are chosen and ended."""
-
-    pour: Annotated[float, Quantity("s", "90 s", 0.0, 86400.0, positive=True)] = 90.0
-    """Duration of a pour, including refilling and wiping."""
-
-    worth: Annotated[float, Quantity("1", "0.005", 0.0, 1.0)] = 0.005
-    """Fraction of the worst loss. If all simulations that fit into one pour promise less in total, the workers stay
-    idle."""
-
-
-class Costs:
-    """Compares values in the unit of the loss per second of wall time.
-
-    The duration of a pour is a setting. The duration of a simulation is estimated from the CPU seconds in outcomes.
-    They are part of the journal, so that a replay yields the same estimate.
-    """
-
-    def __init__(self, settings: CostSettings, worst: float) -> None:
-        self._settings, self._worst = settings, worst
-        self._seen: deque[float] = deque(maxlen=MEDIAN_OF)
-
-    def record(self, seconds: float) -> None:
-        """Record the CPU seconds of a simulation."""
-        if seconds > 0.0:
-            self._seen.append(seconds)
-
-    @property
-    def pour(self) -> float:
-        """Duration of a pour [s]."""
-        return self._settings.pour
-
-    def simulation(self, width: int) -> float:
-        """Seconds between two simulated outcomes with `width` simulations in parallel."""
-        return (statistics.median(self._seen) if self._seen else WITHOUT_OUTCOME) / max(width, 1)
-
-    def prefers_pour(self, simulation: float, pour: float, width: int) -> bool:
-        """Whether a pour has more value per second than a simulation, given the value of each."""
-        return simulation / self.simulation(width) <= pour / self.pour
-
-    def is_idle(self, simulation: float, width: int) -> bool:
-        """Whether the simulations that fit into one pour have a negligible total value, given the value of one."""
-        return simulation * self.pour / self.simulation(width) < self._settings.worth * self._worst

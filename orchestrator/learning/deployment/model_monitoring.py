@@ -12,9 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal
 
-import numpy as np
-
-from actors.optimizer.questions import BenchOffset, Data, DiscrepancyFound, Limit, OffsetPrior, Point, Suggestion
+from actors.optimizer.questions import BenchOffset, DiscrepancyFound, Limit, OffsetPrior, Suggestion
 from orchestrator.learning.deployment.real_pours import PourTrial
 from orchestrator.learning.requests import Ask, Decision
 from orchestrator.learning.stage_result import ResultPart
@@ -413,28 +411,3 @@ def _offset_prior(axis: Axis) -> OffsetPrior:
             return OffsetPrior(shift=UNKNOWN)
         case _:
             return OffsetPrior(factor=CLOCK, origin=axis.lower / width)
-
-
-def subsampled(data: Data, around: Sequence[Point], most: int) -> Data:
-    """Select at most `most` observations: half of them nearest to `around`, the others spread over the rest.
-
-    The selection depends on the points and never on the costs. Leaving out high costs would bias the remaining
-    observations towards low costs.
-    """
-    if len(data) <= most:
-        return data
-    points = np.array(data.points)
-    kept: list[int] = []
-    if around:
-        near = np.linalg.norm(points[:, None, :] - np.array(around)[None, :, :], axis=2).min(axis=1)
-        kept = [int(i) for i in np.argsort(near, kind="stable")[: most // 2]]
-    distance = np.full(len(points), np.inf)
-    for i in kept:
-        distance = np.minimum(distance, np.linalg.norm(points - points[i], axis=1))
-    while len(kept) < most:
-        distance[kept] = -1.0
-        farthest = int(np.argmax(distance))
-        kept.append(farthest)
-        distance = np.minimum(distance, np.linalg.norm(points - points[farthest], axis=1))
-    kept.sort()
-    return Data(tuple(data.points[i] for i in kept), tuple(data.costs[i] for i in kept))

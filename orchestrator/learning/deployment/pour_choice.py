@@ -1,6 +1,6 @@
 """How D3 chooses its real pours: the query for the next one, and what follows from an answer about the simulator.
 
-`PourChoice` is shared by both forms of D3; `d3` decides when to pour and what to simulate.
+`d3` decides when to pour and what to simulate.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ BAD_CAMPAIGNS = {
         DEPLOYED,
         "strategy: D3",
         "strategy: D3\n  simulations_per_pour: 2\n  costs: {pour: 60 s}",
-        "deployment.costs: decides nothing with 'simulations_per_pour: 2'; write 'simulations_per_pour: free'",
+        "deployment.costs: unknown key; simulations run while the arm pours, 'simulations_per_pour' of them; remove it",
     ),
     "learning without pours": (
         DEPLOYED,
@@ -154,7 +154,7 @@ BAD_CAMPAIGNS = {
         DEPLOYED,
         "pours: 15",
         "pours: 15\n  simulations_per_pour: four",
-        "deployment.simulations_per_pour: should be a whole number, or 'free'",
+        "deployment.simulations_per_pour: should be a whole number, got the text 'four'",
     ),
     "negative count in place of a word": (
         DEPLOYED,

@@ -19,7 +19,6 @@ from orchestrator.cli.command_options import call
 from orchestrator.daemon.daemon_settings import load_settings
 from orchestrator.learning.calibration.continuous_calibration import C4Settings
 from orchestrator.learning.campaign_plan import DeploymentSettings
-from orchestrator.learning.deployment.costing import CostSettings
 from orchestrator.learning.deployment.d1 import D1Settings
 from orchestrator.learning.deployment.d2 import D2Settings
 from orchestrator.learning.deployment.d3 import D3Settings
@@ -278,8 +277,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           loss: {{name: spilled_and_retained, retained_weight: 0.5}}
           pours: 6
           prior_simulations: 11
-          simulations_per_pour: free
-          costs: {{pour: 75 s, worth: 0.01}}
+          simulations_per_pour: 3
           kappa: 3
           initial_samples: 4
           on_failed_pour: ignore
@@ -338,8 +336,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert deployment.settings == D3Settings(
         pours=6,
         prior_simulations=11,
-        simulations_per_pour="free",
-        costs=CostSettings(pour=75.0, worth=0.01),
+        simulations_per_pour=3,
         kappa=3.0,
         initial_samples=4,
         on_failed_pour="ignore",
@@ -364,7 +361,6 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
             "strategy: D3\n  pours: 9",
             D3Settings(pours=9, simulations_per_pour=2, prior_simulations=37, model="adaptive"),
         ),
-        ("strategy: D3\n  pours: 9\n  simulations_per_pour: free", D3Settings(pours=9, simulations_per_pour="free")),
         ("strategy: D3\n  pours: 9\n  model: residual", D3Settings(pours=9, model="residual")),
     ],
 )

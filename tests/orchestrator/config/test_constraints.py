@@ -16,10 +16,9 @@ from orchestrator.campaigns.action_assignments import parse_constraint
 from orchestrator.campaigns.campaign_checks import check_campaign
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.fingerprint import fingerprint
-from orchestrator.learning.deployment.costing import CostSettings
 from orchestrator.learning.deployment.d1 import OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
-from orchestrator.learning.deployment.d3 import FreeHybrid, Hybrid
+from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.learning.requests import Pour, Simulate
 from orchestrator.runs.stages import calibration_stages
 from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA, StrategyHarness
@@ -141,7 +140,6 @@ DEPLOYMENTS: dict[str, tuple[type[Any], dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 8}),
     "D2": (RealOnly, {"pours": 8, "initial_samples": 3}),
     "D3": (Hybrid, {"model": "adaptive", "simulations_per_pour": 2}),
-    "D3-free": (FreeHybrid, {"model": "adaptive", "simulations_per_pour": "free", "costs": CostSettings()}),
 }
 
 
@@ -149,7 +147,7 @@ DEPLOYMENTS: dict[str, tuple[type[Any], dict[str, Any]]] = {
 @pytest.mark.parametrize("name", DEPLOYMENTS)
 def test_every_deployment_keeps_to_them_although_the_best_lies_beyond(name: str) -> None:
     kind, changes = DEPLOYMENTS[name]
-    base = {"strategy": name[:2], "pours": 4, "prior_simulations": 8, "constraints": (SLOPE,), **changes}
+    base = {"strategy": name, "pours": 4, "prior_simulations": 8, "constraints": (SLOPE,), **changes}
     strategy = kind(deployment_plan(**base), SCENE, THETA, 5)
     play = StrategyHarness(spill).run(strategy)
     asked = [r.action for r in (*play.simulations, *play.pours) if isinstance(r, Simulate | Pour)]

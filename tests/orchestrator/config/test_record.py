@@ -143,8 +143,6 @@ def sensible(section: dict[str, Any]) -> dict[str, Any]:
     kept = dict(section)
     if kept["strategy"] in ("D2", "D3"):
         kept["pours"] = max(kept.get("pours", 1), 1)
-    if kept.get("simulations_per_pour") != "free":
-        kept.pop("costs", None)
     if (risk := kept.get("risk")) is not None:
         kept["simulations_per_iteration"] = max(kept.get("simulations_per_iteration", 2), 2)
         kept["risk"] = {key: value for key, value in risk.items() if key != "level"} | {"theta": "posterior"}

@@ -14,6 +14,7 @@ from orchestrator.learning.deployment.model_monitoring import Belief, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
 from orchestrator.learning.single_action import PredictedPour
 from orchestrator.records.codec import decode_result
+from orchestrator.records.run_record import Occupancy
 from orchestrator.reports.console_view import print_summary, summary_table
 from orchestrator.reports.figure_style import display_value, display_values
 from orchestrator.reports.run_summary import (
@@ -33,10 +34,9 @@ from tests.support.example_results import changed, shown
 
 BUSY = PoolUse(
     pool_busy=0.974,
-    pool_useful=0.41,
     arm_longest_wait_s=0.061,
     arm_mean_wait_s=0.03,
-    text=pool_line(0.974, 0.41, 0.061),
+    text=pool_line(0.974, 0.061),
 )
 
 
@@ -209,7 +209,7 @@ def test_summary_tells_how_busy_the_pool_was_and_whether_the_arm_waited(results:
     summary = summarise(plan, results, totals=Totals(occupancy={"deployment:narrow": BUSY}))
     assert summary.occupancy["deployment:narrow"] == BUSY
     text = " ".join(shown(summary_table(summary)).split())
-    assert "narrow: pool 97 % busy while there was work (41 % of the time)" in text
+    assert "narrow: pool 97 % busy" in text
     assert "the arm waited 0.061 s at most" in text
 
 
@@ -218,3 +218,34 @@ def test_run_that_was_stopped_at_once_has_a_summary_too() -> None:
     summary = summarise(plan, {})
     assert (summary.learning.theta, summary.outcome.receivers) == (None, {})
     assert "narrow-cup" in shown(summary_table(summary))
+
+
+def test_the_pool_counts_as_busy_by_slots_until_the_last_pour() -> None:
+    pool = Occupancy(slots=2)
+    pool.simulation_started(0.0)
+    pool.simulation_started(0.0)
+    pool.simulation_finished(10.0)  # one of two slots is free for 10 s
+    pool.pour_started(10.0)
+    pool.simulation_finished(20.0)
+    pool.simulation_started(50.0)
+    pool.simulation_started(50.0)
+    pool.pour_finished(60.0)
+    pool.pour_started(60.5)
+    pool.pour_finished(70.5)
+    pool.simulation_finished(90.0)
+    pool.finish()  # simulations after the last pour are not counted
+    assert pool.waits == [0.5]
+    assert pool.busy == pytest.approx(20.0 + 10.0 + 41.0)
+    assert pool.total == pytest.approx(2 * 70.5)
+
+
+def test_a_pause_is_no_wait_of_the_arm() -> None:
+    pool = Occupancy(slots=1)
+    pool.pour_started(0.0)
+    pool.pour_finished(90.0)
+    pool.interrupted()
+    pool.pour_started(4000.0)
+    pool.pour_finished(4090.0)
+    pool.finish()
+    assert pool.waits == []
+    assert pool.total == pytest.approx(180.0)

@@ -25,10 +25,9 @@ from orchestrator.learning.calibration.pointwise_calibration import (
 )
 from orchestrator.learning.calibration.pour_design import DesignedPours
 from orchestrator.learning.campaign_plan import CampaignPlan
-from orchestrator.learning.deployment.costing import CostSettings
 from orchestrator.learning.deployment.d1 import OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
-from orchestrator.learning.deployment.d3 import FreeHybrid, Hybrid
+from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.learning.deployment.objectives import Objectives, Retained, Spillage
 from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Suggest
 from orchestrator.learning.run_errors import LearningError
@@ -53,13 +52,6 @@ CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 BOTH = Objectives((Spillage(), Retained()), pareto=True)
 RISK = plans.risk("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
-FREE = {
-    "pours": 3,
-    "prior_simulations": 12,
-    "simulations_per_pour": "free",
-    "costs": CostSettings(),
-    "model": "adaptive",
-}
 DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 6}),
     "D1, risk": (OneShotPlanning, {"iterations": 4, "simulations_per_iteration": 2, "risk": RISK}),
@@ -69,12 +61,6 @@ DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
 }
 ALL = [*CALIBRATIONS, *DEPLOYMENTS]
 """Whose requests depend on outcomes alone."""
-
-AS_TIME_ALLOWS: dict[str, tuple[Any, dict[str, Any]]] = {
-    "D3, free": (FreeHybrid, FREE),
-    "D3, free, varying noise": (FreeHybrid, {**FREE, "prior_simulations": 45, "noise": "varying"}),
-}
-"""Whose requests depend on who answers first, too."""
 
 
 @cache
@@ -88,7 +74,7 @@ def make(name: str, seed: int) -> Any:
     if name in CALIBRATIONS:
         kind, changes = CALIBRATIONS[name]
         return kind(calibration_plan(strategy=name, **changes), measured(), seed)
-    kind, changes = (DEPLOYMENTS | AS_TIME_ALLOWS)[name]
+    kind, changes = DEPLOYMENTS[name]
     return kind(deployment_plan(strategy=name[:2], **changes), SCENE, THETA, seed)
 
 
@@ -127,7 +113,7 @@ NAN = math.nan
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*ALL, "D3, free", pytest.param("D3, free, varying noise", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ALL)
 @settings(max_examples=examples(5), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**31), share=st.sampled_from([0.1, 0.5, 0.9, 1.0]))
 def test_whatever_fails_every_question_has_numbers_and_the_end_is_an_answer_or_a_reason(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.learning.deployment.d3 import FreeHybrid, Hybrid
+from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import (
     Believed,
@@ -42,31 +42,30 @@ def upside_down(action: Any, theta: Any, rng: Any) -> float:
     return 1.0 - 0.8 * narrow_cup(action, theta, rng)
 
 
-def adaptive(seed: int = 1, **changes: Any) -> Hybrid | FreeHybrid:
+def adaptive(seed: int = 1, **changes: Any) -> Hybrid:
     plan = deployment_plan(**{"model": "adaptive", "simulations_per_pour": 1, **changes})
     strategy = plan.settings.build(plan, SCENE, THETA, seed)
-    assert isinstance(strategy, Hybrid | FreeHybrid)
+    assert isinstance(strategy, Hybrid)
     return strategy
 
 
-def losses(strategy: Hybrid | FreeHybrid) -> list[float]:
+def losses(strategy: Hybrid) -> list[float]:
     return [pour.loss for pour in strategy.result().weighed if pour.loss is not None]
 
 
-def said(strategy: Hybrid | FreeHybrid) -> list[str]:
+def said(strategy: Hybrid) -> list[str]:
     return [decision.text for decision in strategy.decisions if decision.urgent]
 
 
-def believed(strategy: Hybrid | FreeHybrid) -> Believed:
+def believed(strategy: Hybrid) -> Believed:
     trust = strategy.result().model_check
     assert isinstance(trust, Believed)
     return trust
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("simulations_per_pour", [1, "free"])
-def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted(simulations_per_pour: Any) -> None:
-    strategy = adaptive(pours=3, simulations_per_pour=simulations_per_pour)
+def test_after_every_pour_it_says_how_far_the_simulator_is_to_be_trusted() -> None:
+    strategy = adaptive(pours=3)
     StrategyHarness(narrow_cup_biased, narrow_cup, beside=2).run(strategy)
     after = [text for text in said(strategy) if text.startswith("after pour")]
     assert [text.split(" the simulator ")[0] for text in after] == ["after pour 1", "after pour 2", "after pour 3"]
