@@ -11,7 +11,7 @@ once. It does not start a daemon and does not enable the motion of hardware.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Self
 
 from orchestrator.daemon.daemon_client import Client, DaemonError, order_body
 from orchestrator.daemon.pour_request import PourIn
-from sim_engine.errors import InvalidArgumentError
 from sim_engine.resources import require
 
 if TYPE_CHECKING:
@@ -200,25 +199,6 @@ class Station:
     def cancel(self, id: str) -> StationPour:  # noqa: A002
         """Remove a pour from the queue; one that has begun is finished and weighed. Raises DecantError."""
         return _pour(self._client.post(f"/pours/{id}/cancel"))
-
-    def batch(self, id: str, pours: Sequence[Mapping[str, Any]], *, hold: bool = False) -> dict[str, Any]:  # noqa: A002
-        """Queue pours as a whole, or none of them.
-
-        Args:
-            id: of the batch; the same batch with the same id is queued once.
-            pours: the arguments of `pour`, with their ids.
-            hold: hold all until the batch is released.
-
-        Raises:
-            InvalidArgumentError: a pour has no id.
-            DecantError: an order is invalid or refused; nothing was queued.
-        """
-        for at, one in enumerate(pours):
-            if "id" not in one:
-                raise InvalidArgumentError(f"pours[{at}]: has no id; give every pour one of its own")
-        body = {"id": id, "items": [{"pour": dict(one)} for one in pours], "hold": hold}
-        found: dict[str, Any] = self._posted("/batches", body)
-        return found
 
     def pours(self, limit: int = 100) -> pd.DataFrame:
         """Ordered pours, newest first; the columns' units are in `attrs['units']`. Raises DecantError."""

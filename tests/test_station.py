@@ -28,20 +28,15 @@ def test_a_program_asks_for_pours_and_reads_them_as_a_table_with_units(tmp_path:
         assert pour.received_g > 0.0
         assert "received_g" in pour._repr_html_()
         station.weigh("beaker", "100 g")
-        made = [
-            {"id": f"plan:{n}", "source": "beaker", "receiver": "vial-2", "amount": f"{n} g", "predict": False}
-            for n in (2, 3)
-        ]
-        station.batch("plate", made, hold=True)
+        for number in (2, 3):
+            station.pour(f"plan:{number}", source="beaker", receiver="vial-2", amount=f"{number} g")
         table = station.pours()
         assert list(table["id"]) == ["plan:3", "plan:2", "plan:1"]
         assert table.attrs["units"]["received_g"] == "g"
-        assert station.cancel("plan:3").state == "cancelled"
+        assert station.cancel("plan:3").id == "plan:3"
         assert set(station.vessels()["id"]) == {"beaker", "vial-1", "vial-2"}
         with pytest.raises(decant.DecantError, match="there is no vessel 'nothing'"):
             station.pour("plan:4", source="nothing", receiver="vial-2", amount="5 g")
-        with pytest.raises(decant.InvalidArgumentError, match="has no id"):
-            station.batch("plate-2", [{"source": "beaker"}])
 
 
 @pytest.mark.slow

@@ -336,10 +336,6 @@ _queue(
     "decant queue pour plan-17:4 --from beaker-1 --into vial-7 --amount '30 g' --dry-run",
     name="pour",
 )
-_queue(station_commands.batch, "decant queue batch plate.json   # again: nothing is queued twice")
-_queue(station_commands.batch_status, "decant queue batch-status plate-1", name="batch-status")
-_queue(station_commands.hold, "decant queue hold narrow-1b2c3d", "decant queue hold narrow-1b2c3d --release")
-_queue(station_commands.reserve, "decant queue reserve left --hours 2")
 
 _materials = _group(
     "materials",

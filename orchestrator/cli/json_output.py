@@ -36,7 +36,7 @@ from orchestrator.cli.command_results import (
 )
 from orchestrator.daemon.daemon_store import QuestionOut
 from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, StatusOut
-from orchestrator.daemon.station_schemas import AccountOut, BatchOut, ContentOut, PourOut
+from orchestrator.daemon.station_schemas import AccountOut, ContentOut, PourOut
 from orchestrator.learning.dispense import Dose
 from orchestrator.learning.single_action import WeighedPour
 from orchestrator.reports.run_summary import PLANNED, ReceiverSummary, RunSummary
@@ -213,8 +213,6 @@ OUTPUTS: dict[str, Any] = {
     "queue show": CampaignDetailOut,
     "queue logs": EventOutput,
     "queue pour": PourOut,
-    "queue batch": BatchOut,
-    "queue batch-status": BatchOut,
     "materials list": VesselContentsOutput,
     "materials history": VesselHistoryOutput,
 }

@@ -103,6 +103,12 @@ def submit(
     task: Annotated[str, typer.Option(help="Task: run, calibrate or plan.")] = "run",
     rig: Annotated[str, typer.Option(help="Rig to run on, if several match.")] = "",
     priority: Annotated[int, typer.Option(help="Higher priorities run first.")] = 0,
+    caller_id: Annotated[
+        str, typer.Option("--id", help="Id of your own: the same campaign with the same id is queued once.")
+    ] = "",
+    not_before: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Earliest start with its zone: 2026-11-27T08:00:00+01:00.")
+    ] = None,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
     parameters: Parameters = None,
@@ -130,15 +136,15 @@ def submit(
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}") from None
     with connected_client(url, state) as client:
-        body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority}
-        found = client.post("/campaigns", body)
+        body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority, "id": caller_id}
+        found = client.post("/campaigns", {**body, "not_before": not_before})
     if as_json:
         print_json(found)
         return
     print(found["id"])
     print_note(f"queued for {found['rig']}; follow it with: decant queue logs -f {found['id']}")
-    if found["needs_enabling"]:
-        print_message(f"hardware: it waits until its motion is enabled: decant queue enable {found['id']}")
+    if found["waits_for"]:
+        print_message(f"it waits for: {found['waits_for']}")
 
 
 def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
@@ -174,10 +180,9 @@ def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) 
 
 def _standing(one: dict[str, Any]) -> str:
     progress = one["progress"]
-    if one["needs_enabling"]:
-        return f"waits for: decant queue enable {one['id']}"
     if progress is None:
-        return str(one["reason"]).split("\n", maxsplit=1)[0][:100]
+        reason = str(one["reason"]).split("\n", maxsplit=1)[0][:100]
+        return " · ".join(filter(None, (reason, one["waits_for"] and f"waits for: {one['waits_for']}")))
     parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
     if progress["of_pours"]:
         parts.append(f"{progress['pours']}/{progress['of_pours']} pours")
@@ -195,9 +200,9 @@ def show(key: CampaignId, url: Url = None, state: State = None, as_json: Json = 
         print_json(found)
         return
     print(f"{found['id']}: {found['state']}  ({found['task']} on {found['rig']}, {found['mode']})")
-    for name in ("reason", "run", "live"):
+    for name in ("reason", "waits_for", "run", "live"):
         if found[name]:
-            print(f"  {name:10s} {found[name]}")
+            print(f"  {name.replace('_', ' '):10s} {found[name]}")
     print(f"  submitted  {_clock(found['created'])} by {found['by']}")
     if found["progress"] is not None:
         print(f"  now        {_standing(found)}")

@@ -1,8 +1,7 @@
-"""Commands for pours and batches of the daemon, for its SiLA 2 server, and for backups of its state."""
+"""Commands for ordered pours of the daemon, for its SiLA 2 server, and for backups of its state."""
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,10 +10,8 @@ import typer
 
 from orchestrator.cli.command_options import Assignments, Json
 from orchestrator.cli.console import RefusalError, Refused, print_json, print_message
-from orchestrator.cli.queue_commands import CampaignId, State, Url, connected_client
+from orchestrator.cli.queue_commands import State, Url, connected_client
 from orchestrator.daemon.pour_request import PourIn, described
-
-BatchId = Annotated[str, typer.Argument(help="Id of the batch.")]
 
 
 def order(
@@ -69,63 +66,6 @@ def pour_text(pour: dict[str, Any]) -> str:
         low, high = predicted["interval_g"]
         text += f", {low:.1f} to {high:.1f} g expected"
     return text + (f" ({pour['reason']})" if pour["reason"] else "")
-
-
-def batch(
-    file: Annotated[Path, typer.Argument(help="Batch as JSON: id, items with a pour or a campaign each.")],
-    url: Url = None,
-    state: State = None,
-    as_json: Json = False,
-) -> None:
-    """Queue the pours and campaigns of a file as a whole, or refuse them as a whole."""
-    try:
-        body = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RefusalError(f"{file}: can't be read as JSON: {error}") from None
-    with connected_client(url, state) as client:
-        found = client.post("/batches", body)
-    _show_batch(found, as_json=as_json)
-
-
-def _show_batch(found: dict[str, Any], *, as_json: bool = False) -> None:
-    if as_json:
-        print_json(found)
-        return
-    print(f"{found['id']}: " + ", ".join(f"{count} {state}" for state, count in found["states"].items()))
-    for one in found["items"]:
-        print(f"  {one['pour'] or one['campaign']}: {one['state']}" + (f" ({one['reason']})" if one["reason"] else ""))
-
-
-def batch_status(key: BatchId, url: Url = None, state: State = None, as_json: Json = False) -> None:
-    """Show a batch with the state of each item."""
-    with connected_client(url, state) as client:
-        _show_batch(client.get(f"/batches/{key}"), as_json=as_json)
-
-
-def hold(
-    key: CampaignId,
-    release: Annotated[bool, typer.Option("--release", help="Release it again.")] = False,
-    url: Url = None,
-    state: State = None,
-) -> None:
-    """Hold a queued campaign or pour until it is released."""
-    with connected_client(url, state) as client:
-        found = client.post(f"/campaigns/{key}/change", {"hold": not release})
-    print(f"{found['id']}: {'held' if found['held'] else 'released'}")
-
-
-def reserve(
-    rig: Annotated[str, typer.Argument(help="Name of the rig.")],
-    hours: Annotated[float, typer.Option(min=0.01, help="Duration from now.")] = 1.0,
-    note: Annotated[str, typer.Option(help="Reason, for other users.")] = "",
-    url: Url = None,
-    state: State = None,
-) -> None:
-    """Reserve a rig for your own campaigns and pours."""
-    now = time.time()
-    with connected_client(url, state) as client:
-        found = client.post("/reservations", {"rig": rig, "begins": now, "ends": now + 3600.0 * hours, "note": note})
-    print(f"reservation {found['id']}: {rig} until {time.strftime('%H:%M', time.localtime(found['ends']))}")
 
 
 def serve_sila(

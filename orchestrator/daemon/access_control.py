@@ -22,6 +22,7 @@ from orchestrator.daemon.access_tokens import Person, Role, Tokens, TooManyFailu
 from orchestrator.daemon.campaign_queue import CampaignQueue
 from orchestrator.daemon.daemon_settings import LOOPBACK
 from orchestrator.daemon.emergency_stop import EmergencyStops, stop_path
+from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.rig_worker import SharedServices
 
 Message = MutableMapping[str, Any]
@@ -184,6 +185,7 @@ def part(name: str) -> Callable[..., Any]:
 
 Daemon = Annotated[SharedServices, Depends(part("daemon"))]
 Queue = Annotated[CampaignQueue, Depends(part("queue"))]
+Orders = Annotated[Ordering, Depends(part("ordering"))]
 Stops = Annotated[EmergencyStops, Depends(part("stops"))]
 Viewer = Annotated[Person, Depends(needs(Role.VIEWER))]
 Stopping = Annotated[

@@ -8,9 +8,9 @@ from __future__ import annotations
 import asyncio
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from datetime import datetime
 
 from orchestrator.daemon.daemon_store import ENDED, PAUSED, STOPPED, WITHDRAWN, DesiredState, QueueItem
 from orchestrator.daemon.emergency_stop import EmergencyStops
@@ -24,7 +24,7 @@ class RequestRefusedError(RunError):
 
 
 class CampaignQueue:
-    """Submitted campaigns, and the reservations of rigs.
+    """Submitted campaigns.
 
     Args:
         shared: what the parts of the daemon share.
@@ -41,29 +41,25 @@ class CampaignQueue:
             if not self._store.rows("select 1 from campaign where id like ?", f"%{key}"):
                 return key
 
-    def submit(self, items: Sequence[QueueItem], enter: Callable[[int], None] = lambda at: None) -> list[QueueItem]:
-        """Queue campaigns whose snapshots have been checked, in their order: all or none.
+    def submit(self, item: QueueItem, enter: Callable[[], None] = lambda: None) -> QueueItem:
+        """Queue a campaign whose snapshot has been checked.
 
         Args:
-            items: the campaigns.
-            enter: called with each index in the same transaction, after its campaign was stored; may raise.
+            item: the campaign.
+            enter: called in the same transaction, after the campaign was stored; may raise.
 
         Raises:
             RequestRefusedError: the daemon or a rig accepts no new work, or `enter` refuses one.
         """
-        for rig in {item.rig for item in items}:
-            self.refuse_new_work(rig)
-        added = []
+        self.refuse_new_work(item.rig)
         with self._store.together():
-            for at, item in enumerate(items):
-                last = self._store.rows("select coalesce(max(rank), 0) as rank from campaign")[0]["rank"]
-                added.append(replace(item, rank=float(last) + 1.0, created=time.time()))
-                self._store.add(added[-1])
-                enter(at)
-        for item in added:
-            self._shared.note(item.by, "submit", item.id)
+            last = self._store.rows("select coalesce(max(rank), 0) as rank from campaign")[0]["rank"]
+            queued = replace(item, rank=float(last) + 1.0, created=time.time())
+            self._store.add(queued)
+            enter()
+        self._shared.note(item.by, "submit", item.id)
         self._shared.wake()
-        return added
+        return queued
 
     def refuse_new_work(self, rig: str = "") -> None:
         """Raise RequestRefusedError if the daemon or one rig accepts no new work."""
@@ -76,8 +72,8 @@ class CampaignQueue:
             )
 
     def item(self, key: str) -> QueueItem:
-        """Return a campaign by its id or a unique prefix of three letters or more. Raises KeyError."""
-        found = self._store.item(key)
+        """Return a campaign by its id, its caller's id or a unique prefix of three letters or more. Raises KeyError."""
+        found = self._store.item(key) or self._store.by_caller_id(key)
         if found is None and len(key) >= 3:
             similar = [one for one in self._store.items() if one.id.startswith(key)]
             found = similar[0] if len(similar) == 1 else None
@@ -91,8 +87,16 @@ class CampaignQueue:
             raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign {what}")
         return item
 
-    def move(self, key: str, by: str, *, before: str | None = None, priority: int | None = None) -> QueueItem:
-        """Move a queued campaign in front of another one or to the head (''), or change its priority.
+    def move(
+        self,
+        key: str,
+        by: str,
+        *,
+        before: str | None = None,
+        priority: int | None = None,
+        not_before: float | None = None,
+    ) -> QueueItem:
+        """Move a queued campaign in front of another one or to the head (''), or change its priority or earliest start.
 
         Raises:
             KeyError: the campaign does not exist.
@@ -101,6 +105,8 @@ class CampaignQueue:
         item = self._queued(key, "has a place in the queue")
         if priority is not None:
             self._store.change(item.id, priority=priority)
+        if not_before is not None:
+            self._store.change(item.id, not_before=not_before or None)
         if before is not None:
             queue = [one for one in self._store.items(["queued"]) if one.id != item.id]
             at = 0 if before == "" else next((i for i, one in enumerate(queue) if one.id == self.item(before).id), None)
@@ -113,35 +119,6 @@ class CampaignQueue:
         self._shared.note(by, "move", item.id)
         self._shared.wake()
         return self.item(item.id)
-
-    def reserve(self, rig: str, by: str, begins: float, ends: float, note: str) -> dict[str, Any]:
-        """Reserve a rig for the campaigns of a user. What runs already is not interrupted.
-
-        Raises:
-            RequestRefusedError: another reservation overlaps.
-        """
-        for one in self.reservations():
-            if one["rig"] == rig and one["by"] != by and begins < one["ends"] and one["begins"] < ends:
-                raise RequestRefusedError(f"rig {rig} is reserved by {one['by']} (reservation {one['id']})")
-        values = rig, by, begins, ends, note
-        number = self._store.write(
-            "insert into reservation (rig, by, begins, ends, note) values (?, ?, ?, ?, ?)", *values
-        )
-        self._shared.note(by, "reserve", detail=f"rig {rig}")
-        self._shared.wake()
-        return next(one for one in self.reservations() if one["id"] == number)
-
-    def reservations(self) -> list[dict[str, Any]]:
-        """Return the reservations that have not ended, in the order of their begin."""
-        return self._store.rows("select * from reservation where ends > ? order by begins, id", time.time())
-
-    def cancel_reservation(self, number: int, by: str) -> None:
-        """Cancel a reservation. Raises KeyError."""
-        if not self._store.rows("select id from reservation where id = ?", number):
-            raise KeyError(number)
-        self._store.write("delete from reservation where id = ?", number)
-        self._shared.note(by, "cancel reservation", detail=str(number))
-        self._shared.wake()
 
     def pause_all(self, paused: bool, by: str) -> None:
         """Start no further campaigns, or start them again. Running campaigns continue."""
@@ -191,21 +168,28 @@ class CampaignQueue:
         await stopping
         return self.item(item.id)
 
-    def change(self, key: str, by: str, *, hold: bool | None = None, not_before: float | None = None) -> QueueItem:
-        """Hold or release a queued campaign, or set its earliest start; 0 removes it.
-
-        Raises:
-            KeyError: the campaign does not exist.
-            RequestRefusedError: it is not queued.
-        """
-        item = self._queued(key, "can be held or postponed")
-        if hold is not None:
-            self._store.change(item.id, held=hold)
-        if not_before is not None:
-            self._store.change(item.id, not_before=not_before or None)
-        self._shared.note(by, "release" if hold is False else "hold" if hold else "postpone", item.id)
-        self._shared.wake()
-        return self.item(item.id)
+    def waits_for(self, item: QueueItem) -> str:
+        """Return what has to happen before a campaign starts or continues, with the command; '' if only its turn."""
+        shared, worker = self._shared, self._shared.workers.get(item.rig)
+        if question := next(iter(self._store.questions(campaign=item.id)), None):
+            where = f"on the daemon's page, or with 'decant queue answer {question.id}'"
+            return f"an operator has to answer question {question.id} {where}: {question.text}"
+        if item.state in ENDED or (worker is not None and worker.holds(item.id)):
+            return ""
+        if worker is None:
+            return f"an administrator has to add rig {item.rig} to the daemon's settings again"
+        if self._stops.holds(item.rig):
+            return "an administrator has to clear the emergency stop: 'decant estop --clear'"
+        if item.desired_state != DesiredState.RUN:
+            return f"an operator has to resume it: 'decant queue resume {item.id}'"
+        if item.mode == "hardware" and not item.motion_enabled:
+            return f"an operator has to enable its motion: 'decant queue enable {item.id}'"
+        if item.state == "queued" and shared.queue_paused:
+            return "the queue is paused: the command 'resume', or 'decant queue resume'"
+        if item.state == "queued" and item.not_before is not None and item.not_before > time.time():
+            begins = datetime.fromtimestamp(item.not_before).astimezone()
+            return f"its earliest start, {begins.isoformat(' ', 'seconds')}"
+        return ""
 
     def resume(self, key: str, by: str) -> QueueItem:
         """Resume a campaign that is at rest.

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import shutil
 from collections.abc import Iterator
 from typing import Annotated, Any
 
@@ -18,7 +17,7 @@ from fastapi import APIRouter, HTTPException, Path, Request, Response
 from fastapi.responses import JSONResponse
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Queue, Stopping, Stops
+from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Orders, Queue, Stopping, Stops
 from orchestrator.daemon.campaign_queue import RequestRefusedError
 from orchestrator.daemon.daemon_store import ENDED, QuestionOut, QueueItem
 from orchestrator.daemon.emergency_stop import (
@@ -45,7 +44,7 @@ from orchestrator.daemon.schemas import (
     SubmissionIn,
     WhatMovesOut,
 )
-from orchestrator.daemon.submissions import Submission, SubmissionError, prepare, run_request
+from orchestrator.daemon.submissions import SubmissionError, run_request
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count, required_checksum
 
@@ -101,61 +100,65 @@ def enable_motion(daemon: SharedServices, item: QueueItem, moves: WhatMovesOut, 
 router = APIRouter()
 
 
-@router.post("/campaigns", status_code=201, operation_id="submit")
-async def submit(daemon: Daemon, queue: Queue, person: Operator, body: SubmissionIn) -> CampaignOut:
-    """Queue a campaign. It is checked as by `decant run`, and later changes of its files don't affect it."""
+@router.post(
+    "/campaigns",
+    status_code=201,
+    operation_id="submit",
+    responses={200: {"model": CampaignOut, "description": "A campaign that this request has queued before."}},
+)
+async def submit(
+    daemon: Daemon, queue: Queue, orders: Orders, person: Operator, body: SubmissionIn, response: Response
+) -> CampaignOut:
+    """Queue a campaign. It is checked as by `decant run`, and later changes of its files don't affect it.
+
+    Repeated with the same `id` and the same campaign, the call returns the campaign and queues nothing.
+    """
     if bool(body.text) == bool(body.path) or (body.path and body.files):
         raise HTTPException(422, "give either 'text' (with 'files') or 'path'")
-    with _refusing():
-        queue.refuse_new_work()
-    try:
-        submission = Submission(**body.model_dump())
-        item = await asyncio.to_thread(prepare, daemon.settings, submission, queue.new_key(), person.name)
-    except SubmissionError as error:
-        raise HTTPException(422, str(error)) from None
+    if daemon.store.by_caller_id(body.id) is not None:
+        response.status_code = 200
     with _refusing():
         try:
-            return campaign_out(daemon, *queue.submit([item]))
-        except RequestRefusedError:
-            await asyncio.to_thread(shutil.rmtree, daemon.settings.snapshots / item.id, ignore_errors=True)
-            raise
+            return campaign_out(daemon, queue, await orders.campaign(body, person.name))
+        except SubmissionError as error:
+            raise HTTPException(422, str(error)) from None
 
 
 @router.post("/campaigns/{key}/pause", operation_id="pause")
 async def pause(daemon: Daemon, queue: Queue, person: Operator, key: str) -> CampaignOut:
     """Pause at the next checkpoint; a pour that has started is finished and weighed."""
     with _refusing():
-        return campaign_out(daemon, queue.pause(key, person.name))
+        return campaign_out(daemon, queue, queue.pause(key, person.name))
 
 
 @router.post("/campaigns/{key}/stop", operation_id="stop")
 async def stop(daemon: Daemon, queue: Queue, person: Operator, key: str) -> CampaignOut:
     """Stop at the next checkpoint and publish the results so far. The campaign does not continue by itself."""
     with _refusing():
-        return campaign_out(daemon, queue.stop(key, person.name))
+        return campaign_out(daemon, queue, queue.stop(key, person.name))
 
 
 @router.post("/campaigns/{key}/abort", operation_id="abort")
 async def abort(daemon: Daemon, queue: Queue, person: Operator, key: str) -> CampaignOut:
     """Stop the motion. A tilted vessel is brought upright after the operator agrees, or left after a second abort."""
     with _refusing():
-        return campaign_out(daemon, await queue.abort(key, person.name))
+        return campaign_out(daemon, queue, await queue.abort(key, person.name))
 
 
 @router.post("/campaigns/{key}/resume", operation_id="resume")
 async def resume(daemon: Daemon, queue: Queue, person: Operator, key: str) -> CampaignOut:
     """Resume a paused campaign. If the outcome of a pour is unknown, the operator enters it first."""
     with _refusing():
-        return campaign_out(daemon, queue.resume(key, person.name))
+        return campaign_out(daemon, queue, queue.resume(key, person.name))
 
 
 @router.post("/campaigns/{key}/move", operation_id="move")
 async def move(daemon: Daemon, queue: Queue, person: Operator, key: str, body: MoveIn) -> CampaignOut:
-    """Move a campaign to another place in the queue."""
+    """Move a campaign to another place in the queue, or change its earliest start."""
     if body.before:
         found_item(queue, body.before)
     with _refusing():
-        return campaign_out(daemon, queue.move(key, person.name, before=body.before, priority=body.priority))
+        return campaign_out(daemon, queue, queue.move(key, person.name, **body.model_dump()))
 
 
 @contextlib.contextmanager
@@ -184,7 +187,7 @@ async def enable(daemon: Daemon, queue: Queue, person: Operator, key: str, body:
     with _refusing():
         moves = await asyncio.to_thread(what_moves, daemon, item)
         enable_motion(daemon, item, moves, body.laboratory, person.name)
-        return campaign_out(daemon, queue.item(item.id))
+        return campaign_out(daemon, queue, queue.item(item.id))
 
 
 @router.post("/questions/{number}/answer", operation_id="answer")

@@ -25,7 +25,7 @@ from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import locked_alone
 from orchestrator.records.run_registry import make_state_directory
 
-FORMAT = 4
+FORMAT = 5
 
 _SCHEMA = """
 create table campaign (
@@ -34,8 +34,9 @@ create table campaign (
     reason text not null,
     by text not null, created real not null, begun real, ended real, run text, motion_enabled integer not null,
     answers text not null check (json_valid(answers)),
-    batch text not null default '', held integer not null default 0, not_before real
+    caller_id text not null default '', body_hash text not null default '', not_before real
 ) strict;
+create unique index campaign_by_caller_id on campaign (caller_id) where caller_id != '';
 create index campaign_by_state on campaign (state, rig);
 create table question (
     id integer primary key, campaign text not null, rig text not null, kind text not null, about text not null,
@@ -56,13 +57,6 @@ create trigger audit_is_never_deleted before delete on audit begin
 """
 
 _STATION = """
-create table batch (
-    id text primary key, name text not null, by text not null, created real not null, body text not null
-) strict;
-create table reservation (
-    id integer primary key, rig text not null, by text not null, begins real not null, ends real not null,
-    note text not null
-) strict;
 create table pour_order (
     id text primary key, campaign text not null unique, body text not null check (json_valid(body)),
     source text not null, receiver text not null, amount real,
@@ -83,10 +77,10 @@ create table vessel (
 ) strict;
 create table node_action (
     id text primary key, name text not null, args text not null check (json_valid(args)), created real not null,
-    started real, campaign text, error text, json_result text
+    started real, error text, json_result text
 ) strict;
 """
-"""Batches, reservations, ordered pours and materials. Masses in kg, capacities in m³."""
+"""Ordered pours and materials. Masses in kg, capacities in m³."""
 
 
 class StoreError(RunError):
@@ -141,8 +135,8 @@ class QueueItem:
         by: user who submitted it.
         run: name of its run's folder; None before the run starts.
         motion_enabled: whether motion is enabled for the coming part of its run.
-        batch: id of its batch; '' without one.
-        held: whether it waits in the queue until it is released.
+        caller_id: id that its caller chose; '' without one.
+        body_hash: digest of its caller's request, by which a repeated one is recognised.
         not_before: earliest start, seconds since 1970; None: at once.
     """
 
@@ -163,8 +157,8 @@ class QueueItem:
     run: str | None = None
     motion_enabled: bool = False
     answers: dict[str, Any] = field(default_factory=dict)
-    batch: str = ""
-    held: bool = False
+    caller_id: str = ""
+    body_hash: str = ""
     not_before: float | None = None
 
 
@@ -207,7 +201,7 @@ class QuestionOut(BaseModel):
 
 
 _JSON = {"answers", "options", "details"}
-_BOOLEAN = {"motion_enabled", "hands", "held"}
+_BOOLEAN = {"motion_enabled", "hands"}
 
 
 class Store:
@@ -322,28 +316,19 @@ class Store:
         )
         return [_item(row) for row in rows]
 
-    def batch_items(self, batch: str) -> list[QueueItem]:
-        """Return the campaigns of a batch, in the order in which they were submitted."""
-        rows = self._db.execute("select * from campaign where batch = ? order by rowid", [batch])
-        return [_item(row) for row in rows]
+    def by_caller_id(self, caller_id: str) -> QueueItem | None:
+        """Return the campaign with an id of its caller, or None."""
+        row = self._db.execute("select * from campaign where caller_id = ? and caller_id != ''", [caller_id]).fetchone()
+        return None if row is None else _item(row)
 
     def counts(self) -> dict[str, int]:
         """Return the number of campaigns in each state."""
         return dict(self._db.execute("select state, count(*) from campaign group by state").fetchall())
 
-    def reserved_by(self, rig: str, now: float) -> str | None:
-        """Return the user who has reserved a rig at a time; None if it is free. The first reservation counts."""
-        found = self.rows(
-            "select by from reservation where rig = ? and begins <= ? and ends > ? order by id limit 1", rig, now, now
-        )
-        return str(found[0]["by"]) if found else None
-
     def coming(self, rig: str, now: float) -> list[float]:
-        """Return the times at which a queued campaign of a rig may start: its own, or the end of a reservation."""
+        """Return the later times at which queued campaigns of a rig may start."""
         rows = self.rows(
-            "select not_before as at from campaign where state = 'queued' and rig = ? and not_before > ? "
-            "union select ends from reservation where rig = ? and ends > ?",
-            *(rig, now, rig, now),
+            "select not_before as at from campaign where state = 'queued' and rig = ? and not_before > ?", rig, now
         )
         return [float(row["at"]) for row in rows]
 

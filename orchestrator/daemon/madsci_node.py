@@ -30,10 +30,10 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ValidationError, WithJsonSchema
 
 from orchestrator.daemon.daemon_settings import MadsciSettings, networks
-from orchestrator.daemon.daemon_store import ENDED, DesiredState, QueueItem
+from orchestrator.daemon.daemon_store import ENDED, QueueItem
 from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.pour_request import PourIn, described, problems_text
-from orchestrator.daemon.submissions import Submission, prepare
+from orchestrator.daemon.schemas import SubmissionIn
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
@@ -60,11 +60,11 @@ _CAMPAIGN_STATUS = {
 
 _SELECT = """
 select node_action.id, node_action.name, args, node_action.created, coalesce(started, campaign.created) as started,
-    coalesce(node_action.campaign, pour_order.campaign) as campaign, error, json_result
+    campaign.id as campaign, error, json_result
 from node_action left join pour_order on pour_order.id = node_action.id
-    left join campaign on campaign.id = pour_order.campaign
+    left join campaign on campaign.id = pour_order.campaign or campaign.caller_id = node_action.id
 """
-"""Actions. The order of a pour shows that its action was started: the daemon may end between the two entries."""
+"""Actions. The order of a pour or a campaign has the id of its action, and shows that the action was started."""
 
 _POUR = {
     name: (described(name), field.is_required())
@@ -159,7 +159,7 @@ class MadsciNode:
             f"{item.id}: {text}"
             for item in daemon.store.items()
             if (item.by == PERSON and await self._open(item)) or any(worker.holds(item.id) for worker in rigs)
-            if (text := self._waits_for(item))
+            if (text := self._queue.waits_for(item))
         ]
         return {
             **flags,
@@ -192,28 +192,6 @@ class MadsciNode:
         if order is None:
             return item.state != "failed"
         return _status_of(await self._ordering.pour_out(order["id"])) in ("running", "unknown")
-
-    def _waits_for(self, item: QueueItem) -> str:
-        """Return the person's act that a campaign waits for, with the command; '' if it needs none."""
-        daemon, worker = self._daemon, self._daemon.workers.get(item.rig)
-        if question := next(iter(daemon.store.questions(campaign=item.id)), None):
-            where = f"on the daemon's page, or with 'decant queue answer {question.id}'"
-            return f"an operator has to answer question {question.id} {where}: {question.text}"
-        if item.state in ENDED or (worker is not None and worker.holds(item.id)):
-            return ""
-        if worker is None:
-            return f"an administrator has to add rig {item.rig} to the daemon's settings again"
-        if self._stops.holds(item.rig):
-            return "an administrator has to clear the emergency stop: 'decant estop --clear'"
-        if item.desired_state != DesiredState.RUN:
-            return f"an operator has to resume it: 'decant queue resume {item.id}'"
-        if item.mode == "hardware" and not item.motion_enabled:
-            return f"an operator has to enable its motion: 'decant queue enable {item.id}'"
-        if item.state == "queued" and item.held:
-            return f"an operator has to release it: 'decant queue hold {item.id} --release'"
-        if item.state == "queued" and daemon.queue_paused:
-            return "the queue is paused: the command 'resume', or 'decant queue resume'"
-        return ""
 
     # ---- actions
 
@@ -261,7 +239,8 @@ class MadsciNode:
         predicted: dict[str, Any] | None = None
         try:
             if action.name == "run_campaign":
-                await self._submit(action)
+                args = {name: action.args.get(name, "") for name in ("path", "rig")}
+                await self._ordering.campaign(SubmissionIn.model_validate({**args, "id": action.id}), PERSON)
                 return
             dry = action.name == "predict_pour"
             request = PourIn.model_validate({**action.args, "id": action.id, "dry_run": dry})
@@ -277,18 +256,6 @@ class MadsciNode:
                 "update node_action set started = ?, error = ?, json_result = ? where id = ?",
                 *(time.time(), error, kept, action.id),
             )
-
-    async def _submit(self, action: NodeAction) -> None:
-        path, rig = str(action.args.get("path", "")), str(action.args.get("rig", ""))
-        submission = Submission(path=path, rig=rig)
-        item = await asyncio.to_thread(prepare, self._daemon.settings, submission, self._queue.new_key(), PERSON)
-
-        def enter(at: int) -> None:  # in the transaction of the campaign: both are stored, or none
-            self._store.write(
-                "update node_action set started = ?, campaign = ? where id = ?", time.time(), item.id, action.id
-            )
-
-        self._queue.submit([item], enter)
 
     async def result(self, key: str) -> dict[str, Any]:
         """Return `RestActionResult`. Raises KeyError."""
@@ -307,7 +274,7 @@ class MadsciNode:
         else:
             about = await self._ordering.pour_out(action.id)
             status, reason = _status_of(about), str(about["reason"] or "")
-        waits = self._waits_for(item) if status in ("running", "unknown") else ""
+        waits = self._queue.waits_for(item) if status in ("running", "unknown") else ""
         match status:
             case "running":
                 return _result(action, status, error=waits)  # the workcell manager stores every value that it reads

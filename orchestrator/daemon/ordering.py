@@ -1,19 +1,19 @@
-"""Takes orders of other programs: pours and batches, once each, whatever happens to the connection.
+"""Takes the orders of other programs, pours and campaigns, once each, whatever happens to the connection.
 
-`Ordering.pour` places an order and returns it; the same order again returns the pour that exists. `Ordering.batch`
-takes a list of pours and campaigns, or none of them. `Ordering.pour_out` is the state of a pour with its result. An
-order is placed in a task of its own, so a caller that disconnects does not interrupt it.
+`Ordering.pour` places an order and returns it; the same order again returns the pour that exists. `Ordering.campaign`
+does the same for a campaign. `Ordering.pour_out` is the state of a pour with its result. An order is placed in a task
+of its own, so a caller that disconnects does not interrupt it.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
+import hashlib
 import shutil
 import time
-from collections.abc import Callable, Coroutine, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Coroutine
+from dataclasses import replace
+from typing import Any, TypeVar
 
 from actors.interfaces import InvalidActionError, LaboratoryError
 from orchestrator.daemon.campaign_queue import CampaignQueue, RequestRefusedError
@@ -22,7 +22,7 @@ from orchestrator.daemon.materials import SURE, Materials
 from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, settled_pour
 from orchestrator.daemon.pour_request import PourIn
 from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.station_schemas import BatchIn
+from orchestrator.daemon.schemas import SubmissionIn
 from orchestrator.daemon.submissions import Submission, planned_order, prepare
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.run_tasks import POUR
@@ -34,21 +34,11 @@ RESTING = ("weighed", "failed", "unknown", "cancelled", "paused", "dry run")
 """States in which a pour does not change by itself."""
 
 
+Placed = TypeVar("Placed")
+
+
 class DifferentOrderError(RequestRefusedError):
     """The id belongs to another order."""
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A checked submission, not yet in the queue.
-
-    Attributes:
-        item: with its snapshot.
-        order: of a pour, with its request and its prediction; None for a campaign.
-    """
-
-    item: QueueItem
-    order: tuple[PourOrder, dict[str, Any], dict[str, Any] | None] | None = None
 
 
 class Ordering:
@@ -80,36 +70,75 @@ class Ordering:
         """
         if request.dry_run:
             return await self._dry_run(request, by)
-        await self._once(f"pour {request.id}", lambda: self._place(request, by))
+        body = request.model_dump()
+        if await self._once(f"pour {request.id}", lambda: self._place(request, body, by)) != body:
+            raise DifferentOrderError(
+                f"id {request.id} belongs to another order; give every pour an id of its own. Nothing was queued"
+            )
         return await self.pour_out(request.id)
 
-    async def _once(self, key: str, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    async def campaign(self, request: SubmissionIn, by: str) -> QueueItem:
+        """Check and queue a campaign, or return the one that the same request with the same id has queued already.
+
+        Args:
+            request: the campaign; without an id, every call queues one.
+            by: who submits it.
+
+        Raises:
+            SubmissionError: the campaign can't be run.
+            RequestRefusedError: no new work is accepted, or the id belongs to another campaign.
+        """
+        key, digest = self._queue.new_key(), hashlib.sha256(request.model_dump_json().encode()).hexdigest()
+        name = f"campaign {request.id or key}"
+        item = await self._once(name, lambda: self._place_campaign(request, key, digest, by))
+        if item.body_hash != digest:
+            raise DifferentOrderError(
+                f"id {request.id} belongs to another campaign, {item.id}; give every campaign an id of its own. "
+                "Nothing was queued"
+            )
+        return item
+
+    async def _place_campaign(self, request: SubmissionIn, key: str, digest: str, by: str) -> QueueItem:
+        if (known := self._daemon.store.by_caller_id(request.id)) is not None:
+            return known
+        self._queue.refuse_new_work()
+        submission = Submission(**request.model_dump(exclude={"id"}))
+        item = await asyncio.to_thread(prepare, self._daemon.settings, submission, key, by)
+        return await self._enqueue(replace(item, caller_id=request.id, body_hash=digest))
+
+    async def _once(self, key: str, work: Callable[[], Coroutine[Any, Any, Placed]]) -> Placed:
         """Do the same work once for all who ask for it while it lasts; a caller that leaves does not end it."""
         task = self._placing.get(key)
         if task is None:
             task = self._placing[key] = asyncio.create_task(work(), name=key)
             task.add_done_callback(lambda done: self._placing.pop(key, None))
-        await asyncio.shield(task)
+        placed: Placed = await asyncio.shield(task)
+        return placed
 
-    async def _place(self, request: PourIn, by: str) -> None:
-        body = request.model_dump()
+    async def _place(self, request: PourIn, body: dict[str, Any], by: str) -> dict[str, Any]:
+        """Place an order if its id has none; return the request that the id belongs to."""
         if (known := self.book.find(request.id)) is not None:
-            if known["body"] != body:
-                raise DifferentOrderError(
-                    f"id {request.id} belongs to another order; give every pour an id of its own. Nothing was queued"
-                )
-            return
-        prepared = await self._prepared(request, by)
-        await self._enqueue([prepared])
+            return dict(known["body"])
+        item, order, predicted = await self._prepared(request, by)
 
-    async def _prepared(self, request: PourIn, by: str, batch: str = "") -> Prepared:
-        """Check an order and store its snapshot.
+        def enter() -> None:
+            """Within the transaction of its campaign: the amounts of orders before it are promised already."""
+            if reason := self._refusal(order):
+                raise RequestRefusedError(f"{order.id}: {reason}")
+            self.book.add(order, item.id, body, predicted)
 
-        Args:
-            request: the order.
-            by: who orders it.
-            batch: id of its batch.
-        """
+        await self._enqueue(item, enter)
+        return body
+
+    async def _enqueue(self, item: QueueItem, enter: Callable[[], None] = lambda: None) -> QueueItem:
+        try:
+            return self._queue.submit(item, enter)
+        except BaseException:
+            await self._forget(item)
+            raise
+
+    async def _prepared(self, request: PourIn, by: str) -> tuple[QueueItem, PourOrder, dict[str, Any] | None]:
+        """Check an order and store its snapshot; return them, and the prediction if it is wanted."""
         settings = self._daemon.settings
         order = PourOrder.of(request, self.materials)
         if reason := self._refusal(order):
@@ -117,16 +146,15 @@ class Ordering:
         rig = self._rig(order, request.rig)
         self._queue.refuse_new_work(rig)
         submission = Submission(
-            task=POUR, rig=rig, priority=request.priority, order=order, batch=batch, held=request.hold,
-            not_before=request.not_before,
-        )  # fmt: skip
+            task=POUR, rig=rig, priority=request.priority, order=order, not_before=request.not_before
+        )
         item = await asyncio.to_thread(prepare, settings, submission, self._queue.new_key(), by)
         try:
             predicted = await self._predicted(item) if request.predict or request.dry_run else None
         except BaseException:
-            await self._forget([item])
+            await self._forget(item)
             raise
-        return Prepared(item, (order, request.model_dump(), predicted))
+        return item, order, predicted
 
     def _refusal(self, order: PourOrder) -> str:
         more = order.tolerance
@@ -155,10 +183,8 @@ class Ordering:
             raise OrderError(str(error)) from None
 
     async def _dry_run(self, request: PourIn, by: str) -> dict[str, Any]:
-        prepared = await self._prepared(request, by)
-        await self._forget([prepared.item])
-        assert prepared.order is not None
-        order, body, predicted = prepared.order
+        item, order, predicted = await self._prepared(request, by)
+        await self._forget(item)
         held, there = self.materials.content(order.source), self.materials.content(order.receiver)
         density = self.materials.liquid(order.liquid).density
         sure = (held.mass or 0.0) - SURE * held.deviation - self.materials.promised(order.source)
@@ -166,117 +192,13 @@ class Ordering:
         return {
             **{"id": order.id, "campaign": "", "state": "dry run", "reason": "nothing was poured"},
             **{"needs_enabling": False, "source": order.source, "receiver": order.receiver},
-            **{"amount_g": _grams(order.amount), "order": body, "predicted": predicted, "result": None},
+            **{"amount_g": _grams(order.amount), "order": request.model_dump(), "predicted": predicted, "result": None},
             "limits": {"available_g": 1e3 * max(sure, 0.0), "room_ml": 1e6 * max(room, 0.0)},
             **{"run": None, "created": None, "ended": None},
         }
 
-    async def _enqueue(self, prepared: Sequence[Prepared], first: Callable[[], object] = lambda: None) -> None:
-        """Add submissions to the queue, all or none; `first` is called in the same transaction."""
-
-        def enter(at: int) -> None:
-            if at == 0:
-                first()
-            self._enter(prepared[at])
-
-        try:
-            self._queue.submit([one.item for one in prepared], enter)
-        except BaseException:
-            await self._forget([one.item for one in prepared])
-            raise
-
-    def _enter(self, one: Prepared) -> None:
-        """Within the transaction of its campaign: the amounts of orders before it are promised already."""
-        if one.order is None:
-            return
-        order, body, predicted = one.order
-        if reason := self._refusal(order):
-            raise RequestRefusedError(f"{order.id}: {reason}")
-        self.book.add(order, one.item.id, body, predicted)
-
-    async def _forget(self, items: Sequence[QueueItem]) -> None:
-        for item in items:
-            await asyncio.to_thread(shutil.rmtree, self._daemon.settings.snapshots / item.id, ignore_errors=True)
-
-    # ---- batches
-
-    async def batch(self, request: BatchIn, by: str) -> dict[str, Any]:
-        """Queue all items of a batch or none; the same batch again returns the one that exists.
-
-        Raises:
-            OrderError, MaterialError, SubmissionError: an item is invalid; the message begins with its place.
-            RequestRefusedError: an item can't be served now, or the id belongs to another batch.
-        """
-        await self._once(f"batch {request.id}", lambda: self._place_batch(request, by))
-        return await self.batch_out(request.id)
-
-    async def _place_batch(self, request: BatchIn, by: str) -> None:
-        store, body = self._daemon.store, json.dumps(request.model_dump())
-        if known := store.rows("select body from batch where id = ?", request.id):
-            if known[0]["body"] != body:
-                raise DifferentOrderError(f"id {request.id} belongs to another batch. Nothing was queued")
-            return
-        self._queue.refuse_new_work()
-        prepared: list[Prepared] = []
-        at = 0
-        try:
-            for at, item in enumerate(request.items):  # noqa: B007  used in the message
-                if item.pour is not None:
-                    pour = item.pour
-                    if pour.dry_run:
-                        raise OrderError("dry_run: belongs to a single pour")
-                    if self.book.find(pour.id) is not None or pour.id in _ids(prepared):
-                        raise OrderError(f"id {pour.id} belongs to a pour already; give every pour an id of its own")
-                    pour = pour.model_copy(
-                        update={"hold": pour.hold or request.hold, "not_before": pour.not_before or request.not_before}
-                    )
-                    prepared.append(await self._prepared(pour, by, request.id))
-                else:
-                    assert item.campaign is not None
-                    submission = Submission(
-                        **item.campaign.model_dump(),
-                        batch=request.id, held=request.hold, not_before=request.not_before,
-                    )  # fmt: skip
-                    key = self._queue.new_key()
-                    prepared.append(
-                        Prepared(await asyncio.to_thread(prepare, self._daemon.settings, submission, key, by))
-                    )
-        except RunError as error:
-            await self._forget([one.item for one in prepared])
-            kind = type(error) if isinstance(error, RequestRefusedError) else OrderError
-            raise kind(f"items.{at}: {error}. Nothing of the batch was queued") from None
-        except BaseException:
-            await self._forget([one.item for one in prepared])
-            raise
-        values = request.id, request.name, by, time.time(), body
-
-        statement = "insert into batch (id, name, by, created, body) values (?, ?, ?, ?, ?)"
-        await self._enqueue(prepared, lambda: store.write(statement, *values))
-
-    async def batch_out(self, key: str) -> dict[str, Any]:
-        """Return a batch as `BatchOut`. Raises KeyError."""
-        found = self._daemon.store.rows("select id, name, by, created from batch where id = ?", key)
-        if not found:
-            raise KeyError(key)
-        items: list[dict[str, Any]] = []
-        for item in self._daemon.store.batch_items(key):
-            row = self.book.of_campaign(item.id)
-            state = item.state if row is None else (await self._state(item, row))[0]
-            items.append(
-                {
-                    **{"campaign": item.id, "pour": "" if row is None else row["id"], "state": state},
-                    **{"reason": item.reason, "held": item.held, "not_before": item.not_before},
-                    **{"priority": item.priority, "result": None if row is None else row["result"]},
-                }
-            )
-        states: dict[str, int] = {}
-        for one in items:
-            states[one["state"]] = states.get(one["state"], 0) + 1
-        return {**found[0], "states": states, "items": items}
-
-    def batches(self, limit: int) -> list[str]:
-        """Return the ids of batches, newest first."""
-        return [row["id"] for row in self._daemon.store.rows("select id from batch order by rowid desc limit ?", limit)]
+    async def _forget(self, item: QueueItem) -> None:
+        await asyncio.to_thread(shutil.rmtree, self._daemon.settings.snapshots / item.id, ignore_errors=True)
 
     # ---- states and results
 
@@ -302,7 +224,7 @@ class Ordering:
         if row["result"] is not None:
             return str(row["result"]["state"]), item.reason or str(row["result"]["end"])
         if item.state == "queued":
-            return "queued", "held" if item.held else item.reason
+            return "queued", item.reason or self._queue.waits_for(item)
         if item.state in ("stopped", "withdrawn"):
             return "cancelled", item.reason
         if item.state in ("unknown", "waiting for operator") or (
@@ -341,10 +263,6 @@ class Ordering:
         if row is None:
             raise KeyError(key)
         return str(row["campaign"])
-
-
-def _ids(prepared: Sequence[Prepared]) -> set[str]:
-    return {one.order[0].id for one in prepared if one.order is not None}
 
 
 def _grams(mass: float | None) -> float | None:

@@ -7,13 +7,44 @@ help texts and arguments have its descriptions. The module imports pydantic alon
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from datetime import datetime
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 CallerId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,79}$")]
 Key = Annotated[str, Field(min_length=1, max_length=80)]
 Quantity = Annotated[str, Field(max_length=40)]
+
+
+def moment(value: object) -> object:
+    """Convert a time with its zone to seconds since 1970; numbers stay.
+
+    Args:
+        value: text in ISO 8601, such as '2026-11-27T08:00:00+01:00', or seconds since 1970.
+
+    Raises:
+        ValueError: the text is no time, or has no zone.
+    """
+    if not isinstance(value, str):
+        return value
+    try:
+        read = datetime.fromisoformat(value.strip())
+    except ValueError:
+        raise ValueError(
+            f"{value!r} should be a time with its zone, such as '2026-11-27T08:00:00+01:00', or seconds since 1970"
+        ) from None
+    if read.tzinfo is None:
+        utc, local = f"{value.strip()}Z", read.astimezone().isoformat()
+        raise ValueError(f"{value!r} has no zone: '{utc}' is the time in UTC, '{local}' the time at this machine")
+    return read.timestamp()
+
+
+Moment = Annotated[
+    float,
+    BeforeValidator(moment),
+    Field(allow_inf_nan=False, description="Seconds since 1970, or a time with its zone: 2026-11-27T08:00:00+01:00."),
+]
 
 
 class RequestModel(BaseModel):
@@ -74,10 +105,7 @@ class PourIn(RequestModel):
     """Rig; '' for the one on which the vessels stand."""
 
     priority: int = Field(default=0, ge=-1000, le=1000)
-    hold: bool = False
-    """Wait in the queue until it is released."""
-
-    not_before: float | None = None
+    not_before: Moment | None = None
     """Earliest start."""
 
     dry_run: bool = False

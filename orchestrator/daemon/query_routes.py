@@ -93,12 +93,13 @@ def rigs_out(daemon: SharedServices, stops: EmergencyStops) -> list[RigOut]:
 @router.get("/campaigns", operation_id="campaigns")
 async def campaigns(
     daemon: Daemon,
+    queue: Queue,
     person: Viewer,
     state: Annotated[list[str] | None, Query(max_length=20, description="Only campaigns in these states.")] = None,
     limit: Annotated[int, Query(ge=1, le=1000)] = 200,
 ) -> list[CampaignOut]:
     """List campaigns: running ones, then the queue in its order, then the others, newest first."""
-    return [campaign_out(daemon, item) for item in daemon.store.items(state or (), limit)]
+    return [campaign_out(daemon, queue, item) for item in daemon.store.items(state or (), limit)]
 
 
 @router.get("/campaigns/{key}", operation_id="campaign")
@@ -124,7 +125,7 @@ async def campaign(daemon: Daemon, queue: Queue, person: Viewer, key: str) -> Ca
             (pours, night), summary = await asyncio.to_thread(read)
         except (ConfigError, RunError, KeyError):  # for example, a rig that the settings no longer contain
             summary = await asyncio.to_thread(summary_of, directory)
-    table = campaign_out(daemon, item).model_dump()
+    table = campaign_out(daemon, queue, item).model_dump()
     audit = daemon.store.audit(item.id)
     return CampaignDetailOut.model_validate(
         {**table, "pours_made": pours, "night": night, "summary": summary, "audit": audit}
@@ -221,7 +222,7 @@ def found_item(queue: CampaignQueue, key: str) -> QueueItem:
         raise HTTPException(404, f"there is no campaign '{key[:80]}'") from None
 
 
-def campaign_out(daemon: SharedServices, item: QueueItem) -> CampaignOut:
+def campaign_out(daemon: SharedServices, queue: CampaignQueue, item: QueueItem) -> CampaignOut:
     """Convert a campaign to its response model."""
     table, progress = asdict(item), daemon.progress(item)
     waits = item.state not in ENDED and progress is None
@@ -230,6 +231,7 @@ def campaign_out(daemon: SharedServices, item: QueueItem) -> CampaignOut:
         {
             **table,
             "needs_enabling": item.mode == "hardware" and not item.motion_enabled and waits,
+            "waits_for": queue.waits_for(item),
             "progress": progress,
             "report": run is not None and (run / REPORT).is_file(),
             "live": None if progress is None else daemon.live_url,

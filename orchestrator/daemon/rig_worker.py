@@ -464,15 +464,8 @@ class RigWorker:
         store = self._shared.store
         mine = store.wanted(self.rig.name)
         begun = sorted((one for one in mine if one.run is not None), key=lambda one: one.begun or 0.0)
-        now, other = time.time(), store.reserved_by(self.rig.name, time.time())
-        queued = [
-            one
-            for one in mine
-            if one.state == "queued"
-            and not one.held
-            and (one.not_before is None or one.not_before <= now)
-            and other in (None, one.by)
-        ]
+        now = time.time()
+        queued = [one for one in mine if one.state == "queued" and (one.not_before is None or one.not_before <= now)]
         if self._shared.queue_paused:
             queued = []
         found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.motion_enabled), None)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.daemon.pour_request import RequestModel
+from orchestrator.daemon.pour_request import CallerId, Moment, RequestModel
 from orchestrator.reports.run_summary import PourSummary
 
 
@@ -38,6 +38,12 @@ class SubmissionIn(RequestModel):
     priority: int = Field(default=0, ge=-1000, le=1000)
     """Higher priorities run first."""
 
+    id: CallerId | Literal[""] = ""
+    """Chosen by the caller. The same campaign with the same id is queued once, however often it is sent."""
+
+    not_before: Moment | None = None
+    """Earliest start."""
+
 
 class AnswerIn(RequestModel):
     """An answer to a question."""
@@ -53,6 +59,8 @@ class MoveIn(RequestModel):
     """Id of the campaign to move in front of; '' for the head of the queue."""
 
     priority: int | None = Field(default=None, ge=-1000, le=1000)
+    not_before: Moment | None = None
+    """Earliest start; 0 removes it."""
 
 
 class EnableIn(RequestModel):
@@ -145,14 +153,14 @@ class CampaignOut(ResponseModel):
     run: str | None
     """Name of its run's folder."""
 
-    batch: str
-    """Id of its batch; '' without one."""
-
-    held: bool
-    """Whether it waits in the queue until it is released."""
+    caller_id: str
+    """Id that its caller chose; '' without one."""
 
     not_before: float | None
     """Earliest start."""
+
+    waits_for: str
+    """What has to happen before it starts or continues; '' if only its turn."""
 
     motion_enabled: bool
     needs_enabling: bool

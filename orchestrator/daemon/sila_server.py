@@ -289,9 +289,7 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
           Run: Name of the run's folder.
           Details: Everything that the daemon returns about the campaign, as JSON.
         """
-        body = {"id": order_id, "name": "SiLA 2", "items": [{"campaign": {"path": path, "rig": rig}}]}
-        batch = await self._ordered("/batches", body)
-        key = batch["items"][0]["campaign"]
+        key = (await self._ordered("/campaigns", {"id": order_id, "path": path, "rig": rig}))["id"]
         found = await self._ended(f"/campaigns/{_part(key)}", status, intermediate)
         return key, found["run"] or "", json.dumps(found)
 
@@ -427,7 +425,7 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
             found: dict[str, Any] = await self._repeated(self._client.get, path)
             if _has_ended(found):
                 return found
-            reason = found["reason"] or ("an operator has to enable the motion" if found["needs_enabling"] else "")
+            reason = found["reason"] or found.get("waits_for", "")
             if (found["state"], reason) != shown:
                 shown = (found["state"], reason)
                 intermediate.send(*shown)
@@ -442,18 +440,17 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
 
     async def _path_of(self, order_id: str) -> str:
         """Path of the pour or of the campaign with a caller's id."""
-        pour, batch = f"/pours/{_part(order_id)}", f"/batches/{_part(order_id)}"
-        found = [await self._in_thread(self._found, path) for path in (pour, batch)]
-        match found:
-            case [None, None]:
-                raise InvalidOrderError(f"there is no pour and no campaign with the id '{order_id[:80]}'")
-            case [_, None]:
-                return pour
-            case [None, other] if len(other["items"]) == 1 and not other["items"][0]["pour"]:
-                return f"/campaigns/{_part(other['items'][0]['campaign'])}"
-            case [None, _]:
-                raise InvalidOrderError(f"'{order_id}' is a batch of pours; name one of its pours")
-        raise InvalidOrderError(f"a pour and a campaign have the id '{order_id}'; use the daemon's own page for them")
+        paths = f"/pours/{_part(order_id)}", f"/campaigns/{_part(order_id)}"
+        pour, campaign = [await self._in_thread(self._found, path) for path in paths]
+        if campaign is not None and campaign["caller_id"] != order_id:
+            campaign = None  # the daemon's own id, or the beginning of one
+        if pour is None and campaign is None:
+            raise InvalidOrderError(f"there is no pour and no campaign with the id '{order_id[:80]}'")
+        if pour is not None and campaign is not None:
+            raise InvalidOrderError(
+                f"a pour and a campaign have the id '{order_id}'; use the daemon's own page for them"
+            )
+        return paths[pour is None]
 
     def _found(self, path: str) -> Any:
         try:

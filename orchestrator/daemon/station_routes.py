@@ -1,4 +1,4 @@
-"""Routes of the HTTP API for other programs: ordered pours, batches, reservations and materials.
+"""Routes of the HTTP API for other programs: ordered pours and materials.
 
 The logic is in `ordering` and `materials`. A refusal has status 409 with the reason, an invalid order 422.
 """
@@ -9,29 +9,22 @@ import contextlib
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, HTTPException, Query, Response
+from fastapi import APIRouter, HTTPException, Query, Response
 
-from orchestrator.daemon.access_control import Daemon, Operator, Queue, Viewer, part
+from orchestrator.daemon.access_control import Daemon, Operator, Orders, Queue, Viewer
 from orchestrator.daemon.campaign_queue import RequestRefusedError
 from orchestrator.daemon.materials import MaterialError, mass_of
 from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.pour_request import PourIn
-from orchestrator.daemon.query_routes import campaign_out, found_item
 from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.schemas import CampaignOut
 from orchestrator.daemon.station_schemas import (
     AccountOut,
-    BatchIn,
-    BatchOut,
     HandPourIn,
     LiquidIn,
     MaterialsOut,
     PlaceIn,
     PositionIn,
     PourOut,
-    QueueChangeIn,
-    ReservationIn,
-    ReservationOut,
     VesselIn,
     WeighingIn,
 )
@@ -44,7 +37,6 @@ LONGEST_WAIT = 600.0
 router = APIRouter(tags=["station"])
 
 
-Orders = Annotated[Ordering, Depends(part("ordering"))]
 Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT, description="Return as soon as the pour rests [s].")]
 
 
@@ -132,80 +124,6 @@ async def resume_pour(queue: Queue, orders: Orders, person: Operator, key: str) 
     with _answering():
         queue.resume(orders.campaign_of(key), person.name)
         return await orders.pour_out(key)
-
-
-# ---- batches and the queue
-
-
-@router.post("/batches", status_code=201, operation_id="order_batch", response_model=BatchOut)
-async def order_batch(orders: Orders, person: Operator, body: BatchIn) -> dict[str, Any]:
-    """Queue pours and campaigns as a whole, or refuse them as a whole. Idempotent by the batch's `id`."""
-    with _answering():
-        return await orders.batch(body, person.name)
-
-
-@router.get("/batches", operation_id="batches", response_model=list[BatchOut])
-async def batches(
-    orders: Orders, person: Viewer, limit: Annotated[int, Query(ge=1, le=200)] = 20
-) -> list[dict[str, Any]]:
-    """List batches, newest first."""
-    return [await orders.batch_out(key) for key in orders.batches(limit)]
-
-
-@router.get("/batches/{key}", operation_id="batch", response_model=BatchOut)
-async def batch(orders: Orders, person: Viewer, key: str) -> dict[str, Any]:
-    """Return a batch with the state and the result of each item."""
-    with _answering():
-        return await orders.batch_out(key)
-
-
-@router.post("/batches/{key}/{change}", operation_id="change_batch", response_model=BatchOut)
-async def change_batch(
-    daemon: Daemon, queue: Queue, orders: Orders, person: Operator, key: str, change: str
-) -> dict[str, Any]:
-    """Hold or release the queued items of a batch, or cancel them: `hold`, `release` or `cancel`."""
-    if change not in ("hold", "release", "cancel"):
-        raise HTTPException(404, f"'{change[:80]}' is no change of a batch; there are hold, release, cancel")
-    with _answering():
-        await orders.batch_out(key)
-        for item in daemon.store.batch_items(key):
-            if item.state == "queued" and change == "cancel":
-                queue.stop(item.id, person.name)
-            elif item.state == "queued":
-                queue.change(item.id, person.name, hold=change == "hold")
-        return await orders.batch_out(key)
-
-
-@router.post("/campaigns/{key}/change", operation_id="change_queued")
-async def change_queued(daemon: Daemon, queue: Queue, person: Operator, key: str, body: QueueChangeIn) -> CampaignOut:
-    """Hold or release a queued campaign or pour, or change its earliest start."""
-    found_item(queue, key)
-    with _answering():
-        found = queue.change(key, person.name, hold=body.hold, not_before=body.not_before)
-        return campaign_out(daemon, found)
-
-
-@router.post("/reservations", status_code=201, operation_id="reserve", response_model=ReservationOut)
-async def reserve(daemon: Daemon, queue: Queue, person: Operator, body: ReservationIn) -> dict[str, Any]:
-    """Reserve a rig: between two times, only campaigns and pours of this user start there."""
-    if body.rig not in daemon.workers:
-        raise HTTPException(404, f"there is no rig '{body.rig}'")
-    with _answering():
-        return queue.reserve(body.rig, person.name, body.begins, body.ends, body.note)
-
-
-@router.get("/reservations", operation_id="reservations", response_model=list[ReservationOut])
-async def reservations(queue: Queue, person: Viewer) -> list[dict[str, Any]]:
-    """List reservations that have not ended."""
-    return queue.reservations()
-
-
-@router.post("/reservations/{number}/cancel", operation_id="cancel_reservation")
-async def cancel_reservation(queue: Queue, person: Operator, number: int) -> list[ReservationOut]:
-    """Cancel a reservation."""
-    with _answering():
-        queue.cancel_reservation(number, person.name)
-    return [ReservationOut.model_validate(one) for one in queue.reservations()]
 
 
 # ---- materials

@@ -1,4 +1,4 @@
-"""Request and response models of the station's API: ordered pours, batches, reservations and materials.
+"""Request and response models of the station's API: ordered pours and materials.
 
 Quantities in requests are texts with units, such as '30 g'; responses state the unit in the name. Times are in seconds
 since 1970. The models contain no logic.
@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from orchestrator.daemon.pour_request import CallerId, PourIn, Quantity, RequestModel
-from orchestrator.daemon.schemas import ResponseModel, SubmissionIn
+from orchestrator.daemon.pour_request import CallerId, Quantity, RequestModel
+from orchestrator.daemon.schemas import ResponseModel
 
 ResourceId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,59}$")]
 
@@ -117,97 +117,6 @@ class PourOut(ResponseModel):
     ended: float | None
     seconds_left: float | None = None
     """Expected time until it ends, while it runs."""
-
-
-class BatchItemIn(RequestModel):
-    """A pour or a campaign."""
-
-    pour: PourIn | None = None
-    campaign: SubmissionIn | None = None
-
-    @model_validator(mode="after")
-    def _one(self) -> BatchItemIn:
-        if (self.pour is None) == (self.campaign is None):
-            raise ValueError("give either 'pour' or 'campaign'")
-        return self
-
-
-class BatchIn(RequestModel):
-    """Pours and campaigns that are accepted or refused as a whole. The same id again is the same batch."""
-
-    id: CallerId
-    name: str = Field(default="", max_length=200)
-    items: list[BatchItemIn] = Field(min_length=1, max_length=500)
-    hold: bool = False
-    """Hold all items until the batch is released."""
-
-    not_before: float | None = None
-    """Earliest start of all items that state none."""
-
-
-class BatchItemOut(ResponseModel):
-    """One item of a batch."""
-
-    campaign: str
-    """Id in the queue."""
-
-    pour: str
-    """Caller's id of a pour; '' for a campaign."""
-
-    state: str
-    reason: str
-    held: bool
-    not_before: float | None
-    priority: int
-    result: WeighedOut | None
-    """Result of a pour; that of a campaign is at `campaigns/ID`."""
-
-
-class BatchOut(ResponseModel):
-    """A batch with the states and results of its items, in their order."""
-
-    id: str
-    name: str
-    by: str
-    created: float
-    states: dict[str, int]
-    """Number of items in each state."""
-
-    items: list[BatchItemOut]
-
-
-class QueueChangeIn(RequestModel):
-    """Changes of a queued campaign or pour."""
-
-    hold: bool | None = None
-    not_before: float | None = None
-    """Earliest start; 0 removes it."""
-
-
-class ReservationIn(RequestModel):
-    """Reserves a rig for campaigns and pours of its author. What runs already is not interrupted."""
-
-    rig: str = Field(max_length=60)
-    begins: float
-    ends: float
-    note: str = Field(default="", max_length=200)
-
-    @model_validator(mode="after")
-    def _order(self) -> ReservationIn:
-        if self.ends <= self.begins:
-            raise ValueError("'ends' should be later than 'begins'")
-        return self
-
-
-class ReservationOut(ResponseModel):
-    """A reservation."""
-
-    id: int
-    rig: str
-    by: str
-    begins: float
-    ends: float
-    note: str
 
 
 class LiquidIn(RequestModel):

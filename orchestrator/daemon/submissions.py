@@ -216,7 +216,7 @@ class Submission:
     Attributes:
         rig: name of the rig; '' selects the matching one.
         order: an ordered pour instead of a campaign.
-        batch, held, not_before: see `QueueItem`.
+        not_before: see `QueueItem`.
     """
 
     text: str = ""
@@ -226,8 +226,6 @@ class Submission:
     rig: str = ""
     priority: int = 0
     order: PourOrder | None = None
-    batch: str = ""
-    held: bool = False
     not_before: float | None = None
 
 
@@ -295,8 +293,6 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
         "",
         by,
         0.0,
-        batch=submission.batch,
-        held=submission.held,
         not_before=submission.not_before,
     )
     anywhere = run_request(settings, draft, Rig(ANY_RIG))

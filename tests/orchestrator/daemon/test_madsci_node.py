@@ -16,7 +16,7 @@ from orchestrator.daemon.daemon_client import Client
 from orchestrator.daemon.daemon_settings import MadsciSettings
 from orchestrator.daemon.madsci_node import PERSON, create_node, new_ulid
 from orchestrator.daemon.ordering import Ordering
-from orchestrator.daemon.station_schemas import PourIn
+from orchestrator.daemon.pour_request import PourIn
 from tests.support.other_environments import line, python_with, running, told
 from tests.support.station import order, rigs_in, set_up, until_pour
 from tests.support.station_process import node_process, station_process

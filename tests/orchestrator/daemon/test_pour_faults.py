@@ -86,22 +86,19 @@ def test_a_daemon_killed_at_any_stage_makes_the_pour_once_when_the_order_is_repe
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["submitting", "submitted"])
-def test_a_batch_whose_daemon_is_killed_before_it_answers_is_queued_once(tmp_path: Path, stage: str) -> None:
+def test_a_campaign_whose_daemon_is_killed_before_it_answers_is_queued_once(tmp_path: Path, stage: str) -> None:
     text, files = pack(load_campaign(campaign_in(tmp_path)))
-    items = [{"pour": order()}, {"campaign": {"text": text, "files": files, "rig": "left"}}]
-    batch = {"id": "plate-1", "items": items}
+    body = {"id": "study-1", "text": text, "files": files, "rig": "left"}
     with station(tmp_path) as (client, _):
-        register(client)
         client.post("/queue/pause")
     with station(tmp_path, stage) as (client, process):
         with pytest.raises(DaemonError):
-            client.post("/batches", batch)
+            client.post("/campaigns", body)
         assert process.wait(PATIENCE) == -9
     with station(tmp_path) as (client, _):
-        assert len(client.get("/campaigns")) == (2 if stage == "submitted" else 0)
-        first, second = client.post("/batches", batch), client.post("/batches", batch)
-        assert first["items"] == second["items"]
-        assert {one["id"] for one in client.get("/campaigns")} == {one["campaign"] for one in first["items"]}
+        assert len(client.get("/campaigns")) == (1 if stage == "submitted" else 0)
+        first, second = client.post("/campaigns", body), client.post("/campaigns", body)
+        assert [one["id"] for one in client.get("/campaigns")] == [first["id"]] == [second["id"]]
 
 
 @pytest.mark.slow

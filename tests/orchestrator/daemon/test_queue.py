@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import gc
 import json
+import re
 import socket
+from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
+from orchestrator.cli import queue_commands
 from orchestrator.cli.app import app
 from orchestrator.cli.queue_commands import submit
 from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import QueueItem
 from orchestrator.daemon.run_readout import Pours
+from orchestrator.daemon.schemas import SubmissionIn
 from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.runs.run_service import RunHandle, RunRequest
@@ -322,3 +330,67 @@ def test_a_campaign_that_names_a_cluster_uses_the_daemon_s_simulators_and_connec
                 cluster.accept()
 
     run(work())
+
+
+def test_a_campaign_that_is_sent_again_with_its_id_is_queued_once(tmp_path: Path) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            await served.post("/queue/pause")
+            text, files = pack(load_campaign(served.campaign))
+            body = {"id": "study-1", "text": text, "files": files}
+            first, second = await asyncio.gather(*(served.post("/campaigns", body) for _ in range(2)))
+            assert first["id"] == second["id"] == (await served.post("/campaigns", body, status=200))["id"]
+            assert [one["caller_id"] for one in await served.get("/campaigns")] == ["study-1"]
+            assert (await served.get("/campaigns/study-1"))["id"] == first["id"]
+            told = await served.post("/campaigns", {**body, "priority": 1}, status=409)
+            assert told["detail"].startswith(f"id study-1 belongs to another campaign, {first['id']}")
+            for _ in range(2):  # without an id, every request is another campaign
+                await served.submit()
+            assert len(await served.get("/campaigns")) == 3
+            await served.post("/queue/resume")
+            await served.until(first["id"], "finished")
+            assert (await served.post("/campaigns", body, status=200))["id"] == first["id"]
+
+    run(work())
+
+
+def test_a_campaign_waits_for_its_earliest_start_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            late = await served.submit(not_before="2126-11-27T08:00:00+01:00")
+            early = await served.submit(not_before=(datetime.now(UTC) + timedelta(seconds=0.3)).isoformat())
+            await served.until(early, "finished")
+            found = await served.get(f"/campaigns/{late}")
+            assert found["state"] == "queued"
+            assert found["not_before"] == datetime(2126, 11, 27, 7, tzinfo=UTC).timestamp()
+            assert found["waits_for"].startswith("its earliest start, 2126-11-27 ")
+            paths = "/status", "/campaigns", "/questions", f"/campaigns/{late}"
+            answers = {path: await served.get(path) for path in paths}
+            client = SimpleNamespace(get=lambda path, **query: answers[path])
+            monkeypatch.setattr(queue_commands, "connected_client", lambda *where: contextlib.nullcontext(client))
+            commands = {"list": queue_commands.list_campaigns, "show": partial(queue_commands.show, late)}
+            for name, command in commands.items():
+                command()
+                assert found["waits_for"] in capsys.readouterr().out, name
+            await served.post(f"/campaigns/{late}/move", {"not_before": 0})
+            await served.until(late, "finished")
+
+    run(work())
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ("2026-11-27T08:00", "has no zone: '2026-11-27T08:00Z' is the time in UTC"),
+        ("20261127", "has no zone"),
+        ("tomorrow", "should be a time with its zone, such as '2026-11-27T08:00:00+01:00'"),
+        ("1764230400", "should be a time with its zone"),
+        ("", "should be a time with its zone"),
+        (float("inf"), "finite number"),
+    ],
+)
+def test_an_earliest_start_that_is_no_time_is_refused(value: object, text: str) -> None:
+    with pytest.raises(ValidationError, match=re.escape(text)):
+        SubmissionIn.model_validate({"not_before": value})
