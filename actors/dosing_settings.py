@@ -49,7 +49,7 @@ class DosingSettings(Settings):
     """Largest number of top-ups."""
 
     reading_timeout: Duration = 0.7
-    """Time without a reading after which the connection counts as lost."""
+    """Time without a reading after which the cup is turned back; longer for a balance that sends less often."""
 
     time_limit: Duration = 60.0
     """Longest duration of a dose."""

@@ -14,6 +14,7 @@ stop is an end other than "reached" that the bench gave no reason for.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 from collections import Counter
@@ -48,29 +49,70 @@ class Display:
 
     behaviour: DisplayBehaviour = IDEAL
     step: float = 1e-4
-    interval: float = 0.2
+    interval: float = 0.1
     lags: tuple[float, float] = (0.1, 0.5)
 
+    @classmethod
+    def of(cls, **values: Any) -> Display:
+        """A display with some values of its own or of its behaviour."""
+        habits = {key: value for key, value in values.items() if key in DisplayBehaviour.model_fields}
+        others = {key: value for key, value in values.items() if key not in habits}
+        return cls(DisplayBehaviour(**habits), **others)
 
-def repeats(probability: float) -> DisplayBehaviour:
-    """A display that repeats a reading with a probability, at most five times in a row."""
-    return DisplayBehaviour(repeat_probability=probability, longest_repeat=5)
 
+SWITCHING: dict[str, Any] = {"rest_lag": 1.0, "rest_band": 4.0}
+TRACKING: dict[str, Any] = {"zero_tracking": 0.5, "zero_band": 4.0}
+CREEP: dict[str, Any] = {"creep": 2.5e-4}
+SLOW: dict[str, Any] = {"lags": (0.9, 1.1)}
 
-DISPLAYS = {
-    "0.1 g, every 0.1 s": Display(interval=0.1),
-    "0.1 g, every 0.2 s": Display(),
-    "42 % repeated": Display(repeats(0.42)),
-    "60 % repeated": Display(repeats(0.60)),
-    "2 g steps": Display(step=2e-3),
-    "2 g steps, 42 % repeated": Display(repeats(0.42), step=2e-3),
-    "a conversion each 0.5 s": Display(DisplayBehaviour(conversion_interval=0.5), interval=0.1),
-    "late and lost readings": Display(DisplayBehaviour(jitter=0.03, lost=0.02), interval=0.1),
-    "zero tracking": Display(DisplayBehaviour(zero_tracking=0.5, zero_band=4.0), interval=0.1),
-    "filter that switches": Display(DisplayBehaviour(rest_lag=1.0, rest_band=4.0), interval=0.1),
-    "creep": Display(DisplayBehaviour(creep=2.5e-4), interval=0.1),
-    "lag 0.9 to 1.1 s": Display(interval=0.1, lags=(0.9, 1.1)),
+SINGLE = {
+    "0.1 g, every 0.1 s": Display.of(),
+    "0.1 g, every 0.2 s": Display.of(interval=0.2),
+    "42 % repeated": Display.of(repeat_probability=0.42, interval=0.2),
+    "60 % repeated": Display.of(repeat_probability=0.60, interval=0.2),
+    "2 g steps": Display.of(step=2e-3, interval=0.2),
+    "2 g steps, 42 % repeated": Display.of(repeat_probability=0.42, step=2e-3, interval=0.2),
+    "a conversion each 0.5 s": Display.of(conversion_interval=0.5),
+    "late and lost readings": Display.of(jitter=0.03, lost=0.02),
+    "zero tracking": Display.of(**TRACKING),
+    "filter that switches": Display.of(**SWITCHING),
+    "creep": Display.of(**CREEP),
+    "lag 0.9 to 1.1 s": Display.of(**SLOW),
+    "every 1 s": Display.of(interval=1.0),
+    "every 0.5 s, 1 % lost": Display.of(interval=0.5, lost=0.01),
+    "every 0.5 s, 5 % lost, 1 g steps": Display.of(interval=0.5, lost=0.05, step=1e-3),
+    "zero tracking, creep, filter that switches": Display.of(**TRACKING, **CREEP, **SWITCHING),
+    "42 % repeated, lag 0.9 to 1.1 s": Display.of(repeat_probability=0.42, interval=0.2, **SLOW),
+    "42 % repeated, lag 0.9 to 1.1 s, late, 5 % lost": Display.of(
+        repeat_probability=0.42, interval=0.2, jitter=0.03, lost=0.05, **SLOW
+    ),
+    "50 % repeated, up to 8 in a row, every 0.15 s": Display.of(
+        repeat_probability=0.5, longest_repeat=8, interval=0.15
+    ),
 }
+
+PAIRED: dict[str, dict[str, Any]] = {
+    "every 0.5 s": {"interval": 0.5},
+    "every 1 s": {"interval": 1.0},
+    "1 g steps": {"step": 1e-3},
+    "42 % repeated": {"repeat_probability": 0.42},
+    "conversion each 0.5 s": {"conversion_interval": 0.5},
+    "late": {"jitter": 0.03},
+    "5 % lost": {"lost": 0.05},
+    "zero tracking": TRACKING,
+    "filter that switches": SWITCHING,
+    "creep": CREEP,
+    "lag 0.9 to 1.1 s": SLOW,
+}
+"""Behaviours of which every two that do not exclude each other are a row."""
+
+PAIRS = {
+    f"{first} + {second}": Display.of(**PAIRED[first], **PAIRED[second])
+    for first, second in itertools.combinations(PAIRED, 2)
+    if not set(PAIRED[first]) & set(PAIRED[second])
+}
+
+DISPLAYS = {**SINGLE, **PAIRS}
 
 
 @dataclass(frozen=True)
@@ -120,7 +162,10 @@ def _doses(display: Display, seed: int) -> Iterator[Poured]:
     true, density = CUPS[CUP], float(Liquid(mass=0.1).density)
     capacity = true.capacity * density
     liquid = Liquid(mass=float(rng.uniform(0.5, 0.95)) * capacity)
-    bench = VirtualDosingBench(true, liquid, scale, seed, command_interval=float(rng.choice([0.05, 0.1])))
+    # a receiver's mass is no multiple of the display's step
+    receiver = 0.18 + 2e-3 * float(np.random.default_rng((seed, 13)).random())
+    command_interval = float(rng.choice([0.05, 0.1]))
+    bench = VirtualDosingBench(true, liquid, scale, seed, receiver_mass=receiver, command_interval=command_interval)
     weighing, series, own = rng.normal(0.0, 0.3e-3, DOSES + 1).tolist(), None, np.random.default_rng((seed, 3))
     for place in range(DOSES):
         filled = bench.content < AMOUNT + 0.1 * capacity

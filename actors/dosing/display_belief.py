@@ -60,6 +60,7 @@ class DisplayBelief:
         jitter: standard deviation of the time at which a reading arrives [s].
         rest: time constant with which the last few steps of a change are shown [s]: the filters of some balances get
             slower as soon as the load hardly moves.
+        longest: longest time between two readings [s].
     """
 
     repeats: tuple[Beta, Beta] = (UNKNOWN_REPEATS, UNKNOWN_REPEATS)
@@ -68,6 +69,7 @@ class DisplayBelief:
     interval: float = 0.1
     jitter: float = 0.0
     rest: float = 0.0
+    longest: float = 0.0
 
     @classmethod
     def placed(cls, times: Sequence[float], masses: Sequence[float], step: float) -> DisplayBelief:
@@ -95,7 +97,8 @@ class DisplayBelief:
         off = np.abs(np.asarray(masses) - high) / max(step, SMALLEST_STEP)
         near, nearer = (int(np.flatnonzero(np.append(True, off > limit))[-1]) for limit in (5.5, 0.9))
         late = float(times[min(nearer, len(times) - 1)] - times[min(near, len(times) - 1)])
-        return cls(repeats.beta(), step=step, interval=middle, jitter=jitter, rest=late / math.log(5.5))
+        rest, longest = late / math.log(5.5), float(np.max(gaps))
+        return cls(repeats.beta(), step=step, interval=middle, jitter=jitter, rest=rest, longest=longest)
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> DisplayBelief:
@@ -118,7 +121,8 @@ class DisplayBelief:
     @property
     def numbers(self) -> tuple[float, ...]:
         """The belief as numbers, for `of`."""
-        return (*self.repeats[0], *self.repeats[1], self.noise, self.step, self.interval, self.jitter, self.rest)
+        times = (self.interval, self.jitter, self.rest, self.longest)
+        return (*self.repeats[0], *self.repeats[1], self.noise, self.step, *times)
 
     def draws(self, rng: np.random.Generator) -> Iterator[bool]:
         """Whether each of the following readings repeats the one before, without end."""

@@ -17,7 +17,9 @@ the amount in the receiver, if it is known.
 
 from __future__ import annotations
 
+import itertools
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -147,6 +149,13 @@ STALE = 0.01
 MOST_EQUAL = 12
 """Equal readings that count as weighed, however often the display repeats one."""
 
+SILENCE = (2.5, 1.3, 4.5)
+"""Time without a reading after which the cup is turned back: at least the first and at most the last factor times the
+usual interval; in between, the second factor times the longest one so far."""
+
+DECREASE = 1e-3
+"""Largest decrease of the reading over such a time; after a larger one the balance was set to zero [kg]."""
+
 MOST_PAUSES = 6
 """Largest number of such interruptions of one dose."""
 
@@ -164,8 +173,11 @@ as soon as the load hardly moves."""
 LATE_DROPS = 0.14e-3
 """Standard deviation of what still falls into the receiver after it was weighed [kg]."""
 
-LONGEST_SETTLING = 10.0
-"""Time without rest of the balance after which the amount is unknown [s]."""
+LONGEST_SETTLING = (10.0, 12.0)
+"""Time without rest of the balance after which the amount is unknown: [s], and at least so many readings."""
+
+LONGEST_CHECK = (4.0, 8.0)
+"""The same before the dose."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +249,8 @@ class DoseController:
         self._suspected: DoseEnd | None = None
         self._paused = False
         self._remainder = 0.0
-        self._interval = 0.1
+        self._interval, self._longest_gap = belief.display.interval, belief.display.longest
+        self._before_silence: float | None = None
         self._unchanged_since = 0.0
         self._factor_before = float(np.median(belief.flow_factor))
         self._idle_since: float | None = None
@@ -322,8 +335,8 @@ class DoseController:
                 else:
                     self._enter(DosePhase.APPROACH)
                 return 0.0
-        if self._now - self._begin > 4.0:
-            self._finish(DoseEnd.UNSTABLE if last else DoseEnd.CONNECTION_LOST, known=True)
+        if self._now - self._begin > self._patience(LONGEST_CHECK):
+            self._finish(DoseEnd.CONNECTION_LOST if self._silent() else DoseEnd.UNSTABLE, known=True)
         return 0.0
 
     def _approach(self) -> float:
@@ -398,8 +411,8 @@ class DoseController:
                 self._remainder = 0.0
                 self._weighed(late)
                 return 0.0
-        if waited > LONGEST_SETTLING:
-            self._finish(self._end or (DoseEnd.UNSTABLE if last else DoseEnd.CONNECTION_LOST), known=False)
+        if waited > self._patience(LONGEST_SETTLING):
+            self._finish(self._end or (DoseEnd.CONNECTION_LOST if self._silent() else DoseEnd.UNSTABLE), known=False)
         return 0.0
 
     def _slow_filter(self, lag: float) -> float:
@@ -421,6 +434,10 @@ class DoseController:
     def _weighed(self, mass: float) -> None:
         assert self._zero is not None
         amount = mass - self._zero
+        if self._before_silence is not None and amount < self._before_silence - max(2.0 * self._step_size, DECREASE):
+            self._finish(DoseEnd.CONNECTION_LOST, known=False)
+            return
+        self._before_silence = None
         # within one step of the display, the particles know more than it shows
         likely = min(max(float(self._estimator.mass.mean()), amount - self._step_size), amount + self._step_size)
         if self._suspected is not None and self._late_mass - amount > max(2.5e-3, 0.3 * self._late_mass):
@@ -446,6 +463,20 @@ class DoseController:
         """Standard deviation of a weighed amount: two roundings, two readings, and late drops [kg]."""
         rounded = self._step_size / math.sqrt(12.0)
         return math.sqrt(2.0 * (rounded**2 + self._noise**2) + LATE_DROPS**2 + self._remainder**2)
+
+    def _patience(self, limit: tuple[float, float]) -> float:
+        """The larger one of a time and of a number of readings [s]."""
+        return max(limit[0], limit[1] * self._interval)
+
+    def _silent(self) -> bool:
+        """Whether no reading has come for longer than is usual."""
+        if not self._recent:
+            return True
+        gaps = [after.time - before.time for before, after in itertools.pairwise(self._recent[-6:])]
+        usual = max(self._interval, statistics.median(gaps)) if gaps else self._interval
+        least, longer, most = SILENCE
+        limit = min(max(least * usual, longer * self._longest_gap), most * usual)
+        return self._now - self._recent[-1].time > max(limit, self._settings.reading_timeout)
 
     def _blind(self) -> float:
         """Time for which the display may repeat one reading, which hardly one in ten repeats exceeds [s]."""
@@ -518,7 +549,9 @@ class DoseController:
         self._recent.append(reading)
         del self._recent[:-40]
         if len(self._recent) > 1:
-            self._interval += 0.1 * (min(reading.time - self._recent[-2].time, 1.0) - self._interval)
+            gap = reading.time - self._recent[-2].time
+            self._interval += 0.1 * (min(gap, max(1.0, 3.0 * self._interval)) - self._interval)
+            self._longest_gap = max(self._longest_gap, gap)
         if self._zero is None or self.phase is DosePhase.DONE:
             return
         share = 1.0 if now <= self._now else min(max((reading.time - self._now) / (now - self._now), 0.0), 1.0)
@@ -570,8 +603,9 @@ class DoseController:
         assert self._begin is not None
         e, s = self._estimator, self._settings
         net = self._recent[-1].mass - (self._zero or 0.0)
-        if self._now - self._recent[-1].time > s.reading_timeout:
-            self._turn_back(DoseEnd.CONNECTION_LOST)
+        if self._silent():
+            self._before_silence = net
+            self._pause()
         elif self._now - self._begin > s.time_limit:
             self._turn_back(DoseEnd.TIME_LIMIT)
         elif self._doubt_since is not None and self._now - self._doubt_since > LONGEST_DOUBT:

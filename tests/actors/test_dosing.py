@@ -175,6 +175,73 @@ def test_a_cut_line_leaves_the_amount_unknown_and_the_cup_turned_back() -> None:
     assert record.received < 0.1
 
 
+class Unheard:
+    """A controller whose readings do not arrive for some seconds after its first 20 g.
+
+    Args:
+        controller: of the dose.
+        silence: duration [s].
+        shift: of all later readings [kg].
+    """
+
+    def __init__(self, controller: DoseController, silence: float, shift: float = 0.0) -> None:
+        self._controller, self._silence, self._shift = controller, silence, shift
+        self._cut: float | None = None
+
+    def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+        if self._cut is None and self._controller.amount[0] > 0.02:
+            self._cut = time
+        if self._cut is not None:
+            later = [one for one in readings if one.time > self._cut + self._silence]
+            readings = [replace(one, mass=one.mass + self._shift) for one in later]
+        return self._controller.step(time, tilt, readings)
+
+
+def known_display(interval: float, lost: float = 0.0) -> tuple[VirtualDosingBench, DoseController]:
+    """A dose of 100 g onto a balance whose readings were seen when the receiver was put on it."""
+    scale = TrueScale(lag=0.3, interval=interval, behaviour=DisplayBehaviour(lost=lost))
+    bench, rng = VirtualDosingBench(SPOUTED, WATER, scale, 1), np.random.default_rng(1)
+    content = SourceContent(WATER.mass)
+    series = DoseSeries(CUP, DosingSettings(), content, bench.place_receiver(), rng, particles=80)
+    return bench, series.controller(DoseOrder(0.1, receiver_mass=bench.receiver_mass), seed=1)
+
+
+@pytest.mark.parametrize(("interval", "lost"), [(1.0, 0.0), (0.5, 0.1)])
+def test_a_balance_that_sends_seldom_is_not_lost(interval: float, lost: float) -> None:
+    bench, controller = known_display(interval, lost)
+    record, result = bench.dose(controller), controller.result
+    assert result is not None
+    assert result.end is DoseEnd.REACHED
+    assert record.received == pytest.approx(0.1, abs=2.5e-3)
+    assert result.amount == pytest.approx(record.received, abs=0.3e-3)
+
+
+def test_a_balance_that_sends_seldom_and_is_lost_ends_the_dose_below_its_amount() -> None:
+    bench, controller = known_display(1.0)
+    record, result = bench.dose(controller, DosingFault("line cut", 3.0)), controller.result
+    assert result is not None
+    assert (result.end, result.amount) == (DoseEnd.CONNECTION_LOST, None)
+    assert record.received < 0.1
+    # 2.5 intervals of 1 s, and the return
+    assert record.stopped - record.readings[-1].time < 2.5 + 0.6
+
+
+def test_a_dose_continues_after_a_short_silence_of_the_balance() -> None:
+    bench, controller = known_display(0.1)
+    record, result = bench.dose(Unheard(controller, 2.0)), controller.result
+    assert result is not None
+    assert result.end is DoseEnd.REACHED
+    assert record.received == pytest.approx(0.1, abs=2e-3)
+
+
+def test_a_balance_that_returns_with_another_zero_leaves_the_amount_unknown() -> None:
+    bench, controller = known_display(0.1)
+    record, result = bench.dose(Unheard(controller, 2.0, shift=-bench.receiver_mass)), controller.result
+    assert result is not None
+    assert (result.end, result.amount) == (DoseEnd.CONNECTION_LOST, None)
+    assert record.received < 0.06
+
+
 def test_a_stream_beside_the_receiver_is_stopped() -> None:
     record, controller = one_dose(0.1, DosingFault("miss", 0.0))
     assert controller.result is not None
