@@ -144,7 +144,7 @@ class Hypotheses:
     def of(cls, discrepancy: ModelDiscrepancy, centre: Array, latent: Array, contrary: NDArray[np.bool_]) -> Hypotheses:
         """Return the hypotheses of latent variables (J, `latent_size`), a priori standard normal."""
         dimension = len(discrepancy.offset_priors)
-        z, rows = latent[:, : 2 * dimension], ndtr(latent[:, 2 * dimension :])
+        z, rows = latent[:, : 2 * dimension], np.asarray(ndtr(latent[:, 2 * dimension :]))
         width, gain = latent[:, 2 * dimension : 2 * dimension + 2].T
         rest, length, far, known, noise, growth = rows[:, 2:].T
         near = far < NEAR_SHARE

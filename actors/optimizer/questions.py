@@ -209,7 +209,7 @@ def truncated_quantiles(uniform: Array, mean: float, deviation: float, lower: fl
     """
     from scipy.special import ndtr, ndtri  # slow import
 
-    below, above = ndtr((np.array([lower, upper]) - mean) / deviation)
+    below, above = np.asarray(ndtr((np.array([lower, upper]) - mean) / deviation))
     return np.asarray(np.clip(mean + deviation * ndtri(below + uniform * (above - below)), lower, upper))
 
 

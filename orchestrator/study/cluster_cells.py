@@ -129,6 +129,8 @@ def unpack_whole(content: bytes, folder: Path) -> None:
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     with tarfile.open(fileobj=io.BytesIO(content)) as archive:
-        archive.extractall(draft, filter="data")
+        # `extractall` has a parameter for it only from Python 3.11.4 on.
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)
+        archive.extractall(draft)
     shutil.rmtree(folder, ignore_errors=True)
     draft.replace(folder)

@@ -18,6 +18,7 @@ from actors.bench.pour_feasibility import plan_pour
 from actors.contract_tests.arm_contract import ArmBench, ArmContract
 from actors.device_kinds import SimulatedArmKind
 from actors.runtime.remote_object import LocalDevice, RayDevice
+from tests.support.waiting import PATIENCE
 
 
 @pytest.fixture
@@ -93,8 +94,9 @@ def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, m
         arm = make_arm(SimulatedArmSettings(time_scale=0.2))
         await arm.release()
         pouring = asyncio.create_task(arm.execute(path, lambda state: None))
-        while not (await arm.state()).moving or (await arm.state()).time < 0.1:
-            await asyncio.sleep(0.02)
+        async with asyncio.timeout(PATIENCE):
+            while not (await arm.state()).moving or (await arm.state()).time < 0.1:
+                await asyncio.sleep(0.02)
         await arm.stop()
         with pytest.raises(ArmStoppedError) as stopped:
             await pouring

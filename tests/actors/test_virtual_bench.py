@@ -19,7 +19,7 @@ from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from sim_engine.action import DEG
 from sim_engine.outcome import PourOutcome
 from sim_engine.scene import PoseError
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, reach
 
 
 @pytest.fixture
@@ -170,13 +170,6 @@ def test_a_load_beyond_the_brim_is_refused(open_bench, scene, action):
     asyncio.run(play())
 
 
-async def reach(seen, checkpoint):
-    end = time.monotonic() + PATIENCE
-    while not seen or seen[-1].checkpoint != checkpoint:
-        assert time.monotonic() < end, f"never reached {checkpoint}"
-        await asyncio.sleep(0.02)
-
-
 async def tilting(arm):
     """Wait until the arm itself moves: the bench tells of a tilt just before it asks for one."""
     end = time.monotonic() + PATIENCE
@@ -210,7 +203,7 @@ def test_a_cancelled_pour_stops_the_arm_and_the_liquid(open_bench, scene, action
         async with open_bench(time_scale=2.0, operator_time=0.5) as laboratory:
             seen = []
             pour = asyncio.create_task(laboratory.bench.pour(scene, action, seed=5, progress=seen.append))
-            await reach(seen, "approach")
+            await reach(seen, "approach", pour)
             pour.cancel()
             with pytest.raises(NotPouredError, match="nothing was poured"):
                 await pour
@@ -235,7 +228,7 @@ def test_the_death_of_the_arm_fails_the_pour_and_the_next_one_has_a_new_arm(ray_
                 )
             )
             victim = await laboratory.bench.arm.device.pid()
-            await reach(seen, "tilt")
+            await reach(seen, "tilt", pour)
             os.kill(victim, signal.SIGKILL)
             with pytest.raises(UnknownPourError, match="arm: its process died during 'execute'"):
                 await pour

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.support.daemon_thread import Real
-from tests.support.waiting import PATIENCE
+from tests.support.waiting import PATIENCE, wait_for
 
 
 @pytest.fixture
@@ -68,8 +68,7 @@ def test_a_reader_that_never_reads_costs_nothing_and_holds_nobody_up(real: Real)
             f"GET /api/v1/events?after=0 HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {real.token()}\r\n\r\n"
         )
         slow.sendall(request.encode())
-        while not real.daemon.shared.feed.readers:
-            time.sleep(0.01)
+        wait_for(lambda: real.daemon.shared.feed.readers, "reader")
         real.tell(8_000, size=2_000)  # 16 MB, more than any buffer between the two
         with real.client() as client:
             begin = time.monotonic()

@@ -5,14 +5,15 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import psutil
 
 T = TypeVar("T")
 
-PATIENCE = 600.0
-"""Seconds until a test that waits for an event gives up: long enough for any machine, as waiting is free."""
+PATIENCE = 240.0
+"""Seconds until a test that waits for an event gives up: waiting is free. `make test` ends a test after 300 s, which
+would hide the reason."""
 
 POLL = 0.01
 """Interval at which a condition is tested [s]."""
@@ -52,3 +53,17 @@ async def wait_async(found: Callable[[], T], what: str = "", patience: float = P
         assert time.monotonic() < end, f"after {patience:g} s there was no {what or 'change'}"
         await asyncio.sleep(poll)
     return value
+
+
+async def reach(seen: list[Any], checkpoint: str, pour: asyncio.Task[Any], tilt: float = 0.0) -> None:
+    """Wait until a pour's progress has come to a checkpoint, and there to a tilt [rad].
+
+    Raises:
+        Exception: the pour's own, if it has failed before.
+    """
+
+    def there() -> bool:
+        assert not pour.done(), f"the pour ended before {checkpoint}: {pour.result()}"
+        return bool(seen) and seen[-1].checkpoint == checkpoint and (seen[-1].tilt or 0.0) >= tilt
+
+    await wait_async(there, f"{checkpoint} of the pour")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +27,6 @@ from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 from sim_engine.vessel.shapes import cylinder
-from tests.support.waiting import PATIENCE
 
 LABORATORIES = Path(__file__).parents[2] / "configs" / "laboratories"
 
@@ -228,11 +226,3 @@ async def opened_stage(
         stage.answers = {about: list(given) for about, given in (answers or {}).items()}
         stage.late = dict(late or {})
         yield stage
-
-
-async def reach(seen: list[Any], checkpoint: str, patience: float = PATIENCE) -> None:
-    """Wait until a pour's progress has come to a checkpoint."""
-    end = time.monotonic() + patience
-    while not seen or seen[-1].checkpoint != checkpoint:
-        assert time.monotonic() < end, f"never reached {checkpoint}; was at {seen[-1:]}"
-        await asyncio.sleep(0.01)

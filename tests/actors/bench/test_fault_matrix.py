@@ -155,7 +155,7 @@ async def strike_in(stage: Stage, phase: str, fault: Fault, seen: list[Any], pou
     end = time.monotonic() + PATIENCE
     while True:
         assert time.monotonic() < end, f"never came to {phase}"
-        assert not pour.done(), f"a starved machine saw nothing of {phase}"
+        assert not pour.done(), f"the pour ended before {phase} was seen: {pour.result()}"
         state = await stage.bench.arm.state()
         if phase == "weigh" and seen and seen[-1].checkpoint in ("settle", "weigh"):
             break

@@ -15,7 +15,8 @@ from tests.actors.bench.test_wired_dose import ACTION as DOSE_ACTION
 from tests.actors.bench.test_wired_dose import SCENE as DOSE_SCENE
 from tests.actors.bench.test_wired_dose import check_amount, dosed, dosing_spec
 from tests.actors.bench.test_wired_dose import target as dose_target
-from tests.support.wired_bench import OpenStage, Stage, reach, wired_spec
+from tests.support.waiting import reach
+from tests.support.wired_bench import OpenStage, Stage, wired_spec
 
 GRIPPER = GRIPPERS.get("robotiq")(model="2F-85")
 """The pourer of the wired bench is 78 mm wide."""
@@ -87,7 +88,7 @@ def test_a_pourer_lost_while_the_arm_moves_stops_it_and_is_unknown(
         seen: list[Any] = []
         stage.answers["recover"] = ["no"]
         pouring = asyncio.ensure_future(stage.pour(progress=seen.append))
-        await reach(seen, checkpoint)
+        await reach(seen, checkpoint, pouring)
         await stage.site.gripper_fault(*fault)
         with pytest.raises(UnknownPourError, match="the gripper may have lost the pourer"):
             await pouring
@@ -141,7 +142,7 @@ def test_doses_are_poured_from_a_held_pourer_and_a_lost_one_ends_them(open_stage
             seen: list[Any] = []
             stage.answers["recover"] = ["no"]
             pouring = asyncio.ensure_future(dosed(stage, 100, progress=seen.append))
-            await reach(seen, "dose")
+            await reach(seen, "dose", pouring)
             await stage.site.gripper_fault("lost")
             with pytest.raises(UnknownPourError, match="the gripper may have lost the pourer"):
                 await pouring

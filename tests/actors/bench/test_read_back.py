@@ -12,7 +12,8 @@ from actors.bench.virtual_bench import slipped
 from actors.interfaces import UnknownPourError
 from sim_engine.action import DEG
 from sim_engine.scene import SampledMotion
-from tests.support.wired_bench import ACTION, reach, wired_spec
+from tests.support.waiting import reach
+from tests.support.wired_bench import ACTION, wired_spec
 
 PACE = 10.0
 
@@ -42,9 +43,7 @@ def test_of_a_pour_that_was_broken_off_nobody_makes_up_what_became_of_the_liquid
     async def play():
         async with open_stage(without_a_robot()) as stage:
             pour = asyncio.create_task(stage.pour(ACTION.with_values(angular_velocity=20 * DEG), progress=seen.append))
-            await reach(seen, "tilt")
-            while not seen[-1].tilt:
-                await asyncio.sleep(0.01)
+            await reach(seen, "tilt", pour, tilt=1e-6)
             await stage.bench.arm.stop()
             with pytest.raises(UnknownPourError, match="only tells of pours that it completed"):
                 await pour

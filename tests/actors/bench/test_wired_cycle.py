@@ -15,7 +15,8 @@ from actors.balance.weighing_plan import Placement
 from actors.bench.virtual_bench import History
 from actors.interfaces import InvalidActionError, NotPouredError, OperatorSettings, PourProgress
 from sim_engine.outcome import PourMeasurement
-from tests.support.wired_bench import ACTION, SCENE, Stage, opened_stage, reach, wired_spec
+from tests.support.waiting import reach, wait_async
+from tests.support.wired_bench import ACTION, SCENE, Stage, opened_stage, wired_spec
 
 DEFAULT = (Placement.TRAY, Placement.RECEIVER, Placement.MANUAL)
 
@@ -210,8 +211,7 @@ def test_a_pour_given_up_before_consent_was_not_made(open_stage):
         async with open_stage(late={"start": math.inf}) as stage:
             since = await stage.now()
             pour = asyncio.create_task(stage.pour(progress=seen.append))
-            while "start" not in stage.heard:
-                await asyncio.sleep(0.02)
+            await wait_async(lambda: "start" in stage.heard or pour.done(), "question about the start")
             pour.cancel()
             with pytest.raises(NotPouredError, match="nothing was poured"):
                 await pour
@@ -228,7 +228,7 @@ def test_a_pour_given_up_while_it_tilts_stops_the_arm_where_it_is(open_stage):
     async def play():
         async with open_stage(pace=3.0) as stage:
             pour = asyncio.create_task(stage.pour(progress=seen.append))
-            await reach(seen, "tilt")
+            await reach(seen, "tilt", pour)
             pour.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await pour

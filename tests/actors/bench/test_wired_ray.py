@@ -12,7 +12,8 @@ import pytest
 
 from actors.interfaces import Notice, UnknownPourError
 from actors.laboratory import RayLaboratory
-from tests.support.wired_bench import ACTION, SCENE, Trickle, reach, wired_spec
+from tests.support.waiting import reach
+from tests.support.wired_bench import ACTION, SCENE, Trickle, wired_spec
 
 pytestmark = [pytest.mark.ray]
 
@@ -29,9 +30,7 @@ def laboratory(ray_running):
 async def stopped(opened: RayLaboratory, action: Any, how: Any) -> tuple[UnknownPourError, list[Any]]:
     seen: list[Any] = []
     pour = asyncio.create_task(opened.bench.pour(SCENE, action, seed=5, progress=seen.append))
-    await reach(seen, "tilt")
-    while not seen[-1].tilt or seen[-1].tilt < 0.1:
-        await asyncio.sleep(0.01)
+    await reach(seen, "tilt", pour, tilt=0.1)
     await how()
     with pytest.raises(UnknownPourError) as error:
         await pour

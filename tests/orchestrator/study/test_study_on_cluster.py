@@ -6,6 +6,7 @@ The cluster is a stand-in that runs tasks in this process; real ones are in `tes
 from __future__ import annotations
 
 import socket
+import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -124,6 +125,9 @@ def test_a_mesh_travels_with_its_content_and_a_folder_replaces_another(
     monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path / "cache"))
     path = tmp_path / "mine.stl"
     path.write_bytes(MUG.read_bytes())
+    # Debian 12's Python 3.11.2 has no argument `filter`.
+    unpack = tarfile.TarFile.extractall
+    monkeypatch.setattr(tarfile.TarFile, "extractall", lambda archive, path: unpack(archive, path))  # noqa: PLW0108
     sent = portable([VesselSpec(name="mug", shape=MeshShape(path=path, unit="mm"))])
     path.unlink()
     (vessel,) = from_portable(sent)
