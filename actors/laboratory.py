@@ -43,7 +43,9 @@ from actors.simulators.job_runner import Simulator, give_back, pour_simulator
 from actors.simulators.local_worker import process_pool, thread_pool
 from actors.simulators.pool import PoolShare, WorkerPool
 from actors.simulators.ray_worker import ray_pool
-from sim_engine.resources import EXTRAS, PACKAGES, installed
+from sim_engine.engine_package import engine_name
+from sim_engine.errors import EngineError
+from sim_engine.resources import EXTRAS, PACKAGES, cache_directory, installed
 from sim_engine.scene import Scene
 
 
@@ -63,6 +65,11 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
             f"laboratory {spec.name} is external: a program makes its pours and asks for them with decant.AskTell; "
             "'decant plan', and 'decant calibrate' on weighed pours, need no pours"
         )
+    try:
+        engine_name()
+        cache_directory()
+    except (EngineError, OSError) as error:
+        raise LaboratoryError(f"laboratory {spec.name}: simulations are impossible here: {error}") from None
     if spec.arm is not None and need_bench and (missing := arm_kind(spec.arm).missing()) is not None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "

@@ -1,7 +1,7 @@
 """The package that compiles the solver: its choice, its version, and a check of its first pour.
 
 - `engine_name` chooses Taichi or Quadrants, the maintained fork of Taichi: `DECANT_ENGINE`, else the first one that is
-  installed. Outcomes of the two agree within the spread of seeds, not bit for bit.
+  installed and has its shared libraries. Outcomes of the two agree within the spread of seeds, not bit for bit.
 - `engine_version` names the package and its version. Runs record it, and nodes of a cluster compare it.
 - `check_engine` compares one small pour with a stored outcome, once for each version. Compiled for some devices, the
   kernels report no error and leave all liquid in the cup; such an engine is refused.
@@ -11,9 +11,12 @@ This module has no slow imports.
 
 from __future__ import annotations
 
+import ctypes
 import importlib.metadata
 import importlib.util
+import logging
 import os
+import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -27,27 +30,39 @@ if TYPE_CHECKING:
 VARIABLE = "DECANT_ENGINE"
 
 ENGINES = ("taichi", "quadrants")
-"""Supported packages; without `DECANT_ENGINE` the first one that is installed is used."""
+"""Supported packages; without `DECANT_ENGINE` the first one that can be loaded is used."""
+
+LIBRARIES = {"taichi": {"libX11.so.6": "libx11-6", "libz.so.1": "zlib1g"}}
+"""Shared libraries that a wheel needs on Linux in addition to glibc, and the Debian packages that have them."""
+
+_log = logging.getLogger(__name__)
 
 
 def engine_name() -> str:
     """The package that compiles the solver.
 
+    If an earlier one of `ENGINES` is installed and cannot be loaded, this is logged once, with the remedy. Child
+    processes then use the same package: the choice is written to `DECANT_ENGINE`.
+
     Raises:
-        EngineError: `DECANT_ENGINE` names an unknown package, or the package is not installed.
+        EngineError: `DECANT_ENGINE` names an unknown package, or none can be used; the text gives the remedy.
     """
     chosen = os.environ.get(VARIABLE)
-    if not chosen:
-        found = next((name for name in ENGINES if _is_installed(name)), None)
-        if found is None:
-            raise EngineError("no engine is installed: pip install taichi, or quadrants")
-        return found
-    if chosen not in ENGINES:
-        raise EngineError(f"{VARIABLE}={chosen}: there is no such engine; there are {' and '.join(ENGINES)}")
-    if not _is_installed(chosen):
-        wanted = f"'{DISTRIBUTION}[{chosen}]'" if chosen == "quadrants" else chosen
-        raise EngineError(f"{VARIABLE}={chosen}: the package '{chosen}' is not installed: pip install {wanted}")
-    return chosen
+    if chosen:
+        if chosen not in ENGINES:
+            raise EngineError(f"{VARIABLE}={chosen}: there is no such engine; there are {' and '.join(ENGINES)}")
+        if (problem := _problem(chosen)) is not None:
+            raise EngineError(f"{VARIABLE}={chosen}: {problem}")
+        return chosen
+    problems = {name: _problem(name) for name in ENGINES}
+    usable = next((name for name in ENGINES if problems[name] is None), None)
+    if usable is None:
+        raise EngineError(f"no engine can be used: {'; '.join(str(problem) for problem in problems.values())}")
+    for name in ENGINES[: ENGINES.index(usable)]:
+        if _is_installed(name):
+            _log.warning("%s. %s is used; outcomes agree within the spread of seeds", problems[name], usable.title())
+            os.environ[VARIABLE] = usable
+    return usable
 
 
 def engine_version() -> str:
@@ -61,6 +76,27 @@ def engine_version() -> str:
 
 def _is_installed(name: str) -> bool:
     return importlib.util.find_spec(name) is not None
+
+
+def _problem(name: str) -> str | None:
+    """Why a package cannot be used on this machine, with the remedy; None if it can."""
+    if not _is_installed(name):
+        wanted = f"'{DISTRIBUTION}[{name}]'" if name == "quadrants" else name
+        return f"the package '{name}' is not installed: pip install {wanted}"
+    libraries = LIBRARIES.get(name, {}) if sys.platform == "linux" else {}
+    missing = [library for library in libraries if not _is_loadable(library)]
+    if missing:
+        packages = " ".join(libraries[library] for library in missing)
+        return f"{name.title()} can't be loaded without {' and '.join(missing)}: apt install {packages}"
+    return None
+
+
+def _is_loadable(library: str) -> bool:
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
 
 
 EXPECTED = {

@@ -33,31 +33,34 @@ ENVIRONMENT_VARIABLE = "DECANT_CACHE_DIR"
 
 
 _log = logging.getLogger(__name__)
-_reported: set[Path] = set()
+_reported: set[str] = set()
 
 
 def cache_directory() -> Path:
     """The cache directory, created on demand: $DECANT_CACHE_DIR, else the platform's user cache under 'decant'.
 
-    If it cannot be written, for example in a read-only home directory, a folder of this user in the directory for
-    temporary files is used. This is logged once, with the cause.
+    If it cannot be written, for example in a read-only home directory, or this user has no home directory, a folder of
+    this user in the directory for temporary files is used. This is logged once, with the cause.
 
     Raises:
         OSError: neither can be written; the text names both.
     """
-    directory = _configured()
     try:
+        directory = _configured()
         directory.mkdir(parents=True, exist_ok=True)
         if not os.access(directory, os.W_OK | os.X_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(directory))
+    except RuntimeError:  # Path.home() and expanduser()
+        cause = "is unknown, because this user has no home directory"
     except OSError as error:
         cause = f"{directory} can't be written ({error.filename}: {error.strerror})"
-        substitute = _temporary(cause)
-        if directory not in _reported:
-            _log.warning("the cache directory %s; %s is used. Set %s", cause, substitute, _CURE)
-            _reported.add(directory)
-        return substitute
-    return directory
+    else:
+        return directory
+    substitute = _temporary(cause)
+    if cause not in _reported:
+        _log.warning("the cache directory %s; %s is used. Set %s", cause, substitute, _CURE)
+        _reported.add(cause)
+    return substitute
 
 
 _CURE = f"${ENVIRONMENT_VARIABLE} to a folder that you can write"

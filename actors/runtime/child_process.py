@@ -43,6 +43,9 @@ GRACE = 10.0
 _ERRORS_KEPT = 2000
 _PR_SET_PDEATHSIG = 1
 
+_LINES_SHOWN = 3
+_CRASHES = ("*** SIG", "Fatal Python error")
+
 _hidden: dict[str, str | None] = {}
 """Previous values of variables that `own_environment` has changed."""
 
@@ -85,6 +88,14 @@ def _set_environment(values: Mapping[str, str | None]) -> None:
             os.environ.pop(name, None)
         else:
             os.environ[name] = value
+
+
+def last_lines(text: str) -> str:
+    """The last lines of a program's messages as one line, for an error; a crash's stack is left out."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    crash = next((n for n, line in enumerate(lines) if line.startswith(_CRASHES)), len(lines))
+    del lines[crash + 1 :]
+    return " / ".join(lines[-_LINES_SHOWN:])
 
 
 def python_module(module: str, *arguments: str) -> list[str]:

@@ -250,6 +250,15 @@ def forget_ray_logs(folder: Path | None = None) -> int:
     return removed
 
 
+def worker_errors(pid: int) -> str:
+    """The end of a worker's standard error in a private Ray; empty on a cluster, or if it wrote nothing."""
+    folder = ray_folder()
+    for path in [] if folder is None else folder.glob(f"session_*/logs/worker-*-{pid}.err"):
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        return "\n".join(line for line in lines[-100:] if not line.startswith(":"))  # Ray's own marks
+    return ""
+
+
 def ray_lost() -> str:
     """The lost part of a private Ray, a process or its connection to this one; empty while nothing is lost."""
     session = _session

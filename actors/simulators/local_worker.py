@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from actors.interfaces import LaboratoryError
-from actors.runtime.child_process import ConnectedProcess
+from actors.runtime.child_process import ConnectedProcess, last_lines
 from actors.simulators.job_runner import JobCancelledError, JobRunner, Simulator, pour_simulator
 from actors.simulators.pool import Greeting, WorkerLostError, WorkerPool, WorkerReply
 from sim_engine.outcome import SimulatedPour
@@ -31,6 +31,9 @@ from sim_engine.scene import PourTask
 
 LOOK_INTERVAL = 0.1
 """Time between two checks whether a job was cancelled [s]."""
+
+ENDING = 1.0
+"""Time for a process that has closed its connection to end with a status of its own [s]."""
 
 
 class ThreadWorker:
@@ -106,9 +109,9 @@ class ProcessWorker:
                     break
             reply = child.connection.recv()
         except (EOFError, OSError):
-            child.kill()
-            messages = f"; it said: {child.errors_kept}" if child.errors_kept else ""
-            raise WorkerLostError(f"status {child.status}{messages}") from None
+            if not child.wait(ENDING):
+                child.kill()
+            raise WorkerLostError(f"status {child.status}", last_lines(child.errors_kept)) from None
         finally:
             self._cancelled.discard(number)
         if isinstance(reply, SimulatedPour):

@@ -51,7 +51,16 @@ _REPORT_PAUSE = 1.0
 
 
 class WorkerLostError(Exception):
-    """The worker has died or does not respond. The text says how, if that is known."""
+    """The worker has died or does not respond.
+
+    Args:
+        how: it ended, if that is known.
+        messages: the last lines of its standard error, as the likely cause.
+    """
+
+    def __init__(self, how: str = "", messages: str = "") -> None:
+        super().__init__("; ".join(filter(None, (how, messages and f"its last messages: {messages}"))))
+        self.messages = messages
 
 
 class WorkerUnusableError(Exception):
@@ -402,7 +411,9 @@ class WorkerPool:
         if member not in self._members:
             return
         if isinstance(error, WorkerLostError):
-            self._lose(member)
+            if error.messages:
+                self._problem = f"a simulator died at its start; {error}"
+            self._lose(member, error)
         elif error is not None:
             unusable = isinstance(error, WorkerUnusableError)
             self._refuse(member, str(error) if unusable else f"a simulator can't be started: {error}")
@@ -427,7 +438,7 @@ class WorkerPool:
         task.add_done_callback(self._ending.discard)
         task.add_done_callback(mark_retrieved)
 
-    def _lose(self, member: _Member, reason: str = "") -> None:
+    def _lose(self, member: _Member, error: WorkerLostError | None = None) -> None:
         """Replace a worker that is lost or has to be ended. Its jobs go to others; its running job counts one death."""
         self._deaths += 1
         self._stop_timing(member)
@@ -436,13 +447,10 @@ class WorkerPool:
             first = orphans[0]
             first.deaths += 1
             if first.deaths > self._retries:
-                how = f" (the last one: {reason})" if reason else ""
-                first.fail(
-                    SimulationError(
-                        f"{first.deaths} simulators died over this job{how}; they may lack memory (particles: "
-                        f"{first.task.parameters.particles})"
-                    )
-                )
+                how = f" (the last one: {error})" if error is not None and str(error) else ""
+                if error is None or not error.messages:
+                    how += f"; they may lack memory (particles: {first.task.parameters.particles})"
+                first.fail(SimulationError(f"{first.deaths} simulators died over this job{how}"))
                 del orphans[0]
         self._queue.repeat(orphans)
         self._members.remove(member)
@@ -516,7 +524,7 @@ class WorkerPool:
         if member not in self._members:
             return  # its jobs are at other workers
         if isinstance(error, WorkerLostError):
-            self._lose(member, str(error))
+            self._lose(member, error)
             return
         if member.sent[0] is sent:
             self._stop_timing(member, None if error is not None else reply.result().seconds)

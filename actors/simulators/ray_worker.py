@@ -15,6 +15,7 @@ import hashlib
 import io
 import os
 import pickle
+import re
 import socket
 import tempfile
 import time
@@ -28,7 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.interfaces import LaboratoryError, SimulationError
+from actors.runtime.child_process import last_lines
 from actors.runtime.ray_cluster import Versions, versions
+from actors.runtime.ray_runtime import worker_errors
 from actors.runtime.remote_object import actor_class, kill_actor, mark_retrieved
 from actors.simulators.job_runner import JobCancelledError, JobRunner, Simulator, pour_simulator
 from actors.simulators.pool import (
@@ -128,7 +131,7 @@ class RayWorker:
         except ray.exceptions.RayActorError as error:
             if "error raised in its creation task" in str(error):
                 raise WorkerUnusableError(f"a simulator's process does not start: {_last_line(error)}") from error
-            raise WorkerLostError from error
+            raise _lost(error) from error
         if self._expected is not None and (difference := self._expected.difference(found)):
             raise WorkerUnusableError(f"the simulator on {greeting.host} is not like this machine's: {difference}")
         return greeting
@@ -141,7 +144,7 @@ class RayWorker:
         try:
             reply = await asyncio.wrap_future(self._actor.simulate.remote(number, packed, *meshes).future())
         except ray.exceptions.RayActorError as error:
-            raise WorkerLostError from error
+            raise _lost(error) from error
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, LaboratoryError | JobCancelledError):
                 raise error.cause from None
@@ -186,6 +189,11 @@ def ray_pool(
     options = {"num_cpus": cpus, **(placement or {})}
     worker = partial(RayWorker, make, Packer(), options, expected)
     return WorkerPool(size, worker, ahead=1, retries=retries, deadline=deadline, tell=tell)
+
+
+def _lost(error: BaseException) -> WorkerLostError:
+    pid = re.search(r"\bpid: (\d+)", str(error))
+    return WorkerLostError(messages="" if pid is None else last_lines(worker_errors(int(pid[1]))))
 
 
 def _last_line(error: BaseException) -> str:

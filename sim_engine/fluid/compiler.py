@@ -9,8 +9,10 @@ import importlib
 import os
 from typing import Any
 
-from sim_engine.engine_package import engine_name
+from sim_engine.engine_package import ENGINES, VARIABLE, engine_name
+from sim_engine.errors import EngineError
 from sim_engine.fluid.engine_startup import imports
+from sim_engine.resources import ENVIRONMENT_VARIABLE, cache_directory
 
 NAME = engine_name()
 
@@ -25,8 +27,15 @@ for _variable, _value in {
 }.items():
     os.environ.setdefault(_variable, _value)
 
-with imports(NAME):
-    ti: Any = importlib.import_module(NAME)
+if not os.environ.get("HOME"):
+    # Taichi aborts the process if it finds neither variable, as in a service.
+    os.environ[ENVIRONMENT_VARIABLE] = os.environ["XDG_CACHE_HOME"] = str(cache_directory())
+
+try:
+    with imports(NAME):
+        ti: Any = importlib.import_module(NAME)
+except ImportError as error:
+    raise EngineError(f"{NAME} can't be loaded: {error}. {VARIABLE} chooses one of {', '.join(ENGINES)}") from error
 
 KERNELS = "kernels" if NAME == "taichi" else f"kernels-{NAME}"
 """Folder of compiled kernels in the cache directory: the packages do not share it."""

@@ -17,6 +17,7 @@ from actors.laboratory_settings import LaboratorySettings, TrueLiquid
 from actors.optimizer.questions import Data, MinimumQuery
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.campaigns.file_loading import load_laboratory
+from sim_engine.engine_package import LIBRARIES
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
 from sim_engine.search_space import Axis, Space
@@ -114,6 +115,13 @@ def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_
     np.testing.assert_array_equal(np.array(ours.frames.positions), np.array(twins.frames.positions))
     assert measured == measured_twin
     assert measured.loaded == pytest.approx(0.2, abs=1e-3)
+
+
+def test_an_engine_without_its_shared_libraries_is_refused_before_anything_starts(monkeypatch):
+    monkeypatch.setenv("DECANT_ENGINE", "taichi")
+    monkeypatch.setitem(LIBRARIES, "taichi", {"libNone.so.6": "libnone-6"})
+    with pytest.raises(LaboratoryError, match=r"DECANT_ENGINE=taichi: .*apt install libnone-6"):
+        check_laboratory(LaboratorySettings(name="planning"), need_bench=False, brief=True)
 
 
 def test_a_moments_work_needs_no_ray_and_still_simulates_side_by_side(monkeypatch, fake, task):

@@ -137,6 +137,23 @@ def test_simulators_end_although_the_bench_can_not_be_closed(fake):
     assert left == []
 
 
+@pytest.mark.parametrize("kind", ["processes", pytest.param("ray", marks=pytest.mark.ray)])
+def test_simulators_that_crash_are_lost_with_their_last_messages(request, kind, fake, task):
+    """A lack of memory leaves none; else it would be a false cause."""
+    if kind == "ray":
+        request.getfixturevalue("ray_running")
+    make_pool = ray_pool if kind == "ray" else process_pool
+
+    async def play():
+        pool = make_pool(1, make=fake())
+        with pytest.raises(SimulationError, match=r"3 simulators died .*Assertion failure: home != nullptr") as error:
+            await pool.simulate(task(name="aborting"))
+        await pool.close()
+        return str(error.value)
+
+    assert "memory" not in asyncio.run(play())
+
+
 @pytest.mark.slow
 def test_a_dead_process_is_replaced_and_what_kills_every_one_is_given_up(fake, task, tmp_path):
     log = tmp_path / "log"

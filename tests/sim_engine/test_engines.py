@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,10 +16,18 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import child_environment
 from actors.simulators.job_runner import JobRunner
 from sim_engine import engine_package
-from sim_engine.engine_package import ENGINES, EXPECTED, check_engine, check_task, engine_name, engine_version
+from sim_engine.engine_package import (
+    ENGINES,
+    EXPECTED,
+    LIBRARIES,
+    check_engine,
+    check_task,
+    engine_name,
+    engine_version,
+)
 from sim_engine.errors import EngineError, WrongOutcomeError
 from sim_engine.outcome import PourOutcome
-from sim_engine.resources import ENVIRONMENT_VARIABLE, installed
+from sim_engine.resources import ENVIRONMENT_VARIABLE, cache_directory, installed
 from sim_engine.scene import PourTask
 from sim_engine.simulator import PourSimulator
 from tests.support.waiting import PATIENCE
@@ -54,6 +63,50 @@ def test_an_engine_that_is_not_installed_is_refused_with_the_remedy(monkeypatch:
     monkeypatch.setenv("DECANT_ENGINE", "quadrants")
     with pytest.raises(EngineError, match=r"not installed: pip install 'decant-pouring\[quadrants\]'"):
         engine_name()
+
+
+def test_where_taichi_lacks_a_library_quadrants_is_used_here_and_in_children_and_it_is_said_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A bare Debian has no libX11, which Taichi's wheel needs."""
+    monkeypatch.setenv("DECANT_ENGINE", "")
+    monkeypatch.setattr(engine_package, "_is_installed", lambda name: True)
+    monkeypatch.setitem(LIBRARIES, "taichi", {"libNone.so.6": "libnone-6"})
+    assert [engine_name(), engine_name()] == ["quadrants"] * 2
+    assert child_environment()["DECANT_ENGINE"] == "quadrants"
+    (record,) = caplog.records
+    assert "Taichi can't be loaded without libNone.so.6: apt install libnone-6. Quadrants is used" in record.message
+    monkeypatch.setenv("DECANT_ENGINE", "")
+    monkeypatch.setattr(engine_package, "_is_installed", lambda name: name == "taichi")
+    with pytest.raises(EngineError, match=r"apt install libnone-6; the package 'quadrants' is not installed: pip inst"):
+        engine_name()
+
+
+@pytest.mark.parametrize("engine", [name for name in ENGINES if installed(name)])
+def test_a_pour_is_simulated_without_a_home_directory(engine: str, tmp_path: Path) -> None:
+    """As by cron, or a service's user."""
+    environment = {"PATH": os.environ["PATH"], "DECANT_ENGINE": engine, ENVIRONMENT_VARIABLE: str(cache_directory())}
+    if engine_package._problem(engine) is not None:
+        pytest.skip(f"{engine} can't be loaded here")
+    poured = subprocess.run(
+        [sys.executable, "-c", POUR], env=environment, capture_output=True, text=True, timeout=PATIENCE
+    )
+    assert poured.returncode == 0, poured.stderr
+    assert json.loads(poured.stdout)["imported"] == [engine]
+
+
+def test_without_a_home_directory_the_cache_is_a_folder_of_this_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in (ENVIRONMENT_VARIABLE, "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    assert cache_directory() == tmp_path / f"decant-cache-{os.getuid()}"
+    assert "this user has no home directory" in caplog.text
 
 
 @pytest.mark.parametrize(

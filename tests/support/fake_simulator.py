@@ -41,6 +41,9 @@ class FakeSimulator:
             return "half a pour"  # type: ignore[return-value]
         if task.scene.name == "deadly":
             os.kill(os.getpid(), 9)
+        if task.scene.name == "aborting":  # as a C++ library does
+            os.write(2, b"[E core.cpp:50] Assertion failure: home != nullptr\n")
+            os.abort()
         self._note("begin")
         end = time.monotonic() + (0.0 if task.scene.name == "quick" else self.seconds)
         while time.monotonic() < end:
