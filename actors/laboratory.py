@@ -17,7 +17,6 @@ from actors.balance.balance_settings import BalanceSettings, SerialBalanceSettin
 from actors.balance.display_behaviour import IDEAL
 from actors.balance.scale_model import ScaleSettings
 from actors.bench.bench_factory import MakeDevice, OpenBench, open_bench
-from actors.bench.pump_bench import predict_pump_dose
 from actors.bench.virtual_bench import BenchEmulators
 from actors.dosing.display_belief import DisplayBelief
 from actors.dosing.dose_series import DoseForecast, predict_dose
@@ -94,7 +93,7 @@ def check_bench_packages(spec: LaboratorySettings) -> None:
     """
     kind = None if spec.arm is None else arm_kind(spec.arm)
     emulated = kind is not None and kind.emulated
-    if not spec.dispenses or (kind is not None and not emulated and kind.missing() is None and spec.balance is None):
+    if kind is None or (not emulated and kind.missing() is None and spec.balance is None):
         return
     needed = ["psutil"] if spec.mode == "virtual" and emulated else []
     if spec.balance is not None and not spec.balance.typed and isinstance(spec.balance, SerialBalanceSettings):
@@ -132,7 +131,7 @@ def reached(spec: LaboratorySettings) -> Iterator[LaboratorySettings]:
 def predicted_dose(
     spec: LaboratorySettings, scene: Scene, dose: DoseTarget, seed: int, count: int = 20
 ) -> DoseForecast:
-    """Predict a dose of a laboratory: poured from a cup, or by its pump. Nothing starts.
+    """Predict a dose of a laboratory. Nothing starts.
 
     Args:
         spec: of the laboratory.
@@ -144,10 +143,7 @@ def predicted_dose(
     Raises:
         InvalidActionError: the dose is impossible.
     """
-    if spec.pump is None:
-        return predict_dose(scene, dose, seed, spec.dosing, count, _expected_display(spec.balance))
-    deviation = 0.0 if spec.balance is None else spec.balance.deviation
-    return predict_pump_dose(scene, dose, seed, spec.pump, spec.dosing, deviation)
+    return predict_dose(scene, dose, seed, spec.dosing, count, _expected_display(spec.balance))
 
 
 def _expected_display(balance: BalanceSettings | None) -> DisplayBelief | None:

@@ -21,9 +21,7 @@ from actors.dosing_settings import DosingSettings
 from actors.grippers.gripper_interface import GRIPPERS, GripperSettings
 from actors.interfaces import OperatorSettings, RaySettings
 from actors.liquid_devices import (
-    PUMPS,
     SPILL_SENSORS,
-    PumpSettings,
     SourceSettings,
     SpillSensorSettings,
     check_devices,
@@ -168,9 +166,6 @@ class LaboratorySettings(Settings):
     cell: RobotCell | None = None
     """Objects around the arm."""
 
-    pump: Annotated[Annotated[PumpSettings, OneOf(lambda: PUMPS.all)] | None, NOT_IN_FINGERPRINT] = None
-    """A pump or tap instead of the arm, for wanted amounts; `kind` is one of the installed kinds."""
-
     gripper: Annotated[Annotated[GripperSettings, OneOf(lambda: GRIPPERS.all)] | None, NOT_IN_FINGERPRINT] = None
     """The gripper that holds the pourer; `kind` is one of the installed kinds. The operator works it unless given."""
 
@@ -184,7 +179,7 @@ class LaboratorySettings(Settings):
     """What the campaign asks for."""
 
     balance: Annotated[BalanceSettings, OneOf(kinds)] | None = None
-    """The balance next to the arm, or under the receiver of the pump."""
+    """The balance next to the arm."""
 
     source: Annotated[SourceSettings | None, NOT_IN_FINGERPRINT] = None
     """Devices at the source vessel."""
@@ -195,7 +190,7 @@ class LaboratorySettings(Settings):
     """A sensor that watches the table for spills; nothing more is poured until the operator has wiped it."""
 
     operator: Annotated[OperatorSettings, NOT_IN_FINGERPRINT] = OperatorSettings()
-    """The operator next to the arm or the pump."""
+    """The operator next to the arm."""
 
     bench: BenchSettings | None = None
     """Ground truth of a virtual bench. Without bench and arm, the laboratory only simulates and plans."""
@@ -209,22 +204,12 @@ class LaboratorySettings(Settings):
     @property
     def pours(self) -> bool:
         """Whether there is a bench."""
-        return self.dispenses or self.bench is not None or self.mode == "external"
-
-    @property
-    def dispenses(self) -> bool:
-        """Whether there is a device that pours, virtual or real: an arm or a pump."""
-        return self.arm is not None or self.pump is not None
-
-    @property
-    def dispenser(self) -> str:
-        """Name of the arm or the pump in messages; '' without one."""
-        return self.arm.title if self.arm is not None else f"pump {self.pump.kind}" if self.pump is not None else ""
+        return self.arm is not None or self.bench is not None or self.mode == "external"
 
     @property
     def needs_person(self) -> bool:
         """Whether the laboratory needs a person who answers questions."""
-        return self.dispenses and self.operator.answers == "person"
+        return self.arm is not None and self.operator.answers == "person"
 
     @property
     def simulator_count(self) -> int:
@@ -236,9 +221,8 @@ class LaboratorySettings(Settings):
 
         The arm knows its cell, arm and balance the time scale of the bench, and the operator who answers.
         """
-        timed = self.bench or self.pump
-        scale = 1.0 if timed is None else timed.time_scale
-        answers = "virtual" if not self.dispenses or self.mode == "virtual" else "person"
+        scale = 1.0 if self.bench is None else self.bench.time_scale
+        answers = "virtual" if self.arm is None or self.mode == "virtual" else "person"
         return self.with_values(
             arm=None if self.arm is None else self.arm.in_laboratory(self.cell, scale),
             balance=None if self.balance is None else self.balance.with_values(time_scale=scale),
@@ -269,10 +253,9 @@ class LaboratorySettings(Settings):
         if self.mode == "external":
             self._check_external(problems)
             return
-        check_devices(problems, self.mode, self.pump, self.source, self.spill_sensor)
-        if self.pump is not None:
-            self._check_with_pump(problems)
-        elif self.arm is None:
+        at_source = any(place.use == "source" for place in self.places)
+        check_devices(problems, self.mode, self.source, self.spill_sensor, at_source=at_source)
+        if self.arm is None:
             self._check_without_arm(problems)
         else:
             self._check_with_arm(problems)
@@ -295,35 +278,15 @@ class LaboratorySettings(Settings):
                 "the clock's. Remove the section, or write 'mode: virtual'",
                 "bench",
             )
-        if not self.dispenses:
-            text = "a laboratory of hardware needs its arm; add an 'arm' and a 'cell' section, or a 'pump'"
+        if self.arm is None:
+            text = "a laboratory of hardware needs its arm; add an 'arm' and a 'cell' section"
             problems.add(text, key=True, of="arm")
 
     def _check_external(self, problems: Problems) -> None:
-        for key in ("arm", "cell", "gripper", "pump", "balance", "source", "spill_sensor", "operator", "bench"):
+        for key in ("arm", "cell", "gripper", "balance", "source", "spill_sensor", "operator", "bench"):
             if key in self.model_fields_set and problems.valid(key):
                 text = "an external laboratory has no devices of Decant: your program pours and weighs; remove it"
                 problems.add(text, key, key=True)
-
-    def _check_with_pump(self, problems: Problems) -> None:
-        for key, why in (
-            ("arm", "a laboratory pours with an arm or with a pump"),
-            ("cell", "belongs to an arm, and a pump pours here"),
-            ("gripper", "belongs to an arm, and a pump pours here"),
-            ("bench", "hides the liquid of a virtual arm, and a pump pours here"),
-        ):
-            if key in self.model_fields_set and problems.valid(key):
-                problems.add(f"{why}; remove it", key, key=True)
-        balance, inner = self.balance, problems.within("balance")
-        if balance is None:
-            text = "a pump needs a balance under the receiver; add 'balance: {placement: receiver, …}'"
-            problems.add(text, of="balance")
-        elif balance.placement not in ("receiver", "everything"):
-            inner.add("with a pump the balance stands under the receiver; write 'receiver'", "placement")
-        elif self.mode == "virtual" and not balance.receives_load:
-            problems.add("is not emulated next to a pump; write 'kind: simulated'", "balance")
-        else:
-            balance.check_laboratory(inner, mode=self.mode)
 
     def _check_places(self, problems: Problems) -> None:
         assert self.arm is not None

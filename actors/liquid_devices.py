@@ -1,12 +1,12 @@
-"""Devices of a bench besides arm and balance: pumps, spill sensors, and the devices at the source vessel.
+"""Devices of a bench besides arm and balance: refill pumps, spill sensors, and a balance under the source vessel.
 
-- `Pump` is a driver that moves liquid: a pump, or a tap with a valve. It pours wanted amounts instead of an arm, or
-  fills the source vessel of an arm or another pump again. `PumpSettings` are its settings, `PUMPS` the installed kinds.
+- `Pump` is a driver that fills the source vessel again: a pump, or a tap with a valve. `PumpSettings` are its settings,
+  `PUMPS` the installed kinds.
 - `SpillSensor` is a driver that reports a wet table as `SpillEvent`s; `SpillSensorSettings`, `SPILL_SENSORS`.
-- `SourceSettings` is a laboratory's section `source`: a balance under the source vessel, and its refill device.
+- `SourceSettings` is a laboratory's section `source`: the refill pump, and a balance under the source vessel.
 
-Each has a simulated kind here. The steps of a bench with these devices are in `actors.bench.pump_bench` and
-`actors.bench.liquid_supply`. Drivers are plain, blocking classes and run in a process of their own.
+Each has a simulated kind here. The steps of a bench with these devices are in `actors.bench.liquid_supply`. Drivers are
+plain, blocking classes and run in a process of their own.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from sim_engine.settings.quantity import Quantity
 
 Flow = Annotated[float, Quantity("m^3/s", "5 mL/s", 0.0, 1e-3, positive=True)]
 Volume = Annotated[float, Quantity("m^3", "0.2 mL", 0.0, 1e-2, positive=True)]
-Mass = Annotated[float, Quantity("kg", "120 g", 0.0, 10.0)]
 Fraction = Annotated[float, Quantity("1", "0.03", 0.0, 1.0)]
 
 
@@ -89,7 +88,7 @@ class PumpSettings(Settings):
     """Whether the driver has `dispense` ('volume') or `run` ('time')."""
 
     flow: Flow = 4e-6
-    """Nominal flow; the balance under the receiver shows the true one."""
+    """Nominal flow."""
 
     smallest: Volume = 0.2e-6
     """Smallest dependable volume."""
@@ -188,34 +187,32 @@ class SourceSettings(Settings):
     """Devices at the source vessel."""
 
     balance: Annotated[BalanceSettings, OneOf(kinds)] | None = None
-    """Balance under the source vessel of a pump; its weights replace the computed content."""
-
-    vessel: Mass = 0.0
-    """Mass of the empty source vessel with all that stands on this balance."""
+    """Balance under the place with `use: source`; the refill pump then fills by weight."""
 
     refill: Annotated[PumpSettings, OneOf(lambda: PUMPS.all)] | None = None
     """Pump or tap that fills the source vessel again; the operator fills it unless given."""
 
     refill_error: Fraction = 0.03
-    """Standard deviation of a refilled amount, relative to it; a balance under the source vessel is more accurate."""
+    """Standard deviation of a refilled amount, relative to it."""
 
 
 def check_devices(
     problems: Problems,
     mode: str,
-    pump: PumpSettings | None,
     source: SourceSettings | None,
     sensor: SpillSensorSettings | None,
+    *,
+    at_source: bool,
 ) -> None:
     """Add a problem for each device of a laboratory that does not fit its mode.
 
     Args:
-        problems: of the laboratory, whose keys `pump`, `source` and `spill_sensor` are.
+        problems: of the laboratory, whose keys `source` and `spill_sensor` are.
         mode: 'virtual' or 'hardware'.
-        pump, source, sensor: the sections; None if they are missing.
+        source, sensor: the sections; None if they are missing.
+        at_source: whether the laboratory has a place under the outlet of the refill pump.
     """
     devices: list[tuple[tuple[str, ...], PumpSettings | SpillSensorSettings | None]] = [
-        (("pump",), pump),
         (("source", "refill"), None if source is None else source.refill),
         (("spill_sensor",), sensor),
     ]
@@ -230,8 +227,9 @@ def check_devices(
     if source is None or source.balance is None:
         return
     inner = problems.within("source", "balance")
-    if pump is None:
-        problems.add("stands under the source vessel of a pump; an arm holds its source", "source", "balance")
+    if not at_source or source.refill is None:
+        text = "stands under the place where a pump fills the pourer; add 'refill' and a place with 'use: source'"
+        problems.add(text, "source", "balance")
     elif source.balance.typed:
         inner.add("a balance under the source vessel is read without the operator", "placement")
     elif mode == "virtual" and not source.balance.receives_load:
@@ -241,18 +239,16 @@ def check_devices(
 
 
 def device_checks(
-    pump: PumpSettings | None,
-    source: SourceSettings | None,
-    sensor: SpillSensorSettings | None,
+    source: SourceSettings | None = None,
+    sensor: SpillSensorSettings | None = None,
     gripper: GripperSettings | None = None,
 ) -> list[DeviceCheck]:
     """Connect each device of a laboratory in turn, and release it; nothing flows, no finger moves.
 
     Args:
-        pump, source, sensor, gripper: the sections; None if they are missing.
+        source, sensor, gripper: the sections; None if they are missing.
     """
     devices: list[tuple[str, PumpSettings | SpillSensorSettings | GripperSettings | None]] = [
-        ("pump", pump),
         ("refill", None if source is None else source.refill),
         ("spill sensor", sensor),
         ("gripper", gripper),
@@ -296,9 +292,6 @@ class SimulatedPumpSettings(PumpSettings):
 
     scatter: Fraction = 0.005
     """Standard deviation of a volume, relative to it."""
-
-    missed: Annotated[float, Quantity("kg", "1 g", 0.0, 1.0)] = 0.0
-    """Mass of each dose that misses the receiver."""
 
     time_scale: Annotated[float, Quantity("1", "10", 0.0, 1e6)] = 1.0
     """Bench seconds per second of the clock; 0 means no waiting."""

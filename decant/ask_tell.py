@@ -402,6 +402,6 @@ class _ExternalBench:
     ) -> PourMeasurement:
         """See `Bench.pour`."""
         if dose is not None:
-            raise NotPouredError("wanted amounts need an arm or a pump of Decant")
+            raise NotPouredError("wanted amounts need an arm of Decant")
         measured: PourMeasurement = await self._outcome(scene, action)
         return measured

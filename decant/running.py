@@ -164,21 +164,21 @@ def doctor(laboratory: Path | str) -> BenchReport:
     Nothing moves and no setting is changed. For a virtual laboratory, its devices are started for the check.
 
     Args:
-        laboratory: file of a laboratory with an arm or a pump.
+        laboratory: file of a laboratory with an arm.
 
     Returns:
         The checks with their remedies; `ready` is whether none fails, `document()` the JSON of the command.
 
     Raises:
         ConfigError: the file is invalid.
-        InvalidArgumentError: the laboratory has neither arm nor pump.
+        InvalidArgumentError: the laboratory has no arm.
         RunError: the record of accepted safety settings is invalid.
         LaboratoryError: a package is missing, or a virtual device does not start.
     """
     path = Path(laboratory).expanduser()
     spec = load_laboratory(path)
-    if spec.arm is None and spec.pump is None:
-        text = f"{path}: laboratory {spec.name} has neither 'arm' nor 'pump': there is no device to check"
+    if spec.arm is None:
+        text = f"{path}: laboratory {spec.name} has no 'arm': there is no device to check"
         raise InvalidArgumentError(text)
     return check_bench(spec, path, None if spec.mode != "hardware" else read_record(path))
 

@@ -19,7 +19,6 @@ from actors.arm.simulated_arm import SimulatedArmSettings
 from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings, balance_kind
-from actors.balance.scale_model import Load
 from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.consent import Setup
@@ -29,7 +28,6 @@ from actors.bench.held_vessel import HeldVessel, HoldingArm
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.bench.night_consent import NightConsent
 from actors.bench.pour_procedure import PourProcedure
-from actors.bench.pump_bench import PumpBench
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.vessel_handling import VesselHandling
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
@@ -46,7 +44,7 @@ from actors.interfaces import (
     SimulatorPool,
 )
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
-from actors.liquid_devices import PumpSettings, SourceSettings, SpillSensorSettings
+from actors.liquid_devices import SourceSettings, SpillSensorSettings
 from actors.places import PlaceRecord
 from actors.runtime.remote_object import Device
 from sim_engine.action import Action
@@ -145,8 +143,10 @@ class PouringBench:
             self._known[scene.pourer.name] = pour.lasting
 
     async def stop(self) -> None:
-        """Stop any motion; the arm stays locked."""
+        """Stop any motion, and the refill pump; the arm stays locked."""
         await self.arm.stop()
+        if self._setup.supply is not None:
+            await self._setup.supply.interrupt()
 
     async def close(self) -> None:
         """Close the arm, and release balance, supply and spill sensor."""
@@ -194,7 +194,7 @@ class OpenBench:
         operator: answers the questions.
     """
 
-    bench: PouringBench | PumpBench
+    bench: PouringBench
     devices: list[Device]
     emulators: DeviceEmulators | None = None
     operator: Operator | None = None
@@ -246,10 +246,6 @@ class _Opening:
 
         return HeldVessel(self("gripper", cls, *args), spec, arm, tell, weight)
 
-    def pump(self, spec: PumpSettings, name: str) -> PumpDevice:
-        cls, args = spec.driver()
-        return PumpDevice(self(name, cls, *args), spec)
-
     def supply(
         self, spec: SourceSettings | None, contents: BenchContents | None, scale: float, tell: Callable[[Notice], None]
     ) -> LiquidSupply:
@@ -258,7 +254,8 @@ class _Opening:
             timed = spec.balance.with_values(time_scale=scale)
             spec, balance = spec.with_values(balance=timed), self.balance(timed, "source", "source-balance")
         if spec is not None and spec.refill is not None:
-            refill = self.pump(spec.refill, "refill")
+            cls, args = spec.refill.driver()
+            refill = PumpDevice(self("refill", cls, *args), spec.refill)
         return LiquidSupply(spec, balance, refill, contents, tell)
 
     def watch(
@@ -297,8 +294,6 @@ async def open_bench(
             raise LaboratoryError(
                 f"laboratory {spec.name} needs a person next to it who answers questions, and there is none to ask"
             )
-        if spec.pump is not None:
-            return _open_pump(spec, spec.pump, opening, operator, tell)
         if spec.arm is None:
             assert spec.bench is not None
             assert liquid is not None
@@ -323,32 +318,6 @@ def _open_simulated(spec: BenchSettings, dosing: DosingSettings, opening: _Openi
         "virtual", arm_spec, balance_spec, spec.operator_time, arm, balance, operator, ground_truth, _discard_notice
     )
     return OpenBench(PouringBench(setup, dosing), opening.devices, operator=operator)
-
-
-def _open_pump(
-    spec: LaboratorySettings,
-    pump_spec: PumpSettings,
-    opening: _Opening,
-    operator: Operator | None,
-    tell: Callable[[Notice], None],
-) -> OpenBench:
-    if spec.balance is None:
-        raise LaboratoryError(f"laboratory {spec.name}: a pump needs a balance under the receiver; add a 'balance'")
-    pump, balance = opening.pump(pump_spec, "pump"), opening.balance(spec.balance, spec.name)
-    hands, scale = None, pump_spec.time_scale
-    if spec.mode == "virtual":
-
-        async def put(mass: float) -> None:
-            await balance.put(Load((0.0,), (mass,)))
-
-        hands = Hands(BenchContents(spec.balance.position), put)
-        operator = _operator(spec, hands, operator, scale)
-    assert operator is not None
-    questions = OperatorQuestions(operator, spec.operator, tell, scale if scale > 0.0 else 1.0)
-    supply = opening.supply(spec.source, None if hands is None else hands.contents, scale, tell)
-    watch = opening.watch(spec.spill_sensor, questions, tell)
-    bench = PumpBench(spec.mode, pump, balance, spec.balance, questions, supply, watch, spec.dosing, hands, tell)
-    return OpenBench(bench, opening.devices, operator=operator)
 
 
 def _operator(spec: LaboratorySettings, hands: Hands, operator: Operator | None, time_scale: float) -> Operator | None:

@@ -1,6 +1,6 @@
 """The source vessel and the spill sensor of a bench.
 
-- `LiquidSupply` fills the source vessel with the refill device, and weighs the vessel if a balance stands under it.
+- `LiquidSupply` fills the source vessel with the refill device, by weight if a balance stands under it.
 - `SpillWatch` runs a pour under the eyes of the spill sensor. While the table is wet, the operator has to wipe it, and
   nothing is poured.
 
@@ -30,8 +30,8 @@ ANSWER_DEADLINE = 60.0
 LOOK = 0.1
 """Wall time between two looks at the spill sensor during a pour [s]."""
 
-UNLIKELY = 5.0
-"""Difference between weighed and computed content that is reported, in standard deviations."""
+PORTIONS = 3
+"""Largest number of portions of a refill by weight."""
 
 
 class PumpDevice:
@@ -51,7 +51,7 @@ class PumpDevice:
         await self.device.call("connect", deadline=ANSWER_DEADLINE)
 
     async def move(self, volume: float, seed: tuple[int, ...]) -> float:
-        """Move a volume [m³]. Returns the true volume of a simulated pump, also of a stopped one; else 0.
+        """Move a volume [m³]. Returns the true volume of a simulated pump; else 0.
 
         Args:
             volume: wanted [m³].
@@ -62,13 +62,7 @@ class PumpDevice:
         if self.spec.simulates:
             await self.device.call("prepare", seed, deadline=ANSWER_DEADLINE)
         await self.device.call(method, amount, deadline=ANSWER_DEADLINE + 4.0 * volume / self.spec.flow / scale)
-        return await self.moved()
-
-    async def moved(self) -> float:
-        """True volume that has left a simulated pump since the last call [m³]; 0 for a real one."""
-        if not self.spec.simulates:
-            return 0.0
-        return float(await self.device.call("moved", deadline=ANSWER_DEADLINE))
+        return float(await self.device.call("moved", deadline=ANSWER_DEADLINE)) if self.spec.simulates else 0.0
 
     async def stop(self) -> None:
         """See `Pump.stop`."""
@@ -85,7 +79,7 @@ class LiquidSupply:
 
     Args:
         spec: section `source` of the laboratory; None if it has none.
-        balance: under the source vessel; None if there is none.
+        balance: under the pourer where the refill device fills it; None if there is none.
         refill: fills the vessel; None if the operator does.
         contents: of a virtual bench; None on hardware.
         tell: receives notices.
@@ -111,29 +105,6 @@ class LiquidSupply:
         if self._refill is not None:
             await self._refill.connect()
 
-    async def weighed(self, source: DoseSource) -> DoseSource | None:
-        """The source with its weighed content; None without a balance under it. A surprising weight is reported.
-
-        Raises:
-            LaboratoryError: there is no stable weight.
-        """
-        if self.balance is None or self._spec.balance is None:
-            return None
-        if self._contents is not None:
-            await self.balance.put(Load((0.0,), (self._contents.in_pourer + self._spec.vessel,)))
-        weight = await self.balance.weigh()
-        mass = weight.mass - self._spec.vessel
-        deviation = max(self._spec.balance.deviation, weight.step)
-        if not source.fill and abs(mass - source.mass) > UNLIKELY * math.hypot(source.deviation, deviation):
-            self._tell(
-                Notice(
-                    "warning",
-                    f"source {source.name}: the balance under it shows {1e3 * mass:.1f} g of liquid, and "
-                    f"{1e3 * source.mass:.1f} g were expected; the weight counts",
-                )
-            )
-        return replace(source, mass=max(mass, 0.0), deviation=deviation)
-
     async def filled(self, source: DoseSource, density: float, seed: int) -> DoseSource | None:
         """Fill a source with the refill device. Returns the filled source; None if the operator has to fill it.
 
@@ -149,33 +120,48 @@ class LiquidSupply:
         """
         if self._refill is None:
             return None
-        now = await self.weighed(source)
-        held = source.before if now is None else now.mass
-        if held is None:
+        if source.before is None:
             return None
-        missing = source.mass - held
+        missing = max(source.mass - source.before, 0.0)
         if missing > self._refill.spec.smallest * density:
-            moved = await self._refill.move(missing / density, (seed, 61))
-            if self._contents is not None:
-                self._contents.in_pourer += density * moved
-        self._tell(Notice("info", f"source {source.name}: refilled with {1e3 * max(missing, 0.0):.0f} g"))
-        deviation = math.hypot(source.deviation, self._spec.refill_error * max(missing, 0.0))
-        found = await self.weighed(source) or replace(source, deviation=deviation)
-        return replace(found, fill=False, before=None)
+            await self._move(missing, density, (seed, 61))
+        self._tell(Notice("info", f"source {source.name}: refilled with {1e3 * missing:.0f} g"))
+        deviation = math.hypot(source.deviation, self._spec.refill_error * missing)
+        return replace(source, deviation=deviation, fill=False, before=None)
 
     async def top_up(self, mass: float, density: float, seed: int) -> bool:
-        """Add a mass [kg] to the pourer under the outlet. Returns whether there is a refill device for it.
+        """Add a mass [kg] to the pourer under the outlet, by weight if a balance stands there.
+
+        Returns whether there is a refill device for it.
 
         Raises:
-            LaboratoryError: the device has failed.
+            LaboratoryError: a device has failed.
         """
         if self._refill is None:
             return False
-        await self._refill.connect()
-        moved = await self._refill.move(max(mass / density, self._refill.spec.smallest), (seed, 61))
+        await self.connect()
+        smallest = self._refill.spec.smallest * density
+        begin, missing = await self._weight(), mass
+        for number in range(PORTIONS):
+            await self._move(max(missing, smallest), density, (seed, 61, number) if number else (seed, 61))
+            missing = 0.0 if begin is None else mass - (await self._weight() or 0.0) + begin
+            if missing <= smallest:
+                break
+        return True
+
+    async def _weight(self) -> float | None:
+        """What the balance under the source shows [kg]; None if there is none."""
+        if self.balance is None:
+            return None
+        if self._contents is not None:
+            await self.balance.put(Load((0.0,), (self._contents.in_pourer,)))
+        return (await self.balance.weigh()).mass
+
+    async def _move(self, mass: float, density: float, seed: tuple[int, ...]) -> None:
+        assert self._refill is not None
+        moved = await self._refill.move(mass / density, seed)
         if self._contents is not None:
             self._contents.in_pourer += density * moved
-        return True
 
     async def interrupt(self) -> None:
         """Stop the refill device and end a weighing; errors are suppressed."""
@@ -218,7 +204,6 @@ class SpillWatch:
         self,
         pour: Callable[[], Awaitable[PourMeasurement]],
         safe: Callable[[], Awaitable[Any]],
-        alarm: Callable[[], Awaitable[None]] | None = None,
     ) -> PourMeasurement:
         """Make a pour once the table is dry. Its notes get the events since the pour before as `spills`.
 
@@ -227,7 +212,6 @@ class SpillWatch:
         Args:
             pour: makes it.
             safe: makes sure that nothing can move, before the operator reaches into the cell.
-            alarm: called when the table gets wet during the pour; None: the pour goes on.
 
         Raises:
             NotPouredError: the table is not dry, or the sensor cannot be read; nothing was poured.
@@ -238,7 +222,7 @@ class SpillWatch:
             await self._wiped(safe)
         except LaboratoryError as error:
             raise NotPouredError(f"{error}. Nothing was poured") from error
-        async with self._following(alarm):
+        async with self._following():
             measured = await pour()
         with contextlib.suppress(LaboratoryError):  # the pour counts; the next one begins with another look
             if self._spec.simulates:
@@ -248,8 +232,8 @@ class SpillWatch:
             return measured
         return replace(measured, notes={**measured.notes, "spills": [asdict(event) for event in self._seen]})
 
-    async def look(self) -> list[SpillEvent]:
-        """Read the sensor now; also connects it. Returns the new events.
+    async def look(self) -> None:
+        """Read the sensor now; also connects it.
 
         Raises:
             LaboratoryError: it cannot be read.
@@ -266,7 +250,6 @@ class SpillWatch:
             else:
                 self.wet.pop(event.place, None)
                 self._tell(Notice("note", f"spill sensor: {event.place} is dry"))
-        return events
 
     async def _wiped(self, safe: Callable[[], Awaitable[Any]]) -> None:
         """Ask the operator to wipe what is wet, until the sensor reports that it is dry."""
@@ -290,16 +273,14 @@ class SpillWatch:
             problem = f"the spill sensor still reports liquid: {', '.join(self.wet)}" if self.wet else ""
 
     @contextlib.asynccontextmanager
-    async def _following(self, alarm: Callable[[], Awaitable[None]] | None) -> AsyncIterator[None]:
+    async def _following(self) -> AsyncIterator[None]:
         over = asyncio.Event()
 
         async def follow() -> None:
             failed = False
             while not over.is_set():
                 try:
-                    events = await self.look()
-                    if alarm is not None and any(event.wet for event in events):
-                        await alarm()
+                    await self.look()
                     failed = False
                 except LaboratoryError as error:
                     if not failed:

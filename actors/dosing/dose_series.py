@@ -70,8 +70,7 @@ class DoseForecast:
         longest: duration that 95 % of the doses do not exceed [s].
         enough: probability that the source holds the amount.
         fine_flow: at the end of the dose [kg/s].
-        clean_flow: smallest flow that leaves the lip cleanly; a slower stream may run down the outside [kg/s]. 0 for a
-            pump, which has no lip.
+        clean_flow: smallest flow that leaves the lip cleanly; a slower stream may run down the outside [kg/s].
         ends: number of simulated doses by their end.
         weighing: half of the interval that contains the true amount with a probability of 90 %, once it is weighed
             [kg].

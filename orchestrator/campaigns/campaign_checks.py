@@ -528,21 +528,17 @@ def check_campaign(
             receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
             role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
             checker.reachable(plan.deployment, scene, role)
-    if plan.laboratory.pump is not None:
-        for key, stage in (("calibration", plan.calibration), ("deployment", plan.deployment)):
-            if stage is not None:
-                checker.add(((key,),), f"needs an arm; laboratory '{plan.laboratory.name}' doses with a pump")
     if plan.dispense is not None and lab.places:
         checker.add((("dispense",),), f"is poured without places; laboratory '{lab.name}' has some")
     if plan.dispense is not None:
         balance = plan.laboratory.balance
-        if plan.laboratory.dispenses and (balance is None or balance.placement not in ("receiver", "everything")):
+        if plan.laboratory.arm is not None and (balance is None or balance.placement not in ("receiver", "everything")):
             text = (
                 f"laboratory '{plan.laboratory.name}': wanted amounts need a connected balance under the receiver; "
                 "write 'balance: {placement: receiver}' and set it up so"
             )
             checker.add((("dispense",), ("laboratory",)), text)
-        checker.doses(plan.dispense, simulated=not plan.laboratory.dispenses)
+        checker.doses(plan.dispense, simulated=plan.laboratory.arm is None)
     return list(dict.fromkeys(checker.problems))
 
 

@@ -256,9 +256,6 @@ def resolve_calibration(
 DOSE_MOTION = {"angular_velocity": math.radians(115.0), "max_angle": math.radians(110.0)}
 """Fastest tilt and range of a dose, where the motion does not limit them."""
 
-PUMP_PLACE = {"x_offset": 0.0, "height": 0.1}
-"""Place of the source of a pump in its scenes; nothing moves there."""
-
 
 def resolve_dispense(
     section: DispenseSettings, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
@@ -290,8 +287,7 @@ def resolve_dispense(
     given: set[str] = set()
     for motion in (builder.file.motion, section.motion):
         given |= set() if motion is None else set(motion.fixed())
-    usual = DOSE_MOTION if laboratory.pump is None else DOSE_MOTION | PUMP_PLACE
-    constants = {name: value for name, value in usual.items() if name not in given}
+    constants = {name: value for name, value in DOSE_MOTION.items() if name not in given}
     scenes = []
     for pourer, (name, receiver) in itertools.product(pourers, receivers.items()):
         assert pourer is not None

@@ -191,9 +191,7 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
     low, high = (1e3 * value for value in predicted.interval)
     fine, clean = 1e3 * predicted.fine_flow, 1e3 * predicted.clean_flow
     risk = f"the last stream has {fine:.1f} g/s and leaves the lip cleanly"
-    if clean == 0.0:
-        risk = f"a pump's stream has {fine:.1f} g/s and runs down no lip"
-    elif fine < clean:
+    if fine < clean:
         risk = f"the last stream has {fine:.1f} g/s only; a part may run down the outside of the pourer"
     place = f" into {planned.position}" if planned.position else ""
     filled = "filled before; " if source.fill else ""

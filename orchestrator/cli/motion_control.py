@@ -74,7 +74,7 @@ def consent_to_motion(request: RunRequest, count: str = "", path: PathReport | N
         path: of the only pour; None: paths from all over the actions are planned.
 
     Returns:
-        The checksum of the accepted safety settings; '' without hardware, and for a pump, which has no path.
+        The checksum of the accepted safety settings; '' without hardware.
 
     Raises:
         RefusalError: motion is not enabled (exit code 2).
@@ -88,9 +88,7 @@ def consent_to_motion(request: RunRequest, count: str = "", path: PathReport | N
     if laboratory.places:
         names = ", ".join(place.name for place in laboratory.places)
         lines.append(f"vessels        carried between {names}; the gripper opens and closes")
-    if laboratory.arm is None:
-        confirm(laboratory, lines)
-        return ""
+    assert laboratory.arm is not None, "a laboratory of hardware has an arm"
     checksum = required_checksum(plan)
     if path is not None:
         confirm(laboratory, [*lines, *report_lines(path)])
@@ -111,9 +109,9 @@ def require_flag(laboratory: LaboratorySettings, *, enabled: bool, again: str) -
     Raises:
         RefusalError: exit code 2.
     """
-    if laboratory.mode == "hardware" and not enabled:
+    if laboratory.mode == "hardware" and laboratory.arm is not None and not enabled:
         raise RefusalError(
-            f"laboratory {laboratory.name} is hardware: {laboratory.dispenser} would move. Try it without moving first "
+            f"laboratory {laboratory.name} is hardware: {laboratory.arm.title} would move. Try it without moving first "
             f"('decant robot check', 'decant pour --dry-run'); then enable motion for this one run: {again}"
         )
 
@@ -140,7 +138,8 @@ def confirm(laboratory: LaboratorySettings, lines: Sequence[str]) -> None:
             f"laboratory {laboratory.name} is hardware: an operator enables its motion, who reads what it will do and "
             "types its name. That needs a terminal, with nothing piped into it"
         )
-    announce(laboratory.name, laboratory.dispenser, lines, " for this run")
+    assert laboratory.arm is not None, "a laboratory of hardware has an arm"
+    announce(laboratory.name, laboratory.arm.title, lines, " for this run")
     termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)  # discard keys that were pressed before this text was shown
     print("> ", end="", file=sys.stderr, flush=True)
     typed = sys.stdin.readline()

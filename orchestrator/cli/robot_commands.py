@@ -57,7 +57,7 @@ def check(
     """Check everything that a pour needs, and print advice: network, controller, safety settings, balance.
 
     Nothing moves, nothing flows, and no setting is changed. For a virtual laboratory, controller and balance are
-    started for the check. Pump, refill device and spill sensor are connected where the laboratory has them. Exit code 1
+    started for the check. Refill pump and spill sensor are connected where the laboratory has them. Exit code 1
     if a check fails.
     """
     from actors.interfaces import LaboratoryError
@@ -68,10 +68,7 @@ def check(
     from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
     spec = read_laboratory(laboratory)
-    if spec.pump is not None and (accept_safety or record_to is not None):
-        text = f"--accept-safety and --record read the controller of an arm; laboratory {spec.name} pours with a pump"
-        raise RefusalError(text)
-    if spec.arm is None and spec.pump is None:
+    if spec.arm is None:
         raise without_arm(
             laboratory,
             spec,
@@ -80,7 +77,7 @@ def check(
     virtual = spec.mode != "hardware"
     print_message(
         f"laboratory {spec.name}, {spec.mode}"
-        + (": no robot, no balance; both are started for this" if virtual and spec.arm is not None else "")
+        + (": no robot, no balance; both are started for this" if virtual else "")
     )
     try:
         record = None if virtual else read_record(laboratory)

@@ -68,8 +68,7 @@ def what_moves(daemon: SharedServices, item: QueueItem) -> WhatMovesOut:
     try:
         work = run_request(daemon.settings, item, daemon.settings.rig(item.rig))
         arm = work.campaign.laboratory.arm
-        if arm is None:
-            raise MotionNotEnabledError("a real pump is enabled from the command line only: decant run --enable-motion")
+        assert arm is not None, "a laboratory of hardware has an arm"
         required_checksum(work.campaign)
         found = envelope(arm, campaign_pours(work.campaign, work.stages))
     except (ConfigError, RunError, KeyError) as error:

@@ -278,7 +278,7 @@ class PlannedOrder:
         try:
             if target is not None:
                 check_dose(self.scene, target)
-                if not laboratory.dispenses:
+                if laboratory.arm is None:
                     check_straight(self.scene)
                 return []
             vessels = build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)

@@ -119,8 +119,6 @@ def found_at(spec: LaboratorySettings) -> dict[str, str]:
     Returns:
         Findings by device; a device that can't be read has an entry with the reason.
     """
-    if spec.pump is not None:
-        return {"bench": "a pump, which is not read between runs"}
     if spec.arm is None:
         return {"bench": "simulated: it has no arm and no balance that could be read"}
     found: dict[str, str] = {}

@@ -460,7 +460,7 @@ def _time_scale(plan: CampaignPlan) -> float | None:
     laboratory = plan.laboratory
     if laboratory.mode != "virtual":
         return None
-    scales = (one.time_scale for one in (laboratory.arm, laboratory.pump, laboratory.bench) if one is not None)
+    scales = (one.time_scale for one in (laboratory.arm, laboratory.bench) if one is not None)
     return next((scale for scale in scales if scale is not None), None)
 
 

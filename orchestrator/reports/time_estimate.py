@@ -313,8 +313,6 @@ def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space | Non
     if laboratory.arm is not None:
         whole = laboratory.operator.time + laboratory.arm.warning_time + WAYS + motion + WEIGHINGS
         return laboratory.arm.on_clock(whole) + liquid
-    if laboratory.pump is not None and laboratory.pump.time_scale > 0.0:
-        return (laboratory.operator.time + WEIGHINGS) / laboratory.pump.time_scale
     if bench is None or bench.time_scale <= 0.0:
         return liquid
     return (bench.operator_time + WAYS + motion + WEIGHINGS) / bench.time_scale + liquid

@@ -75,7 +75,7 @@ def check_bench(
     """Check everything that a pour needs. Nothing moves; for a virtual laboratory, its devices are started meanwhile.
 
     Args:
-        spec: of the laboratory; with an arm or a pump.
+        spec: of the laboratory; with an arm.
         path: its file, for the advice.
         record: accepted safety settings; None: none, or the laboratory is virtual.
         tare: also tare the balance.
@@ -95,13 +95,13 @@ def check_bench(
             checks += found.checks(record, accept=accept, virtual=spec.mode != "hardware")
             checks += balance_diagnostics(ready.balance, tare=tare)
             gripper = None if ready.gripper is None else ready.gripper.beside(ready.arm)
-            checks += device_checks(None, None, None, gripper)
+            checks += device_checks(gripper=gripper)
     else:
         checks += balance_diagnostics(spec.balance, tare=tare)
     if spec.mode == "hardware" and spec.source is not None and spec.source.balance is not None:
         under_source = balance_diagnostics(spec.source.balance, tare=False)
         checks += [replace(check, name=f"source {check.name}") for check in under_source]
-    checks += device_checks(spec.pump, spec.source, spec.spill_sensor)
+    checks += device_checks(spec.source, spec.spill_sensor)
     try:
         check_laboratory(spec.with_values(ray=None), need_bench=True)
     except LaboratoryError as error:

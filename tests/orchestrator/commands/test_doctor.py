@@ -123,7 +123,7 @@ def test_a_program_gets_the_report_that_the_command_prints(laboratory: Path) -> 
     assert not report.ready  # nobody has accepted its safety settings
     assert "not accepted yet" in str(report)
     assert "not accepted yet" in report._repr_html_()
-    with pytest.raises(decant.InvalidArgumentError, match="has neither 'arm' nor 'pump'"):
+    with pytest.raises(decant.InvalidArgumentError, match="has no 'arm'"):
         decant.doctor("configs/laboratories/planning.yaml")
 
 

@@ -1,8 +1,8 @@
-"""A tap with a valve, and a strip that conducts when it is wet: the devices of a bench that pours without an arm.
+"""A tap with a valve, and a strip that conducts when it is wet: devices of a bench besides arm and balance.
 
 `Valve` and `Wires` are the devices; in this example they are objects, and real ones are at the end of a cable. A tap
-may pour wanted amounts (`pump: {kind: tap}`), or fill the source vessel again (`source: {refill: {kind: tap}}`). The
-balance under a source vessel is a balance as any other, see `balance.py`.
+may fill the source vessel again (`source: {refill: {kind: tap}}`). The balance under a source vessel is a balance as
+any other, see `balance.py`.
 """
 
 from __future__ import annotations
