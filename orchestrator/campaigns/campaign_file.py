@@ -215,9 +215,6 @@ class DeploymentSection(StageSettings):
     objectives: list[AnyObjective] | None = None
     """Several objectives instead of a loss."""
 
-    pareto: Switch | None = None
-    """Search for all Pareto-optimal actions; the weights then choose one of them."""
-
     floor: Annotated[float, Quantity("1", "0.5", 0.01, 1.0)] | None = None
     """Minimum share of the load (of the target volume) that a pour must deliver to be better than none; 0.5 unless
     given."""
@@ -229,16 +226,13 @@ class DeploymentSection(StageSettings):
         """Check that the objectives replace the loss, and that each is named once."""
         super().check_values(problems)
         if self.objectives is None:
-            for key in ("pareto", "floor"):
-                if self.value(key) is not None and problems.valid("objectives"):
-                    problems.add("belongs to 'objectives'; name some, or remove it", key, key=True)
+            if self.floor is not None and problems.valid("objectives"):
+                problems.add("belongs to 'objectives'; name some, or remove it", "floor", key=True)
             return
         if self.loss is not None:
             problems.add("stands beside 'objectives'; keep one of them", "loss", key=True)
         if not self.objectives:
             problems.add("is empty; name at least one, for example '- {name: spillage}'", "objectives")
-        if self.pareto and len(self.objectives) == 1:
-            problems.add("needs two objectives that can't both be had", "pareto", key=True)
         names = [part.name for part in self.objectives]
         for i, name in enumerate(names):
             if name in names[:i] and problems.within("objectives", i).valid("name"):

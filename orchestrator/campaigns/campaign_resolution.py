@@ -98,7 +98,7 @@ def _objectives(
             beside = frozenset(names[:i] + names[i + 1 :])
             part.check(scene, actions, beside, PlacedProblems(place.at("objectives", i), report))
     floor = 0.5 if section.floor is None else section.floor
-    return Objectives(tuple(section.objectives), floor, bool(section.pareto))
+    return Objectives(tuple(section.objectives), floor)
 
 
 def resolve_deployment(

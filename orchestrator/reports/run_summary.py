@@ -16,7 +16,7 @@ from pydantic import Field, SerializeAsAny, create_model
 
 from orchestrator.learning.calibration.calibration_scores import CalibrationGain
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
-from orchestrator.learning.deployment.deployment_result import ParetoAction, Recommended, RiskFound
+from orchestrator.learning.deployment.deployment_result import Recommended, RiskFound
 from orchestrator.learning.deployment.model_monitoring import Believed
 from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.learning.deployment.safe_window import WindowFound
@@ -251,7 +251,6 @@ class ReceiverSummary(ResultPart):
     model_check: PredictionCheck | Believed
     gave_up: str | None
     ended: str | None
-    pareto_front: tuple[ParetoAction, ...] | None
     risk: RiskFound | None
     window: WindowFound | None
     prediction: dict[str, SampleStatistics] | None

@@ -404,7 +404,6 @@ def _receiver(
         model_check=result.model_check,
         gave_up=result.gave_up,
         ended=result.ended,
-        pareto_front=result.pareto_front,
         risk=result.risk,
         window=result.window,
         prediction=prediction,

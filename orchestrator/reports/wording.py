@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, MemoryFound
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
-from orchestrator.learning.deployment.deployment_result import ParetoAction, RiskFound
+from orchestrator.learning.deployment.deployment_result import RiskFound
 from orchestrator.learning.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
 from orchestrator.learning.deployment.safe_window import WindowFound
@@ -25,7 +25,6 @@ from orchestrator.reports import figure_style as style
 from orchestrator.reports.loss_units import (
     DISCREPANCY,
     LossUnit,
-    at_least_nothing,
     deployment_unit,
     minimised_loss,
 )
@@ -151,7 +150,6 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
         )
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
-    said += [f"Pareto-optimal: {_compromise(one)}." for one in row.pareto_front or ()]
     if row.ended:
         said.append(f"The search ended: {row.ended.rstrip('.')}.")
     if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
@@ -171,15 +169,6 @@ def _prediction(row: ReceiverSummary) -> str:
     amount = amount_text(row.predicted_delivered_g, row.predicted_delivered_ml)
     delivered = f"; delivered {amount} in the mean" if amount else ""
     return f"Simulated again with {count} new seeds: {shares} (mean ± standard deviation){delivered}."
-
-
-def _compromise(one: ParetoAction) -> str:
-    """'spillage 1.2 ± 0.3 %, time 40.0 ± 1.0 % with angular velocity 41.2 deg/s, …'."""
-    parts = [
-        f"{name.replace('_', ' ')} {100 * at_least_nothing(mean):.1f} ± {100 * one.deviations[name]:.1f} %"
-        for name, mean in one.objectives.items()
-    ]
-    return f"{', '.join(parts)} with {style.display_values(one.action_si)}"
 
 
 def amount_text(grams: float | None, millilitres: float | None) -> str:

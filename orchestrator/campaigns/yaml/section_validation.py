@@ -242,6 +242,7 @@ def _bound(number: float) -> str:
 
 
 REMOVED = {
+    "pareto": "the weighted sum of the objectives is minimised; give each a 'weight', and remove it",
     "costs": "simulations run while the arm pours, 'simulations_per_pour' of them; remove it",
 }
 """Remedies for keys of earlier versions."""

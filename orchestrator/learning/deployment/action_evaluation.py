@@ -64,14 +64,12 @@ class SeedMean:
 
     def search(self, *, everything: bool = False, **parts: Any) -> MinimumQuery | RiskQuery:
         """A query for the next action to simulate."""
-        self._ledger.scalarization.weigh(exploring=not everything)
         pending = self._ledger.trials.pending(everything=everything)
         data = self._data(everything=everything)
         return self._requests.query(MinimumQuery, data, everything=everything, pending=pending, **parts)
 
     def regression(self, **parts: Any) -> RegressionQuery | RiskQuery:
         """A query about all simulations, without a proposal."""
-        self._ledger.scalarization.weigh(exploring=False)
         return self._requests.query(RegressionQuery, self._data(everything=True), **parts)
 
     def _data(self, *, everything: bool) -> Data:

@@ -85,6 +85,11 @@ class Costing:
         """Costs of a weighed pour."""
         return self._vector(measurement.fractions, action)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the objectives; empty with a plain loss."""
+        return () if self.objectives is None else self.objectives[0].names
+
     def total(self, vector: Vector) -> float:
         """The number that is minimised."""
         return vector[0] if self.objectives is None else self.objectives[0].total(vector)

@@ -154,7 +154,7 @@ class OneShotPlanning(Deployment[D1Settings]):
             if self._ledger.counted == 0 and self._ledger.pours_left:  # the pour was refused
                 self._ask_for_the_best()
             else:  # the only pour has been weighed
-                self._finish()
+                self._finished = True
         elif len(trials) == 0:
             count = min(max(self._settings.initial_samples, 1), max(wanted - 1, 1))
             self._questions.put(self._requests.space_filling(count=count), "start", plan)
@@ -181,7 +181,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         suggestion = self._evaluation.allowed(suggestion)
         self._report.final, self._searched = suggestion, list(self._trials.all)
         if suggestion.best_point is None:
-            self._finish()  # too few simulations succeeded; the result reports how many were lost
+            self._finished = True  # too few simulations succeeded; the result reports how many were lost
         elif self._settings.window is None:
             self._use(suggestion)
         else:
@@ -193,7 +193,7 @@ class OneShotPlanning(Deployment[D1Settings]):
     def _use(self, suggestion: Suggestion) -> None:
         """Pour the recommended action, or finish if no pour is planned."""
         if self._plan.pours < 1 or suggestion.best_point is None:
-            self._finish()
+            self._finished = True
         else:
             self._pour(suggestion.best_point, self._evaluation.prediction(suggestion))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from actors.optimizer.questions import Data, MinimumQuery, RegressionQuery
+from actors.optimizer.questions import MinimumQuery, RegressionQuery
 from orchestrator.learning.campaign_plan import DeploymentPlan
 from orchestrator.learning.deployment.deployment_base import MAP_RESOLUTION, Deployment
 from orchestrator.learning.deployment.deployment_ledger import SearchSettings
@@ -42,7 +42,6 @@ class RealOnly(Deployment[D2Settings]):
         if self._pouring is not None:
             return
         ledger = self._ledger
-        self._scalarization.weigh(exploring=ledger.pours_left)
         if ledger.pours_left:
             made = [p.point for p in ledger.pours if p.status != "refused"]
             known = [*(point for point, _ in ledger.known), *made]
@@ -59,6 +58,3 @@ class RealOnly(Deployment[D2Settings]):
         """A query about the real cost."""
         real = self._ledger.real()
         return self._requests.query(kind, real, mean=self._settings.mean, map_resolution=MAP_RESOLUTION)
-
-    def _front_query(self, simulated: Data, poured: Data) -> RegressionQuery:
-        return self._requests.query(RegressionQuery, poured, mean=self._settings.mean)

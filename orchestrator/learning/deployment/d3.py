@@ -11,10 +11,8 @@ from typing import Annotated, Literal
 
 from actors.optimizer.questions import (
     FOUND,
-    Data,
     Limit,
     MinimumQuery,
-    PourQuery,
     Suggestion,
     found_good,
 )
@@ -198,7 +196,6 @@ class Hybrid(Deployment[D3Settings]):
             count = min(max(settings.initial_samples, 1), settings.prior_simulations)
             self._questions.put(self._requests.space_filling(count=count), "start", simulate)
         elif self._trials.ready:
-            self._scalarization.weigh(exploring=True)
             # in the paper κ is constant, and no simulation only fills space
             known, pending, plain = self._ledger.simulated(), self._trials.pending(), not settings.adaptive
             left = self._before - self._ledger.spent
@@ -230,9 +227,6 @@ class Hybrid(Deployment[D3Settings]):
     def _conclude(self, suggestion: Suggestion) -> None:
         self._choice.record(suggestion)
         super()._conclude(suggestion)
-
-    def _front_query(self, simulated: Data, poured: Data) -> PourQuery:
-        return self._choice.about(poured, simulated, count=0)
 
     # -- results ---------------------------------------------------------------------------------------------------
 

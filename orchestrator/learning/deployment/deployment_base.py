@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Generic, TypeVar, cast
 
-from actors.optimizer.questions import Data, Point, PourQuery, RegressionQuery, Suggestion
+from actors.optimizer.questions import Point, Suggestion
 from orchestrator.learning.campaign_plan import DeploymentPlan, DeploymentSettings
 from orchestrator.learning.deployment.deployment_ledger import MAX_REFUSED, DeploymentLedger, DeploymentRequests
 from orchestrator.learning.deployment.deployment_result import Deployed, Recommended, SimulatedAction
@@ -85,7 +85,7 @@ class DeploymentReport:
             parts: further fields of the result.
         """
         ledger, final, decode = self._ledger, self.final, self._plan.actions.decode
-        names, front, latest = ledger.scalarization.names, ledger.scalarization.front, final or self.latest_map
+        names, latest = ledger.costing.names, final or self.latest_map
         if gave_up is None and ledger.refused >= MAX_REFUSED:
             gave_up = f"{ledger.refused} pours were refused as invalid; the action space hardly allows any"
         recommended = None
@@ -112,7 +112,6 @@ class DeploymentReport:
             model_check=model_check or trust([p for p in ledger.pours if p.status == "weighed" and p.cost is not None]),
             gave_up=gave_up,
             objectives=names,
-            pareto_front=None if front is None else tuple(front),
             map=None if latest is None else displayed_map(latest.surrogate, self._plan.actions),
             recommended=recommended,
             **parts,
@@ -134,8 +133,8 @@ class Deployment(ABC, Generic[S]):
         self._settings = cast(S, plan.settings)
         self._scene = scene
         self._seeds = SeedStream(seed, f"{plan.strategy} {scene.name}")
-        self._ledger = DeploymentLedger(plan, scene, parameters, self._seeds.rng)
-        self._trials, self._scalarization = self._ledger.trials, self._ledger.scalarization
+        self._ledger = DeploymentLedger(plan, scene, parameters)
+        self._trials = self._ledger.trials
         self._requests = DeploymentRequests(self._ledger, self._seeds)
         self._questions = OptimizerQueries(self._seeds)
         self._report = DeploymentReport(self._ledger)
@@ -233,7 +232,7 @@ class Deployment(ABC, Generic[S]):
         if suggestion.surrogate is not None:
             self._report.latest_map = suggestion
         known, worst = None, self._ledger.costing.worst
-        if suggestion.means and not self._scalarization.exploring:
+        if suggestion.means:
             scatter = observed_scatter(suggestion, suggestion.noises[0] if suggestion.noises else None)
             band = suggestion.bands[0] if suggestion.bands else None
             known = Prediction(suggestion.means[0], suggestion.deviations[0], scatter, band)
@@ -249,28 +248,12 @@ class Deployment(ABC, Generic[S]):
 
     def _conclude(self, suggestion: Suggestion) -> None:
         self._report.final = suggestion
-        self._finish()
-
-    def _finish(self) -> None:
-        """Finish; if a front is searched, first regress each objective."""
-        if not self._scalarization.wanted or self._scalarization.front is not None:
-            self._finished = True
-            return
-        simulated = self._scalarization.of(self._trials.counting(everything=True))
-        self._scalarization.look_for_front(
-            simulated, self._ledger.poured, self._plan.actions, self._front_query, self._questions, self._finish
-        )
-
-    def _front_query(self, simulated: Data, poured: Data) -> RegressionQuery | PourQuery:
-        """How one objective is regressed: of the simulations, unless a strategy pours."""
-        return self._requests.query(RegressionQuery, simulated)
+        self._finished = True
 
     def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
         text = f"{what}  {described(values)}"
         if not suggestion.means:
             found = Decision(f"{text}  (no surrogate yet)")
-        elif self._scalarization.exploring:
-            found = Decision(f"{text}  (a scalarization under random weights)")
         else:
             found = expecting(text, Prediction(suggestion.means[index], suggestion.deviations[index]))
         self.decisions.append(found)

@@ -13,15 +13,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-import numpy as np
-
 from actors.optimizer.questions import Data, Point, SpaceFillingQuery, SurrogateQuery
 from orchestrator.learning.calibration.calibration_base import Kappa
 from orchestrator.learning.campaign_plan import DeploymentPlan, DeploymentSettings, Draw
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.objectives import Vector
 from orchestrator.learning.deployment.real_pours import PourTrial, point_of, prior_pours
-from orchestrator.learning.deployment.scalarization import Scalarization
 from orchestrator.learning.requests import ADDED, Decision, Failed, Outcome, Pour, Prediction, Simulate
 from orchestrator.learning.trials import SeedStream, Trials
 from sim_engine.action import Action, described
@@ -64,16 +61,12 @@ class DeploymentLedger:
         added: weighed pours that were made without a request.
         former: points and costs of the pours from before the campaign.
         costing: converts outcomes to costs.
-        scalarization: objectives, and the quantity that the next query minimises.
         decisions: texts for the log.
     """
 
-    def __init__(
-        self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, plan: DeploymentPlan, scene: Scene, parameters: SimulationParameters) -> None:
         self.plan, self.scene = plan, scene
         self.costing = Costing.of(plan, scene, parameters)
-        self.scalarization = Scalarization(self.costing, rng)
         self.trials = Trials()
         self.pours: list[PourTrial] = []
         self.added: list[PourTrial] = []
@@ -94,7 +87,7 @@ class DeploymentLedger:
             self.trials.settle(request, None, refused=True)
         else:
             vector = self.costing.of_theta(request.parameters).simulated(outcome, request.action)
-            self.trials.settle(request, self.scalarization.note(request, vector))
+            self.trials.settle(request, None if vector is None else self.costing.total(vector))
 
     def begin(self, point: Point, predicted: Prediction | None) -> PourTrial:
         """Enter a pour that is about to be requested."""
@@ -169,14 +162,11 @@ class DeploymentLedger:
     def real(self) -> Data:
         """Observations of the real cost; those from before the campaign come first."""
         poured = self.poured
-        return self.scalarization.data(poured, [*poured, *self.scalarization.of(self.trials.counting(everything=True))])
+        return Data(tuple(point for point, _ in poured), tuple(self.costing.total(vector) for _, vector in poured))
 
     def simulated(self, *, everything: bool = False) -> Data:
         """Observations of the simulated cost that the next choice may use; with `everything`, all."""
-        if not self.scalarization.exploring:
-            return self.trials.data(everything=everything)
-        observed = self.scalarization.of(self.trials.counting(everything=everything))
-        return self.scalarization.data(observed, [*self.poured, *observed])
+        return self.trials.data(everything=everything)
 
 
 class DeploymentRequests:

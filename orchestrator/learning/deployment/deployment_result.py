@@ -90,22 +90,6 @@ class RiskFound(ResultPart):
     """Number of posterior θ among them; 0 with a single θ."""
 
 
-class ParetoAction(ResultPart):
-    """An action of the Pareto front: no other action is better in all objectives."""
-
-    action: dict[str, float | None]
-    """Searched dimensions in display units."""
-
-    action_si: dict[str, float]
-    """The same in SI."""
-
-    objectives: dict[str, float]
-    """Expected objectives, by name."""
-
-    deviations: dict[str, float]
-    """Standard deviation of each."""
-
-
 class SimulatedAction(ResultPart):
     """A simulated action with its loss."""
 
@@ -169,9 +153,6 @@ class Deployed(StageResult):
 
     objectives: tuple[str, ...] = ()
     """Names of several objectives; empty with a plain loss."""
-
-    pareto_front: tuple[ParetoAction, ...] | None = None
-    """The Pareto front, if it was searched."""
 
     map: DisplayedMap | None = None
     """The loss over the two most important dimensions."""

@@ -1,9 +1,7 @@
 """Several objectives of a pour: little spillage, little liquid left, short duration, a given volume.
 
 - `Objective` is the base class; `Spillage`, `Retained`, `Time` and `TargetVolume` are the built-in objectives.
-- `Objectives` combines them into a weighted sum or a Pareto front.
-
-The search for the front is in `scalarization`.
+- `Objectives` combines them into a weighted sum.
 """
 
 from __future__ import annotations
@@ -166,7 +164,7 @@ class TargetVolume(Objective):
 
 @dataclass(frozen=True)
 class Objectives:
-    """Objectives that deployment minimises instead of a loss: Σ w_j f_j(a), or the Pareto front of all f_j.
+    """Objectives that deployment minimises instead of a loss: Σ w_j f_j(a).
 
     Not pouring spills nothing and takes no time. A pour that delivers less than `floor` of the wanted volume (the load,
     or the target volume) is therefore worse in every objective than any pour that delivers enough. Its values are the
@@ -174,12 +172,10 @@ class Objectives:
 
     Attributes:
         floor: fraction that must be delivered, > 0.
-        pareto: whether the front is searched; the weights then only select the recommended action.
     """
 
     parts: tuple[Objective, ...]
     floor: float = 0.5
-    pareto: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:

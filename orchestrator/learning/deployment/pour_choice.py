@@ -52,13 +52,12 @@ class PourChoice:
     @property
     def acquisition(self) -> Literal["lcb", "posterior_minimum", "least_loss"]:
         """Acquisition of the next pour."""
-        if self._rules is not None and not self._ledger.scalarization.exploring:
+        if self._rules is not None:
             return "least_loss"
         return "lcb" if self._ledger.pours or self._ledger.known else "posterior_minimum"
 
     def query(self, *, count: int, **parts: Any) -> PourQuery:
         """A query for the next pour and `count` − 1 simulations; with a count of 0, about the real cost only."""
-        self._ledger.scalarization.weigh(exploring=count != 0)
         return self.about(self._ledger.real(), self._simulated(), count=count, **parts)
 
     def about(self, poured: Data, simulated: Data, **parts: Any) -> PourQuery:

@@ -158,7 +158,7 @@ def objectives(*parts: str, more: str = "") -> str:
 
 
 def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None:
-    text = objectives(TARGET, "{name: time, weight: 0.2, scale: 6 s}", more="  pareto: true\n  floor: 0.3\n")
+    text = objectives(TARGET, "{name: time, weight: 0.2, scale: 6 s}", more="  floor: 0.3\n")
     plan = load(tmp_path, text)
     assert plan.deployment is not None
     found = plan.deployment.objectives
@@ -166,7 +166,7 @@ def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None
     target, time = found.parts
     assert (target.name, target.weight, target.volume, target.tolerance) == ("target_volume", 1.0, 1.5e-4, 2e-6)
     assert (time.name, time.weight, time.scale) == ("time", 0.2, 6.0)
-    assert (found.pareto, found.floor) == (True, 0.3)
+    assert found.floor == 0.3
     assert plan.deployment.loss_name == "objectives"
     (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
     assert dataclasses.replace(load_campaign(tmp_path / "again.json"), source=plan.source) == plan
@@ -192,10 +192,10 @@ def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None
         (objectives(TARGET, "{name: retained}"), "objectives[1]: wants the pourer to be emptied, and target_volume"),
         (
             objectives("{name: spillage}", more="  pareto: true\n"),
-            "pareto: needs two objectives that can't both",
+            "pareto: unknown key; the weighted sum of the objectives is minimised; give each a 'weight', and remove it",
         ),
         (objectives("{name: spillage}", more="  loss: {name: grams}\n"), "loss: stands beside 'objectives'; keep one"),
-        (DEPLOYED + "  pareto: true\n", "deployment.pareto: belongs to 'objectives'; name some, or remove it"),
+        (DEPLOYED + "  floor: 0.3\n", "deployment.floor: belongs to 'objectives'; name some, or remove it"),
         (
             objectives(TARGET)
             .replace(", max_angle: [70 deg, 125 deg], hold_time: [0 s, 3 s]", "")

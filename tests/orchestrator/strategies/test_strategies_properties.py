@@ -50,14 +50,14 @@ CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
     "C3": (BayesianCalibration, {"iterations": 6, "initial_samples": 4}),
     "C4": (ContinuousBayesianCalibration, {"simulations": 12, "initial_samples": 6}),
 }
-BOTH = Objectives((Spillage(), Retained()), pareto=True)
+BOTH = Objectives((Spillage(), Retained()))
 RISK = plans.risk("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
 DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 6}),
     "D1, risk": (OneShotPlanning, {"iterations": 4, "simulations_per_iteration": 2, "risk": RISK}),
     "D2": (RealOnly, {"pours": 5}),
     "D3": (Hybrid, {"pours": 3, "prior_simulations": 6, "simulations_per_pour": 2}),
-    "D3, front": (Hybrid, {"pours": 3, "prior_simulations": 6, "simulations_per_pour": 2, "objectives": BOTH}),
+    "D3, objectives": (Hybrid, {"pours": 3, "prior_simulations": 6, "simulations_per_pour": 2, "objectives": BOTH}),
 }
 ALL = [*CALIBRATIONS, *DEPLOYMENTS]
 """Whose requests depend on outcomes alone."""

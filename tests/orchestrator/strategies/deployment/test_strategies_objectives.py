@@ -1,17 +1,14 @@
-"""Several objectives: what each is, that not pouring never wins, and the front that is found."""
+"""Several objectives: what each is, and that not pouring never wins."""
 
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.d1 import OneShotPlanning
@@ -26,19 +23,14 @@ from orchestrator.learning.deployment.objectives import (
     Time,
     duration,
 )
-from orchestrator.learning.deployment.scalarization import scalarised, undominated
-from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Simulate, Simulated, Suggest
-from orchestrator.records.codec import decode_result, encode_result
-from orchestrator.reports.console_view import summary_table
-from orchestrator.reports.summarise import summarise
-from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
+from orchestrator.learning.requests import Outcome, Poured, Request, Simulate, Simulated, Suggest
+from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of
 from sim_engine.action import DEG, Action
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import Fractions, Loss, PourMeasurement
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.vessel import build_vessel
 from tests.support.plans import deployment_plan
-from tests.support.toy_campaign import toy_plan
 
 STRATEGIES = {"D1": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
 ACTIONS = Space(
@@ -87,8 +79,8 @@ def answers(request: Request) -> Outcome | None:
     return Poured(PourMeasurement(loaded=0.2, spilled=0.2 * spilled, retained=0.2 * retained))
 
 
-def make(name: str, parts: tuple[Objective, ...], seed: int = 0, *, pareto: bool = False, **changes: Any) -> Any:
-    objectives = Objectives(parts, pareto=pareto)
+def make(name: str, parts: tuple[Objective, ...], seed: int = 0, **changes: Any) -> Any:
+    objectives = Objectives(parts)
     values: dict[str, Any] = {"actions": ACTIONS, "objectives": objectives, "pours": 8, "prior_simulations": 20}
     plan = deployment_plan(strategy=name, **(values | changes))
     return STRATEGIES[name](plan, SCENE, THETA, seed)
@@ -209,102 +201,3 @@ def test_a_planned_pour_stops_at_the_wanted_volume() -> None:
         poured = world(SCENE.action(planned.best_values)).poured * SCENE.liquid.volume
         missed.append(abs(poured - TARGET.volume))
     assert max(missed) < 0.012 * LITRE  # of 120 mL, with 0.5 % of noise in a pour
-
-
-# -- the front -----------------------------------------------------------------------------------------------------
-
-
-def test_a_scalarisation_reaches_the_middle_of_a_concave_front_and_a_sum_does_not() -> None:
-    front = [(0.0, 1.0), (0.6, 0.6), (1.0, 0.0)]
-    chosen = {int(np.argmin(scalarised(front, (w, 1.0 - w), (1.0, 1.0)))) for w in np.linspace(0.05, 0.95, 19)}
-    summed = {int(np.argmin([w * a + (1.0 - w) * b for a, b in front])) for w in np.linspace(0.05, 0.95, 19)}
-    assert chosen == {0, 1, 2}
-    assert summed == {0, 2}
-
-
-def test_pours_that_delivered_too_little_do_not_squeeze_the_range_of_the_others() -> None:
-    good = [(0.1, 0.4), (0.2, 0.3)]
-    with_bad = scalarised([*good, (2.0, 2.0)], (0.5, 0.5), (1.0, 1.0))
-    assert with_bad[:2] == scalarised(good, (0.5, 0.5), (1.0, 1.0))
-    assert with_bad[2] > 5 * max(with_bad[:2])
-
-
-def test_only_what_nothing_beats_is_on_the_front() -> None:
-    assert undominated([(1.0, 2.0), (2.0, 1.0), (2.0, 2.0), (1.0, 2.0), (3.0, 0.5)]) == [0, 1, 3, 4]
-
-
-@pytest.mark.parametrize("strategy", STRATEGIES)
-def test_the_front_is_reported_with_actions_that_pour_and_none_beats_another(strategy: str) -> None:
-    found = make(strategy, (SPILLAGE, TIME), 1, pareto=True, pours=12, iterations=16)
-    played = play(found)
-    result = decode_result(json.loads(json.dumps(encode_result(found.result()), allow_nan=False)))
-    front = result.pareto_front
-    assert len(front) >= 3
-    vectors = [(row.objectives["spillage"], row.objectives["time"]) for row in front]
-    assert undominated(vectors) == list(range(len(vectors)))
-    assert vectors == sorted(vectors)
-    assert all(delivered(world(SCENE.action(row.action_si))) > 0.45 for row in front)
-    made = {r.action for r in played.asked if isinstance(r, Simulate | Pour)}
-    assert {SCENE.action(row.action_si) for row in front} <= made
-    assert result.recommended.action_si is not None
-    assert all(row.predicted is None for row in result.pours if strategy != "D1")
-
-
-def test_people_read_the_front_at_the_end_with_what_it_costs_and_how_it_is_poured(tmp_path: Path) -> None:
-    found = make("D1", (SPILLAGE, TIME), 1, pareto=True, pours=0, iterations=10)
-    played = play(found)
-    deployment = deployment_plan(
-        strategy="D1", actions=ACTIONS, pours=0, objectives=Objectives((SPILLAGE, TIME), pareto=True)
-    )
-    plan = toy_plan(tmp_path, deployment=deployment)
-    summary = summarise(plan, {"deployment:cup": found.result()})
-    assert summary.outcome.loss == "objectives"
-    console = Console(width=200)
-    with console.capture() as capture:
-        console.print(summary_table(summary))
-    text = capture.get()
-    assert "spillage + time [%]" in text
-    front = found.result().pareto_front
-    first = front[0].objectives
-    assert f"Pareto-optimal: spillage {100 * first['spillage']:.1f} ± " in text
-    assert text.count("Pareto-optimal") == len(front)
-    assert "deg/s, max angle" in text
-    assert any("under random weights" in decision.text for decision in found.decisions)
-    assert played.pours == []
-
-
-def covered(actions: list[Action]) -> float:
-    """Area of (spillage, time) that some of the actions beat, below 0.5 and 1."""
-    vectors = []
-    for action in actions:
-        truth = world(action)
-        measured = PourMeasurement(1.0, truth.spilled, truth.retained)
-        vectors.append(costing((SPILLAGE, TIME)).poured(measured, action))
-    area, best = 0.0, 1.0
-    for spillage, time in sorted(vectors):
-        if spillage < 0.5 and time < best:
-            area, best = area + (0.5 - spillage) * (best - time), time
-    return area
-
-
-@pytest.mark.slow
-def test_a_search_for_the_front_covers_more_of_it_than_as_many_drawn_actions() -> None:
-    searched, drawn = [], []
-    for seed in range(3):
-        search = make("D1", (SPILLAGE, TIME), seed, pareto=True, pours=0, iterations=48, simulations_per_iteration=1)
-        searched.append(covered([request.action for request in play(search).simulations]))
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        drawn.append(covered([SCENE.action(ACTIONS.draw(rng)) for _ in range(48)]))
-    assert np.mean(searched) > np.mean(drawn) + 0.5 * np.std(drawn)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("strategy", STRATEGIES)
-def test_a_search_for_the_front_is_repeated_by_a_replay_and_whatever_finishes_first(strategy: str) -> None:
-    def fresh() -> Any:
-        return make(strategy, (SPILLAGE, TIME), 4, pareto=True, pours=4, simulations_per_pour=2, iterations=8)
-
-    first, late = play(fresh(), slots=3), play(fresh(), slots=3, order="last")
-    assert (late.simulations, late.pours) == (first.simulations, first.pours)
-    assert replay(fresh(), first) == first.asked
