@@ -74,7 +74,7 @@ from orchestrator.runs.stages import (
 )
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import PourOutcome, SimulatedPour, normalised_spillage
+from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.prediction_band import LEVEL, CalibrationResidual, band
 from sim_engine.scene import PoseError, PourTask, Scene
 
@@ -282,7 +282,7 @@ async def spilled(
         outcome = (await pool.simulate(PourTask(scene, action, theta, seed, pose_error=error))).outcome
     except InvalidActionError:
         return 1.0
-    found = normalised_spillage(outcome.fractions)
+    found = outcome.fractions.spillage
     return 1.0 if found is None else found
 
 

@@ -43,7 +43,6 @@ from orchestrator.runs.stages import (
     scenes_of,
     stage_seed,
 )
-from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import band
 from sim_engine.resources import cache_directory
 from sim_engine.scene import PourTask
@@ -85,7 +84,7 @@ def predictions(plan: CampaignPlan, seed: int, draws: int) -> dict[str, Any]:
                 task = PourTask(scenes[one.scene], one.pour.action, theta, stage_seed(seed, f"draw {k}"))
                 with contextlib.suppress(InvalidActionError):
                     outcome = asyncio.run(pool.simulate(task)).outcome
-                    r = normalised_spillage(outcome.fractions) if outcome.invalid is None else None
+                    r = outcome.fractions.spillage if outcome.invalid is None else None
                     values += [] if r is None else [r]
             if values:
                 interval = band(values, found.theta.particles)

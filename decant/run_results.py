@@ -36,7 +36,6 @@ from orchestrator.reports.stage_views import (
 )
 from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import SampleStatistics
 from sim_engine.resources import require
 
@@ -203,7 +202,7 @@ class Run:
                 case Simulated(found):
                     fractions = found.fractions
                     row |= {"poured": fractions.poured, "spilled": fractions.spilled, "retained": fractions.retained}
-                    row |= {"spillage": normalised_spillage(fractions), "cpu_s": found.cpu_s}
+                    row |= {"spillage": fractions.spillage, "cpu_s": found.cpu_s}
                     row["failed"] = found.invalid
                 case Failed(kind, reason):
                     row["failed"] = f"{kind}: {reason}"

@@ -3,10 +3,11 @@
 - `PourOutcome` and `SimulatedPour` are simulated; `SimulatedPour` also holds particles at some times if requested
   (`RecordedFrames`).
 - `PourMeasurement` is weighed.
-- `normalised_spillage` and `Loss` are the quantities that are compared and minimised.
+- `Fractions.spillage` and `Loss` are the quantities that are compared and minimised.
 
-Calibration compares the normalised spillage r = spilled / poured, which is undefined below 5 % poured. Deployment
-minimises, by default, (spilled + w·retained) / loaded, so that not pouring is not a solution.
+Names: `poured`, `spilled` and `retained` are fractions of the load; masses end in `_g`, or are in kg in a
+`PourMeasurement`. The spillage r = spilled / poured is what calibration compares; it is undefined below 5 % poured.
+Deployment minimises, by default, (spilled + w·retained) / loaded, so that not pouring is not a solution.
 """
 
 from __future__ import annotations
@@ -36,6 +37,10 @@ ESCAPED_LIMIT = 0.002
 """Largest escaped fraction of a valid simulation: above it the solver has leaked, and its results are invalid."""
 
 
+MINIMUM_POURED = 0.05
+"""Smallest poured fraction at which r = spilled / poured is defined."""
+
+
 @dataclass(frozen=True)
 class Fractions:
     """Final places of the liquid, as fractions of the load.
@@ -49,6 +54,14 @@ class Fractions:
     poured: float
     spilled: float
     retained: float
+
+    @property
+    def spillage(self) -> float | None:
+        """The paper's c = C / k: spilled over poured; None (undefined) below `MINIMUM_POURED`.
+
+        Source: Lopez-Guevara et al., CoRL 2017, section 3.1.
+        """
+        return None if self.poured < MINIMUM_POURED else self.spilled / self.poured
 
 
 @dataclass(frozen=True)
@@ -184,20 +197,7 @@ class SimulatedPour:
         return self if self.frames is None else SimulatedPour(self.outcome, self.frames.copied())
 
 
-MINIMUM_POURED = 0.05
-"""Smallest poured fraction at which r = spilled / poured is defined."""
-
 LossName = Literal["spilled_and_retained", "normalised", "grams", "particles"]
-
-
-def normalised_spillage(fractions: Fractions) -> float | None:
-    """The paper's c = C / k: spilled over poured; None (undefined) below `MINIMUM_POURED`.
-
-    Source: Lopez-Guevara et al., CoRL 2017, section 3.1.
-    """
-    if fractions.poured < MINIMUM_POURED:
-        return None
-    return fractions.spilled / fractions.poured
 
 
 class Loss(Settings):
@@ -229,7 +229,7 @@ class Loss(Settings):
             case "spilled_and_retained":
                 return fractions.spilled + self.retained_weight * fractions.retained
             case "normalised":
-                return normalised_spillage(fractions)
+                return fractions.spillage
             case "grams":
                 return fractions.spilled * loaded_mass * 1e3
             case "particles":

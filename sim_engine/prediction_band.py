@@ -35,7 +35,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
-from sim_engine.outcome import PourOutcome, normalised_spillage
+from sim_engine.outcome import PourOutcome
 from sim_engine.scene import Scene
 
 LEVEL = 0.9
@@ -218,7 +218,7 @@ def band_of(outcomes: Sequence[PourOutcome], residual: CalibrationResidual | Non
         residual: as in `band`.
     """
     usable = [outcome for outcome in outcomes if outcome.invalid is None]
-    spillages = [r for outcome in usable if (r := normalised_spillage(outcome.fractions)) is not None]
+    spillages = [r for outcome in usable if (r := outcome.fractions.spillage) is not None]
     return band(spillages, usable[0].particles, residual) if spillages else None
 
 
@@ -275,6 +275,6 @@ def spreads(outcomes: Sequence[PourOutcome]) -> dict[str, SampleStatistics]:
     """
     valid = [outcome for outcome in outcomes if outcome.invalid is None]
     values = {name: [float(getattr(outcome, name)) for outcome in valid] for name in FRACTIONS}
-    values["spillage"] = [r for outcome in valid if (r := normalised_spillage(outcome.fractions)) is not None]
+    values["spillage"] = [r for outcome in valid if (r := outcome.fractions.spillage) is not None]
     found = {name: SampleStatistics.of(seeds) for name, seeds in values.items()}
     return {name: spread for name, spread in found.items() if spread is not None}

@@ -232,7 +232,7 @@ class DeploymentSection(StageSettings):
         if self.loss is not None:
             problems.add("stands beside 'objectives'; keep one of them", "loss", key=True)
         if not self.objectives:
-            problems.add("is empty; name at least one, for example '- {name: spillage}'", "objectives")
+            problems.add("is empty; name at least one, for example '- {name: spilled}'", "objectives")
         names = [part.name for part in self.objectives]
         for i, name in enumerate(names):
             if name in names[:i] and problems.within("objectives", i).valid("name"):

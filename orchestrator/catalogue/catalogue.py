@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 INDEX_NAME = "catalogue.sqlite"
 
-FORMAT = 4
+FORMAT = 5
 """Version of the index's content; an index of another version is rebuilt."""
 
 

@@ -104,6 +104,7 @@ POURS = (
     Column("loaded_g", "number", "in the pourer before", "g"),
     Column("spilled_g", "number", "next to the receiver", "g"),
     Column("retained_g", "number", "left in the pourer", "g"),
+    Column("delivered_g", "number", "in the receiver: neither spilled nor left in the pourer", "g"),
     Column("spillage", "number", "spilled / poured; empty where less than 5 % was poured", "1"),
     Column("loss", "number", "what the deployment minimised, as measured", "of loss_name"),
     Column("predicted_loss", "number", "what its strategy expected", "of loss_name"),

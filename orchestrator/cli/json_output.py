@@ -59,6 +59,8 @@ class _PlannedParts(CommandOutput):
     """Mean spilled / poured of the simulations with further seeds."""
 
     predicted_spillage_deviation: float | None
+    """Standard deviation of spilled / poured over their seeds."""
+
     loss: str
     """Name of the loss that was minimised."""
 

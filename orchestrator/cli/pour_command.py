@@ -268,15 +268,12 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool)
 
 def told(weighed: WeighedPour) -> str:
     """What was weighed, in a line."""
-    spillage = weighed.spillage
-    r = (
-        "too little was poured to speak of spillage"
-        if spillage is None
-        else f"spillage {100 * spillage:.2f} % of poured"
-    )
-    parts = {"loaded": weighed.loaded, "spilled": weighed.spilled, "retained": weighed.retained}
-    masses = ", ".join(f"{name} {1e3 * mass:.1f} g" for name, mass in parts.items())
-    return f"{masses}, delivered {weighed.delivered_g:.1f} g ({weighed.delivered_ml:.1f} mL); {r}"
+    spillage = "too little was poured to speak of spillage"
+    if weighed.spillage is not None:
+        spillage = f"spillage {100 * weighed.spillage:.2f} % of poured"
+    parts = ("loaded", "spilled", "retained", "delivered")
+    masses = ", ".join(f"{name} {getattr(weighed, f'{name}_g'):.1f} g" for name in parts)
+    return f"{masses} ({weighed.delivered_ml:.1f} mL); {spillage}"
 
 
 def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool) -> None:

@@ -455,16 +455,15 @@ def _row(
     line: int, pour: RecordedPour, outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None
 ) -> ScoredRow:
     from orchestrator.reports.prediction_scores import ScoredRow
-    from sim_engine.outcome import normalised_spillage
     from sim_engine.prediction_band import SampleStatistics, band_of
 
     usable = [outcome for outcome in outcomes if outcome.invalid is None]
-    values = [r for outcome in usable if (r := normalised_spillage(outcome.fractions)) is not None]
+    values = [r for outcome in usable if (r := outcome.fractions.spillage) is not None]
     return ScoredRow(
         line,
         pour.split,
         pour.action,
-        pour.normalised_spillage,
+        pour.spillage,
         SampleStatistics.of(values),
         band_of(outcomes, residual),
         len(outcomes) - len(values),

@@ -47,10 +47,11 @@ from orchestrator.learning.campaign_plan import (
 )
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.d2 import D2Settings
-from orchestrator.learning.dispense import DOSE, Dispense, KnownSource, spilled_mass
+from orchestrator.learning.dispense import Dispense, KnownSource
 from orchestrator.learning.requests import Failed, Simulated, Slots
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.single_action import OnePour, RepeatedSimulation
+from orchestrator.learning.stage_result import DOSE, weighed_masses
 from orchestrator.materials.vessel_account import MIXTURE, Transfer
 from orchestrator.records.run_record import RunPour, read_record
 from orchestrator.runs.run_service import RunRequest
@@ -426,14 +427,14 @@ def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float
         deviation: of one weighing [kg]; a mass is the difference of two.
     """
     about: dict[str, Any] = measured.notes.get(DOSE, {})
-    received = 1e3 * float(about.get("received", measured.delivered))
+    masses = weighed_masses(measured)
+    received = masses.delivered_g or 0.0
     half = INTERVAL * 1e3 * float(about.get("deviation", math.sqrt(2.0) * deviation))
-    spilled = spilled_mass(measured)
     found: dict[str, Any] = {
         "received_g": received,
         "received_interval_g": [received - half, received + half],
-        "spilled_g": None if spilled is None else 1e3 * spilled,
-        "left_in_source_g": 1e3 * measured.retained,
+        "spilled_g": masses.spilled_g,
+        "left_in_source_g": masses.retained_g,
         "end": str(about.get("end", "")),
         "duration_s": about.get("duration"),
     }

@@ -210,7 +210,7 @@ class RecordedPour:
         return self.poured / (self.poured + self.retained)
 
     @property
-    def normalised_spillage(self) -> float | None:
+    def spillage(self) -> float | None:
         """r = spilled / poured; None if too little was poured to define it."""
         return None if self.poured_fraction < MINIMUM_POURED else self.spilled / self.poured
 
@@ -235,7 +235,7 @@ class MeasuredPour:
     @classmethod
     def from_record(cls, record: RecordedPour) -> MeasuredPour:
         """Convert one row of a file of recorded pours."""
-        return cls(record.action, record.normalised_spillage, record.poured_fraction, record.split, record.scene)
+        return cls(record.action, record.spillage, record.poured_fraction, record.split, record.scene)
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ class RecordSet:
     @property
     def training_pours(self) -> int:
         """Number of training pours on which a θ can be simulated and compared."""
-        return sum(pour.split == "train" and pour.normalised_spillage is not None for pour in self.pours)
+        return sum(pour.split == "train" and pour.spillage is not None for pour in self.pours)
 
 
 @dataclass(frozen=True)

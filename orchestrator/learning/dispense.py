@@ -18,13 +18,9 @@ from actors.dosing.dose_series import NINETY_PERCENT
 from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
-from orchestrator.learning.stage_result import ResultPart, StageResult
+from orchestrator.learning.stage_result import DOSE, ResultPart, StageResult, WeighedMasses, weighed_masses
 from orchestrator.learning.strategy import Progress
 from orchestrator.learning.trials import SeedStream
-from sim_engine.outcome import PourMeasurement
-
-DOSE = "dose"
-"""Purpose of these pours."""
 
 FILL_DEVIATION = 0.5e-3
 """Standard deviation of the content of a source that was filled on a scale [kg]."""
@@ -265,12 +261,10 @@ class Dispense:
         else:
             self._sources[pour.dose.source.name] = left
         about: dict[str, Any] = {}
-        received = spilled = None
+        masses = WeighedMasses()
         match outcome:
             case Poured(measured):
-                about = measured.notes.get(DOSE, {})
-                received, outside = 1e3 * float(about.get("received", measured.delivered)), spilled_mass(measured)
-                spilled = None if outside is None else 1e3 * outside
+                about, masses = measured.notes.get(DOSE, {}), weighed_masses(measured)
                 end = str(about.get("end", ""))
             case Failed(kind, reason):
                 end = f"{kind}: {reason}"
@@ -280,9 +274,9 @@ class Dispense:
             Dose(
                 number=pour.number,
                 wanted_g=1e3 * pour.dose.amount,
-                received_g=received,
+                received_g=masses.delivered_g,
                 deviation_g=None if "deviation" not in about else 1e3 * about["deviation"],
-                spilled_g=spilled,
+                spilled_g=masses.spilled_g,
                 duration_s=about.get("duration"),
                 end=end,
                 position=pour.dose.position,
@@ -301,13 +295,6 @@ class Dispense:
     def result(self) -> Dispensed:
         """The doses so far."""
         return Dispensed(scene=self._plan.scenes[0].name, doses=tuple(self._doses))
-
-
-def spilled_mass(measured: PourMeasurement) -> float | None:
-    """Mass outside the receiver [kg]; None after a dose on a bench that does not weigh it."""
-    about: dict[str, Any] = measured.notes.get(DOSE, {})
-    found: float | None = about.get("spilled", measured.spilled)
-    return found
 
 
 def left_after(dose: DoseTarget, outcome: Outcome) -> KnownSource | None:

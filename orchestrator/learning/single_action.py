@@ -27,12 +27,12 @@ from orchestrator.learning.requests import (
     Simulated,
     Slots,
 )
-from orchestrator.learning.stage_result import ResultPart, StageResult
+from orchestrator.learning.stage_result import StageResult, WeighedMasses, weighed_masses
 from orchestrator.learning.strategy import Progress
 from orchestrator.learning.trials import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import PourMeasurement, PourOutcome, normalised_spillage
+from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.prediction_band import (
     CalibrationResidual,
     PredictionInterval,
@@ -43,29 +43,11 @@ from sim_engine.prediction_band import (
 from sim_engine.scene import PoseError, Scene
 
 
-class WeighedPour(ResultPart):
-    """Weights and derived quantities of a pour."""
-
-    loaded: float
-    """Mass in the pourer before the pour [kg]."""
-
-    spilled: float
-    """Mass outside the receiver [kg]."""
-
-    retained: float
-    """Mass left in the pourer [kg]."""
-
-    delivered_g: float
-    """Mass in the receiver [g]: neither spilled nor left in the pourer."""
+class WeighedPour(WeighedMasses):
+    """Masses of a single pour."""
 
     delivered_ml: float
-    """The same as a volume [ml], from the liquid's density."""
-
-    poured_fraction: float
-    """Fraction of the load that left the pourer."""
-
-    spillage: float | None
-    """r = spilled / poured; None below 5 % poured, where it is undefined."""
+    """The delivered mass as a volume [ml], from the liquid's density."""
 
 
 class OnePoured(StageResult):
@@ -132,17 +114,9 @@ class OnePour:
         """The weights, or the reason why there are none."""
         match self._outcome:
             case PourMeasurement() as measured:
-                fractions = measured.fractions
-                weighed = WeighedPour(
-                    loaded=measured.loaded,
-                    spilled=measured.spilled,
-                    retained=measured.retained,
-                    delivered_g=1e3 * measured.delivered,
-                    delivered_ml=self._liquid.millilitres(measured.delivered),
-                    poured_fraction=fractions.poured,
-                    spillage=normalised_spillage(fractions),
-                )
-                return OnePoured(weighed=weighed)
+                volume = self._liquid.millilitres(measured.delivered)
+                masses = weighed_masses(measured).model_dump()
+                return OnePoured(weighed=WeighedPour(**masses, delivered_ml=volume))
             case Failed(kind, reason):
                 return OnePoured(failed=f"{kind}: {reason}")
         return OnePoured()
@@ -291,7 +265,7 @@ CONFIRM = "confirm"
 """Purpose of these pours."""
 
 
-class ConfirmingPour(ResultPart):
+class ConfirmingPour(WeighedMasses):
     """A pour of the recommended action."""
 
     number: int
@@ -303,14 +277,8 @@ class ConfirmingPour(ResultPart):
     loss: float | None
     """Loss in its own unit; None if nothing was weighed."""
 
-    spillage: float | None
-    """r = spilled / poured; None below 5 % poured, and if nothing was weighed."""
-
-    delivered_g: float | None
-    """Mass in the receiver [g]."""
-
     delivered_ml: float | None
-    """The same as a volume [ml], from the liquid's density."""
+    """The delivered mass as a volume [ml], from the liquid's density."""
 
 
 class Confirmed(StageResult):
@@ -400,9 +368,8 @@ class Confirmation:
                 number=row.number,
                 failed=f"invalid_action: {row.reason}" if row.status == "refused" else row.reason,
                 loss=row.loss,
-                spillage=row.spillage,
-                delivered_g=row.delivered_g,
                 delivered_ml=row.delivered_ml,
+                **row.model_dump(include=set(WeighedMasses.model_fields)),
             )
         )
 

@@ -1,6 +1,7 @@
 """Base of all stage results, and the form in which results show actions and surrogates.
 
 - `StageResult` is the base class. Each kind is defined in the module of its strategy.
+- `WeighedMasses` are the masses of a pour with its spillage; every form of a weighed pour has these fields.
 - `displayed_action` and `displayed_map` convert actions and surrogates for display; the units are part of the keys.
 
 Reading and writing of results is in `orchestrator.records.codec`, the list of all kinds in `strategy_registry`.
@@ -15,7 +16,11 @@ from pydantic import BaseModel, ConfigDict
 
 from actors.optimizer.questions import SurrogateMap
 from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.outcome import PourMeasurement
 from sim_engine.search_space import Space
+
+DOSE = "dose"
+"""Purpose of the pours of wanted amounts, and the key of their notes."""
 
 
 class ResultPart(BaseModel):
@@ -69,6 +74,40 @@ class DisplayedMap(ResultPart):
 
     deviation: tuple[tuple[float, ...], ...]
     """Posterior standard deviation, in the unit of the cost."""
+
+
+class WeighedMasses(ResultPart):
+    """Masses of a pour, and its spillage; None if nothing was weighed."""
+
+    loaded_g: float | None = None
+    """Mass in the pourer before the pour [g]."""
+
+    spilled_g: float | None = None
+    """Mass outside the receiver [g]; None also after a dose on a bench that does not weigh it."""
+
+    retained_g: float | None = None
+    """Mass left in the pourer [g]."""
+
+    delivered_g: float | None = None
+    """Mass in the receiver [g]: neither spilled nor left in the pourer."""
+
+    spillage: float | None = None
+    """r = spilled / poured; None below 5 % poured, where it is undefined."""
+
+
+def weighed_masses(measured: PourMeasurement | None) -> WeighedMasses:
+    """The masses of a measurement; all None without one."""
+    if measured is None:
+        return WeighedMasses()
+    about: dict[str, Any] = measured.notes.get(DOSE, {})
+    spilled: float | None = about.get("spilled", measured.spilled)
+    return WeighedMasses(
+        loaded_g=1e3 * measured.loaded,
+        spilled_g=None if spilled is None else 1e3 * spilled,
+        retained_g=1e3 * measured.retained,
+        delivered_g=1e3 * float(about.get("received", measured.delivered)),
+        spillage=None if spilled is None else measured.fractions.spillage,
+    )
 
 
 UNIT_SUFFIXES = {"deg/s": "deg_s", "deg/s^2": "deg_s2", "deg": "deg", "mm": "mm", "s": "s"}

@@ -18,7 +18,6 @@ from orchestrator.learning.strategy import Progress, Strategy, is_sound
 from orchestrator.learning.trials import SeedStream
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import normalised_spillage
 
 Key = tuple[tuple[tuple[str, float], ...], tuple[tuple[str, float | None], ...]]
 
@@ -43,8 +42,8 @@ class FinalPoured(StageResult):
     loss: float
     """Loss in its own unit; the worst loss if nothing was weighed."""
 
-    spillage: float
-    """r = spilled / poured; 1 if nothing was weighed."""
+    spillage: float | None
+    """r = spilled / poured; None below 5 % poured, and if nothing was weighed."""
 
     made: bool
     """Whether the action was poured and weighed."""
@@ -192,11 +191,11 @@ class FinalPour:
         match outcome:
             case Poured(measurement) if is_sound(measurement.fractions):
                 loss = self._costing.total(self._costing.poured(measurement, self._action))
-                spillage = normalised_spillage(measurement.fractions)
+                spillage = measurement.fractions.spillage
                 self._made = FinalPoured(
                     action_si=self._action.values(),
                     loss=loss,
-                    spillage=1.0 if spillage is None else spillage,
+                    spillage=spillage,
                     made=True,
                     reason="" if spillage is not None else "hardly anything was poured",
                 )
@@ -215,7 +214,7 @@ class FinalPour:
 
     def _lost(self, reason: str) -> FinalPoured:
         action = None if self._action is None else self._action.values()
-        return FinalPoured(action_si=action, loss=self._costing.worst, spillage=1.0, made=False, reason=reason)
+        return FinalPoured(action_si=action, loss=self._costing.worst, spillage=None, made=False, reason=reason)
 
 
 def _key(request: Simulate) -> Key:

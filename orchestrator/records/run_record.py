@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from actors.interfaces import PourProgress
-from orchestrator.learning.dispense import spilled_mass
 from orchestrator.learning.requests import Ask, Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggested
-from orchestrator.learning.stage_result import displayed_action
+from orchestrator.learning.stage_result import displayed_action, weighed_masses
 from orchestrator.learning.strategy import Progress
 from orchestrator.records.codec import Results
 from orchestrator.records.events import (
@@ -46,7 +45,7 @@ from orchestrator.records.events import (
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader
 from orchestrator.records.journal_file import Header
 from orchestrator.records.states import RESTING, State
-from sim_engine.outcome import PourMeasurement, normalised_spillage
+from sim_engine.outcome import PourMeasurement
 
 Row = dict[str, Any]
 
@@ -99,10 +98,7 @@ class RunPour:
         row["predicted"] = None if self.request.predicted is None else self.request.predicted.mean
         match self.outcome:
             case Poured(weighed):
-                spilled = spilled_mass(weighed)
-                row |= {"loaded_g": 1e3 * weighed.loaded, "spilled_g": None if spilled is None else 1e3 * spilled}
-                row["retained_g"] = 1e3 * weighed.retained
-                row["spillage"] = None if spilled is None else normalised_spillage(weighed.fractions)
+                row |= weighed_masses(weighed).model_dump()
             case Failed(kind, reason):
                 row["failed"] = f"{kind}: {reason}"
         return row

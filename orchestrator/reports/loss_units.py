@@ -10,7 +10,7 @@ from orchestrator.learning.campaign_plan import CampaignPlan, DeploymentPlan
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.requests import Pour, Prediction
 from orchestrator.records.run_record import RunPour
-from sim_engine.outcome import Loss, LossName, PourMeasurement, normalised_spillage
+from sim_engine.outcome import Loss, LossName, PourMeasurement
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def loss_of_pour(plan: CampaignPlan, pour: Pour, measured: PourMeasurement) -> f
     if pour.dose is not None:
         return abs(measured.delivered - pour.dose.amount)
     if plan.deployment is None or is_calibration(plan, pour):
-        return normalised_spillage(measured.fractions)
+        return measured.fractions.spillage
     if plan.deployment.objectives is not None:
         scene = next(scene for scene in plan.deployment.scenes if scene.name == pour.scene)
         costing = Costing.of(plan.deployment, scene, plan.parameters)

@@ -21,7 +21,7 @@ from orchestrator.learning.deployment.model_monitoring import Believed
 from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.learning.deployment.safe_window import WindowFound
 from orchestrator.learning.single_action import Confirmed
-from orchestrator.learning.stage_result import ResultPart, StageResult
+from orchestrator.learning.stage_result import ResultPart, StageResult, WeighedMasses
 from orchestrator.learning.strategy_registry import result_kinds
 from orchestrator.records.run_record import PourState
 from sim_engine.liquids import SimulationParameters
@@ -84,7 +84,7 @@ class StageSummary(ResultPart):
     unusable_simulations: int
 
 
-class PourSummary(ResultPart):
+class PourSummary(WeighedMasses):
     """A requested pour."""
 
     stage: str
@@ -118,15 +118,6 @@ class PourSummary(ResultPart):
 
     remark: str
     """Remarks: the reason of a failure, an unknown outcome, the operator's answer."""
-
-    loaded_g: float | None
-    spilled_g: float | None
-    retained_g: float | None
-    spillage: float | None
-    """Fraction of the load that was spilled: spilled / loaded."""
-
-    spilled_of_poured: float | None
-    """r = spilled / poured; null if too little was poured."""
 
     time: float | None
     """When it began, or ended: seconds since 1970."""

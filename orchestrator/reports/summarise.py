@@ -13,6 +13,7 @@ from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.single_action import Confirmed, PredictedPour
+from orchestrator.learning.stage_result import weighed_masses
 from orchestrator.records.codec import Results
 from orchestrator.records.journal_check import JournalCheck
 from orchestrator.records.journal_file import Header
@@ -60,7 +61,6 @@ from orchestrator.reports.stage_views import (
     theta_of,
 )
 from sim_engine.model_validity import NotCovered
-from sim_engine.outcome import normalised_spillage
 
 MOST_DECISIONS = 300
 """Largest number of decisions in a summary, the most recent ones."""
@@ -246,17 +246,16 @@ def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False
     """A pour in numbers and words; see `pour_summaries`."""
     request, measured, values = pour.request, pour.measured, pour.request.action.values()
     calibrating, unit, names = True, SPILLAGE, tuple(name for name, value in values.items() if value is not None)
-    loss = None if measured is None else normalised_spillage(measured.fractions)
+    loss = None if measured is None else measured.fractions.spillage
     if plan is not None:
         calibrating, unit = is_calibration(plan, request), unit_of_pour(plan, request)
         section: CalibrationPlan | DeploymentPlan | None = plan.calibration if calibrating else plan.deployment
         names = ("angular_velocity", "x_offset") if section is None else section.actions.names
         loss = None if measured is None else loss_of_pour(plan, request, measured)
-    row = pour.row()
-    spilled = row.get("spilled_g")
+    masses = weighed_masses(measured)
     state = "unknown" if pour.state == "under way" and not live else pour.state
     came = "" if measured is None else "too little was poured" if loss is None else unit.text(loss)
-    if measured is not None and spilled is None:
+    if measured is not None and masses.spilled_g is None:
         came = f"{1e3 * measured.delivered:.2f} g received"
     action = style.display_values({name: values[name] for name in names})
     if request.dose is not None:
@@ -275,11 +274,7 @@ def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False
         loss=unit.meaning,
         best=best,
         remark=_remark(state, pour),
-        loaded_g=row.get("loaded_g"),
-        spilled_g=spilled,
-        retained_g=row.get("retained_g"),
-        spillage=None if measured is None or spilled is None else measured.fractions.spilled,
-        spilled_of_poured=row.get("spillage"),
+        **masses.model_dump(),
         time=pour.time,
         seconds=pour.seconds,
     )

@@ -685,7 +685,7 @@ def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:
             str(pour.number),
             *(_bare(name, pour.action_si[name]) for name in searched),
             *("—" if grams is None else f"{grams:.1f}" for grams in (pour.loaded_g, pour.spilled_g, pour.retained_g)),
-            "—" if pour.spilled_of_poured is None else f"{100 * pour.spilled_of_poured:.2f}",
+            "—" if pour.spillage is None else f"{100 * pour.spillage:.2f}",
             pour.predicted or "—",
             pour.measured if pour.state == "weighed" and not pour.calibration else "—",
             pour.remark,

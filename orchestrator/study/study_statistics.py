@@ -70,7 +70,8 @@ class Key:
 
 @dataclass(frozen=True)
 class Final:
-    """A pour of a recommended action. A pour that was not made has the worst loss and counts as all spilled."""
+    """A pour of a recommended action. Without a spillage, because nothing or almost nothing was poured, it counts as
+    all spilled; a pour that was not made has the worst loss, too."""
 
     loss: float
     spillage: float
@@ -144,7 +145,7 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
         elif cell.kind == "final":
             key = Key(cell.level, receivers[cell.receiver], cell.arm)
             one = result_of(data.results, FINAL, FinalPoured)
-            pour = Final(one.loss, one.spillage, one.made)
+            pour = Final(one.loss, 1.0 if one.spillage is None else one.spillage, one.made)
             found.finals.setdefault(key, {}).setdefault(cell.repetition, []).append(pour)
     found.calibrated = {name: found.calibrated[name] for name in order if name in found.calibrated}
     return found

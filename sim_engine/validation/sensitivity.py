@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, ParameterInfo, SimulationParameters
-from sim_engine.outcome import normalised_spillage
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation.case_result import Figure, Measurement, Series, reported
@@ -218,7 +217,7 @@ def sensitivity(
         if progress is not None:
             progress(done, len(jobs))
         outcome = simulator.simulate(PourTask(SCENE, POURS[pour], theta, seed)).outcome
-        spillage = normalised_spillage(outcome.fractions)
+        spillage = outcome.fractions.spillage
         if outcome.invalid is None and spillage is not None:
             spilled.setdefault((pour, theta), []).append(spillage)
     if progress is not None:

@@ -184,7 +184,7 @@ deployment:
   receiver: cone.yaml
   motion: {max_angle: 115 deg, height: 60 mm}
   actions: {angular_velocity: [60 deg/s, 100 deg/s], x_offset: [60 mm, 90 mm]}
-  objectives: [{name: spillage}, {name: gentle, weight: 0.2, rough: 100 deg/s}]
+  objectives: [{name: spilled}, {name: gentle, weight: 0.2, rough: 100 deg/s}]
   pours: 2
 outputs: {directory: runs}
 """

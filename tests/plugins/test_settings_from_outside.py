@@ -14,7 +14,7 @@ import pytest
 
 from decant.plugins import DeploymentPlan, Loss, Objectives
 from decant.plugins.testing import ACTIONS, SCENE, THETA, StrategyHarness, check_strategy
-from orchestrator.learning.deployment.objectives import Spillage
+from orchestrator.learning.deployment.objectives import Spilled
 from tests.plugins.decant_example.objective import Gentle
 from tests.plugins.decant_example.strategy import Hypercube, HypercubeSettings
 from tests.support.toy_spillage import narrow_cup
@@ -47,8 +47,8 @@ def test_it_does_what_every_strategy_has_to_do() -> None:
 
 
 def test_an_objective_of_ones_own_takes_part_in_the_weighted_sum() -> None:
-    objectives = Objectives((Spillage(), Gentle(weight=0.3)))
-    assert objectives.names == ("spillage", "gentle")
+    objectives = Objectives((Spilled(), Gentle(weight=0.3)))
+    assert objectives.names == ("spilled", "gentle")
     slow, fast = (SCENE.action(ACTIONS.decode([u, 0.5])) for u in (0.0, 1.0))
     worst = objectives.worst(SCENE, ACTIONS)
     costs = [objectives.parts[1].cost(None, action, SCENE) for action in (slow, fast)]  # type: ignore[arg-type]
@@ -102,7 +102,7 @@ deployment:
   actions: {{angular_velocity: [20 deg/s, 120 deg/s], x_offset: [70 mm, 130 mm]}}
   pours: 5
   centred: true
-  objectives: [{{name: spillage}}, {{name: gentle, rough: 60 deg/s, weight: 0.2}}]
+  objectives: [{{name: spilled}}, {{name: gentle, rough: 60 deg/s, weight: 0.2}}]
 """
 
 BAD = {

@@ -302,6 +302,8 @@ def _one_of(value: Any, expected: str) -> str:
     words = [word.strip("' ") for word in expected.replace(" or ", ", ").split(",")]
     guess = did_you_mean(str(value), words)
     hint = f"did you mean '{guess}'?" if guess else f"should be {expected}"
+    if value == "spillage" and guess == "spilled":  # the name that this objective had before
+        hint = "spillage is spilled / poured, and this objective is spilled / loaded: write 'spilled'"
     return f"{value!r} is not known here; {hint}" if isinstance(value, str) else f"should be {expected}"
 
 

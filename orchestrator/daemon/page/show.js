@@ -182,13 +182,13 @@ function weights(question, names, send) {
 export function poursTable(pours) {
   if (!pours.length) return el("p", { class: "quiet" }, "None yet.");
   return el("table", {},
-    el("thead", {}, el("tr", {}, ["Campaign", "Pour", "Into", "Action", "Expected", "Measured", SPILLED].map((head) =>
+    el("thead", {}, el("tr", {}, ["Campaign", "Pour", "Into", "Action", "Expected", "Measured", "Spilled"].map((head) =>
       el("th", { scope: "col" }, head)))),
     el("tbody", {}, pours.map((pour) => el("tr", { class: pour.state.replace(" ", "-") },
       cell("Campaign", pour.campaign), cell("Pour", pour.number), cell("Into", pour.receiver), cell("Action", pour.action),
       cell("Expected", pour.predicted || "—", pour.predicted ? pour.loss : ""),
       cell("Measured", pour.measured || stateText(pour.state), pour.state === "weighed" ? pour.loss : ""),
-      cell(SPILLED, pour.spillage === null ? "—" : percent(pour.spillage))))));
+      cell("Spilled", pour.spilled_g === null ? "—" : `${pour.spilled_g.toFixed(1)} g`)))));
 }
 
 /** Where the vessels stand that an arm carries, and what they hold. */
@@ -211,8 +211,6 @@ export function nightTimeline(events) {
       el("li", { class: kind }, el("time", {}, clock(time)), el("b", {}, NIGHT[kind]), el("span", {}, text)))),
   ];
 }
-
-const SPILLED = "Spilled / loaded";
 
 /** A cell; `meaning` says what its value is. */
 const cell = (head, text, meaning = "") =>

@@ -29,7 +29,6 @@ from orchestrator.learning.strategy import Progress, is_sound
 from orchestrator.learning.trials import OptimizerQueries, Trial, Trials
 from sim_engine.action import ACTION_DIMENSIONS, Action, described
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import normalised_spillage
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
 
@@ -301,4 +300,4 @@ def _spillage(outcome: Outcome) -> float | None:
     """c_s of a valid simulation; otherwise None."""
     if not isinstance(outcome, Simulated) or outcome.outcome.invalid is not None:
         return None
-    return normalised_spillage(outcome.outcome.fractions) if is_sound(outcome.outcome.fractions) else None
+    return outcome.outcome.fractions.spillage if is_sound(outcome.outcome.fractions) else None

@@ -31,7 +31,7 @@ from orchestrator.learning.stage_result import DisplayedMap, ResultPart, StageRe
 from orchestrator.learning.strategy import Progress, is_sound
 from orchestrator.learning.trials import OptimizerQueries, SeedStream, Trial, Trials
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import MINIMUM_POURED, normalised_spillage
+from sim_engine.outcome import MINIMUM_POURED
 from sim_engine.settings.model import MOST_SIMULATIONS, PositiveSimulationCount, Problems
 from sim_engine.settings.quantity import Quantity
 
@@ -215,7 +215,7 @@ class Calibration(ABC, Generic[S]):
             return None
         if not is_sound(outcome.outcome.fractions):
             return None
-        simulated = normalised_spillage(outcome.outcome.fractions)
+        simulated = outcome.outcome.fractions.spillage
         if simulated is None:
             self._undefined += 1
             return None

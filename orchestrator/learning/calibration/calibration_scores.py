@@ -29,7 +29,6 @@ from orchestrator.learning.stage_result import ResultPart, StageResult
 from orchestrator.learning.strategy import Progress, is_sound
 from orchestrator.learning.trials import SeedStream
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import CalibrationResidual, left_over
 from sim_engine.search_space import Space
 
@@ -208,7 +207,7 @@ class Evaluation:
             del self._open[request]
         case.answered = True
         if isinstance(outcome, Simulated) and outcome.outcome.invalid is None and is_sound(outcome.outcome.fractions):
-            case.simulated = normalised_spillage(outcome.outcome.fractions)
+            case.simulated = outcome.outcome.fractions.spillage
             case.reason = "" if case.simulated is not None else "too little poured"
         else:
             case.reason = getattr(outcome, "reason", "") or "invalid outcome"

@@ -23,7 +23,6 @@ from orchestrator.learning.stage_result import ResultPart, StageResult, displaye
 from orchestrator.learning.strategy import Progress, is_sound
 from orchestrator.learning.trials import SeedStream
 from sim_engine.action import Action, described
-from sim_engine.outcome import normalised_spillage
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
 
@@ -146,7 +145,7 @@ class SimulatedPoint(ResultPart):
     """Searched dimensions of the action."""
 
     spillage: float
-    """Simulated spillage c_s."""
+    """Simulated spillage c_s = spilled / poured."""
 
 
 class DesignPoured(StageResult):
@@ -267,7 +266,7 @@ class DesignedPours:
                 fractions = measurement.fractions
                 assert planned.action is not None
                 planned.measured = MeasuredPour(
-                    planned.action, normalised_spillage(fractions), fractions.poured, planned.split, planned.scene.name
+                    planned.action, fractions.spillage, fractions.poured, planned.split, planned.scene.name
                 )
             case Failed("invalid_action", reason) if planned.tries < MAX_TRIES:
                 planned.notes.append(reason)

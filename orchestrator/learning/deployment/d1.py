@@ -25,7 +25,6 @@ from orchestrator.learning.strategy import Progress, Strategy, is_sound
 from orchestrator.learning.trials import Trial
 from sim_engine.action import Action, described
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import normalised_spillage
 from sim_engine.prediction_band import SampleStatistics
 from sim_engine.scene import Scene
 from sim_engine.settings.model import PositiveSimulationCount, PourCount, Problems
@@ -137,7 +136,7 @@ class OneShotPlanning(Deployment[D1Settings]):
                 and outcome.outcome.invalid is None
                 and is_sound(outcome.outcome.fractions)
             ):
-                self._spillages[request] = normalised_spillage(outcome.outcome.fractions)
+                self._spillages[request] = outcome.outcome.fractions.spillage
 
     def _next(self) -> None:
         trials, done, wanted = self._trials, self._ledger.spent, self._settings.rounds

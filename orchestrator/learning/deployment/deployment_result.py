@@ -36,7 +36,7 @@ class Recommended(ResultPart):
     """D1: mean r = spilled / poured of its simulations, whose seeds took part in choosing it."""
 
     predicted_spillage_deviation: float | None = None
-    """D1: standard deviation of r over these seeds."""
+    """D1: standard deviation of r = spilled / poured over these seeds."""
 
     hyperparameters: dict[str, float] | None = None
     """Those of the surrogate."""

@@ -1,6 +1,6 @@
-"""Several objectives of a pour: little spillage, little liquid left, short duration, a given volume.
+"""Several objectives of a pour: little liquid spilled, little left, short duration, a given volume.
 
-- `Objective` is the base class; `Spillage`, `Retained`, `Time` and `TargetVolume` are the built-in objectives.
+- `Objective` is the base class; `Spilled`, `Retained`, `Time` and `TargetVolume` are the built-in objectives.
 - `Objectives` combines them into a weighted sum.
 """
 
@@ -39,7 +39,7 @@ class Objective(Settings):
 
     tag: ClassVar[str] = "name"
     plugins: ClassVar[str] = "decant.objectives"
-    required: ClassVar[dict[str, str]] = {"name": "spillage"}
+    required: ClassVar[dict[str, str]] = {"name": "spilled"}
 
     name: str = ""
     """Name of the objective."""
@@ -63,10 +63,10 @@ class Objective(Settings):
         """Add problems that the objective has in a scene or in combination with the other objectives."""
 
 
-class Spillage(Objective):
-    """spilled / loaded."""
+class Spilled(Objective):
+    """spilled / loaded: unlike the spillage, it is defined for every pour, and a small miss counts little."""
 
-    name: Literal["spillage"] = "spillage"
+    name: Literal["spilled"] = "spilled"
     """Fraction of the load that is spilled."""
 
     def cost(self, fractions: Fractions, action: Action, scene: Scene) -> float:

@@ -20,11 +20,11 @@ from orchestrator.learning.campaign_plan import ExistingPours
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.objectives import Vector
 from orchestrator.learning.requests import Decision, Failed, Outcome, Poured, Prediction
-from orchestrator.learning.stage_result import ResultPart, displayed_action
+from orchestrator.learning.stage_result import ResultPart, WeighedMasses, displayed_action, weighed_masses
 from orchestrator.learning.strategy import is_sound
 from sim_engine.action import Action
 from sim_engine.liquids import Liquid
-from sim_engine.outcome import PourMeasurement, normalised_spillage
+from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.search_space import Space
 
@@ -42,7 +42,7 @@ LARGEST_Z = 3.0
 Status = Literal["pouring", "weighed", "refused", "failed", "added"]
 
 
-class PourRow(ResultPart):
+class PourRow(WeighedMasses):
     """A real pour of a deployment: its action, its prediction and its outcome."""
 
     number: int
@@ -79,20 +79,8 @@ class PourRow(ResultPart):
     objectives: dict[str, float]
     """Values by name of objective, if there are several."""
 
-    spillage: float | None
-    """r = spilled / poured; None below 5 % poured, and if nothing was weighed."""
-
-    spilled_g: float | None
-    """Mass outside the receiver [g]."""
-
-    retained_g: float | None
-    """Mass left in the pourer [g]."""
-
-    delivered_g: float | None = None
-    """Mass in the receiver [g]: neither spilled nor left in the pourer."""
-
     delivered_ml: float | None = None
-    """The same as a volume [ml], from the liquid's density."""
+    """The delivered mass as a volume [ml], from the liquid's density."""
 
 
 class PredictionCheck(ResultPart):
@@ -172,10 +160,7 @@ class PourTrial:
             predicted_interval=None if predicted is None else predicted.of_a_pour(),
             loss=self.cost,
             objectives={} if self.vector is None else dict(zip(objectives, self.vector, strict=False)),
-            spillage=None if weighed is None else normalised_spillage(weighed.fractions),
-            spilled_g=None if weighed is None else weighed.spilled * 1e3,
-            retained_g=None if weighed is None else weighed.retained * 1e3,
-            delivered_g=None if weighed is None else weighed.delivered * 1e3,
+            **weighed_masses(weighed).model_dump(),
             delivered_ml=None if weighed is None else liquid.millilitres(weighed.delivered),
         )
 

@@ -153,7 +153,7 @@ def test_a_load_that_is_not_told_is_refused(given: str, said: str, folder: Path)
 
 OBJECTIVES = """\
   objectives:
-    - {name: spillage}
+    - {name: spilled}
     - {name: target_volume, volume: 50 mL, tolerance: 2 mL}
 """
 

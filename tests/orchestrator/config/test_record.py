@@ -166,7 +166,7 @@ LOSSES = st.sampled_from(
         {},
         {"loss": {"retained_weight": 0.123456789}},
         {"loss": {"name": "spilled_and_retained"}},
-        {"objectives": [{"name": "spillage", "weight": 0.3}, {"name": "retained"}], "floor": 0.7},
+        {"objectives": [{"name": "spilled", "weight": 0.3}, {"name": "retained"}], "floor": 0.7},
     ]
 )
 MOTIONS = st.sampled_from([{}, {"hold_time": "0.3 s"}, {"max_hold_time": "3.3 s", "pivot": {"x": "3 mm", "z": "4 mm"}}])

@@ -91,7 +91,7 @@ def test_a_run_may_not_be_gone_on_with_under_another_risk_or_window(tmp_path: Pa
         ({"window": {"tolerance": "2"}}, "outside 0.01 … 100 %"),
         ({"strategy": "D2", "pours": 5, "risk": RISK}, "belongs to D1, not to D2"),
         ({"strategy": "D3", "pours": 5, "window": {"tolerance": "2 %"}}, "belongs to D1, not to D3"),
-        ({"risk": RISK, "objectives": [{"name": "spillage"}]}, "can't be combined with 'objectives'"),
+        ({"risk": RISK, "objectives": [{"name": "spilled"}]}, "can't be combined with 'objectives'"),
     ],
 )
 def test_each_thing_that_is_wrong_is_one_error(tmp_path: Path, deployment: dict[str, Any], complaint: str) -> None:

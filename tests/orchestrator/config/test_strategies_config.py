@@ -177,11 +177,15 @@ def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (objectives("{name: spilage}"), "objectives[0].name: 'spilage' is not known here; did you mean 'spillage'?"),
+        (objectives("{name: spiled}"), "objectives[0].name: 'spiled' is not known here; did you mean 'spilled'?"),
+        (
+            objectives("{name: spillage}"),
+            "spillage is spilled / poured, and this objective is spilled / loaded: write 'spilled'",
+        ),
         (objectives("{weight: 2}"), "deployment.objectives[0]: key 'name' is missing"),
         (objectives(), "deployment.objectives: is empty; name at least one"),
-        (objectives("{name: spillage}", "{name: spillage}"), "objectives[1]: spillage stands twice in the list"),
-        (objectives("{name: spillage, volume: 1 mL}"), "volume: belongs to target_volume, not to spillage; remove it"),
+        (objectives("{name: spilled}", "{name: spilled}"), "objectives[1]: spilled stands twice in the list"),
+        (objectives("{name: spilled, volume: 1 mL}"), "volume: belongs to target_volume, not to spilled; remove it"),
         (
             objectives("{name: target_volume}"),
             "objectives[0]: key 'volume' is missing; add for example",
@@ -191,10 +195,10 @@ def test_objectives_are_read_in_si_and_written_out_again(tmp_path: Path) -> None
         (objectives(TARGET.replace(" 2 mL", " 160 mL")), "tolerance: is as much as the volume: not pouring would do"),
         (objectives(TARGET, "{name: retained}"), "objectives[1]: wants the pourer to be emptied, and target_volume"),
         (
-            objectives("{name: spillage}", more="  pareto: true\n"),
+            objectives("{name: spilled}", more="  pareto: true\n"),
             "pareto: unknown key; the weighted sum of the objectives is minimised; give each a 'weight', and remove it",
         ),
-        (objectives("{name: spillage}", more="  loss: {name: grams}\n"), "loss: stands beside 'objectives'; keep one"),
+        (objectives("{name: spilled}", more="  loss: {name: grams}\n"), "loss: stands beside 'objectives'; keep one"),
         (DEPLOYED + "  floor: 0.3\n", "deployment.floor: belongs to 'objectives'; name some, or remove it"),
         (
             objectives(TARGET)

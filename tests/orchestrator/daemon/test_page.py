@@ -379,10 +379,10 @@ def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_
         page.locator("#pours tbody tr").first.wait_for()
         rows = page.locator("#pours tbody tr").all_inner_texts()
         assert len(rows) == len(found["pours_made"]) == 3
-        assert f"{100 * found['pours_made'][-1]['spillage']:.2f} %" in rows[0]
+        assert f"{found['pours_made'][-1]['spilled_g']:.1f} g" in rows[0]
         assert found["pours_made"][-1]["predicted"] in rows[0]
         heads = page.locator("#pours thead th").all_inner_texts()
-        assert (heads[0], heads[-1]) == ("Campaign", "Spilled / loaded")
+        assert (heads[0], heads[-1]) == ("Campaign", "Spilled")
         cells = page.locator("#pours tbody tr").first.locator("td").all_inner_texts()
         assert cells[0] == "cup"
         assert cells[5].split("\n")[-1].strip() == "(spilled + retained) / loaded"

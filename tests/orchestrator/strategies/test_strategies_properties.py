@@ -28,7 +28,7 @@ from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.d1 import OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
 from orchestrator.learning.deployment.d3 import Hybrid
-from orchestrator.learning.deployment.objectives import Objectives, Retained, Spillage
+from orchestrator.learning.deployment.objectives import Objectives, Retained, Spilled
 from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Suggest
 from orchestrator.learning.run_errors import LearningError
 from orchestrator.records.codec import encode_result
@@ -50,7 +50,7 @@ CALIBRATIONS: dict[str, tuple[Any, dict[str, Any]]] = {
     "C3": (BayesianCalibration, {"iterations": 6, "initial_samples": 4}),
     "C4": (ContinuousBayesianCalibration, {"simulations": 12, "initial_samples": 6}),
 }
-BOTH = Objectives((Spillage(), Retained()))
+BOTH = Objectives((Spilled(), Retained()))
 RISK = plans.risk("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.05))
 DEPLOYMENTS: dict[str, tuple[Any, dict[str, Any]]] = {
     "D1": (OneShotPlanning, {"iterations": 6}),

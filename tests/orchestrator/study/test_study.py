@@ -234,7 +234,7 @@ def test_an_action_that_can_not_be_poured_and_none_at_all_have_the_worst_loss(tm
         assert one.ask(Slots(1, 1)) == []
         one.tell(request, outcome)
         assert one.finished
-        assert (one.result().loss, one.result().spillage, one.result().made) == (3.0, 1.0, False)
+        assert (one.result().loss, one.result().spillage, one.result().made) == (3.0, None, False)
 
 
 def test_other_code_than_that_of_finished_cells_is_named_once_and_is_no_error(tmp_path: Path) -> None:

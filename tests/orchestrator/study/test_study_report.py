@@ -120,9 +120,6 @@ def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
             predicted_scatter=None,
             loss=loss,
             objectives={},
-            spillage=None,
-            spilled_g=None,
-            retained_g=None,
         )
         for number, (status, loss) in enumerate(rows, start=1)
     ]

@@ -27,7 +27,7 @@ from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Reques
 from orchestrator.runs.strategy_harness import SCENE, THETA, StrategyHarness, outcome_of, replay
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import PourMeasurement, normalised_spillage
+from sim_engine.outcome import PourMeasurement
 from sim_engine.search_space import Axis, Space
 from tests.orchestrator.strategies.test_strategies_properties import Shuffled
 from tests.support.plans import calibration_plan, deployment_plan
@@ -187,7 +187,7 @@ def _costs(name: str, play: StrategyHarness) -> list[float]:
             known.append(outcome.measurement.fractions.spilled)
         if isinstance(outcome, Simulated) and outcome.outcome.invalid is None and isinstance(request, Simulate):
             fractions = outcome.outcome.fractions
-            if math.isfinite(fractions.spilled) and normalised_spillage(fractions) is not None:
+            if math.isfinite(fractions.spilled) and fractions.spillage is not None:
                 waiting.setdefault(request.action, []).append(fractions.spilled)
     known += [float(np.mean(costs)) for costs in waiting.values()]
     return [*known, *(cost for costs in waiting.values() for cost in costs)]

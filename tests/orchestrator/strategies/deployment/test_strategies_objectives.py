@@ -18,7 +18,7 @@ from orchestrator.learning.deployment.objectives import (
     Objective,
     Objectives,
     Retained,
-    Spillage,
+    Spilled,
     TargetVolume,
     Time,
     duration,
@@ -41,19 +41,19 @@ ACTIONS = Space(
     )
 )
 LITRE = 1e-3
-SPILLAGE, RETAINED, TIME = Spillage(), Retained(), Time(scale=8.0)
+SPILLED, RETAINED, TIME = Spilled(), Retained(), Time(scale=8.0)
 TARGET = TargetVolume(volume=0.12 * LITRE, tolerance=0.002 * LITRE)
 
 SETS = {
-    "spillage": (SPILLAGE,),
+    "spilled": (SPILLED,),
     "retained": (RETAINED,),
     "time": (TIME,),
-    "spillage and time": (SPILLAGE, TIME),
-    "spillage and retained": (SPILLAGE, RETAINED),
-    "all of the load": (SPILLAGE, RETAINED, TIME),
+    "spilled and time": (SPILLED, TIME),
+    "spilled and retained": (SPILLED, RETAINED),
+    "all of the load": (SPILLED, RETAINED, TIME),
     "a volume": (TARGET,),
     "a volume, quickly": (TARGET, TIME.model_copy(update={"weight": 0.3})),
-    "hurry above all": (SPILLAGE.model_copy(update={"weight": 0.01}), TIME.model_copy(update={"weight": 100.0})),
+    "hurry above all": (SPILLED.model_copy(update={"weight": 0.01}), TIME.model_copy(update={"weight": 100.0})),
 }
 
 
@@ -119,7 +119,7 @@ def test_objectives_have_no_good_action_that_simulations_go_on_for() -> None:
     def all_spilled(request: Request) -> Outcome | None:
         return Simulated(outcome_of(0.95, seed=request.seed)) if isinstance(request, Simulate) else answers(request)
 
-    strategy = make("D3", (SPILLAGE,), pours=1, prior_simulations=9, simulations_per_pour=0, model="adaptive")
+    strategy = make("D3", (SPILLED,), pours=1, prior_simulations=9, simulations_per_pour=0, model="adaptive")
     StrategyHarness(lambda *_: 0.0, answer=all_spilled).run(strategy)
     assert len(strategy.result().simulated) == 9
 
@@ -175,7 +175,7 @@ def test_the_best_action_of_the_toy_world_pours_and_without_a_floor_often_would_
     best = min(grid(), key=lambda action: cost(costing(parts), action))
     assert delivered(world(best)) >= 0.5 * wanted(parts)
     without = min(grid(), key=lambda action: cost(costing(parts, floor=1e-9), action))
-    if name in ("spillage", "time", "spillage and time", "hurry above all"):
+    if name in ("spilled", "time", "spilled and time", "hurry above all"):
         assert delivered(world(without)) < 0.4
 
 
