@@ -26,12 +26,28 @@ from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBa
 from actors.grippers.gripper_interface import GripperEmulator
 from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
-from actors.interfaces import DeviceCheck
+from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.places import PlaceSettings, Role
 from sim_engine.action import Action
 from sim_engine.scene import Scene
 from sim_engine.settings.model import Problems
+from sim_engine.settings.plugin_registry import own_extras
 from sim_engine.vessel.vessel import Vessel
+
+
+def _emulator(name: str) -> Any:
+    """The class of an emulated device.
+
+    Raises:
+        LaboratoryError: the emulators are not installed.
+    """
+    emulators = own_extras("decant.emulators", name)
+    if name not in emulators:
+        raise LaboratoryError(
+            "this installation has no emulated devices (the package actors.emulators is missing); "
+            "use a simulated bench, such as configs/laboratories/twin.yaml"
+        )
+    return emulators[name]
 
 
 class SimulatedArmKind(ArmKind[SimulatedArmSettings]):
@@ -166,9 +182,8 @@ class UrArmKind(ArmKind[UrArmSettings]):
 
     def start_emulator(self) -> ArmEmulator:
         """See `ArmKind.start_emulator`."""
-        from actors.emulators.ur_controller.arm_emulator import UrEmulator
-
-        return UrEmulator(self.spec)
+        emulator: ArmEmulator = _emulator("ur")(self.spec)
+        return emulator
 
     def figure(self) -> ArmFigure:
         """See `ArmKind.figure`."""
@@ -214,10 +229,10 @@ class SerialBalanceKind(BalanceKind[SerialBalanceSettings]):
 
     def start_emulator(self) -> BalanceEmulator | None:
         """See `BalanceKind.start_emulator`."""
-        from actors.emulators.serial_balance.balance_process import SerialBalanceEmulator
-
-        virtual = self.spec.virtual
-        return None if virtual is None else SerialBalanceEmulator(self.spec, virtual)
+        if self.spec.virtual is None:
+            return None
+        emulator: BalanceEmulator = _emulator("serial")(self.spec, self.spec.virtual)
+        return emulator
 
     def diagnostics(self, *, tare: bool) -> list[DeviceCheck]:
         """See `BalanceKind.diagnostics`; checks the port first."""
@@ -242,9 +257,8 @@ class EmulatedRobotiqSettings(RobotiqSettings):
 
     def start_emulator(self) -> GripperEmulator:
         """See `GripperSettings.start_emulator`."""
-        from actors.emulators.gripper_emulators import RobotiqEmulator
-
-        return RobotiqEmulator(self)
+        emulator: GripperEmulator = _emulator("robotiq")(self)
+        return emulator
 
 
 class EmulatedOnRobotSettings(OnRobotSettings):
@@ -254,9 +268,8 @@ class EmulatedOnRobotSettings(OnRobotSettings):
 
     def start_emulator(self) -> GripperEmulator:
         """See `GripperSettings.start_emulator`."""
-        from actors.emulators.gripper_emulators import OnRobotEmulator
-
-        return OnRobotEmulator(self)
+        emulator: GripperEmulator = _emulator("onrobot")(self)
+        return emulator
 
 
 _LABEL = r"[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?"

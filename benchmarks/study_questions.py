@@ -19,9 +19,9 @@ from pathlib import Path
 from machine import ROOT, write_table
 from players import by_turn, coverage
 
-from orchestrator.cli.study_command import read_study
 from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED
 from orchestrator.reports.stage_views import deployments_of
+from orchestrator.study.study_command import read_study
 from orchestrator.study.study_folder import CellResult, finished_results
 from orchestrator.study.study_plan import cells_of
 from orchestrator.study.study_statistics import (

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from orchestrator.cli import physics_command
+from orchestrator.extra_commands import physics_command
 
 DOCS = Path(__file__).resolve().parent
 

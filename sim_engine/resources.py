@@ -3,7 +3,6 @@
 - `load_arrays` and `store_arrays` keep results that are slow to compute in one cache directory, which may be deleted at
   any time.
 - `require` checks that the package of an extra is installed.
-- `optional_module` imports from a package of Decant that can be left out.
 
 This module has no slow imports.
 """
@@ -12,7 +11,6 @@ from __future__ import annotations
 
 import errno
 import getpass
-import importlib
 import importlib.util
 import logging
 import os
@@ -21,7 +19,6 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,19 +182,6 @@ class MissingExtraError(DecantError, ImportError):
 def installed(module: str) -> bool:
     """Whether a package is installed; it is not imported."""
     return importlib.util.find_spec(module) is not None
-
-
-def optional_module(name: str) -> Any:
-    """A module of a package of Decant that can be left out; None without that package.
-
-    The core reaches such packages by names of modules, and runs without them.
-    """
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not name.startswith(error.name):
-            raise
-        return None
 
 
 def require(module: str, what_for: str) -> None:

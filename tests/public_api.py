@@ -32,9 +32,18 @@ def public_api() -> str:
     ]
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines += [
-        f"entry point {group}: {name}" for group, names in project["entry-points"].items() for name in sorted(names)
+        f"entry point {group}: {name}"
+        for group, names in project["entry-points"].items()
+        for name in sorted(names)
+        if group not in OF_OWN_EXTRAS
     ]
     return "\n".join(sorted(lines)) + "\n"
+
+
+OF_OWN_EXTRAS = tuple(
+    f"decant.{kind}" for kind in ("commands", "documents", "emulators", "files", "outputs", "stage_results")
+)
+"""Groups that only packages of Decant itself use (`sim_engine.settings.plugin_registry.own_extras`)."""
 
 
 def _lines(name: str, value: Any) -> list[str]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import functools
 import sys
-from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -20,7 +19,6 @@ from orchestrator.cli import (
     dose_command,
     file_commands,
     materials_commands,
-    physics_command,
     pour_command,
     queue_commands,
     report_command,
@@ -28,12 +26,10 @@ from orchestrator.cli import (
     run_commands,
     simulate_command,
     station_commands,
-    study_command,
-    vessel_command,
     view_command,
 )
-from orchestrator.cli.command_options import command, examples
-from sim_engine.resources import optional_module
+from orchestrator.cli.command_options import add_command, add_group
+from sim_engine.settings.plugin_registry import own_extras
 
 app = typer.Typer(
     name="decant",
@@ -71,44 +67,7 @@ def decant(
     """Options that precede the command."""
 
 
-def _group(name: str, text: str, *shown: str, quiet: bool = False) -> Callable[..., None]:
-    """Add a group of commands; returns `_add` for its commands.
-
-    Args:
-        name: its name.
-        text: its help text.
-        shown: examples: how its commands are used together.
-        quiet: whether its commands have the option `--quiet`.
-    """
-    group = typer.Typer(
-        name=name, no_args_is_help=True, rich_markup_mode="markdown", help=text, epilog=examples(*shown)
-    )
-    app.add_typer(group)
-    return functools.partial(_add, to=group, quiet=quiet)
-
-
-def _add(
-    work: Callable[..., None],
-    *shown: str,
-    name: str | None = None,
-    to: typer.Typer = app,
-    unknown_options: bool = False,
-    quiet: bool = False,
-) -> None:
-    """Add a command.
-
-    Args:
-        work: the function; its docstring is the help text.
-        shown: examples.
-        name: name of the command; None: that of the function.
-        to: the group that it belongs to.
-        unknown_options: whether unknown options are taken as words instead of being refused.
-        quiet: whether it has the option `--quiet`.
-    """
-    settings = {"ignore_unknown_options": unknown_options}
-    add = to.command(name or work.__name__, context_settings=settings, epilog=examples(*shown))
-    add(command(work, quiet=quiet))
-
+_add, _group = functools.partial(add_command, app), functools.partial(add_group, app)
 
 _add(
     campaign_commands.run,
@@ -158,7 +117,6 @@ _add(
     report_command.report,
     "decant report quickstart-20300131-1              # a run in the folder runs/",
     "decant report runs/quickstart-20300131-1 --pdf -o for-the-lab-meeting.html",
-    "decant report configs/studies/quick.yaml         # or the study's folder",
     quiet=True,
 )
 _add(
@@ -170,55 +128,7 @@ _add(
 )
 _add(file_commands.plugins, "decant plugins", "decant plugins --json")
 
-_vessel = _group(
-    "vessel",
-    "Make a vessel file from measurements; one command for each kind of source. It states its uncertainty.",
-    "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
-    "decant vessel mesh scan.stl mug.yaml --unit mm",
-    quiet=True,
-)
-_vessel(
-    vessel_command.profile,
-    "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
-    "decant vessel profile cup.yaml --height '95 mm' --fill fill.csv --wall '3 mm' --brimful '322 g'",
-)
-_vessel(
-    vessel_command.photo,
-    "decant vessel photo side.png cup.yaml --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
-)
-_vessel(vessel_command.points, "decant vessel points cloud.ply cup.yaml --unit mm --wall '3 mm'")
-_vessel(vessel_command.depth, "decant vessel depth depth.png cup.yaml --focal 615 --wall '3 mm' --height '95 mm'")
-_vessel(
-    vessel_command.mesh,
-    "decant vessel mesh scan.stl mug.yaml --unit mm --wall '3 mm'",
-    "decant vessel mesh cup.stl cup.yaml --drop-bodies --brimful '322 g'",
-)
-
-_add(
-    physics_command.validate_solver,
-    "decant validate-solver",
-    "decant validate-solver outflow walls --full",
-    "decant validate-solver --full --write docs",
-    name="validate-solver",
-)
-
 app.add_typer(run_commands.runs)
-
-_study = _group(
-    "study",
-    "Compare strategies with repetitions, on virtual benches that differ from the simulator.",
-    "decant study run configs/studies/quick.yaml",
-    "decant study report configs/studies/quick.yaml   # again, from the results that there are",
-    quiet=True,
-)
-_study(
-    study_command.run_study,
-    "decant study run configs/studies/quick.yaml",
-    "decant study run configs/studies/paper.yaml --dry-run   # estimate the cost",
-    "decant study run configs/studies/paper.yaml --jobs 2    # continues a stopped study",
-    name="run",
-)
-_study(study_command.report_study, "decant study report configs/studies/quick.yaml", name="report")
 
 _robot = _group(
     "robot",
@@ -276,9 +186,6 @@ _balance(
     "decant balance record --from kern.jsonl      # explain a recording",
     "decant balance record --from terminal.log    # explain the lines as another program saved them",
 )
-
-if (recordings := optional_module("orchestrator.recordings.recording_commands")) is not None:
-    recordings.add_commands(_group)
 
 _server = _group(
     "server",
@@ -363,6 +270,9 @@ _add(
     "decant estop --clear   # accept work again",
     unknown_options=True,
 )
+
+for _register in own_extras("decant.commands").values():
+    _register(app)
 
 
 def main() -> None:

@@ -191,3 +191,46 @@ def command(work: Callable[..., None], *, quiet: bool = False) -> Callable[..., 
         run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {one.name: one.annotation for one in parameters}
     return run
+
+
+def add_group(app: typer.Typer, name: str, text: str, *shown: str, quiet: bool = False) -> Callable[..., None]:
+    """Add a group of commands to the application, or find the one of this name; returns `add_command` for it.
+
+    Args:
+        app: the application.
+        name: name of the group.
+        text: its help text.
+        shown: examples: how its commands are used together.
+        quiet: whether its commands have the option `--quiet`.
+    """
+    known = (group.typer_instance for group in app.registered_groups)
+    group = next((each for each in known if each is not None and each.info.name == name), None)
+    if group is None:
+        group = typer.Typer(
+            name=name, no_args_is_help=True, rich_markup_mode="markdown", help=text, epilog=examples(*shown)
+        )
+        app.add_typer(group)
+    return functools.partial(add_command, group, quiet=quiet)
+
+
+def add_command(
+    app: typer.Typer,
+    work: Callable[..., None],
+    *shown: str,
+    name: str | None = None,
+    unknown_options: bool = False,
+    quiet: bool = False,
+) -> None:
+    """Add a command to the application or to a group.
+
+    Args:
+        app: the application or the group.
+        work: the function; its docstring is the help text.
+        shown: examples.
+        name: name of the command; None: that of the function.
+        unknown_options: whether unknown options are taken as words instead of being refused.
+        quiet: whether it has the option `--quiet`.
+    """
+    settings = {"ignore_unknown_options": unknown_options}
+    add = app.command(name or work.__name__, context_settings=settings, epilog=examples(*shown))
+    add(command(work, quiet=quiet))

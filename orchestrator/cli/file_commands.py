@@ -25,7 +25,6 @@ from orchestrator.cli.console import (
     print_note,
     print_warning,
 )
-from sim_engine.resources import optional_module
 
 
 def validate(
@@ -64,6 +63,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
     from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_vessel
     from orchestrator.campaigns.yaml.file_access import resolved
     from orchestrator.campaigns.yaml.yaml_source import Document, kind_of
+    from sim_engine.settings.plugin_registry import file_kind
 
     doing(f"reading {path}")
     match kind_of(Document.read(resolved(path)).data):
@@ -76,20 +76,8 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             return f"vessel, holds {1e6 * built.capacity:.4g} mL to the brim", []
         case "laboratory":
             return f"laboratory, {load_laboratory(path).mode}", []
-        case "recording":
-            recordings = optional_module("orchestrator.recordings.recording_file")
-            if recordings is None:
-                return "", [f"{path}: is a recorded pour; this installation has no package orchestrator.recordings"]
-            recording = recordings.load_recording(path)
-            for warning in recording.warnings:
-                print_warning(warning)
-            return f"recorded pour, {len(recording.readings)} readings, {1e3 * recording.gain:.4g} g", []
-        case "study":
-            from orchestrator.study.study_file import load_study
-            from orchestrator.study.study_plan import cells_of
-
-            study = load_study(path)
-            return f"study, {len(cells_of(study))} cells, seed {study.seed}", []
+        case "recording" | "study" as kind:
+            return file_kind(kind).check(path)
         case "daemon":
             from orchestrator.daemon.daemon_settings import load_settings
 

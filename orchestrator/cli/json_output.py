@@ -41,8 +41,8 @@ from orchestrator.learning.dispense import Dose
 from orchestrator.learning.single_action import WeighedPour
 from orchestrator.reports.run_summary import PLANNED, ReceiverSummary, RunSummary
 from sim_engine.liquids import SimulationParameters
-from sim_engine.resources import optional_module
 from sim_engine.settings.model import DescribedSchema, meanings
+from sim_engine.settings.plugin_registry import own_extras
 
 
 class _PlannedParts(CommandOutput):
@@ -209,7 +209,7 @@ OUTPUTS: dict[str, Any] = {
     "robot check": CheckOutput,
     "robot archive": ArchiveOutput,
     "balance check": BalanceCheckOutput,
-    **getattr(optional_module("orchestrator.recordings.recording_outputs"), "OUTPUTS", {}),
+    **own_extras("decant.outputs").get("recording", {}),
     "queue submit": CampaignOut,
     "queue list": QueueOutput,
     "queue show": CampaignDetailOut,

@@ -10,11 +10,8 @@ from typing import Any
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.campaign_file import CampaignFile
 from orchestrator.campaigns.vessel_file import VesselFile
-from orchestrator.study.study_file import StudyFile
-from sim_engine.resources import optional_module
 from sim_engine.settings.model import SchemaGenerator, Settings
-
-RECORDINGS = optional_module("orchestrator.recordings.recording_file")
+from sim_engine.settings.plugin_registry import file_kind
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -36,7 +33,7 @@ def laboratory_schema() -> dict[str, Any]:
 
 def study_schema() -> dict[str, Any]:
     """Schema of study files."""
-    return _schema(StudyFile, "Study")
+    return _schema(file_kind("study").settings(), "Study")
 
 
 def daemon_schema() -> dict[str, Any]:
@@ -48,8 +45,7 @@ def daemon_schema() -> dict[str, Any]:
 
 def recording_schema() -> dict[str, Any]:
     """Schema of the YAML file of a recorded pour."""
-    assert RECORDINGS is not None, "without the package there is no such schema"
-    return _schema(RECORDINGS.RecordingFile, "Recording")
+    return _schema(file_kind("recording").settings(), "Recording")
 
 
 def result_schema() -> dict[str, Any]:
@@ -72,7 +68,7 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "laboratory": laboratory_schema,
     "study": study_schema,
     "daemon": daemon_schema,
-    **({"recording": recording_schema} if RECORDINGS else {}),
+    "recording": recording_schema,
     "result": result_schema,
     "output": output_schema,
 }

@@ -1,4 +1,4 @@
-"""The command `decant report`: writes the page of a run or a study again from its folder."""
+"""The command `decant report`: writes the page of a run again from its folder."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import typer
 
 from orchestrator.cli.command_options import Json
 from orchestrator.cli.console import FAILED, RefusalError, check_output, print_json, print_note, print_warning
-from orchestrator.cli.shell_completion import RUNS, files_of, local_runs
+from orchestrator.cli.shell_completion import RUNS, local_runs
 
 
 def report(
     what: Annotated[
         Path,
         typer.Argument(
-            help="Folder of a run, or its name in runs/; folder or file of a study.",
-            metavar="RUN|STUDY",
-            autocompletion=lambda incomplete: local_runs(incomplete) + files_of("study")(incomplete),
+            help="Folder of a run, or its name in runs/.",
+            metavar="RUN",
+            autocompletion=local_runs,
         ),
     ],
     output: Annotated[
@@ -27,23 +27,20 @@ def report(
     pdf: Annotated[bool, typer.Option("--pdf", help="Also write every figure of a run as PDF, for LaTeX.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Write the report of a run or a study: one self-contained HTML file, suitable for printing.
+    """Write the report of a run: one self-contained HTML file, suitable for printing.
 
     It contains the settings, the work done, θ* with its region, every pour, figures and costs. It recommends an action
     with its expected deviation, and lists open questions. Runs that are paused, failed or unknown have reports too,
     which state this.
     """
     from orchestrator.records.journal import JOURNAL_NAME
-    from orchestrator.study.study_folder import SETTINGS
 
     check_output(output, "--output", ".html")
     folder = what if what.exists() or len(what.parts) > 1 else RUNS / what
     if (folder / JOURNAL_NAME).is_file():
         page, figures = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
-    elif (folder / SETTINGS).is_file() or folder.suffix in (".yaml", ".yml"):
-        if output is not None or pdf:
-            raise RefusalError(f"{folder}: is a study; its page and figures (PNG, SVG) go to its folder")
-        page, figures = _of_study(folder), []
+    elif folder.suffix in (".yaml", ".yml"):
+        raise RefusalError(f"{folder}: is a file; name a run's folder, or for a study: decant study report {folder}")
     else:
         raise RefusalError(_nothing_there(folder))
     print_note(f"report  {page}")
@@ -61,10 +58,7 @@ def _nothing_there(folder: Path) -> str:
         return f"{folder}: {check_journal(folder / JOURNAL_NAME).verdict}"
     near = sorted(path.parent.name for path in folder.absolute().parent.glob(f"*/{JOURNAL_NAME}"))
     known = f"; runs there: {', '.join(near)}" if near else ""
-    return (
-        f"{folder}: neither a run nor a study is here; name a run's folder (with its {JOURNAL_NAME}), a study's "
-        f"folder, or a study's file{known}"
-    )
+    return f"{folder}: no run is here; name a run's folder (with its {JOURNAL_NAME}){known}"
 
 
 def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
@@ -104,13 +98,3 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
             raise
         raise RefusalError(f"{folder}: no report can be made of damaged records; {check.verdict}", FAILED) from None
     return page, list(figures.values())
-
-
-def _of_study(what: Path) -> Path:
-    from orchestrator.cli.study_command import read_study
-    from orchestrator.study.study_folder import check_settings, file_of
-    from orchestrator.study.study_page import write_report
-
-    plan = read_study(what if what.is_file() else file_of(what))
-    check_settings(plan)
-    return write_report(plan, plan.folder)

@@ -7,7 +7,7 @@ import typing
 from orchestrator.learning.campaign_plan import CalibrationSettings, DeploymentSettings, StrategySettings
 from orchestrator.learning.deployment.objectives import Objective
 from orchestrator.learning.stage_result import StageResult
-from sim_engine.settings.plugin_registry import PluginRegistry
+from sim_engine.settings.plugin_registry import PluginRegistry, own_extras
 
 
 def _strategy(loaded: object, name: str) -> type[StrategySettings]:
@@ -51,13 +51,13 @@ def deployments() -> dict[str, type[DeploymentSettings]]:
 
 def result_kinds() -> tuple[type[StageResult], ...]:
     """All kinds of results: Decant's own, and those of installed packages with strategies. Loads all strategies."""
-    from orchestrator.learning import dispense, single_action, study_strategies
+    from orchestrator.learning import dispense, single_action
     from orchestrator.learning.calibration import calibration_base, calibration_scores, pour_design
     from orchestrator.learning.deployment import deployment_result
 
     own = (
         *(pour_design, calibration_base, calibration_scores, deployment_result),
-        *(single_action, dispense, study_strategies),
+        *(single_action, dispense, *own_extras("decant.stage_results").values()),
     )
     packages = {settings.__module__.partition(".")[0] for settings in STRATEGIES.all.values()}
     kinds = StageResult.KINDS.values()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, Parameters
+from orchestrator.cli.command_options import Json, Parameters, add_group
 from orchestrator.cli.console import (
     FAILED,
     RefusalError,
@@ -21,50 +21,17 @@ from orchestrator.cli.console import (
     waiting_for,
 )
 from orchestrator.cli.shell_completion import RUNS, local_runs
+from sim_engine.settings.plugin_registry import FileKind
 
 if TYPE_CHECKING:
     from orchestrator.recordings.recording_file import PourRecording
     from orchestrator.recordings.recording_fit import Fit, Judgement
     from orchestrator.recordings.recording_replay import PourReplay
+    from sim_engine.settings.model import Settings
 
 Recordings = Annotated[
     list[Path], typer.Argument(help="Recorded pours (YAML), or folders of them.", metavar="RECORDING")
 ]
-
-
-def add_commands(add_group: Callable[..., Callable[..., None]]) -> None:
-    """Add the group `decant recording` to the command line.
-
-    Args:
-        add_group: adds a group, and returns the function that adds its commands (`orchestrator.cli.app`).
-    """
-    from orchestrator.recordings.first_day_command import first_day
-
-    add = add_group(
-        "recording",
-        "Recorded pours: export them from runs, replay them, fit unknown quantities, and record a first day.",
-        "decant recording replay configs/recordings/dose-1.yaml",
-        "decant recording export runs/dispense-20300131-1",
-        quiet=True,
-    )
-    add(export, "decant recording export dispense-20300131-1   # a run in the folder runs/")
-    add(
-        replay,
-        "decant recording replay configs/recordings/dose-1.yaml --png pictures",
-        "decant recording replay day-one/ --fitted fit.json",
-    )
-    add(
-        fit,
-        "decant recording fit day-one/ --unknown grip --unknown lag --judge day-two/ --output fit.json",
-        "decant recording fit configs/recordings/dose-1.yaml --until '5 s'   # judged on the rest",
-    )
-    add(
-        first_day,
-        "decant recording first-day day-one --campaign configs/campaigns/first-day.yaml",
-        "decant recording first-day practice --practise --wrong grip   # in minutes, without a laboratory",
-        "decant recording first-day day-one   # explain the recordings of a folder again",
-        name="first-day",
-    )
 
 
 def export(
@@ -281,3 +248,54 @@ def fit_text(found: Fit, judged: Sequence[Judgement]) -> str:
             "inside 90 %"
         )
     return "\n".join(lines)
+
+
+def _settings() -> type[Settings]:
+    from orchestrator.recordings.recording_file import RecordingFile
+
+    return RecordingFile
+
+
+def _check(path: Path) -> tuple[str, list[str]]:
+    from orchestrator.recordings.recording_file import load_recording
+
+    recording = load_recording(path)
+    for warning in recording.warnings:
+        print_warning(warning)
+    return f"recorded pour, {len(recording.readings)} readings, {1e3 * recording.gain:.4g} g", []
+
+
+RECORDING_FILE = FileKind(_settings, _check)
+"""Files of recorded pours, for `decant validate` and `decant schema`."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the group `decant recording`."""
+    from orchestrator.recordings.first_day_command import first_day
+
+    add = add_group(
+        app,
+        "recording",
+        "Recorded pours: export them from runs, replay them, fit unknown quantities, and record a first day.",
+        "decant recording replay configs/recordings/dose-1.yaml",
+        "decant recording export runs/dispense-20300131-1",
+        quiet=True,
+    )
+    add(export, "decant recording export dispense-20300131-1   # a run in the folder runs/")
+    add(
+        replay,
+        "decant recording replay configs/recordings/dose-1.yaml --png pictures",
+        "decant recording replay day-one/ --fitted fit.json",
+    )
+    add(
+        fit,
+        "decant recording fit day-one/ --unknown grip --unknown lag --judge day-two/ --output fit.json",
+        "decant recording fit configs/recordings/dose-1.yaml --until '5 s'   # judged on the rest",
+    )
+    add(
+        first_day,
+        "decant recording first-day day-one --campaign configs/campaigns/first-day.yaml",
+        "decant recording first-day practice --practise --wrong grip   # in minutes, without a laboratory",
+        "decant recording first-day day-one   # explain the recordings of a folder again",
+        name="first-day",
+    )

@@ -29,7 +29,7 @@ from orchestrator.reports.run_summary import SUMMARY_NAME, RunFiles, RunSummary,
 from orchestrator.reports.stage_views import evaluation_of, theta_of
 from orchestrator.reports.summarise import pool_use, summarise, summarise_record
 from orchestrator.runs.run_folder import FIGURES, read_versions
-from sim_engine.resources import optional_module
+from sim_engine.settings.plugin_registry import own_extras
 
 if TYPE_CHECKING:
     from orchestrator.runs.run_service import RunHandle, RunRequest
@@ -81,10 +81,12 @@ def publish(
     directory = result.directory
     figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
     if plan.outputs.pour_recordings:
-        recordings = optional_module("orchestrator.recordings.recording_export")
-        missing = ["this installation has no package orchestrator.recordings"]
-        for reason in missing if recordings is None else recordings.export_recordings(directory, plan=plan)[1]:
-            _log.warning("not recorded: %s", reason)
+        exports = own_extras("decant.documents")
+        if not exports:
+            _log.warning("not recorded: this installation has no package that writes recorded pours")
+        for export in exports.values():
+            for reason in export(directory, plan=plan)[1]:
+                _log.warning("not recorded: %s", reason)
     summary = summary_of(plan, result, RunFiles(figures=figures, recording=recording, dropped_events=dropped_events))
     write_summary(directory, summary)
     found = theta_of(result.results)

@@ -24,7 +24,6 @@ from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.requests import Simulate
 from orchestrator.learning.strategy import Strategy
-from orchestrator.learning.study_strategies import AnsweredByTable, FinalPour, SimulatedTable
 from orchestrator.records.codec import Results, result_of
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.run_record import answers
@@ -42,6 +41,7 @@ from orchestrator.runs.stages import (
     with_posterior,
 )
 from orchestrator.study.study_plan import FINAL, GRID, StudyCell, StudyPlan
+from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 

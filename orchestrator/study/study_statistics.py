@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.calibration.calibration_scores import CALIBRATED, UNCALIBRATED, Scores
 from orchestrator.learning.deployment.deployment_result import Deployed
-from orchestrator.learning.study_strategies import FinalPoured
 from orchestrator.records.codec import result_of
 from orchestrator.runs.stages import CALIBRATION, EVALUATION
 from orchestrator.study.study_folder import CellResult
 from orchestrator.study.study_plan import FINAL, StudyPlan, cells_of
+from orchestrator.study.study_strategies import FinalPoured
 
 RANDOM = "random θ"
 """Label of the random θ of a study, which count as one strategy."""

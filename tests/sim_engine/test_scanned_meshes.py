@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.app import app
 from orchestrator.cli.file_commands import validate
-from orchestrator.cli.vessel_tables import read_points
+from orchestrator.extra_commands.vessel_tables import read_points
 from orchestrator.reports.pour_figures import section
 from sim_engine.errors import DecantError
 from sim_engine.vessel.exact_cavity import exact_cavity

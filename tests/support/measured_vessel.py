@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
 from scipy.ndimage import gaussian_filter
 
-from orchestrator.cli import vessel_command
+from orchestrator.extra_commands import vessel_command
 from sim_engine.vessel.profile import outer_profile
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec
 from sim_engine.vessel.vessel import build_vessel

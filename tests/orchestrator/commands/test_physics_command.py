@@ -13,8 +13,8 @@ import pytest
 from matplotlib.text import Text
 from typer.testing import CliRunner
 
-from orchestrator.cli import physics_command
 from orchestrator.cli.app import app
+from orchestrator.extra_commands import physics_command
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.figure_style import INK
 from sim_engine import solver_fingerprint as sources

@@ -12,7 +12,7 @@ import trimesh
 from PIL import ExifTags, Image
 
 from orchestrator.campaigns.file_loading import load_vessel
-from orchestrator.cli.vessel_tables import read_fill_table, read_photograph
+from orchestrator.extra_commands.vessel_tables import read_fill_table, read_photograph
 from sim_engine.errors import DecantError
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel

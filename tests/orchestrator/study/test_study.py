@@ -21,7 +21,6 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.requests import Failed, Poured, Slots
-from orchestrator.learning.study_strategies import FinalPour
 from orchestrator.runs.run_service import RunResources
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import (
@@ -37,6 +36,7 @@ from orchestrator.study.study_folder import (
 )
 from orchestrator.study.study_plan import StudyPlan, cells_of, study_fingerprint
 from orchestrator.study.study_runner import run_cell
+from orchestrator.study.study_strategies import FinalPour
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from sim_engine.solver_fingerprint import folder_digest

@@ -18,7 +18,6 @@ from orchestrator.learning.calibration.calibration_scores import ScoredPair, Sco
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
 from orchestrator.learning.stage_result import DisplayedMap
-from orchestrator.learning.study_strategies import FinalPoured
 from orchestrator.reports.figure_style import new_figure
 from orchestrator.study.calibration_figures import Drawn, draw_calibrations, series_style
 from orchestrator.study.deployment_figures import draw_deployments, means
@@ -27,6 +26,7 @@ from orchestrator.study.study_folder import CellResult, code_now, code_summary, 
 from orchestrator.study.study_page import pours_needed, tables, write_report
 from orchestrator.study.study_plan import StudyCell, StudyPlan, cells_of
 from orchestrator.study.study_statistics import Estimate, at_pour, effect, estimate, gather, running_least
+from orchestrator.study.study_strategies import FinalPoured
 from sim_engine.liquids import SimulationParameters
 from tests.support.example_results import strays
 from tests.support.study_files import read, written

@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Json
+from orchestrator.cli.command_options import Json, add_group
 from orchestrator.cli.console import FAILED, INTERRUPTED, RefusalError, Refused, print_json, print_note
 from orchestrator.cli.shell_completion import files_of
+from sim_engine.settings.plugin_registry import FileKind
 
 if TYPE_CHECKING:
     from actors.interfaces import RaySettings
     from orchestrator.study.study_plan import StudyCell, StudyPlan
     from orchestrator.study.study_runner import CellStatus, CellWorkers
+    from sim_engine.settings.model import Settings
 
 SHOWN_FAILURES = 5
 
@@ -226,3 +228,41 @@ def _report(plan: StudyPlan, folder: Path) -> Path:
     page = write_report(plan, folder)
     print_note(f"figures, tables and a page: {page}")
     return page
+
+
+def _settings() -> type[Settings]:
+    from orchestrator.study.study_file import StudyFile
+
+    return StudyFile
+
+
+def _check(path: Path) -> tuple[str, list[str]]:
+    from orchestrator.study.study_file import load_study
+    from orchestrator.study.study_plan import cells_of
+
+    study = load_study(path)
+    return f"study, {len(cells_of(study))} cells, seed {study.seed}", []
+
+
+STUDY_FILE = FileKind(_settings, _check)
+"""Study files, for `decant validate` and `decant schema`."""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    add = add_group(
+        app,
+        "study",
+        "Compare strategies with repetitions, on virtual benches that differ from the simulator.",
+        "decant study run configs/studies/quick.yaml",
+        "decant study report configs/studies/quick.yaml   # again, from the results that there are",
+        quiet=True,
+    )
+    add(
+        run_study,
+        "decant study run configs/studies/quick.yaml",
+        "decant study run configs/studies/paper.yaml --dry-run   # estimate the cost",
+        "decant study run configs/studies/paper.yaml --jobs 2    # continues a stopped study",
+        name="run",
+    )
+    add(report_study, "decant study report configs/studies/quick.yaml", name="report")

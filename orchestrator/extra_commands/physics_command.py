@@ -10,12 +10,13 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Json
+from orchestrator.cli.command_options import Json, add_command
 from orchestrator.cli.console import FAILED, RefusalError, print_json, print_message, stdout_for_results
 
 if TYPE_CHECKING:
@@ -401,3 +402,17 @@ def _criteria(measurements: Sequence[Mapping[str, Any]]) -> str:
         words = ", ".join({"FAIL": "**fails**"}.get(verdict(m), verdict(m)) for m in some)
         lines.append(f"| {quantity} | {numbers} | {values} | {reference} | {criterion} | {words} |")
     return "\n".join(lines) + "\n"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command, if the cases are installed."""
+    if find_spec("sim_engine.validation") is None:
+        return
+    add_command(
+        app,
+        validate_solver,
+        "decant validate-solver",
+        "decant validate-solver outflow walls --full",
+        "decant validate-solver --full --write docs",
+        name="validate-solver",
+    )

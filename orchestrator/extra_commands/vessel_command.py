@@ -11,12 +11,13 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from orchestrator.cli.command_options import Json, grouped
+from orchestrator.cli.command_options import Json, add_group, grouped
 from orchestrator.cli.console import RefusalError, print_json, print_note, print_warning, waiting_for
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ def photo(
     """
 
     def seen(wall: float, floor: float) -> tuple[Radii, float]:
-        from orchestrator.cli.vessel_tables import read_photograph
+        from orchestrator.extra_commands.vessel_tables import read_photograph
         from sim_engine.resources import require
         from sim_engine.vessel_acquisition.photograph import radii_within, silhouette
 
@@ -180,7 +181,7 @@ def points(
     """
 
     def work(notes: list[str]) -> Made:
-        from orchestrator.cli.vessel_tables import read_points
+        from orchestrator.extra_commands.vessel_tables import read_points
         from sim_engine.vessel_acquisition.point_cloud import scan_of
 
         return _scanned(out, sizes, vessel, notes, scan_of(read_points(cloud, _unit(unit), _axis(up), notes)))
@@ -207,7 +208,7 @@ def depth(
     """
 
     def work(notes: list[str]) -> Made:
-        from orchestrator.cli.vessel_tables import read_depth
+        from orchestrator.extra_commands.vessel_tables import read_depth
         from sim_engine.vessel_acquisition.point_cloud import points_on_table, scan_of
 
         if focal is None:
@@ -369,7 +370,7 @@ def _measured(sizes: Sizes, vessel: Vessel, height: float) -> list[Evidence]:
     """Read callipers and tables."""
     import numpy as np
 
-    from orchestrator.cli.vessel_tables import read_diameters, read_fill_table, read_tilt_table
+    from orchestrator.extra_commands.vessel_tables import read_diameters, read_fill_table, read_tilt_table
     from sim_engine.vessel_acquisition.measurements import FillTable, Radii, TiltTable
 
     found: list[Evidence] = []
@@ -582,3 +583,33 @@ def _written_mesh(
     lines += [f"name: {json.dumps(name, ensure_ascii=False)}", f"mesh: {path.name}", "unit: mm", f"up: {up}"]
     out.write_text("\n".join(lines) + "\n")
     return Made(built.capacity, deviation, None, picture, notes, doubts)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands, if the fits are installed."""
+    if find_spec("sim_engine.vessel_acquisition") is None:
+        return
+    add = add_group(
+        app,
+        "vessel",
+        "Make a vessel file from measurements; one command for each kind of source. It states its uncertainty.",
+        "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
+        "decant vessel mesh scan.stl mug.yaml --unit mm",
+        quiet=True,
+    )
+    add(
+        profile,
+        "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
+        "decant vessel profile cup.yaml --height '95 mm' --fill fill.csv --wall '3 mm' --brimful '322 g'",
+    )
+    add(
+        photo,
+        "decant vessel photo side.png cup.yaml --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
+    )
+    add(points, "decant vessel points cloud.ply cup.yaml --unit mm --wall '3 mm'")
+    add(depth, "decant vessel depth depth.png cup.yaml --focal 615 --wall '3 mm' --height '95 mm'")
+    add(
+        mesh,
+        "decant vessel mesh scan.stl mug.yaml --unit mm --wall '3 mm'",
+        "decant vessel mesh cup.stl cup.yaml --drop-bodies --brimful '322 g'",
+    )
