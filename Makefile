@@ -30,9 +30,7 @@ $(READY): requirements.lock pyproject.toml
 install: $(READY)
 
 demo: $(READY)
-	@bench=; $(BIN)/python -c 'import rtde_receive' 2>/dev/null || { bench="--laboratory configs/laboratories/twin.yaml"; \
-		echo "ur-rtde has no wheel for this Python: the demo runs on the simulated bench ($$bench)"; }; \
-	$(BIN)/decant run configs/campaigns/quickstart.yaml $$bench
+	$(BIN)/decant run configs/campaigns/quickstart.yaml
 
 test: lint unit
 

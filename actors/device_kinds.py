@@ -191,12 +191,6 @@ class UrArmKind(ArmKind[UrArmSettings]):
 
         return LinkFigure(self.spec)
 
-    def missing(self) -> str | None:
-        """See `ArmKind.missing`."""
-        from actors.arm.ur.rtde_client import client_missing
-
-        return client_missing()
-
     def diagnostics(self) -> ArmDiagnostics:
         """See `ArmKind.diagnostics`."""
         from actors.arm.ur.commissioning import UrDiagnostics

@@ -71,8 +71,7 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
         raise LaboratoryError(f"laboratory {spec.name}: simulations are impossible here: {error}") from None
     if spec.arm is not None and need_bench and (missing := arm_kind(spec.arm).missing()) is not None:
         raise LaboratoryError(
-            f"laboratory {spec.name}: {missing}. Use Python 3.11 or 3.12, or a bench of numbers "
-            "(--laboratory configs/laboratories/twin.yaml)"
+            f"laboratory {spec.name}: {missing}. Or use a simulated bench (--laboratory configs/laboratories/twin.yaml)"
         )
     if need_bench:
         check_bench_packages(spec)

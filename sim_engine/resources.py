@@ -148,7 +148,6 @@ EXTRAS = {
     "ray": "lab",
     "serial": "lab",
     "psutil": "lab",
-    "rtde_receive": "lab",
     "rerun": "live",
     "apprise": "daemon",
     "fastapi": "daemon",
@@ -167,7 +166,6 @@ EXTRAS = {
 
 PACKAGES = {
     "serial": "pyserial",
-    "rtde_receive": "ur-rtde",
     "skimage": "scikit-image",
     "pythonjsonlogger": "python-json-logger",
     "unitelabs": "unitelabs-cdk",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import functools
 import gc
+import importlib.util
 import os
 import re
 import shutil
@@ -17,7 +18,6 @@ from pathlib import Path
 import pytest
 import typer.testing
 
-from actors.arm.ur.rtde_client import client_missing
 from orchestrator.records.run_registry import VARIABLE
 from tests.support.hypothesis_examples import load_profile
 
@@ -47,8 +47,6 @@ Their files alternate: many tests of the first wait for devices, and those of th
 
 REALTIME = (Path(__file__).parent / "end_to_end", Path(__file__).parent / "reliability")
 """Folders whose tests watch other processes: each is `realtime`."""
-
-WITHOUT_ARM = client_missing() is not None
 
 WITH_PROCESSES = tuple(
     Path(__file__).parent / name for name in ("actors", "plugins", "orchestrator/commands", "orchestrator/daemon")
@@ -99,16 +97,6 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
                 definition.finish(item._request)
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
-    """Without `ur-rtde`, of which the newest Pythons have no wheel, a test that needs an arm is left out."""
-    report = yield
-    said = f"{report.longrepr}{report.capstderr}" if WITHOUT_ARM and report.failed else ""
-    if re.search(r"ur-rtde|rtde_(control|receive)", said):
-        report.outcome, report.longrepr = "skipped", (str(item.path), None, "ur-rtde is not installed")
-    return report
-
-
 @pytest.hookimpl(trylast=True)  # after those that were not chosen have gone
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """A starved machine misses deadlines, and no arm should move on then: what is `realtime` is tried up to thrice.
@@ -121,6 +109,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         rank |= {path: (index + 1) / len(files) for index, path in enumerate(files)}
     items.sort(key=lambda item: rank.get(item.path, 0.0))
     for item in items:
+        if item.get_closest_marker("ur_rtde") is not None and importlib.util.find_spec("rtde_receive") is None:
+            item.add_marker(pytest.mark.skip(reason="ur-rtde, of which Python 3.13 has no wheel, is not installed"))
         if any(item.path.is_relative_to(folder) for folder in REALTIME):
             item.add_marker("realtime")
         if item.get_closest_marker("realtime") is not None:

@@ -146,7 +146,7 @@ def test_authors_of_plug_ins_test_them_with_what_the_wheel_carries(wheel: Path, 
 
 def test_every_package_of_an_extra_is_declared_in_it() -> None:
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    package = {"serial": "pyserial", "rtde_receive": "ur-rtde", "rerun": "rerun-sdk"}
+    package = {"serial": "pyserial", "rerun": "rerun-sdk"}
     package |= {"prometheus_client": "prometheus-client", "pythonjsonlogger": "python-json-logger"}
     package |= {"skimage": "scikit-image"}
     for module, extra in EXTRAS.items():

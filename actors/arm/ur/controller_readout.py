@@ -145,8 +145,6 @@ def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patie
 
 
 def _exchange(connection: rtde.Requests, rate: float, seconds: float) -> Exchange:
-    if connection.ask(rtde.REQUEST_PROTOCOL_VERSION, struct.pack(">H", 2)) != b"\x01":
-        raise OSError("it doesn't know protocol 2")
     trips = []
     version: tuple[int, ...] = ()
     for _ in range(ROUND_TRIPS if seconds else 1):
@@ -154,26 +152,16 @@ def _exchange(connection: rtde.Requests, rate: float, seconds: float) -> Exchang
         version = struct.unpack(">4I", connection.ask(rtde.GET_URCONTROL_VERSION)[:16])
         trips.append(time.monotonic() - asked)
     names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer", "actual_qd", *STATUS)
-    known = _known(connection, names, rate)
-    if connection.ask(rtde.START) != b"\x01":
-        raise OSError("it doesn't begin to send")
-    layout = struct.Struct(">B" + "".join(rtde.FORMATS[kind][0] for kind in known.values()))
+    outputs = rtde.Outputs(connection, names, rate)
     arrivals: list[float] = []
     package, begin = b"", time.monotonic()
     while not arrivals or time.monotonic() - begin < seconds:
-        kind, payload = connection.next()
-        if kind == rtde.DATA_PACKAGE:
-            arrivals.append(time.monotonic())
-            package = payload
+        package = outputs.next()
+        arrivals.append(time.monotonic())
     if seconds and len(arrivals) < 2:
         raise OSError("it sends no packages")
     duration = arrivals[-1] - arrivals[0]
-    values, place = {}, 1
-    numbers = layout.unpack(package)
-    for name, kind_name in known.items():
-        count = rtde.FORMATS[kind_name][1]
-        values[name] = tuple(numbers[place : place + count])
-        place += count
+    values = outputs.values(package)
     payload_mass = values.get("payload")
     return Exchange(
         version=version,
@@ -186,19 +174,6 @@ def _exchange(connection: rtde.Requests, rate: float, seconds: float) -> Exchang
         wanted=rate,
         values=values,
     )
-
-
-def _known(connection: rtde.Requests, names: Sequence[str], rate: float) -> dict[str, str]:
-    """The requested values that this controller has, with their types; it sends them from now on."""
-    while True:
-        answer = connection.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(names).encode("ascii"))
-        kinds = rtde.names(answer[1:])
-        found = {name: kind for name, kind in zip(names, kinds, strict=False) if kind in rtde.FORMATS}
-        if len(found) == len(names):
-            return found
-        if not found:
-            raise OSError(f"it knows none of {', '.join(names)}")
-        names = tuple(found)
 
 
 PATIENT_GAP = 0.1

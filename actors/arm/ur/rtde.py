@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 REQUEST_PROTOCOL_VERSION = ord("V")
 GET_URCONTROL_VERSION = ord("v")
@@ -114,3 +115,56 @@ class Requests:
 def names(payload: bytes) -> list[str]:
     """Field names, separated by commas; some clients add a comma after the last one."""
     return [name.strip() for name in payload.decode("ascii", "replace").strip(",\0 \n").split(",") if name.strip()]
+
+
+class Outputs:
+    """Values that a controller sends at a rate over one connection.
+
+    Args:
+        requests: of the connection; protocol 2 is requested.
+        fields: wanted; those that this controller lacks are left out, since it refuses a recipe that names one.
+        rate: of packages [Hz].
+
+    Attributes:
+        fields: those that it sends.
+
+    Raises:
+        OSError: the connection is lost, or the controller refuses.
+    """
+
+    def __init__(self, requests: Requests, fields: Sequence[str], rate: float) -> None:
+        self._requests = requests
+        if requests.ask(REQUEST_PROTOCOL_VERSION, b"\0\2") != b"\1":
+            raise OSError("it doesn't know protocol 2")
+        kinds: dict[str, str] = {}
+        while len(kinds) < len(fields):
+            answer = requests.ask(SETUP_OUTPUTS, struct.pack(">d", rate) + ",".join(fields).encode("ascii"))
+            kinds = {field: kind for field, kind in zip(fields, names(answer[1:]), strict=False) if kind in FORMATS}
+            if not kinds:
+                raise OSError(f"it knows none of {', '.join(fields)}")
+            if len(kinds) < len(fields):
+                fields, kinds = tuple(kinds), {}
+        self.fields = tuple(kinds)
+        self._counts = {field: FORMATS[kind][1] for field, kind in kinds.items()}
+        self._layout = struct.Struct(">B" + "".join(FORMATS[kind][0] for kind in kinds.values()))
+        if requests.ask(START) != b"\1":
+            raise OSError("it doesn't begin to send")
+
+    def next(self) -> bytes:
+        """Wait for the next package; returns its payload, for `values`.
+
+        Raises:
+            OSError: the connection is lost.
+            PackageError: it sends something else.
+        """
+        while True:
+            kind, payload = self._requests.next()
+            if kind == DATA_PACKAGE:
+                if len(payload) != self._layout.size:
+                    raise PackageError(f"a data package of {len(payload)} instead of {self._layout.size} bytes")
+                return payload
+
+    def values(self, payload: bytes) -> dict[str, tuple[Any, ...]]:
+        """The values of a package, by field."""
+        numbers = iter(self._layout.unpack(payload)[1:])
+        return {field: tuple(next(numbers) for _ in range(count)) for field, count in self._counts.items()}

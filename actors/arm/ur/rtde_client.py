@@ -1,24 +1,19 @@
-"""A small interface to the RTDE client library, for the worker process only. A client is discarded, never reconnected.
+"""RTDE of a controller, for the worker process only. A client is discarded, never reconnected.
 
-It uses only the part of the library that reads values. `InputWriter` writes the three input registers: the library's
-own writer claims all outputs, the speed slider and registers of a fieldbus, so that no PLC, gripper or ROS driver could
-be connected at the same time. The library's control interface uploads its own program when it is created, reconnects by
-itself, uploads again, and then ends the running program and sometimes its process. This is not acceptable in a cell
-where nothing may run without consent.
-
-`client_missing` reports whether the library is installed.
+`OutputReader` receives the values in a thread. `InputWriter` writes the input registers of the program, and no others:
+client libraries claim all outputs, the speed slider and registers of a fieldbus, so that no PLC, gripper or ROS driver
+could be connected at the same time. Their control interfaces upload a program of their own and reconnect by themselves.
+This is not acceptable in a cell where nothing may run without consent.
 """
 
 from __future__ import annotations
 
 import contextlib
-import faulthandler
-import importlib.util
 import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from actors.arm.ur import rtde
@@ -37,21 +32,8 @@ from actors.arm.ur.worker_messages import (
     TroubleError,
 )
 
-
-def client_missing() -> str | None:
-    """Why no arm can be reached from this machine: the client library is not installed; None if it is."""
-    if importlib.util.find_spec("rtde_receive") is not None:
-        return None
-    return (
-        "the arm needs the package ur-rtde, which is not installed: pip install 'decant-pouring[lab]' "
-        "(Python 3.13 and later build it from its source: see docs/laboratory/connect-an-arm.md)"
-    )
-
-
 PORTS = {rtde.PORT: "RTDE", 30001: "primary interface"}
 PROBE_TIME = 2.0
-CONSTRUCTION_TIME = 5.0
-"""Time after which a blocked constructor ends the process [s], because it holds the interpreter lock."""
 
 ATTEMPTS, BETWEEN_ATTEMPTS = 3, 0.4
 """Number of connection attempts, and the time between them [s]: a controller may need a moment to notice that the
@@ -90,7 +72,7 @@ class RtdeClient:
         registers: first of the three integer inputs that are written.
 
     Raises:
-        TroubleError: the controller cannot be reached, another client writes these inputs, or the library is missing.
+        TroubleError: the controller cannot be reached, or another client writes these inputs.
     """
 
     def __init__(self, address: str, rate: float, silence: float, registers: int) -> None:
@@ -101,23 +83,15 @@ class RtdeClient:
                 pass
         except DashboardError as error:
             raise TroubleError("lost", f"no robot at {address}: {error}. {_ENABLED}") from None
-        if (missing := client_missing()) is not None:
-            raise TroubleError("refused", missing)
-        from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
-
         for attempt in range(1, ATTEMPTS + 1):
             try:
-                self._forces = _offered(address, (_FORCE, _WRIST))
-                with _bounded(CONSTRUCTION_TIME):
-                    self._receive: Any = RTDEReceiveInterface(address, rate, [*_VARIABLES, *self._forces])
+                self._outputs = OutputReader(address, rate)
                 self._inputs = InputWriter(address, registers)
                 self._tilt: InputWriter | None = None
                 break
-            except (RuntimeError, ValueError, TroubleError) as error:
+            except TroubleError:
                 if attempt == ATTEMPTS:
-                    if isinstance(error, TroubleError):
-                        raise
-                    raise TroubleError("lost", f"{address}: {error}") from None
+                    raise
                 time.sleep(BETWEEN_ATTEMPTS)
         self._address, self._registers = address, registers
         self._commands = int(time.monotonic() * 1e3) % 1_000_000  # not the number that an earlier client wrote last
@@ -136,43 +110,37 @@ class RtdeClient:
         Raises:
             TroubleError: the connection is lost, or the controller's time does not advance.
         """
-        r = self._receive
-        if not r.isConnected():
-            raise TroubleError("lost", "the connection to the controller was lost")
-        for _ in range(20):
-            time_before = r.getTimestamp()
-            last = self._last
-            if last is not None and time_before == last.time:
-                self._same_readings += 1
-                if self._same_readings >= _SAME_READINGS and time.monotonic() - last.seen > patience * self._silence:
-                    raise TroubleError(
-                        "lost", f"the controller has said nothing new for {patience * self._silence:g} s"
-                    )
-                return last
-            reading = DataPackage(
-                time=time_before,
-                seen=time.monotonic(),
-                joints=tuple(r.getActualQ()),
-                speeds=tuple(r.getActualQd()),
-                robot_mode=r.getRobotMode(),
-                safety_mode=r.getSafetyMode(),
-                runtime=r.getRuntimeState(),
-                slider=r.getTargetSpeedFraction(),
-                scaling=r.getSpeedScaling(),
-                payload=r.getPayload(),
-                centre=tuple(r.getPayloadCog()),
-                number=r.getOutputIntRegister(NUMBER),
-                status=r.getOutputIntRegister(STATUS),
-                clock=r.getOutputDoubleRegister(CLOCK),
-                tool=tuple(r.getOutputDoubleRegister(TOOL + k) for k in range(6)),
-                status_bits=r.getRobotStatus(),
-                force=tuple(r.getActualTCPForce()) if _FORCE in self._forces else (),
-                wrist=tuple(r.getFtRawWrench()) if _WRIST in self._forces else (),
-            )
-            if r.getTimestamp() == time_before:
-                self._last, self._same_readings = reading, 0
-                return reading
-        raise TroubleError("lost", "packages come faster than they can be read")
+        if self._outputs.lost:
+            raise TroubleError("lost", f"the connection to the controller was lost ({self._outputs.lost})")
+        seen, values = self._outputs.latest()
+        last = self._last
+        if last is not None and values["timestamp"][0] == last.time:
+            self._same_readings += 1
+            if self._same_readings >= _SAME_READINGS and time.monotonic() - last.seen > patience * self._silence:
+                raise TroubleError("lost", f"the controller has said nothing new for {patience * self._silence:g} s")
+            return last
+        self._same_readings = 0
+        self._last = DataPackage(
+            time=values["timestamp"][0],
+            seen=seen,
+            joints=values["actual_q"],
+            speeds=values["actual_qd"],
+            robot_mode=values["robot_mode"][0],
+            safety_mode=values["safety_mode"][0],
+            runtime=values["runtime_state"][0],
+            slider=values["target_speed_fraction"][0],
+            scaling=values["speed_scaling"][0],
+            payload=values["payload"][0],
+            centre=values["payload_cog"],
+            number=values[f"output_int_register_{NUMBER}"][0],
+            status=values[f"output_int_register_{STATUS}"][0],
+            clock=values[f"output_double_register_{CLOCK}"][0],
+            tool=tuple(values[f"output_double_register_{TOOL + k}"][0] for k in range(6)),
+            status_bits=values["robot_status_bits"][0],
+            force=values.get(_FORCE, ()),
+            wrist=values.get(_WRIST, ()),
+        )
+        return self._last
 
     def fresh(self) -> DataPackage:
         """A package that is newer than this call.
@@ -180,8 +148,8 @@ class RtdeClient:
         Raises:
             TroubleError: none arrives.
         """
-        before = self._receive.getTimestamp()
         self._last, self._same_readings = None, 0
+        before = self.look(AT_REST).time
         while True:
             time.sleep(0.004)
             reading = self.look(AT_REST)
@@ -216,6 +184,47 @@ class RtdeClient:
         if self._tilt is not None:
             self._commands += 1
             self._tilt.write(TILT_SPEED, speed, float(self._commands))
+
+
+class OutputReader:
+    """Receives the controller's values over a connection of its own, in a thread.
+
+    Args:
+        address: of the controller.
+        rate: of packages [Hz].
+
+    Attributes:
+        lost: why no more packages come; '' while they may.
+
+    Raises:
+        TroubleError: the controller does not answer, or lacks a value.
+    """
+
+    def __init__(self, address: str, rate: float) -> None:
+        self.lost = ""
+        try:
+            connection = socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME)
+            self._outputs = rtde.Outputs(rtde.Requests(connection), (*_VARIABLES, _FORCE, _WRIST), rate)
+            self._latest = time.monotonic(), self._outputs.next()
+            connection.settimeout(None)
+        except (OSError, rtde.PackageError) as error:
+            raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
+        if missing := [name for name in _VARIABLES if name not in self._outputs.fields]:
+            raise TroubleError("refused", f"{address}: its software is too old: it has no {', '.join(missing)}")
+        threading.Thread(target=self._follow, name="outputs", daemon=True).start()
+
+    def _follow(self) -> None:
+        try:
+            while True:
+                payload = self._outputs.next()
+                self._latest = time.monotonic(), payload
+        except (OSError, rtde.PackageError) as error:
+            self.lost = str(error)
+
+    def latest(self) -> tuple[float, dict[str, tuple[Any, ...]]]:
+        """When the latest package arrived [s of `time.monotonic`], and its values by field."""
+        seen, payload = self._latest
+        return seen, self._outputs.values(payload)
 
 
 class InputWriter:
@@ -289,18 +298,6 @@ class InputWriter:
             self._writing.release()
 
 
-def _offered(address: str, names: tuple[str, ...]) -> list[str]:
-    """Which values the controller has. It refuses a recipe that names another one."""
-    try:
-        with socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME) as connection:
-            requests = rtde.Requests(connection)
-            requests.ask(rtde.REQUEST_PROTOCOL_VERSION, b"\0\2")
-            answer = requests.ask(rtde.SETUP_OUTPUTS, struct.pack(">d", 1.0) + ",".join(names).encode("ascii"))
-    except (OSError, rtde.PackageError) as error:
-        raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
-    return [name for name, kind in zip(names, rtde.names(answer[1:]), strict=False) if kind in rtde.FORMATS]
-
-
 def _probe(address: str, port: int, name: str) -> None:
     try:
         with socket.create_connection((address, port), timeout=PROBE_TIME):
@@ -313,13 +310,3 @@ def _probe(address: str, port: int, name: str) -> None:
 
 
 _ENABLED = "Is the controller on, on this network, and are its services enabled?"
-
-
-@contextlib.contextmanager
-def _bounded(seconds: float) -> Iterator[None]:
-    """End this process if the body takes longer. The timer is a C thread, which does not need the interpreter lock."""
-    faulthandler.dump_traceback_later(seconds, exit=True)
-    try:
-        yield
-    finally:
-        faulthandler.cancel_dump_traceback_later()

@@ -1,7 +1,7 @@
-"""`python -m actors.arm.ur.rtde_worker FD`: the process that holds the client library.
+"""`python -m actors.arm.ur.rtde_worker FD`: the process that exchanges values with the controller.
 
-It ends when its driver closes the connection or dies. The library's messages go to standard output, which the driver
-reads after errors. Requests are executed one after another; a separate thread receives stops and signs of life.
+It ends when its driver closes the connection or dies. Requests are executed one after another; a separate thread
+receives stops and signs of life.
 """
 
 from __future__ import annotations

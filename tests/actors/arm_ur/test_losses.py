@@ -9,8 +9,10 @@ import os
 import pickle
 import signal
 import socket
+import struct
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +23,7 @@ import pytest
 
 from actors.arm.arm_interface import ArmError, ArmLostError, ArmNotReleasedError, ArmRefusedError, ArmStoppedError
 from actors.arm.planned_pour import JointPath
+from actors.arm.ur import rtde
 from actors.arm.ur.ur_driver import UrArm
 from actors.arm.ur.urscript_writer import path_program
 from actors.arm.ur.worker_messages import MotionSettings
@@ -28,7 +31,7 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import child_environment
 from tests.support.loopback import free_address
 from tests.support.ur_pours import START, pour_path, settings
-from tests.support.waiting import PATIENCE, alive
+from tests.support.waiting import alive
 
 from .conftest import Call, Rig
 
@@ -360,28 +363,27 @@ def test_a_path_that_leaves_the_box_is_refused(resting: Rig) -> None:
         resting.arm.move_to_start(replace(pour_path(), approach=way))
 
 
-@pytest.mark.slow
-@pytest.mark.realtime
-def test_without_the_client_library_it_is_said_which_one_is_missing(
-    make_rig: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rig = make_rig(connect=False)
-    (tmp_path / "sitecustomize.py").write_text("import sys; sys.modules['rtde_receive'] = None")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with pytest.raises(ArmRefusedError, match=r"needs the package ur-rtde.*3\.13"):
-        rig.arm.connect()
-
-
-@pytest.mark.realtime
-def test_the_driver_does_not_load_the_client_library() -> None:
-    program = (
-        "import sys, actors.arm.ur.ur_driver; "
-        "print([m for m in sys.modules if m.startswith('rtde') or m.startswith('dashboard_client')])"
-    )
-    said = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE, env=child_environment()
-    )
-    assert said.stdout.strip() == "[]"
+def test_values_arrive_whole_between_messages_and_what_an_older_controller_lacks_is_left_out() -> None:
+    """The controller refuses a recipe that names an unknown value, and sends text messages at any time."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        text = rtde.package(rtde.TEXT_MESSAGE, b"\5hello\4test\1")
+        theirs.sendall(rtde.package(rtde.REQUEST_PROTOCOL_VERSION, b"\1") + text)
+        theirs.sendall(rtde.package(rtde.SETUP_OUTPUTS, b"\0DOUBLE,NOT_FOUND,VECTOR6D,INT32"))
+        theirs.sendall(rtde.package(rtde.SETUP_OUTPUTS, b"\1DOUBLE,VECTOR6D,INT32"))
+        theirs.sendall(text + rtde.package(rtde.START, b"\1") + text)
+        outputs = rtde.Outputs(rtde.Requests(ours), ("timestamp", "ft_raw_wrench", "actual_q", "robot_mode"), 125.0)
+        assert outputs.fields == ("timestamp", "actual_q", "robot_mode")
+        whole = rtde.package(rtde.DATA_PACKAGE, struct.pack(">B7di", 1, 12.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, -1))
+        theirs.sendall(whole[:9])
+        sending = threading.Timer(0.05, theirs.sendall, [whole[9:] + text + whole])
+        sending.start()
+        values = {"timestamp": (12.5,), "actual_q": (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), "robot_mode": (-1,)}
+        assert [outputs.values(outputs.next()) for _ in range(2)] == [values, values]
+        sending.join()
+        theirs.sendall(rtde.package(rtde.DATA_PACKAGE, b"\1 of another recipe"))
+        with pytest.raises(rtde.PackageError, match="19 instead of 61 bytes"):
+            outputs.next()
 
 
 def test_errors_survive_the_way_between_processes() -> None:

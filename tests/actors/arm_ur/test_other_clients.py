@@ -74,8 +74,8 @@ def test_other_inputs_can_be_chosen(make_rig: Makers) -> None:
 @contextlib.contextmanager
 def other_client(name: str, address: str) -> Iterator[list[str]]:
     """A client in a process of its own; on leaving, its number of cycles and 'taken' if its values arrived."""
-    if importlib.util.find_spec({"ur_rtde": "rtde_io", "makers": "urpy"}[name]) is None:
-        pytest.skip(f"the client {name} is not installed (makers: the package urpy)")
+    if name == "makers" and importlib.util.find_spec("urpy") is None:
+        pytest.skip("the manufacturer's client, of the package urpy, is not installed")
     program = [sys.executable, "-m", "tests.support.other_clients", name, address]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     found: list[str] = []
@@ -91,7 +91,7 @@ def other_client(name: str, address: str) -> Iterator[list[str]]:
 
 @pytest.mark.slow
 @pytest.mark.realtime
-@pytest.mark.parametrize("name", ["ur_rtde", "makers"])
+@pytest.mark.parametrize("name", [pytest.param("ur_rtde", marks=pytest.mark.ur_rtde), "makers"])
 def test_a_client_of_other_makers_exchanges_values_while_the_arm_pours(unconnected: Rig, name: str) -> None:
     rig = unconnected
     with other_client(name, rig.controller.address) as found:

@@ -21,6 +21,8 @@ from tests.support.loopback import free_address
 
 from .conftest import observe
 
+pytestmark = pytest.mark.ur_rtde
+
 Seen = Callable[[str], dict[str, Any]]
 
 GENERATIONS = ["ur10", "ur10e"]

@@ -13,6 +13,8 @@ from tests.support.waiting import wait_for
 
 from .conftest import Client, observe
 
+pytestmark = pytest.mark.ur_rtde
+
 Start = Callable[..., VirtualController]
 
 
