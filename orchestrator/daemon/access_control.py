@@ -10,18 +10,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Annotated, Any
 
-from fastapi import Depends, HTTPException, Request
+from fastapi import Depends, HTTPException, Request, Response
+from fastapi.exception_handlers import http_exception_handler
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from starlette.exceptions import HTTPException as AnyHTTPException
 
-from orchestrator.daemon import PHYSICAL
 from orchestrator.daemon.access_tokens import Person, Role, Tokens, TooManyFailuresError
 from orchestrator.daemon.campaign_queue import CampaignQueue
 from orchestrator.daemon.daemon_settings import LOOPBACK
-from orchestrator.daemon.emergency_stop import EmergencyStops, stop_path
+from orchestrator.daemon.emergency_stop import EmergencyStops, is_stop, not_stopped, route_scope
 from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.rig_worker import SharedServices
 
@@ -31,6 +33,9 @@ Send = Callable[[Message], Awaitable[None]]
 
 BEARER = HTTPBearer(auto_error=False, description="A token of the file 'tokens' in the daemon's state directory.")
 
+
+MOST_WORDS = 20
+"""Words of the headers `Authorization` of a stop that are compared with the tokens."""
 
 DRAIN = 10.0
 """Longest time for which the rest of a refused body is read and dropped [s]."""
@@ -44,17 +49,20 @@ class RequestGuard:
     """ASGI middleware that refuses requests that are too large or use a foreign host name.
 
     The host name is checked because of DNS rebinding: a page of another site could reach the API through a name that
-    resolves to this machine. A request that stops an arm may have any size, and other spellings of its path reach the
-    route, too.
+    resolves to this machine. Such a page has no token; a request that stops an arm and has a valid one may use any host
+    name, or none as in HTTP/1.0. It may have any size and any form; see `route_scope`.
 
     Args:
         app: application to protect.
         limit: largest body [bytes].
         host: address that the API listens at; host names are checked on the loopback interface only.
+        tokens: valid tokens.
     """
 
-    def __init__(self, app: Callable[[Message, Receive, Send], Awaitable[None]], limit: int, host: str) -> None:
-        self._app, self._limit = app, limit
+    def __init__(
+        self, app: Callable[[Message, Receive, Send], Awaitable[None]], limit: int, host: str, tokens: Tokens
+    ) -> None:
+        self._app, self._limit, self._tokens = app, limit, tokens
         self._names = frozenset((*LOOPBACK, "[::1]", host)) if host in LOOPBACK else None
 
     async def __call__(self, scope: Message, receive: Receive, send: Send) -> None:
@@ -62,19 +70,19 @@ class RequestGuard:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
+        scope = route_scope(scope)
+        stop = is_stop(scope)
         headers = {name.lower(): value for name, value in scope["headers"]}
         expects = b"100-continue" in headers.get(b"expect", b"").lower()
         host = headers.get(b"host", b"").decode("latin-1").lower()
         name = host if host.startswith("[") and host.endswith("]") else host.rpartition(":")[0] or host
-        stop = stop_path(scope["path"]) if scope["method"] == "POST" else None
-        if self._names is not None and name not in self._names:
+        foreign = self._names is not None and name not in self._names
+        if foreign and not (stop and stopping_person(scope, self._tokens)):
             text = "this daemon is reached as 127.0.0.1 or localhost, and not by another name"
-            if stop is not None:
-                text = f"NOTHING WAS STOPPED: {text}. Repeat the call with the right name, or {PHYSICAL}"
-            await _refuse(receive, send, 421, text, drain=not expects)
+            await _refuse(receive, send, 421, not_stopped(text) if stop else text, drain=not expects)
             return
-        if stop is not None:
-            await self._app({**scope, "path": stop}, receive, send)
+        if stop:
+            await self._app(scope, receive, send)
             return
         length = headers.get(b"content-length", b"0")
         if length.isdigit() and int(length) > self._limit:
@@ -138,19 +146,40 @@ async def respond_early(receive: Receive, send: Send, status: int, body: bytes, 
 
 
 class EarlyResponse(JSONResponse):
-    """A response that is sent before the request's body has ended."""
+    """A response that is sent before the request's body; a body that comes is dropped."""
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
-        """Send it, then read and drop the rest of the body."""
-        await respond_early(receive, send, self.status_code, bytes(self.body))
+        """Send it, then read and drop the body, unless the client waits for 100 Continue with it."""
+        expects = any(name == b"expect" for name, _ in scope["headers"])
+        await respond_early(receive, send, self.status_code, bytes(self.body), drain=not expects)
 
 
-def needs(role: Role, advice: str = "") -> Callable[..., Awaitable[Person]]:
+async def refused(request: Request, error: Exception) -> Response:
+    """Answer with a refusal; that of a stop begins with NOT STOPPED.
+
+    Lone surrogates of the request that its text quotes are escaped, since UTF-8 has none.
+    """
+    assert isinstance(error, AnyHTTPException)
+    text = str(error.detail).encode("utf-8", "backslashreplace").decode("utf-8")
+    text = not_stopped(text) if is_stop(request.scope) else text
+    return await http_exception_handler(request, HTTPException(error.status_code, text, dict(error.headers or {})))
+
+
+def stopping_person(scope: MutableMapping[str, Any], tokens: Tokens) -> Person | None:
+    """Return the holder of any valid token of a stop, with the highest role.
+
+    Proxies join two headers into one, and each of the two may be the right one.
+    """
+    lines = b",".join(value for name, value in scope["headers"] if name == b"authorization").decode("latin-1")
+    people = [tokens.find(word) for word in re.split(r"[\s,]+", lines)[:MOST_WORDS]]
+    return max(filter(None, people), key=lambda person: person.role, default=None)
+
+
+def needs(role: Role) -> Callable[..., Awaitable[Person]]:
     """Make a dependency that returns the token's holder if its role is sufficient.
 
     Args:
         role: lowest role that is sufficient.
-        advice: end of the texts of refusals.
     """
 
     async def person(
@@ -158,15 +187,16 @@ def needs(role: Role, advice: str = "") -> Callable[..., Awaitable[Person]]:
     ) -> Person:
         tokens: Tokens = request.app.state.tokens
         address = request.client.host if request.client is not None else ""
-        if shown is None:
-            text = f"a token is needed: 'Authorization: Bearer TOKEN'{advice}"
+        found = stopping_person(request.scope, tokens) if is_stop(request.scope) else None
+        if found is None and shown is None:
+            text = "a token is needed: 'Authorization: Bearer TOKEN'"
             raise HTTPException(401, text, {"WWW-Authenticate": "Bearer"})
         try:
-            found = tokens.person(shown.credentials.strip(), address)
+            found = found or tokens.person(shown.credentials.strip() if shown else "", address)
         except TooManyFailuresError as error:
-            raise HTTPException(429, f"{error}{advice}", {"Retry-After": str(int(error.wait) + 1)}) from None
+            raise HTTPException(429, str(error), {"Retry-After": str(int(error.wait) + 1)}) from None
         if found is None:
-            raise HTTPException(401, f"this token is not known{advice}", {"WWW-Authenticate": "Bearer"})
+            raise HTTPException(401, "this token is not known", {"WWW-Authenticate": "Bearer"})
         if found.role < role:
             raise HTTPException(403, f"{found.name} is a {found.role.name.lower()}; this takes {role.name.lower()}")
         return found
@@ -188,9 +218,5 @@ Queue = Annotated[CampaignQueue, Depends(part("queue"))]
 Orders = Annotated[Ordering, Depends(part("ordering"))]
 Stops = Annotated[EmergencyStops, Depends(part("stops"))]
 Viewer = Annotated[Person, Depends(needs(Role.VIEWER))]
-Stopping = Annotated[
-    Person,
-    Depends(needs(Role.VIEWER, f". NOTHING WAS STOPPED: repeat the call with a token of any role, or {PHYSICAL}")),
-]
 Operator = Annotated[Person, Depends(needs(Role.OPERATOR))]
 Admin = Annotated[Person, Depends(needs(Role.ADMIN))]

@@ -13,22 +13,14 @@ import logging
 from collections.abc import Iterator
 from typing import Annotated, Any
 
-from fastapi import APIRouter, HTTPException, Path, Request, Response
+from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Orders, Queue, Stopping, Stops
+from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Orders, Queue, Stops, Viewer
 from orchestrator.daemon.campaign_queue import RequestRefusedError
 from orchestrator.daemon.daemon_store import ENDED, QuestionOut, QueueItem
-from orchestrator.daemon.emergency_stop import (
-    ALL_STOPPED,
-    BODY_TIME,
-    RIG_TIME,
-    UNSTORED,
-    ArmStops,
-    StopBody,
-    read_stop,
-)
+from orchestrator.daemon.emergency_stop import UNSTORED, recorded_reason
 from orchestrator.daemon.query_routes import campaign_out, found_item, status
 from orchestrator.daemon.remote_operator import AnswerError
 from orchestrator.daemon.rig_worker import SharedServices
@@ -36,7 +28,6 @@ from orchestrator.daemon.schemas import (
     AnswerIn,
     CampaignOut,
     ClearIn,
-    EmergencyIn,
     EnableIn,
     MoveIn,
     StatusOut,
@@ -95,6 +86,11 @@ def enable_motion(daemon: SharedServices, item: QueueItem, moves: WhatMovesOut, 
     daemon.note(by, "enable motion", item.id, moves.laboratory)
     daemon.wake()
 
+
+StoppedRig = Annotated[
+    list[str] | None, Query(description="Stop only this rig; '' for all. A rig that does not exist stops all.")
+]
+StopReason = Annotated[list[str] | None, Query(description="Text for the records; its first 500 characters are kept.")]
 
 router = APIRouter()
 
@@ -218,56 +214,31 @@ async def resume_queue(daemon: Daemon, queue: Queue, stops: Stops, person: Opera
     return await status(daemon, stops, person)
 
 
-@router.post(
-    "/emergency-stop",
-    operation_id="emergency_stop",
-    response_model=StoppedOut,
-    openapi_extra={
-        "parameters": [
-            {
-                "name": "rig",
-                "in": "query",
-                "schema": {"type": "string", "default": ""},
-                "description": "Stop only this rig; '' for all. A rig that does not exist stops all.",
-            }
-        ],
-        "requestBody": {"content": {"application/json": {"schema": EmergencyIn.model_json_schema()}}},
-    },
-)
-async def emergency_stop(request: Request, daemon: Daemon, stops: Stops, person: Stopping) -> Response:
+@router.post("/emergency-stop", operation_id="emergency_stop", response_model=StoppedOut)
+async def emergency_stop(
+    request: Request, daemon: Daemon, stops: Stops, person: Viewer, rig: StoppedRig = None, reason: StopReason = None
+) -> Response:
     """Stop every arm, or the arm of one rig, and give up its work. The rig takes no new work until the stop is cleared.
 
-    A viewer's token is sufficient. The stop is given before the body is read, and nothing in the body prevents it:
-    what can't be used is shortened, replaced or ignored, and `notes` report it. The body is read for at most 0.5 s.
-    Name the rig in the query: if there are several rigs and the query names none, the stop waits for the body for at
-    most 0.05 s, and then stops all.
+    A viewer's token is sufficient. Rig and reason are in the query; a body is never read, and nothing in the request
+    prevents the stop: what can't be used is shortened, replaced or ignored, and `notes` report it.
     """
-    body = StopBody(request.receive)
-    named = list(dict.fromkeys(request.query_params.getlist("rig")))
-    rig: object = named[0] if len(named) == 1 else named
-    arms: ArmStops = {}
-    if not named:
-        if len(stops.rig_names) < 2:  # the only arm is meant in any case
-            await stops.stop_arms("".join(stops.rig_names), arms)
-        await body.read(RIG_TIME)
-        rig = read_stop(body.content).rig if body.complete else ""
-    scope, notes = stops.scope(rig)
-    await stops.stop_arms(scope, arms)
-    stops.latch(person.name, "", scope)
-    await body.read(BODY_TIME)
-    said = read_stop(body.content)
-    if said.rig not in ("", rig):
-        notes.append(("the query names another rig than the body" if named else "the rig came too late") + ALL_STOPPED)
-        scope = ""
-    notes += [*body.notes(malformed=bool(request.scope.get("state", {}).get("malformed"))), *said.notes]
-    notes = await stops.stop(person.name, said.reason, scope, arms=arms, notes=notes)
+    rigs, reasons = list(dict.fromkeys(rig or [""])), dict.fromkeys(reason or [])
+    body = request.headers.get("content-length", "0").strip("0") or "transfer-encoding" in request.headers
+    notes = ["a body is not read: rig and reason belong into the query"] if body else []
+    if others := sorted(request.query_params.keys() - {"rig", "reason"}):
+        names = ", ".join(recorded_reason(name)[0][:60] for name in others[:5])
+        notes.append(f"ignored in the query: {names}" + (" and others" if len(others) > 5 else ""))
+    notes = await stops.stop(
+        person.name, "; ".join(filter(None, reasons)), rigs[0] if len(rigs) == 1 else rigs, notes=notes
+    )
     try:
         found: dict[str, Any] = (await status(daemon, stops, person)).model_dump(mode="json")
     except UNSTORED as error:
         _log.error("the state can't be read after an emergency stop: %s", error)
         found = {}
         notes.append("the state of the daemon can't be read: see its log")
-    response = JSONResponse if body.complete else EarlyResponse
+    response = EarlyResponse if body else JSONResponse
     return response({**found, "notes": notes})
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import ssl
 import time
 import zipfile
@@ -36,7 +37,7 @@ STOP_TIMEOUT = httpx.Timeout(8.0, connect=5.0)
 """Of an emergency stop: longer than the daemon waits for an arm that does not confirm it."""
 
 LONGEST_SENT = 2000
-"""Characters of a reason that are sent with an emergency stop; the daemon records fewer."""
+"""Characters of a reason or a rig that are sent with an emergency stop; the daemon records fewer."""
 
 
 class DaemonError(RunError):
@@ -126,15 +127,13 @@ class Client:
         Raises:
             DaemonError: the stop was not confirmed; the message names the physical emergency stop.
         """
-        sent = json.dumps({"reason": reason[:LONGEST_SENT]}).encode()  # ASCII, whatever the characters
-        where = {"rig": rig.encode("utf-8", "replace").decode()}
-        headers = {"Content-Type": "application/json"}
+        texts = {"rig": rig[:LONGEST_SENT], "reason": reason[:LONGEST_SENT]}
+        query = {name: re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text) for name, text in texts.items()}
         try:
-            found = self._call(
-                "POST", "/emergency-stop", params=where, content=sent, headers=headers, timeout=STOP_TIMEOUT
-            )
+            found = self._call("POST", "/emergency-stop", params=query, timeout=STOP_TIMEOUT)
         except DaemonError as error:
-            text = f"THE STOP WAS NOT CONFIRMED: {PHYSICAL}. {error}"
+            refusal = str(error).startswith("NOT STOPPED")
+            text = str(error) if refusal else f"THE STOP WAS NOT CONFIRMED: {PHYSICAL}. {error}"
             raise DaemonError(text, error.exit_code, unreachable=error.unreachable) from None
         return found.json()
 

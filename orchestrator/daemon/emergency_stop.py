@@ -1,11 +1,11 @@
 """Emergency stops: their requests over HTTP, the stops of the arms, and what stays latched until it is cleared.
 
-Nothing that comes with a request prevents the stop. Method, path and token suffice. What the rest of the request can't
-say is ignored, and a note reports it.
+Nothing that comes with a request prevents the stop. Path and token suffice; rig and reason are in the query. A body is
+never read. What the rest of the request can't say is ignored, and a note reports it.
 
 - `EmergencyStops` stops the arms of one rig or of all, latches the stop, and clears it.
-- `is_stop` recognises the paths that stop an arm; `StopProtocol` keeps uvicorn from refusing their malformed bodies.
-- `StopBody` reads a body for a limited time; `read_stop` finds reason and rig in its bytes.
+- `route_scope` gives a stop in any legal form of a request the path and method of its route; `StopForms` is the
+  middleware that does so. `StopProtocol` keeps uvicorn from refusing a stop before it is a request.
 - `recorded_reason` shortens a reason for the records; `later_stop` merges the records of several stops.
 """
 
@@ -14,39 +14,29 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import posixpath
 import re
 import sqlite3
 import time
 from collections.abc import Awaitable, Callable, MutableMapping, Sequence
-from dataclasses import dataclass
-from itertools import islice
 from typing import Any
-from urllib.parse import parse_qs
+from urllib.parse import quote_from_bytes
 
+import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from orchestrator.daemon import PHYSICAL
 from orchestrator.daemon.daemon_store import DesiredState
 from orchestrator.daemon.rig_worker import RigWorker, SharedServices
 from orchestrator.learning.run_errors import RunError
 
 STOP_PATH = "/api/v1/emergency-stop"
 
-RIG_TIME = 0.05
-"""Longest time for which a stop of one of several rigs waits for the body that may name the rig [s]."""
-
-BODY_TIME = 0.5
-"""Longest time for which the body of a stop is read, from the request's begin [s]."""
-
-LONGEST_BODY = 1_000_000
-"""Bytes of a body that are kept; the others are read and dropped."""
-
-LONGEST_FORM = 10_000
-"""Characters of a body that is read as a form."""
+LONGEST_LINE = 65536
+"""Bytes of a request line that are waited for."""
 
 LONGEST_REASON = 500
 """Characters of a reason that are recorded."""
-
-ALL_STOPPED = ": every arm was stopped"
 
 EMERGENCY = "emergency"
 """Flag of the emergency stop of all rigs; that of one rig has the rig's name after it."""
@@ -59,158 +49,112 @@ LEAVING_STEPS = 4
 
 REPLACEMENT = "\N{REPLACEMENT CHARACTER}"
 
-_PATHS = re.compile(r"/+api/+v1/+(emergency-stop|campaigns/+[^/]+/+abort)/*", re.IGNORECASE)
-_NODE = re.compile(r"/+admin/+(?:\w+\.)?safety_stop/*", re.IGNORECASE)
+_ABSOLUTE = re.compile(r"https?://([^/?#]*)", re.IGNORECASE)
+_PATHS = re.compile(
+    r"(?:/.*)?/(?:(emergency[-_]stop)|(?:api/v1/campaigns/([^/]+)/abort)|(admin/(?:\w+\.)?safety_stop))", re.IGNORECASE
+)
+_VISIBLE = bytes(range(0x21, 0x7F))
 
-ArmStops = dict[str, asyncio.Task[None]]
-"""Stops that are under way, by rig."""
-
+Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+_IS_STOP = "decant.is_stop"
 
 
 def stop_path(path: str) -> str | None:
     """Return the route's own path if a path is that of a stop or an abort in another spelling; None for others."""
-    if _PATHS.fullmatch(path) is None:
+    match = _PATHS.fullmatch("/" + posixpath.normpath(path).lstrip("/"))
+    if match is None:
         return None
-    words = [word for word in path.split("/") if word]
-    return STOP_PATH if len(words) == 3 else f"/api/v1/campaigns/{words[3]}/abort"
+    stop, campaign, node = match.groups()
+    return STOP_PATH if stop else f"/{node}" if node else f"/api/v1/campaigns/{campaign}/abort"
 
 
-def is_stop(method: str, path: str) -> bool:
-    """Whether a request stops an arm: over the API, or over the MADSci node."""
-    return method == "POST" and (stop_path(path) is not None or _NODE.fullmatch(path) is not None)
+def route_scope(scope: Scope) -> Scope:
+    """Return the scope of a request for its route.
+
+    A target in absolute form (RFC 9112, section 3.2.2), which clients send that believe in a proxy, becomes a path, and
+    its authority replaces `Host`. A request that stops an arm, in any spelling and with any method that may change
+    something, gets the path and the method of the route.
+    """
+    path, changes = scope["path"], {}
+    if absolute := _ABSOLUTE.match(path):
+        path = path[absolute.end() :] or "/"
+        host = absolute[1].rpartition("@")[2].encode("latin-1", "replace")
+        changes = {"path": path, "headers": [*((n, v) for n, v in scope["headers"] if n != b"host"), (b"host", host)]}
+    path, _, query = path.partition("?")  # an encoded question mark
+    stop = stop_path(path)
+    if stop is None:
+        return {**scope, **changes}
+    changes |= {"path": stop, _IS_STOP: True, "query_string": scope["query_string"] or query.encode("utf-8", "replace")}
+    if scope["method"].upper() in ("POST", "PUT", "PATCH"):
+        changes["method"] = "POST"
+    return {**scope, **changes}
+
+
+def is_stop(scope: Scope) -> bool:
+    """Whether a request, as `route_scope` returns it, is to stop an arm."""
+    return bool(scope.get(_IS_STOP))
+
+
+def not_stopped(text: str) -> str:
+    """Return the text of a refused stop: it begins with NOT STOPPED and names the physical stop."""
+    return f"NOT STOPPED: {text.rstrip('.')}. If an arm moves, {PHYSICAL}"
+
+
+class StopForms:
+    """ASGI middleware that passes requests on as `route_scope` returns them.
+
+    Args:
+        app: application that gets them.
+    """
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one ASGI connection."""
+        await self._app(route_scope(scope) if scope["type"] == "http" else scope, receive, send)
 
 
 class StopProtocol(H11Protocol):
-    """HTTP protocol that passes a stop on even if its body is malformed, such as invalid chunks.
+    """HTTP protocol that passes a stop on even if it is malformed where the stop does not need it.
 
     uvicorn's own protocol answers with status 400 and closes the connection, so that the client takes the stop as
-    refused. Here the body ends at the malformed part. Requests that are no stops are refused as before.
+    refused. Here empty lines before a request are ignored (RFC 9112, section 2.2), bytes in a request's target that
+    should have been percent-encoded are encoded (`curl` sends a reason as it was typed), and the body of a stop ends
+    at its malformed part.
     """
+
+    _line = b""
+
+    def data_received(self, data: bytes) -> None:
+        """Pass data on, with the request line corrected."""
+        if self.conn.their_state is h11.IDLE and not self.conn.trailing_data[0]:
+            self._line = (self._line + data).lstrip(b"\r\n")
+            line, end, rest = self._line.partition(b"\n")
+            if not end and len(line) <= LONGEST_LINE:
+                return
+            self._line = b""
+            method, _, target = line.rstrip(b"\r").partition(b" ")
+            target, _, version = target.rpartition(b" ")
+            encoded = quote_from_bytes(target, _VISIBLE).encode()
+            self._malformed_stop = stop_path(target.partition(b"?")[0].decode("latin-1")) is not None
+            data = b" ".join((method, encoded, version)) + b"\r\n" + rest if end else line
+        super().data_received(data)
+
+    _malformed_stop = False
 
     def send_400_response(self, msg: str) -> None:
         """Refuse malformed data, unless they are in the body of a stop."""
         cycle = self.cycle
-        if cycle is None or cycle.response_complete or not is_stop(cycle.scope["method"], cycle.scope["path"]):
-            super().send_400_response(msg)
+        if cycle is None or cycle.response_complete or not is_stop(route_scope({**cycle.scope})):
+            super().send_400_response(not_stopped(msg) if self._malformed_stop else msg)
             return
-        cycle.scope["state"]["malformed"] = True
         cycle.more_body = cycle.keep_alive = False
         cycle.message_event.set()
-
-
-class StopBody:
-    """The body of a stop, read for a limited time from now on.
-
-    Args:
-        receive: ASGI callable of the request.
-
-    Attributes:
-        complete: whether its end was read.
-    """
-
-    def __init__(self, receive: Receive) -> None:
-        self._receive = receive
-        self._begin = time.monotonic()
-        self._kept, self._length = bytearray(), 0
-        self.complete = False
-
-    async def read(self, until: float) -> None:
-        """Read to the end of the body, but no longer than `until` [s] after the beginning."""
-        try:
-            async with asyncio.timeout(self._begin + until - time.monotonic()):
-                while not self.complete:
-                    message = await self._receive()
-                    chunk = message.get("body", b"")
-                    self._length += len(chunk)
-                    self._kept += chunk[: LONGEST_BODY - len(self._kept)]
-                    self.complete = not message.get("more_body", False)  # also if the client has left
-        except TimeoutError:
-            pass
-
-    @property
-    def content(self) -> bytes:
-        """Bytes that were read and kept."""
-        return bytes(self._kept)
-
-    def notes(self, *, malformed: bool) -> list[str]:
-        """Describe what was not read."""
-        found = []
-        if malformed:
-            found.append("the body is malformed HTTP and was read up to there")
-        if not self.complete:
-            found.append(f"the body did not end within {BODY_TIME:g} s: what came later is ignored")
-        if self._length > len(self._kept):
-            found.append(f"the body is longer than {LONGEST_BODY / 1e6:g} MB: the rest is ignored")
-        return found
-
-
-@dataclass(frozen=True)
-class StopRequest:
-    """What the body of a stop says.
-
-    Attributes:
-        reason: any JSON value; '' if there is none.
-        rig: any JSON value; '' if there is none.
-        notes: what was ignored.
-    """
-
-    reason: object = ""
-    rig: object = ""
-    notes: tuple[str, ...] = ()
-
-
-def read_stop(body: bytes) -> StopRequest:
-    """Find reason and rig in a body: JSON or a form, whatever its declared type. Other text is taken as the reason."""
-    text, notes = _text(body)
-    if not text.strip():
-        return StopRequest(notes=tuple(notes))
-    try:
-        value = json.loads(text, object_pairs_hook=_members)
-    except (ValueError, RecursionError):
-        form: dict[str, Any] = dict(parse_qs(text)) if len(text) <= LONGEST_FORM else {}
-        form = {name: values[0] if len(set(values)) == 1 else values for name, values in form.items()}
-        if not form.keys() & {"reason", "rig"}:
-            return StopRequest(text, notes=(*notes, "the body is neither JSON nor a form: it is taken as the reason"))
-        value = form
-    if isinstance(value, str):
-        return StopRequest(value, notes=(*notes, "the body is a text: it is taken as the reason"))
-    if value is None:
-        return StopRequest(notes=tuple(notes))
-    if not isinstance(value, dict):
-        return StopRequest(notes=(*notes, "the body is no JSON object: it is ignored"))
-    others = value.keys() - {"reason", "rig"}
-    if others:
-        shown = sorted(_shown(key) for key in islice(others, 5))
-        notes.append(f"ignored in the body: {', '.join(shown)}" + (" and others" if len(others) > 5 else ""))
-    rig = value.get("rig")
-    return StopRequest(value.get("reason", ""), "" if rig is None else rig, tuple(notes))
-
-
-def _text(body: bytes) -> tuple[str, list[str]]:
-    try:
-        return body.decode(json.detect_encoding(body)), []
-    except UnicodeDecodeError:
-        return body.decode("latin-1"), ["the body is not UTF-8: it is read as Latin-1"]
-
-
-def _members(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the members of a JSON object. Several different rigs stay a list, which is no rig's name."""
-    rigs = [value for key, value in pairs if key == "rig"]
-    found = dict(pairs)
-    if any(rig != rigs[-1] for rig in rigs):
-        found["rig"] = rigs
-    return found
-
-
-def _shown(value: object) -> str:
-    """Return a value as a short text that can be stored and printed."""
-    return recorded_reason(value)[0][:60]
-
-
-def unknown_rig(rig: object) -> str:
-    """Return the note about a rig that does not exist."""
-    return f"there is no rig '{_shown(rig)}'{ALL_STOPPED}"
 
 
 def recorded_reason(reason: object) -> tuple[str, list[str]]:
@@ -291,38 +235,7 @@ class EmergencyStops:
             return f"the emergency stop of rig {rig} is latched; it accepts requests again after it is cleared"
         return ""
 
-    async def stop_arms(self, rig: str, arms: ArmStops) -> None:
-        """Begin to stop the arm of a rig, or ('') every arm, and let nothing start there. Part of `stop`.
-
-        Args:
-            rig: an existing rig, or ''.
-            arms: stops that the same request has begun; each arm is stopped once. Those that begin are added.
-        """
-        for worker in self._affected(rig)[1]:
-            worker.latched = True
-            if worker.running is not None and worker.rig.name not in arms:
-                arms[worker.rig.name] = asyncio.create_task(worker.running.emergency())
-        for _ in range(LEAVING_STEPS):
-            await asyncio.sleep(0)
-
-    def latch(self, by: str, reason: str, rig: str = "") -> None:
-        """Store an emergency stop, so that it holds after a restart. Authors and reasons of several are kept."""
-        flag, workers = self._affected(rig)
-        with contextlib.suppress(*UNSTORED):
-            self._store.set_flag(flag, later_stop(self._store.flag(flag), by, reason, time.time()))
-            for worker in workers:
-                if worker.running is not None:
-                    self._store.change(worker.running.item.id, desired_state=str(DesiredState.ABORT))
-
-    async def stop(
-        self,
-        by: str,
-        reason: object = "",
-        rig: object = "",
-        *,
-        arms: ArmStops | None = None,
-        notes: Sequence[str] = (),
-    ) -> list[str]:
+    async def stop(self, by: str, reason: object = "", rig: object = "", notes: Sequence[str] = ()) -> list[str]:
         """Stop every arm, give all work up, and accept nothing new until `clear`. The arms are stopped first.
 
         Args:
@@ -330,31 +243,40 @@ class EmergencyStops:
             reason: reason, if given; its first 500 printable characters are recorded.
             rig: stop only this rig; '' for all. The stop of all rigs and that of one are set and cleared separately.
                 A rig that does not exist stops all.
-            arms: stops that the same request has begun before; see `stop_arms`.
-            notes: what was changed or ignored in the request.
+            notes: what was ignored in the request.
 
         Returns:
             These notes, and others on reason and rig. The audit entry has them, too.
         """
-        affected, found = self.scope(rig)
-        arms = {} if arms is None else arms
-        await self.stop_arms(affected, arms)
+        affected, unknown = self.scope(rig)
+        flag, workers = self._affected(affected)
+        arms = []
+        for worker in workers:
+            worker.latched = True
+            if worker.running is not None:
+                arms.append(asyncio.create_task(worker.running.emergency()))
+        for _ in range(LEAVING_STEPS):
+            await asyncio.sleep(0)
         text, changes = recorded_reason(reason)
-        self.latch(by, text, affected)
-        found = [*notes, *found, *changes]
+        found = [*notes, *unknown, *changes]
+        with contextlib.suppress(*UNSTORED):  # it holds after a restart; authors and reasons of several are kept
+            self._store.set_flag(flag, later_stop(self._store.flag(flag), by, text, time.time()))
+            for worker in workers:
+                if worker.running is not None:
+                    self._store.change(worker.running.item.id, desired_state=str(DesiredState.ABORT))
         with contextlib.suppress(*UNSTORED):
             detail = ": ".join(filter(None, (f"rig {affected}" if affected else "", text)))
             self._shared.note(
                 by, "emergency stop", detail=f"{detail} ({'; '.join(found)})".lstrip() if found else detail
             )
-        await asyncio.gather(*arms.values(), return_exceptions=True)
+        await asyncio.gather(*arms, return_exceptions=True)
         return found
 
     def scope(self, rig: object) -> tuple[str, list[str]]:
         """Return the rig that a stop is for, '' for all, and a note if the wanted rig does not exist."""
         if isinstance(rig, str) and (not rig or rig in self.rig_names):
             return rig, []
-        return "", [unknown_rig(rig)]
+        return "", [f"there is no rig '{recorded_reason(rig)[0][:60]}': every arm was stopped"]
 
     @property
     def rig_names(self) -> list[str]:

@@ -13,13 +13,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fastapi import FastAPI, HTTPException, Request, Response
-from fastapi.exception_handlers import http_exception_handler
+from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 from orchestrator.daemon import archive_routes, command_routes, query_routes, station_routes
-from orchestrator.daemon.access_control import Daemon, RequestGuard, Stops
+from orchestrator.daemon.access_control import Daemon, RequestGuard, Stops, refused
 from orchestrator.daemon.access_tokens import Tokens
 from orchestrator.daemon.daemon_store import StoreError
 from orchestrator.daemon.ordering import Ordering
@@ -74,7 +73,7 @@ def create_app() -> FastAPI:
     app.include_router(page_router())
     for kind in (StoreError, OSError):
         app.add_exception_handler(kind, _not_stored)
-    app.add_exception_handler(AnyHTTPException, _refused)
+    app.add_exception_handler(AnyHTTPException, refused)
     app.state.shutdown = _nothing
     return app
 
@@ -91,7 +90,7 @@ def serve_app(daemon: Supervisor, tokens: Tokens, shutdown: Callable[[], None]) 
     app.state.daemon, app.state.queue, app.state.stops = daemon.shared, daemon.queue, daemon.stops
     app.state.tokens, app.state.shutdown = tokens, shutdown
     app.state.ordering = Ordering(daemon.shared, daemon.queue)
-    app.add_middleware(RequestGuard, limit=settings.body_limit, host=settings.host)
+    app.add_middleware(RequestGuard, limit=settings.body_limit, host=settings.host, tokens=tokens)
     return app
 
 
@@ -129,13 +128,6 @@ async def _readiness(daemon: Daemon, stops: Stops, response: Response) -> Health
         problems.append("ending")
     response.status_code = 503 if problems else 200
     return HealthOut(ok=not problems, problems=problems)
-
-
-async def _refused(request: Request, error: Exception) -> Response:
-    """Answer with a refusal; lone surrogates of the request that its text quotes are escaped, since UTF-8 has none."""
-    assert isinstance(error, AnyHTTPException)
-    text = str(error.detail).encode("utf-8", "backslashreplace").decode("utf-8")
-    return await http_exception_handler(request, HTTPException(error.status_code, text, dict(error.headers or {})))
 
 
 async def _not_stored(request: Request, error: Exception) -> JSONResponse:

@@ -28,9 +28,12 @@ from typing import Annotated, Any
 from fastapi import FastAPI, HTTPException, Request
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ValidationError, WithJsonSchema
+from starlette.exceptions import HTTPException as AnyHTTPException
 
+from orchestrator.daemon.access_control import refused
 from orchestrator.daemon.daemon_settings import MadsciSettings, networks
 from orchestrator.daemon.daemon_store import ENDED, QueueItem
+from orchestrator.daemon.emergency_stop import StopForms
 from orchestrator.daemon.ordering import Ordering
 from orchestrator.daemon.pour_request import PourIn, described, problems_text
 from orchestrator.daemon.schemas import SubmissionIn
@@ -335,8 +338,11 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
         except ValueError:
             known = False
         if not known:
-            return JSONResponse({"detail": f"{address} is not in the node's list (madsci: allow)"}, 403)
+            return await refused(request, HTTPException(403, f"{address} is not in the node's list (madsci: allow)"))
         return await call_next(request)
+
+    app.add_middleware(StopForms)
+    app.add_exception_handler(AnyHTTPException, refused)
 
     @app.exception_handler(KeyError)
     async def unknown(request: Request, error: KeyError) -> JSONResponse:
@@ -363,7 +369,6 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
         return {"success": False}
 
     @app.post("/admin/{command}")
-    @app.post("/admin/{command}/")
     async def admin(command: str) -> Any:
         # From Python 3.11 on, the client writes 'AdminCommands.PAUSE' where it means 'pause'.
         return await node.command(command.rpartition(".")[2].lower())

@@ -70,18 +70,6 @@ class EnableIn(RequestModel):
     """Name of the laboratory, typed by an operator who has read what will move."""
 
 
-class EmergencyIn(RequestModel):
-    """Optional body of an emergency stop. Anything else is accepted, too: nothing in a body prevents the stop."""
-
-    model_config = ConfigDict(extra="allow")
-
-    reason: str = ""
-    """Text for the records; its first 500 characters are kept."""
-
-    rig: str = ""
-    """Stop only this rig; '' for all. A rig that does not exist stops all. Better named in the query."""
-
-
 class ClearIn(RequestModel):
     """Selects the emergency stop to clear."""
 

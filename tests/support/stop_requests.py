@@ -49,47 +49,106 @@ JSON = "Content-Type: application/json"
 FORM = "Content-Type: application/x-www-form-urlencoded"
 CHUNKED = "Transfer-Encoding: chunked"
 
+UNREAD = "a body is not read: rig and reason belong into the query"
+
+
+def query(name: str, text: str, *, note: str = "", reason: str | None = None) -> StopCase:
+    return StopCase(name, path=f"{PATH}?{text}", note=note, reason=reason)
+
+
 CASES = [
-    sized("sound", b'{"reason": "glass"}', JSON, reason="glass"),
-    sized("no body", b"", reason=""),
-    sized("malformed", b'{"reason": "glass', JSON, note="neither JSON nor a form"),
-    sized("line end", b"\n", JSON, reason=""),
-    sized("extra key", b'{"reason": "glass", "by": "ann"}', JSON, note="ignored in the body: by", reason="glass"),
-    sized("null", b'{"reason": null, "rig": null}', JSON, reason=""),
-    sized("number", b'{"reason": 5}', JSON, note="not a text", reason="5"),
-    sized("long", json.dumps({"reason": "x" * 501}).encode(), JSON, note="501 characters", reason="x" * 500),
-    sized("text", b'"stop"', JSON, note="taken as the reason", reason="stop"),
-    sized("list", b"[]", JSON, note="no JSON object", reason=""),
+    StopCase("no body", reason=""),
+    sized("empty body", b"", reason=""),
+    query("reason", "reason=broken+glass", reason="broken glass"),
+    query("long", f"reason={'x' * 501}", note="501 characters", reason="x" * 500),
+    query("two reasons", "reason=glass&reason=smoke&reason=glass", reason="glass; smoke"),
+    # curl sends what was typed, also where it should be encoded: github.com/curl/curl/issues/9271
+    query("as typed", "reason=glass on the table", reason="glass on the table"),
+    query("UTF-8 as typed", "reason=Gl\xc3\xa4ser", reason="Gläser"),
+    query("UTF-8", "reason=Gl%C3%A4ser", reason="Gläser"),
+    query("Latin-1", "reason=Perch%E9", reason="Perch\N{REPLACEMENT CHARACTER}"),
+    query("control characters", "reason=a%1b%5B2J", note="replaced", reason="a\N{REPLACEMENT CHARACTER}[2J"),
+    query("malformed", "&&=%&reason=%zz", note="ignored in the query: ", reason="%zz"),
+    query("another key", "reason=glass&by=ann", note="ignored in the query: by", reason="glass"),
+    query("unknown rig", "rig=Nothing", note="there is no rig 'Nothing': every arm was stopped"),
+    query("unknown bytes", "rig=%ff", note="there is no rig"),
+    query("two rigs", "rig=a&rig=b", note="every arm was stopped"),
+    sized("sound", b'{"reason": "glass"}', JSON, note=UNREAD, reason=""),
+    sized("malformed body", b'{"reason": "glass', JSON, note=UNREAD, reason=""),
+    sized("line end", b"\n", JSON, note=UNREAD),
+    sized("null", b'{"reason": null, "rig": null}', JSON, note=UNREAD),
+    sized("text", b'"stop"', JSON, note=UNREAD),
     # `curl -d` declares a form, also for JSON: github.com/dmuth/fastapi-httpbin/issues/10
-    sized("form", b"reason=broken+glass", FORM, reason="broken glass"),
-    sized("JSON as a form", b'{"reason": "glass"}', FORM, reason="glass"),
+    sized("form", b"reason=broken+glass", FORM, note=UNREAD, reason=""),
+    sized("JSON as a form", b'{"reason": "glass"}', FORM, note=UNREAD),
     # fetch() with JSON.stringify() declares text/plain: github.com/fastapi/fastapi/issues/3373
-    sized("JSON as text", b'{"reason": "glass"}', "Content-Type: text/plain;charset=UTF-8", reason="glass"),
-    sized("without a type", b'{"reason": "glass"}', reason="glass"),
-    sized("invalid type", b'{"reason": "glass"}', "Content-Type: ;;/=\xff", reason="glass"),
+    sized("JSON as text", b'{"reason": "glass"}', "Content-Type: text/plain;charset=UTF-8", note=UNREAD),
+    sized("without a type", b'{"reason": "glass"}', note=UNREAD),
+    sized("invalid type", b'{"reason": "glass"}', "Content-Type: ;;/=\xff", note=UNREAD),
     # PowerShell's Invoke-RestMethod sends Latin-1: github.com/yzwijsen/chatgpt-powershell/issues/4
-    sized("Latin-1", '{"reason": "Perché?"}'.encode("latin-1"), JSON, note="Latin-1", reason="Perché?"),
-    sized("UTF-16", '{"reason": "Gläser"}'.encode("utf-16"), JSON, reason="Gläser"),
-    sized("lone surrogate", b'{"reason": "a\\ud800"}', JSON, note="replaced", reason="a\N{REPLACEMENT CHARACTER}"),
-    sized("control characters", b'{"reason": "a\\u001b[2Jb\\nc"}', JSON, note="replaced"),
-    sized("unknown rig", b'{"rig": "Nothing"}', JSON, note="there is no rig 'Nothing': every arm was stopped"),
-    sized("rig that is a number", b'{"rig": 7}', JSON, note="there is no rig '7': every arm was stopped"),
-    sized("two rigs", b'{"rig": "a", "rig": "b"}', JSON, note="every arm was stopped"),
-    sized("deep", b"[" * 100_000, JSON, note="neither JSON"),
-    sized("5 MB", b'{"reason": "' + b"x" * 5_000_000 + b'"}', JSON, note="longer than 1 MB"),
-    sized("trailing slash", b"{}", JSON, path=f"{PATH}/"),
-    sized("address that ended in a slash", b"{}", JSON, path=f"/{PATH}"),
-    sized("capitals", b"{}", JSON, path="/api/v1/Emergency-Stop"),
-    sized("unknown rig in the query", b"", path=f"{PATH}?rig=%ff", note="there is no rig"),
-    sized("another protocol", b"{}", "Upgrade: websocket", "Connection: Upgrade", JSON),
-    StopCase("bad chunks", b"zz\r\n{}\r\n", (CHUNKED, JSON), note="malformed HTTP"),
-    StopCase("bad second chunk", b'2\r\n{}\r\n-1\r\n', (CHUNKED, JSON), note="malformed HTTP"),
-    StopCase("chunks that go bad", b"", (CHUNKED, JSON), b"zz\r\n{}\r\n"),
-    StopCase("late", b"", ("Content-Length: 19", JSON), b'{"reason": "glass"}'),
-    StopCase("never ending", b'{"reason": "gl', ("Content-Length: 19", JSON), note="did not end within 0.5 s"),
+    sized("Latin-1 body", '{"reason": "Perché?"}'.encode("latin-1"), JSON, note=UNREAD),
+    sized("UTF-16", '{"reason": "Gläser"}'.encode("utf-16"), JSON, note=UNREAD),
+    sized("lone surrogate", b'{"reason": "a\\ud800"}', JSON, note=UNREAD),
+    sized("unknown rig in the body", b'{"rig": "Nothing"}', JSON, note=UNREAD),
+    sized("deep", b"[" * 100_000, JSON, note=UNREAD),
+    sized("5 MB", b'{"reason": "' + b"x" * 5_000_000 + b'"}', JSON, note=UNREAD),
+    sized("trailing slash", b"{}", JSON, path=f"{PATH}/", note=UNREAD),
+    sized("another protocol", b"{}", "Upgrade: websocket", "Connection: Upgrade", JSON, note=UNREAD),
+    StopCase("bad chunks", b"zz\r\n{}\r\n", (CHUNKED, JSON), note=UNREAD),
+    StopCase("bad second chunk", b'2\r\n{}\r\n-1\r\n', (CHUNKED, JSON), note=UNREAD),
+    StopCase("chunks that go bad", b"", (CHUNKED, JSON), b"zz\r\n{}\r\n", note=UNREAD),
+    StopCase("late", b"", ("Content-Length: 19", JSON), b'{"reason": "glass"}', note=UNREAD),
+    StopCase("never ending", b'{"reason": "gl', ("Content-Length: 19", JSON), note=UNREAD),
     # curl waits for 100 Continue: github.com/Kludex/uvicorn/issues/88
-    StopCase("100-continue", b"", ("Content-Length: 19", "Expect: 100-continue", JSON), note="did not end within 0.5"),
+    StopCase("100-continue", b"", ("Content-Length: 19", "Expect: 100-continue", JSON), note=UNREAD),
 ]  # fmt: skip
+
+FORMS = {
+    # what clients send that have a proxy setting: RFC 9112, section 3.2.2
+    "absolute form": "POST http://{host}{path} HTTP/1.1|Host: {host}|{token}",
+    "absolute form of another name": "POST HTTPS://ann@lab.example:1{path}?rig= HTTP/1.1|Host: {host}|{token}",
+    "HTTP/1.0": "POST {path} HTTP/1.0|{token}",
+    "HTTP/1.0 that stays open": "POST {path} HTTP/1.0|Connection: keep-alive|{token}",
+    "another name": "POST {path} HTTP/1.1|Host: lab.example|{token}",
+    "empty name": "POST {path} HTTP/1.1|Host:|{token}",
+    "slashes": "POST //api//v1/emergency-stop/// HTTP/1.1|Host: {host}|{token}",
+    "dots": "POST /api/v1/./x/../emergency-stop HTTP/1.1|Host: {host}|{token}",
+    "capitals": "POST /API/v1/Emergency-Stop HTTP/1.1|Host: {host}|{token}",
+    "encoded": "POST /api/v1/%65mergency%2Dstop HTTP/1.1|Host: {host}|{token}",
+    "encoded question mark": "POST {path}%3Frig= HTTP/1.1|Host: {host}|{token}",
+    "behind a prefix": "POST /decant{path} HTTP/1.1|Host: {host}|{token}",
+    # what proxies make of two headers
+    "joined tokens": "POST {path} HTTP/1.1|Host: {host}|Authorization: Bearer a, {bearer}",
+    "joined tokens, the first is right": "POST {path} HTTP/1.1|Host: {host}|{token}, Bearer a",
+    "two headers": "POST {path} HTTP/1.1|Host: {host}|Authorization: Basic YTpi|{token}",
+    "two headers, the first is right": "POST {path} HTTP/1.1|Host: {host}|{token}|Authorization: Basic YTpi",
+    "one scheme": "POST {path} HTTP/1.1|Host: {host}|authorization:\tbEARER \t a,{bare}",
+    "folded": "POST {path} HTTP/1.1|Host: {host}|Authorization: Bearer| {bare}",
+    "put": "PUT {path} HTTP/1.1|Host: {host}|{token}",
+    "patch": "PATCH {path}/ HTTP/1.1|Host: {host}|{token}",
+    "lower case": "post {path} HTTP/1.1|Host: {host}|{token}",
+    "empty lines before it": "||POST {path} HTTP/1.1|Host: {host}|{token}",
+    "HTTP/2 offered": "POST {path} HTTP/1.1|Host: {host}|Connection: Upgrade, HTTP2-Settings|Upgrade: h2c|"
+    "HTTP2-Settings: AAMAAABkAAQAAP__|{token}",
+}  # fmt: skip
+"""Heads of requests that are legal, or that clients and proxies send; '|' ends a line."""
+
+
+def head_of(form: str, url: str, token: str) -> bytes:
+    """Return the head of a request."""
+    fields = {"host": urlsplit(url).netloc, "path": PATH, "bare": token, "bearer": f"Bearer {token}"}
+    text = form.format(**fields, token=f"Authorization: Bearer {token}")
+    return f"{text}||".replace("|", "\r\n").encode("latin-1")
+
+
+@contextlib.contextmanager
+def connected(url: str) -> Iterator[socket.socket]:
+    """A connection to the daemon."""
+    where = urlsplit(url)
+    assert where.hostname
+    assert where.port
+    with socket.create_connection((where.hostname, where.port), timeout=PATIENCE) as connection:
+        yield connection
 
 
 @contextlib.contextmanager
@@ -97,12 +156,9 @@ def sent(
     url: str, token: str, case: StopCase, host: str | None = None, method: str = "POST"
 ) -> Iterator[socket.socket]:
     """Send a request up to its body; yields the connection."""
-    where = urlsplit(url)
-    assert where.hostname
-    assert where.port
-    head = (f"{method} {case.path} HTTP/1.1", f"Host: {where.netloc if host is None else host}", *case.headers)
+    head = (f"{method} {case.path} HTTP/1.1", f"Host: {urlsplit(url).netloc if host is None else host}", *case.headers)
     token_line = (f"Authorization: Bearer {token}",) if token else ()
-    with socket.create_connection((where.hostname, where.port), timeout=PATIENCE) as connection:
+    with connected(url) as connection:
         connection.sendall("\r\n".join((*head, *token_line, "", "")).encode("latin-1") + case.body)
         yield connection
 

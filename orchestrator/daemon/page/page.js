@@ -232,7 +232,7 @@ async function doing(what, work) {
 /** An emergency stop, of one rig or ('') of all. One that is not confirmed is not missed. */
 async function stop(rig) {
   const what = rig ? `STOP ${rig}` : "EMERGENCY STOP";
-  const done = await doing(what, () => call(`emergency-stop?rig=${encodeURIComponent(rig)}`, { reason: "from the page" }, { timeout: 8000 }));
+  const done = await doing(what, () => call(`emergency-stop?rig=${encodeURIComponent(rig)}&reason=from+the+page`, undefined, { method: "POST", timeout: 8000 }));
   if (!done) alarm(`${what} was not confirmed: ${PHYSICAL}.`);
 }
 

@@ -117,7 +117,7 @@ def test_an_emergency_stop_is_latched_until_somebody_clears_it(tmp_path: Path) -
         async with serving(tmp_path, held) as served:
             key, waiting = await served.submit(), await served.submit()
             laboratory = await served.pouring()
-            status = await served.post("/emergency-stop", {"reason": "glass"}, role=Role.VIEWER)
+            status = await served.post("/emergency-stop?reason=glass", role=Role.VIEWER)
             assert laboratory.arm_stops == 1
             assert status["emergency"]["reason"] == "glass"
             found = await served.until(key, "unknown")
