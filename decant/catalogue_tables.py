@@ -18,9 +18,9 @@ def find_runs(*words: str, **conditions: Unpack[Conditions]) -> pd.DataFrame:
     """Runs of this machine, newest first; `open_run(path)` opens one. Names may contain * and ?.
 
     Args:
-        words: all of them must occur in a run's names, vessels, tags or notes.
+        words: all of them must occur in a run's names, vessels or notes.
         conditions: any of `since`, `until` ('2030-03-01', '2030-03', '7d' ago; to the end of the day or month),
-            `campaign`, `pourer`, `receiver`, `liquid`, `strategy`, `tag` (names), `mode` ('virtual' or 'real'), and
+            `campaign`, `pourer`, `receiver`, `liquid`, `strategy` (names), `mode` ('virtual' or 'real'), and
             `state` as `decant runs` shows it ('finished', 'interrupted' …). All given conditions must hold.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Tags and notes of a run, stored in a file in the run's folder, so that they move with the run."""
+"""Notes of a run, stored in a file in the run's folder, so that they move with the run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import fcntl
 import getpass
 import json
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -31,63 +30,61 @@ class Note(BaseModel):
     text: str
 
 
-class Annotations(BaseModel):
-    """All tags and notes of a run; notes in the order in which they were written."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
+class _Annotations(BaseModel):
+    model_config = ConfigDict(extra="forbid")
 
     tags: tuple[str, ...] = ()
+    """Of a file of an earlier version."""
+
     notes: tuple[Note, ...] = ()
 
 
 class AnnotationsError(RunError):
-    """The annotations of a run can't be read or written; the text gives the reason and the remedy."""
+    """The notes of a run can't be read or written; the text gives the reason and the remedy."""
 
 
-def read_annotations(run: Path) -> Annotations:
-    """The annotations of a run; empty if there are none.
+def read_notes(run: Path) -> tuple[Note, ...]:
+    """The notes of a run, the oldest first. Tags, which earlier versions have written, are a note of their words.
 
     Raises:
-        AnnotationsError: the file is not a file of annotations.
+        AnnotationsError: the file is not a file of notes.
     """
     path = run / ANNOTATIONS_NAME
     try:
-        return Annotations.model_validate_json(path.read_bytes())
+        content = _Annotations.model_validate_json(path.read_bytes())
+        if not content.tags:
+            return content.notes
+        return (Note(time=path.stat().st_mtime, by="", text=f"tags: {', '.join(content.tags)}"), *content.notes)
     except FileNotFoundError:
-        return Annotations()
+        return ()
     except (OSError, ValidationError) as error:
         raise AnnotationsError(f"{path}: can't be read ({str(error).splitlines()[0]}); correct or remove it") from None
 
 
-def annotate(
-    run: Path, *, add: Sequence[str] = (), remove: Sequence[str] = (), note: str | None = None, by: str | None = None
-) -> Annotations:
-    """Add tags to a run, remove others, and add a note.
+def add_note(run: Path, text: str, by: str | None = None) -> tuple[Note, ...]:
+    """Add a note to a run; returns all of them.
 
     The file is replaced atomically; concurrent changes wait for each other.
 
     Args:
-        note: text of the note.
+        text: of the note.
         by: its author; the user of this process unless given.
 
     Raises:
-        AnnotationsError: as `read_annotations`, or the file can't be written.
+        AnnotationsError: as `read_notes`, or the file can't be written.
     """
     path = run / ANNOTATIONS_NAME
-    notes = [] if note is None else [Note(time=time.time(), by=_user() if by is None else by, text=note)]
     try:
         with path.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
-            before = read_annotations(run)
-            tags = tuple(name for name in dict.fromkeys((*before.tags, *add)) if name not in remove)
-            changed = Annotations(tags=tags, notes=(*before.notes, *notes))
+            notes = (*read_notes(run), Note(time=time.time(), by=_user() if by is None else by, text=text))
             draft = path.with_suffix(".part")
-            text = json.dumps(changed.model_dump(mode="json"), indent=2, ensure_ascii=False)
-            draft.write_text(text + "\n", encoding="utf-8")
+            content = json.dumps({"notes": [note.model_dump() for note in notes]}, indent=2, ensure_ascii=False)
+            draft.write_text(content + "\n", encoding="utf-8")
             draft.replace(path)
     except OSError as error:
         raise AnnotationsError(f"{path}: can't be written: {error.strerror}") from None
-    return changed
+    return notes
 
 
 def _user() -> str:

@@ -1,9 +1,9 @@
-"""The catalogue of this machine's runs: one SQLite file with the tables `run`, `pour`, `posterior`, `tag` and `note`.
+"""The catalogue of this machine's runs: one SQLite file with the tables `run`, `pour`, `posterior` and `note`.
 
 - `Catalogue` serves the command line, the HTTP API and the library. The daemon's client has the same queries for
   another machine.
 - The file is an index over the runs' folders and may be deleted at any time. `Catalogue.refresh` reads the runs that
-  changed since they were last read.
+  changed since they were last read, and all runs if another version of Decant has written the index.
 - Several processes may use it at the same time: runs are read without a lock, and each is entered in a transaction.
 """
 
@@ -14,28 +14,31 @@ import json
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
+from zlib import crc32
 
-from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, annotate
+from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, add_note
 from orchestrator.catalogue.export import write_tables
-from orchestrator.catalogue.queries import condition_sql, differing_settings, outcomes
+from orchestrator.catalogue.queries import condition_sql
 from orchestrator.catalogue.run_reading import TABLES, UNREADABLE, Column, RunRows, read_run, unreadable
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import has_begun
-from orchestrator.records.run_record import Row, read_header
+from orchestrator.records.run_record import Row
 from orchestrator.records.run_registry import known, make_state_directory, state_directory
 from orchestrator.records.states import RESTING
+from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 if TYPE_CHECKING:
     from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource
 
 INDEX_NAME = "catalogue.sqlite"
 
-FORMAT = 5
-"""Version of the index's content; an index of another version is rebuilt."""
+FORMAT = 6
+"""Version of the index's content. An index of another format, or of another version of Decant, is made again."""
 
 
 class CatalogueError(RunError):
@@ -69,7 +72,7 @@ class Refreshed:
     """Result of a refresh.
 
     Attributes:
-        missing: number of known folders without a run.
+        missing: number of runs whose folders are gone since the last refresh.
         problems: reasons why runs can't be read.
     """
 
@@ -119,12 +122,11 @@ class Catalogue:
         """Close the file. May be called twice."""
         self._connection.close()
 
-    def refresh(self, progress: Callable[[int, int], None] | None = None, *, rebuild: bool = False) -> Refreshed:
-        """Read the runs that were written since they were last read.
+    def refresh(self, progress: Callable[[int, int], None] | None = None) -> Refreshed:
+        """Read the runs that were written since they were last read, and remove those whose folders are gone.
 
         Args:
             progress: called with the number of runs read so far, and their total.
-            rebuild: read all runs, and remove missing ones from the index.
 
         Raises:
             CatalogueError: the list of runs or the index can't be read or written.
@@ -132,22 +134,21 @@ class Catalogue:
         try:
             stamps = dict(self._connection.execute("select path, stamp from run").fetchall())
             folders = {str(path): _stamp(path) for path in dict.fromkeys((*known(self.state), *map(Path, stamps)))}
-            changed = [path for path, stamp in folders.items() if stamp and (rebuild or stamp != stamps.get(path))]
+            changed = [path for path, stamp in folders.items() if stamp and stamp != stamps.get(path)]
             missing = [path for path, stamp in folders.items() if not stamp and path in stamps]
-            gone = "delete from run" if rebuild else "update run set stamp = ''"
-            self._connection.executemany(f"{gone} where path = ?", [[path] for path in missing])
+            self._connection.executemany("delete from run where path = ?", [[path] for path in missing])
             for number, path in enumerate(changed, start=1):
                 if progress is not None:
                     progress(number, len(changed))
                 self._read(path, folders[path])
-            query = "select reason from run where state = ? and stamp != '' order by path"
+            query = "select reason from run where state = ? order by path"
             problems = [row[0] for row in self._connection.execute(query, [UNREADABLE])]
         except (OSError, sqlite3.Error) as error:
             raise CatalogueError(
                 f"{self.state}: the catalogue can't be brought up to date ({error}); correct that, or name another "
                 "state directory with --state"
             ) from None
-        return Refreshed(0 if rebuild else len(missing), problems)
+        return Refreshed(len(missing), problems)
 
     def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
         """Runs, the newest first; see `run_reading.RUNS`. Raises ValueError for an invalid condition."""
@@ -167,19 +168,6 @@ class Catalogue:
         written = [dict(zip(("time", "by", "text"), note, strict=True)) for note in notes]
         return {**found, "notes": written, "list_of_pours": self.pours({"run": found["path"]})}
 
-    def compare(self, names: Sequence[str]) -> Row:
-        """'runs' (their folders), the differing 'settings', and the 'outcomes' of each run."""
-        found, plans = [self._find(name) for name in names], []
-        for run in found:
-            plans.append(read_header(Path(run["path"])).fingerprint)
-        results = [outcomes(run) for run in found]
-        return {"runs": [run["path"] for run in found], "settings": differing_settings(plans), "outcomes": results}
-
-    def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
-        """Change a run's tags; returns 'run' and 'tags'."""
-        found = self._find(name)
-        return {"run": found["run"], "tags": annotate(Path(found["path"]), add=add, remove=remove).tags}
-
     def note(self, name: str, text: str, by: str | None = None) -> Row:
         """Add a note to a run; returns 'run' and 'notes'.
 
@@ -187,7 +175,7 @@ class Catalogue:
             by: author of the note; the user of this process unless given.
         """
         found = self._find(name)
-        notes = annotate(Path(found["path"]), note=text, by=by).notes
+        notes = add_note(Path(found["path"]), text, by)
         return {"run": found["run"], "notes": [note.model_dump() for note in notes]}
 
     def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
@@ -262,19 +250,17 @@ class Catalogue:
                 raise  # a full disk, a locked index: not an error of the run
             # Its content doesn't fit the columns: it is damaged, or exceeds the limits of SQLite.
             problem = f"{path}: its journal has values that can't be entered ({error}); see `decant runs check`"
-            self._enter(path, stamp, unreadable(Path(path), problem, read.annotations))
+            self._enter(path, stamp, unreadable(Path(path), problem, read.notes))
 
     def _enter(self, path: str, stamp: str, read: RunRows) -> None:
-        """Replace the rows of a run. The previous folder of a moved run, with the same name and start, is removed."""
-        run, annotations = read.run, read.annotations
+        """Replace the rows of a run."""
+        run = read.run
         with _transaction(self._connection):
-            query = "delete from run where path = ? or (run = ? and begun = ? and stamp = '')"
-            self._connection.execute(query, [path, run.get("run"), run.get("begun")])
+            self._connection.execute("delete from run where path = ?", [path])
             self._insert("run", [[*_stored("run", run), stamp]])
             self._insert("pour", [_stored("pour", pour) for pour in read.pours])
             self._insert("posterior", [[path, read.posterior]] if read.posterior else [])
-            self._insert("tag", [[path, tag] for tag in annotations.tags])
-            self._insert("note", [[path, note.time, note.by, note.text] for note in annotations.notes])
+            self._insert("note", [[path, note.time, note.by, note.text] for note in read.notes])
 
     def _insert(self, table: str, rows: Sequence[Sequence[Any]]) -> None:
         if rows:
@@ -282,33 +268,30 @@ class Catalogue:
 
 
 _TYPES = {"text": "text", "texts": "text", "integer": "integer", "number": "real", "time": "real", "values": "text"}
-_ANNOTATIONS = {"tags": "tag", "notes": "note"}
-"""Columns of runs that are tables of their own."""
+_NOTES = "notes"
+"""The column of runs that is a table of its own."""
 
 _SOURCES = {"run": "runs", "pour": "pour"}
-"""Sources of the rows of `TABLES`. The view `runs` adds tags, notes and the present state to the table."""
+"""Sources of the rows of `TABLES`. The view `runs` adds notes and the present state to the table."""
 
 _BELONGS = "path text references run on delete cascade"
 
 
 def _layout() -> Iterator[str]:
     """The statements that create the tables."""
-    own = {name: [c for c in columns if c.name not in _ANNOTATIONS] for name, columns in TABLES.items()}
+    own = {name: [c for c in columns if c.name != _NOTES] for name, columns in TABLES.items()}
     declared = {name: ", ".join(f"{c.name} {_TYPES[c.type]}" for c in columns) for name, columns in own.items()}
     yield "drop view if exists runs"
-    for table in ("note", "tag", "posterior", "pour", "run"):
+    for table in ("tag", "note", "posterior", "pour", "run"):  # earlier versions have tags
         yield f"drop table if exists {table}"
     yield f"create table run ({declared['run'].replace('path text', 'path text primary key')}, stamp text) strict"
     yield f"create table pour ({declared['pour'].replace('path text', _BELONGS)}) strict"
     yield f"create table posterior ({_BELONGS}, content text) strict"
-    yield f"create table tag ({_BELONGS}, tag text) strict"
     yield f"create table note ({_BELONGS}, time real, by text, text text) strict"
-    for table in ("pour", "posterior", "tag", "note"):
+    for table in ("pour", "posterior", "note"):
         yield f"create index {table}_by_path on {table} (path)"
     columns = [f"state_now(state, path) as {c.name}" if c.name == "state" else c.name for c in own["run"]]
-    for name, text in (("tags", "tag"), ("notes", "text")):
-        table = _ANNOTATIONS[name]
-        columns.append(f"(select json_group_array({text}) from {table} where {table}.path = run.path) as {name}")
+    columns.append(f"(select json_group_array(text) from note where note.path = run.path) as {_NOTES}")
     yield f"create view runs as select {', '.join(columns)} from run"
 
 
@@ -321,7 +304,7 @@ def _opened(path: str) -> sqlite3.Connection:
         if not _has_format(connection):
             with _transaction(connection):
                 if not _has_format(connection):  # another process may have created the tables
-                    for statement in (*_layout(), f"pragma user_version = {FORMAT}"):
+                    for statement in (*_layout(), f"pragma user_version = {_user_version()}"):
                         connection.execute(statement)
     except BaseException:
         connection.close()
@@ -330,7 +313,12 @@ def _opened(path: str) -> sqlite3.Connection:
 
 
 def _has_format(connection: sqlite3.Connection) -> bool:
-    return bool(connection.execute("pragma user_version").fetchone()[0] == FORMAT)
+    return bool(connection.execute("pragma user_version").fetchone()[0] == _user_version())
+
+
+def _user_version() -> int:
+    """A number that differs between formats, and between versions of Decant, which may read more from a run."""
+    return crc32(f"{FORMAT} {version(DISTRIBUTION)}".encode()) >> 1  # SQLite's is signed
 
 
 @contextlib.contextmanager
@@ -362,7 +350,7 @@ def _stored(table: str, row: Row) -> list[Any]:
     """The values of a row, without those that are tables of their own."""
     stored = []
     for column in TABLES[table]:
-        if column.name not in _ANNOTATIONS:
+        if column.name != _NOTES:
             value = row.get(column.name)
             is_json = column.type in ("texts", "values") and value is not None
             stored.append(json.dumps(value, ensure_ascii=False) if is_json else value)

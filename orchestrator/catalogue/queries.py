@@ -1,8 +1,7 @@
-"""Conditions of catalogue queries, their conversion to SQL, and comparisons of runs.
+"""Conditions of catalogue queries, and their conversion to SQL.
 
 - `CONDITIONS` declares the conditions for the command line, the HTTP API and notebooks.
 - `condition_sql` converts conditions to SQL, which `orchestrator.catalogue.catalogue` executes.
-- `differing_settings` and `outcomes` compare runs.
 
 The module imports nothing heavy: `decant --help` needs it.
 """
@@ -11,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Annotated, Any, TypedDict, get_type_hints
@@ -35,7 +34,6 @@ class Conditions(TypedDict, total=False):
     strategy: Annotated[_Text, "C1 to C4, D1 to D3, or one of a package."]
     mode: Annotated[_Text, "'virtual' or 'real'."]
     state: Annotated[_Text, "finished, paused, failed, unknown, interrupted …"]
-    tag: Annotated[_Text, "A tag of the run."]
 
 
 class PourConditions(Conditions, total=False):
@@ -54,7 +52,7 @@ _DATES = (("%Y-%m-%dT%H:%M:%S", 0), ("%Y-%m-%dT%H:%M", 60), ("%Y-%m-%d", 86_400)
 MODES = {"virtual": "virtual", "real": "hardware", "hardware": "hardware", "external": "external"}
 
 _LISTS = ("liquid", "pourer", "receiver", "strategy")
-_SEARCHED = ("run", "path", "campaign", "mode", "state", "reason", "laboratory", *_LISTS, "tags", "notes")
+_SEARCHED = ("run", "path", "campaign", "mode", "state", "reason", "laboratory", *_LISTS, "notes")
 _ALL_TEXT = " || ' ' || ".join(f"coalesce({name}, '')" for name in _SEARCHED)
 _LIKE = "lower({}) glob lower(?)"
 _ANY_LIKE = "exists (select 1 from json_each({}) where lower(value) glob lower(?))"
@@ -66,7 +64,7 @@ def condition_sql(table: str, conditions: Mapping[str, Any]) -> tuple[str, list[
     Args:
         table: 'run' or 'pour'.
         conditions: those of `CONDITIONS`, as text; 'words', each of which must occur in a run's names, vessels, liquid,
-            strategy, state, tags or notes; 'run', the name of a run's folder, or its path. None sets no condition.
+            strategy, state or notes; 'run', the name of a run's folder, or its path. None sets no condition.
 
     Raises:
         ValueError: a date or the mode is invalid.
@@ -94,8 +92,8 @@ def condition_sql(table: str, conditions: Mapping[str, Any]) -> tuple[str, list[
             case "run":
                 own.append("(lower(run) glob lower(?) or path = ?)")
                 values += [str(text), str(Path(text).absolute())]
-            case "state" | "tag":
-                of_run.append(_LIKE.format(name) if name == "state" else _ANY_LIKE.format("tags"))
+            case "state":
+                of_run.append(_LIKE.format(name))
                 run_values.append(text)
             case _:
                 own.append((_ANY_LIKE if table == "run" and name in _LISTS else _LIKE).format(name))
@@ -137,46 +135,3 @@ def _after(begin: datetime, lasts: int) -> datetime:
         return begin + timedelta(seconds=lasts)
     months = begin.month - 1 - lasts
     return begin.replace(year=begin.year + months // 12, month=months % 12 + 1)
-
-
-_MISSING = object()
-
-
-def differing_settings(plans: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Settings in which runs differ: place in the plan → its value in each run, None if a run does not have it.
-
-    If a whole section is missing in one run, the section is listed, not all of its values.
-
-    Args:
-        plans: the fingerprints of the runs' plans.
-    """
-    found: dict[str, list[Any]] = {}
-    _compare("", plans, found)
-    return found
-
-
-def _compare(place: str, values: Sequence[Any], found: dict[str, list[Any]]) -> None:
-    if all(value == values[0] for value in values):
-        return
-    if all(isinstance(value, Mapping) for value in values):
-        for key in dict.fromkeys(key for value in values for key in value):
-            _compare(f"{place}.{key}" if place else key, [value.get(key, _MISSING) for value in values], found)
-        return
-    same_length = all(isinstance(value, list) and len(value) == len(values[0]) for value in values)
-    if same_length and any(isinstance(part, Mapping) for part in values[0]):
-        for index, parts in enumerate(zip(*values, strict=True)):
-            _compare(f"{place}[{index}]", parts, found)
-        return
-    found[place] = [None if value is _MISSING else value for value in values]
-
-
-def outcomes(run: Mapping[str, Any]) -> dict[str, Any]:
-    """The result of a run, one value for each line of a comparison: by θ, and by receiver."""
-    theta = {f"θ* {name}": value for name, value in (run["theta"] or {}).items()}
-    shown: dict[str, Any] = {
-        name: run[name] for name in ("state", "simulations", "pours", "spilled_g", "test_discrepancy")
-    }
-    for receiver, advice in (run["recommended"] or {}).items():
-        shown |= {f"{receiver}: {name}": advice[name] for name in ("strategy", "best_loss", "predicted_loss")}
-        shown |= {f"{receiver}: {name}": value for name, value in advice["action"].items()}
-    return shown | theta

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, Field, create_model
 
 from orchestrator.campaigns.prior_data import scenes_in
-from orchestrator.catalogue.annotations import Annotations, AnnotationsError, Note, read_annotations
+from orchestrator.catalogue.annotations import AnnotationsError, Note, read_notes
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.stage_result import displayed_action
 from orchestrator.records.codec import CodecError, from_json
@@ -79,7 +79,6 @@ RUNS = (
     Column("test_discrepancy", "number", "mean |measured − simulated| spillage of θ* on pours kept for testing", "1"),
     Column("theta", "values", "θ*, in SI units"),
     Column("recommended", "values", "by receiver: action to use from now on (display units), expected and best loss"),
-    Column("tags", "texts", "given by people: `decant runs tag`"),
     Column("notes", "texts", "written by people: `decant runs note`"),
 )
 """Columns of the table of runs."""
@@ -147,21 +146,6 @@ PreviousRunDetail = create_model(
 )
 
 
-class RunComparison(BaseModel):
-    """Runs side by side, with one value for each run."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    runs: list[str]
-    """Paths of their folders."""
-
-    settings: dict[str, list[Any]]
-    """Settings in which the runs differ: path in the plan → values."""
-
-    outcomes: list[dict[str, Any]]
-    """Outcome of each run."""
-
-
 UNREADABLE = "unreadable"
 """The state of a run of which only the folder is known; its reason is why it can't be read."""
 
@@ -169,34 +153,32 @@ UNREADABLE = "unreadable"
 @dataclass(frozen=True)
 class RunRows:
     """The catalogue's content of a run: rows by the names of the columns, its posterior (JSON; '' without one), and its
-    tags and notes."""
+    notes."""
 
     run: Row
     pours: list[Row] = field(default_factory=list)
     posterior: str = ""
-    annotations: Annotations = field(default_factory=Annotations)
+    notes: tuple[Note, ...] = ()
 
 
 def read_run(directory: Path) -> RunRows:
     """Read a run, also while it is being written. A run that can't be read is `UNREADABLE`; nothing is raised."""
-    annotations = Annotations()
+    notes: tuple[Note, ...] = ()
     try:
-        annotations = read_annotations(directory)
-        return RunRows(*_rows(directory), annotations=annotations)
+        notes = read_notes(directory)
+        return RunRows(*_rows(directory), notes=notes)
     except (RunError, CodecError, AnnotationsError, OSError) as error:
-        return unreadable(directory, str(error), annotations)
+        return unreadable(directory, str(error), notes)
     except Exception as error:  # damaged content can cause any error, and must not hide other runs
-        return unreadable(
-            directory, f"{directory}: its journal is damaged ({type(error).__name__}: {error})", annotations
-        )
+        return unreadable(directory, f"{directory}: its journal is damaged ({type(error).__name__}: {error})", notes)
 
 
-def unreadable(directory: Path, problem: str, annotations: Annotations) -> RunRows:
+def unreadable(directory: Path, problem: str, notes: tuple[Note, ...]) -> RunRows:
     """An unreadable run: its folder, the time of its last change, and the reason."""
     row: Row = {"run": directory.name, "path": str(directory), "state": UNREADABLE, "reason": problem}
     with contextlib.suppress(OSError):
         row["begun"] = row["ended"] = directory.stat().st_mtime
-    return RunRows(row, annotations=annotations)
+    return RunRows(row, notes=notes)
 
 
 def _rows(directory: Path) -> tuple[Row, list[Row], str]:

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from orchestrator.campaigns.campaign_prior import KnownPosterior
-from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
+from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
 from orchestrator.cli.command_results import (
     ArchiveOutput,
     BalanceCheckOutput,
@@ -202,7 +202,6 @@ OUTPUTS: dict[str, Any] = {
     "runs show": PreviousRunDetail,
     "runs known": KnownOutput,
     "runs check": RunCheckOutput,
-    "runs compare": RunComparison,
     "runs export": ExportOutput,
     "study run": StudyOutput | StudyCostOutput,
     "study report": StudyOutput,

@@ -82,7 +82,7 @@ Which = Annotated[
 ]
 
 _LIMIT = Annotated[int | None, typer.Option("--limit", min=1, help="Show at most this many, the newest.")]
-_WORDS = Annotated[list[str] | None, typer.Argument(metavar="[WORDS]", help="Words in a run's names, tags or notes.")]
+_WORDS = Annotated[list[str] | None, typer.Argument(metavar="[WORDS]", help="Words in a run's names or notes.")]
 _OTHERS: dict[str, Any] = {
     "words": _WORDS,
     "run": Annotated[
@@ -96,7 +96,7 @@ _CONDITIONS: dict[str, Any] = {
         typer.Option(
             "--in-state" if name == "state" else f"--{name}",
             help=text,
-            autocompletion=catalogued("tags" if name == "tag" else name),
+            autocompletion=catalogued(name),
         ),
     ]
     for name, text in CONDITIONS.items()
@@ -148,7 +148,7 @@ def newest(context: typer.Context, state: State = None, daemon: Daemon = False) 
 
 @_command(
     "decant runs list --receiver beaker --mode real --since 2030-03",
-    "decant runs list water spring-clean   # both words, anywhere: names, vessels, tags, notes",
+    "decant runs list water spring-clean   # both words, anywhere: names, vessels, notes",
     "decant runs list --daemon --since 7d   # on the machine at $DECANT_URL",
     name="list",
     conditions=("words", "limit"),
@@ -179,7 +179,6 @@ def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = 
             "best loss": "  ".join(
                 f"{name} {_loss(one['best_loss'], one['loss'])}" for name, one in run["recommended"].items()
             ),
-            "tags": ", ".join(run["tags"]),
         }
         for run in found
     ]
@@ -205,7 +204,7 @@ def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = Fals
 
 @_command("decant runs show quickstart-20300301-1")
 def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
-    """Show one run: state, θ*, recommendations, pours, tags, notes, and files."""
+    """Show one run: state, θ*, recommendations, pours, notes, and files."""
     with _client(daemon) as client:
         found = client.run(run)
     if as_json:
@@ -227,7 +226,6 @@ def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json 
             f"{_loss(one['best_loss'], one['loss'])} the best poured"
             for receiver, one in found["recommended"].items()
         },
-        "tags": ", ".join(found["tags"]),
         "folder": found["path"],
     }
     width = max(map(len, lines))
@@ -316,49 +314,6 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
         raise RefusalError(f"{folder}: {len(found.problems)} problem(s) found", FAILED)
 
 
-@_command("decant runs compare quickstart-20300301-1 quickstart-20300301-2")
-def compare(
-    which: Annotated[list[str], typer.Argument(help="Two or more runs.", autocompletion=catalogued_runs)],
-    state: State = None,
-    daemon: Daemon = False,
-    as_json: Json = False,
-) -> None:
-    """Compare runs: the settings in which they differ, and their outcomes."""
-    from orchestrator.reports.console_view import print_table
-
-    if len(which) < 2:
-        raise RefusalError("comparing takes two runs or more: decant runs compare RUN RUN")
-    with _client(daemon) as client:
-        found = client.compare(which)
-    if as_json:
-        print_json(found)
-        return
-    heads = [Path(path).name for path in found["runs"]]
-    heads = heads if len(set(heads)) == len(heads) else found["runs"]
-    asked = [_compared(place, heads, values) for place, values in found["settings"].items()]
-    outcomes = found["outcomes"]
-    keys = dict.fromkeys(key for one in outcomes for key in one)
-    ended = [_compared(key, heads, [one.get(key) for one in outcomes]) for key in keys]
-    print_table(asked or [_compared("(the same settings)", heads, [""] * len(heads))], title="settings")
-    print_table(ended, title="outcomes")
-
-
-@_command("decant runs tag quickstart-20300301-1 good paper", "decant runs tag RUN --remove good")
-def tag(
-    run: Which,
-    tags: Annotated[list[str] | None, typer.Argument(help="Tags to add.")] = None,
-    remove: Annotated[list[str] | None, typer.Option(help="A tag to remove. Repeatable.")] = None,
-    state: State = None,
-    daemon: Daemon = False,
-) -> None:
-    """Add tags to a run, or remove them. They are stored in the run's folder and are copied with it."""
-    if not tags and not remove:
-        raise RefusalError("name tags to put on the run, or --remove those to take off")
-    with _client(daemon) as client:
-        found = client.tag(run, tags or [], remove or [])
-    print(f"{found['run']}: {', '.join(found['tags']) or 'no tags'}")
-
-
 @_command("decant runs note quickstart-20300301-1 'the tray was wet from the first pour on'")
 def note(
     run: Which,
@@ -366,7 +321,7 @@ def note(
     state: State = None,
     daemon: Daemon = False,
 ) -> None:
-    """Add a note to a run, with date and author. It is stored in the run's folder."""
+    """Add a note to a run, with date and author. It is in the run's folder; `decant runs list` finds its words."""
     with _client(daemon) as client:
         found = client.note(run, text)
     print(f"{found['run']}: {len(found['notes'])} note{'s' * (len(found['notes']) > 1)}")
@@ -447,14 +402,6 @@ def _import_posteriors(paths: Sequence[Path]) -> None:
         for one in read:
             import_posterior(one)
     print(f"{len(read)} posterior{'s' * (len(read) > 1)} entered: {', '.join(one.posterior for one in read)}")
-
-
-@_command("decant runs rebuild")
-def rebuild(state: State = None) -> None:
-    """Rebuild the index from the runs' journals; runs that no longer exist are removed from it."""
-    with _catalogue(rebuild=True) as catalogue:
-        count = len(catalogue.runs({}))
-    print(f"{count} run{'s' * (count != 1)} in the catalogue")
 
 
 # -- formatting ------------------------------------------------------------------------------------------------------
@@ -544,18 +491,6 @@ def _words(name: str) -> str:
     return name.removesuffix(next((s for s in suffixes if name.endswith(s)), "")).replace("_", " ")
 
 
-def _compared(name: str, heads: Sequence[str], values: Sequence[Any]) -> dict[str, str]:
-    """Return one row of a comparison."""
-    return {"": name, **{head: _plain(value) for head, value in zip(heads, values, strict=True)}}
-
-
-def _plain(value: Any) -> str:
-    if value is None:
-        return ""
-    text = f"{value:.5g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= 60 else f"{text[:57]}…"
-
-
 def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}g}"
 
@@ -583,7 +518,7 @@ def _client(daemon: bool = False) -> Iterator[Catalogue | RemoteCatalogueClient]
 
 
 @contextlib.contextmanager
-def _catalogue(*, rebuild: bool = False) -> Iterator[Catalogue]:
+def _catalogue() -> Iterator[Catalogue]:
     """Open the catalogue and update it; problems with unreadable runs are printed at the end."""
     from orchestrator.catalogue.catalogue import Catalogue
 
@@ -597,14 +532,14 @@ def _catalogue(*, rebuild: bool = False) -> Iterator[Catalogue]:
         with Catalogue() as catalogue:
             if catalogue.warning:
                 print_message(f"note: {catalogue.warning}")
-            refreshed = catalogue.refresh(progress, rebuild=rebuild)
+            refreshed = catalogue.refresh(progress)
             yield catalogue
     for problem in refreshed.problems:
         print_message(f"note: {problem}")
     if refreshed.missing:
         print_note(
-            f"note: {refreshed.missing} known run{'s are' if refreshed.missing > 1 else ' is'} not where it was; what "
-            "was last known of it is shown (`decant runs add` after a move, `decant runs rebuild` forgets it)"
+            f"note: the folder{'s' * (refreshed.missing > 1)} of {refreshed.missing} known run"
+            f"{'s are' if refreshed.missing > 1 else ' is'} gone, and no longer listed; after a move: `decant runs add`"
         )
 
 

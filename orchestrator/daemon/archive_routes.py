@@ -1,6 +1,6 @@
 """Routes of the HTTP API for the catalogue of previous runs; the counterpart of `decant runs`.
 
-Viewers list, compare and export runs and pours. Operators add tags and notes. Queries run in a thread, since the first
+Viewers list and export runs and pours. Operators add notes. Queries run in a thread, since the first
 one may read many journals. The catalogue itself is in `orchestrator.catalogue`.
 """
 
@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from orchestrator.catalogue.annotations import Note
 from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.queries import CONDITIONS
-from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail, RunComparison
+from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
 from orchestrator.daemon.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.materials import Materials
 from orchestrator.daemon.rig_worker import SharedServices
@@ -47,7 +47,7 @@ def _filters(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
     }
     fields["words"] = (
         list[Annotated[str, Field(max_length=200)]],
-        Field(default=[], max_length=20, description="Words that must all occur in a run's names, tags or notes."),
+        Field(default=[], max_length=20, description="Words that must all occur in a run's names or notes."),
     )
     fields["limit"] = (int, Field(default=200, ge=1, le=1000, description="Return at most this many, the newest."))
     model = create_model(name, __config__=ConfigDict(extra="forbid"), **fields, **more)
@@ -70,28 +70,12 @@ PoursAsked = Annotated[dict[str, Any], Depends(_filters("PoursAsked", run=_RUN))
 ExportAsked = Annotated[dict[str, Any], Depends(_filters("ExportAsked", format=_FORMATS))]
 
 
-class TagsIn(BaseModel):
-    """Tags to add to a run and tags to remove from it."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    add: list[Annotated[str, Field(min_length=1, max_length=60)]] = Field(default=[], max_length=20)
-    remove: list[Annotated[str, Field(min_length=1, max_length=60)]] = Field(default=[], max_length=20)
-
-
 class NoteIn(BaseModel):
     """A note about a run."""
 
     model_config = ConfigDict(extra="forbid")
 
     text: str = Field(min_length=1, max_length=4000)
-
-
-class TagsOut(BaseModel):
-    """A run's tags."""
-
-    run: str
-    tags: list[str]
 
 
 class NotesOut(BaseModel):
@@ -135,16 +119,6 @@ async def pours(daemon: Daemon, person: Viewer, asked: PoursAsked) -> Any:
     return await _in_catalogue(daemon, lambda catalogue: catalogue.pours(asked))
 
 
-@router.get("/runs/compare", operation_id="compare_runs")
-async def compare(
-    daemon: Daemon,
-    person: Viewer,
-    run: Annotated[list[str], Query(min_length=2, max_length=20, description="Names of two or more runs.")],
-) -> RunComparison:
-    """Compare runs: the settings in which they differ, and their outcomes."""
-    return RunComparison.model_validate(await _in_catalogue(daemon, lambda catalogue: catalogue.compare(run)))
-
-
 @router.get(
     "/runs/export",
     operation_id="export_runs",
@@ -177,7 +151,7 @@ async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response
 
 @router.get("/runs/{run}", operation_id="run", response_model=PreviousRunDetail)
 async def run(daemon: Daemon, person: Viewer, run: str) -> Any:
-    """Return one run by its folder's name or a prefix of it: θ*, recommendation, pours, tags and notes."""
+    """Return one run by its folder's name or a prefix of it: θ*, recommendation, pours and notes."""
     return await _in_catalogue(daemon, lambda catalogue: catalogue.run(run))
 
 
@@ -193,14 +167,6 @@ async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
     if not path.is_file():
         raise HTTPException(404, f"{run} has no report")
     return FileResponse(path, media_type="text/html")
-
-
-@router.post("/runs/{run}/tags", operation_id="tag_run")
-async def tag(daemon: Daemon, person: Operator, run: str, body: TagsIn) -> TagsOut:
-    """Add tags to a run or remove them. They are stored in the run's folder."""
-    found = await _in_catalogue(daemon, lambda catalogue: catalogue.tag(run, body.add, body.remove))
-    daemon.note(person.name, "tag", detail=f"{found['run']}: {', '.join(found['tags'])}")
-    return TagsOut.model_validate(found)
 
 
 @router.post("/runs/{run}/notes", operation_id="note_run")

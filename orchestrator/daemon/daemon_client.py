@@ -282,14 +282,6 @@ class RemoteCatalogueClient:
         """See `Catalogue`."""
         return dict(self._client.get(_of(name)))
 
-    def compare(self, names: Sequence[str]) -> Row:
-        """See `Catalogue`."""
-        return dict(self._client.get("/runs/compare", run=list(names)))
-
-    def tag(self, name: str, add: Sequence[str], remove: Sequence[str]) -> Row:
-        """See `Catalogue`."""
-        return dict(self._client.post(f"{_of(name)}/tags", {"add": list(add), "remove": list(remove)}))
-
     def note(self, name: str, text: str) -> Row:
         """See `Catalogue`."""
         return dict(self._client.post(f"{_of(name)}/notes", {"text": text}))

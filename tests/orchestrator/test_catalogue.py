@@ -10,6 +10,7 @@ import shlex
 import shutil
 import signal
 import sqlite3
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -191,15 +192,15 @@ def test_runs_of_elsewhere_are_entered_and_a_moved_one_is_known_once_with_its_re
     tmp_path: Path, state: Path
 ) -> None:
     directory = made(tmp_path)
-    assert invoke(f"runs tag {directory.name} good").exit_code == 0
     assert "1 note" in invoke(f"runs note {directory.name} 'the tray was wet'").stdout
     shutil.move(tmp_path / "runs", tmp_path / "elsewhere")
     gone = invoke("runs list")
-    assert directory.name in gone.stdout
-    assert "not where it was" in gone.stderr
+    assert directory.name not in gone.stdout
+    assert "no longer listed; after a move: `decant runs add`" in gone.stderr
+    assert "gone" not in invoke("runs list").stderr, "it is said once"
     result = invoke(f"runs add {tmp_path / 'elsewhere'}")
     assert (result.exit_code, result.stdout) == (0, "1 run entered, or known already\n")
-    (found,) = asked(words=("WET",), tag="good")
+    (found,) = asked(words=("WET",))
     assert found["path"] == str(tmp_path / "elsewhere" / directory.name)
 
 
@@ -211,7 +212,41 @@ def test_what_cannot_be_read_is_said_and_hides_nothing_else(tmp_path: Path, stat
     assert good.name in result.stdout
     assert f"{bad / JOURNAL_NAME}: not a journal of Decant" in result.stderr
     shutil.rmtree(bad)
-    assert invoke("runs rebuild").stdout == "1 run in the catalogue\n"
+    assert bad.name not in invoke("runs list").stdout
+
+
+def test_tags_of_an_earlier_version_are_words_of_a_note(tmp_path: Path, state: Path) -> None:
+    directory = made(tmp_path)
+    note = {"time": 1.9e9, "by": "ann", "text": "the tray was wet"}
+    (directory / "remarks.json").write_text(json.dumps({"tags": ["good", "paper"], "notes": [note]}))
+    assert "2 notes" not in invoke(f"runs note {directory.name} 'wiped'").stdout
+    (found,) = asked(words=("paper", "wiped"))
+    assert found["notes"] == ["tags: good, paper", "the tray was wet", "wiped"]
+
+
+def posterior_rows(catalogue: Catalogue) -> list[str]:
+    return [row[0] for row in catalogue._connection.execute("select content from posterior")]
+
+
+def test_an_index_of_another_version_is_made_again_from_the_runs(
+    tmp_path: Path, state: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new version may read more from the same journals, as the keys of a posterior."""
+    made(tmp_path)
+    with monkeypatch.context() as earlier:
+        earlier.setattr(index, "version", lambda name: "0.0.1")
+        earlier.setattr(index, "read_run", lambda path: replace(read_run(path), posterior='{"old": 1}'))
+        with Catalogue() as catalogue:
+            catalogue.refresh()
+            catalogue.refresh()  # reading a journal has changed its files
+            assert posterior_rows(catalogue) == ['{"old": 1}']
+    with Catalogue() as catalogue:
+        catalogue.refresh()
+        assert posterior_rows(catalogue) == [], "the run has no calibration, and therefore no posterior"
+        catalogue._connection.execute("update run set campaign = 'kept'")
+    with Catalogue() as catalogue:
+        catalogue.refresh()
+        assert [run["campaign"] for run in catalogue.runs({})] == ["kept"], "the same version reads a run once"
 
 
 def test_one_command_says_which_action_was_used_for_a_vessel_and_what_it_spilled(tmp_path: Path, state: Path) -> None:
@@ -227,14 +262,6 @@ def test_one_command_says_which_action_was_used_for_a_vessel_and_what_it_spilled
         assert "VIRTUAL" in line
     told = json.loads(invoke("runs pours --receiver cup --json").stdout)
     assert [pour["spilled_g"] for pour in told["pours"]] == [pour["spilled_g"] for pour in asked("pour")]
-
-
-def test_runs_side_by_side_differ_in_what_was_asked_differently(tmp_path: Path, state: Path) -> None:
-    one, other = made(tmp_path), made(tmp_path, seed=8)
-    result = json.loads(invoke(f"runs compare {one.name} {other.name} --json").stdout)
-    assert result["settings"] == {"seed": [7, 8]}
-    assert [outcome["pours"] for outcome in result["outcomes"]] == [4, 4]
-    assert "seed" in invoke(f"runs compare {one.name} {other.name}").stdout
 
 
 def test_exports_hold_everything_and_say_what_it_means(tmp_path: Path, state: Path) -> None:
@@ -261,7 +288,6 @@ def test_exports_hold_everything_and_say_what_it_means(tmp_path: Path, state: Pa
         ("runs list --mode maybe", "mode 'maybe' is not one of virtual, real, hardware"),
         ("runs show nothing", "nothing: no such run in the catalogue"),
         ("runs add nowhere", "nowhere: is not a folder"),
-        ("runs compare one", "comparing takes two runs or more"),
         ("runs export x --format xls", "--format xls: should be csv or parquet"),
     ],
 )

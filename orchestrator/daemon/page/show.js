@@ -244,7 +244,7 @@ export function previousRuns(runs, acts) {
     `${into} ${found.best_loss === null ? "—" : percent(found.best_loss)}`).join(", ") || "—";
   return el("ul", {}, runs.map((run) => el("li", {},
     el("span", {}, el("b", {}, run.run), " ", modeBadge(run.mode), ` ${day(run.begun)}, ${stateText(run.state)}, ${run.pours} pours`,
-      ` of ${run.liquid.join(", ")}, best: ${best(run)}`, run.tags.map((tag) => [" ", el("b", { class: "badge" }, tag)]),
+      ` of ${run.liquid.join(", ")}, best: ${best(run)}`,
       run.notes.map((note) => el("p", { class: "quiet" }, note))),
     button(`note ${run.run}`, "Note", () => acts.note(run), "plain"),
     button(`previous ${run.run}`, "Save report", () => acts.previousReport(run), "plain"))));

@@ -89,7 +89,6 @@ def test_bash_offers_runs_and_the_vessels_they_used(place: Path, monkeypatch: py
     monkeypatch.setenv("DECANT_STATE", str(place / "state"))
     run = made(place)
     assert completed(place, "bash", f"decant runs show {run.name[:2]}") == {run.name}
-    assert completed(place, "bash", f"decant runs compare {run.name} ") == {run.name}
     (receiver,) = completed(place, "bash", "decant runs pours --receiver ")
     assert completed(place, "bash", f"decant runs list --receiver {receiver[0]}") == {receiver}
     assert completed(place, "bash", "decant runs list --receiver zzz") == set()

@@ -34,7 +34,7 @@ async def finished(served: Served) -> str:
     return str((await served.until(await served.submit(), "finished"))["run"])
 
 
-def test_runs_and_pours_of_the_daemon_are_found_and_tagged_by_operators_only(tmp_path: Path) -> None:
+def test_runs_and_pours_of_the_daemon_are_found_and_noted_by_operators_only(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path) as served:
             name = await finished(served)
@@ -45,15 +45,10 @@ def test_runs_and_pours_of_the_daemon_are_found_and_tagged_by_operators_only(tmp
             assert [pour["number"] for pour in pours] == [1, 2, 3]
             assert all(60 <= pour["angular_velocity_deg_s"] <= 180 for pour in pours)
 
-            await served.post(f"/runs/{name}/tags", {"add": ["good"]}, role=Role.VIEWER, status=403)
-            assert await served.post(f"/runs/{name}/tags", {"add": ["good", "wet"]}) == {
-                "run": name, "tags": ["good", "wet"]
-            }  # fmt: skip
-            await served.post(f"/runs/{name}/tags", {"remove": ["wet"]})
+            await served.post(f"/runs/{name}/notes", {"text": "good"}, role=Role.VIEWER, status=403)
             await served.post(f"/runs/{name}/notes", {"text": "the tray was wet"})
-            (found,) = await served.get("/runs", tag="good", words=["tray"])
+            (found,) = await served.get("/runs", words=["tray"])
             shown = await served.get(f"/runs/{name[:-1]}")
-            assert shown["tags"] == ["good"]
             assert [(note["by"], note["text"]) for note in shown["notes"]] == [("operator", "the tray was wet")]
             assert [pour["id"] for pour in shown["list_of_pours"]] == [pour["id"] for pour in pours]
 
@@ -69,7 +64,6 @@ def test_what_can_not_be_found_or_asked_says_why(tmp_path: Path) -> None:
                 ("/runs?since=999999999d", 422, "is not a date"),
                 ("/runs?mode=dream", 422, "is not one of"),
                 ("/runs?reciever=cup", 422, "reciever"),
-                ("/runs/compare?run=one&run=two", 404, "no such run"),
                 ("/runs/%2e%2e%2f%2e%2e%2fetc%2fpasswd", 404, ""),
             ):
                 answer = await served.http.get(f"/api/v1{path}", headers=served.headers(Role.VIEWER))
@@ -79,13 +73,10 @@ def test_what_can_not_be_found_or_asked_says_why(tmp_path: Path) -> None:
     run(work())
 
 
-def test_runs_are_compared_exported_and_their_reports_read(tmp_path: Path) -> None:
+def test_runs_are_exported_and_their_reports_read(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path) as served:
             first, second = await finished(served), await finished(served)
-            found = await served.get("/runs/compare", run=[first, second])
-            assert found["settings"] == {}
-            assert [one["pours"] for one in found["outcomes"]] == [3, 3]
             answer = await served.http.get(
                 "/api/v1/runs/export", params={"format": ["csv", "parquet"]}, headers=served.headers(Role.VIEWER)
             )
@@ -112,13 +103,12 @@ def test_the_command_line_answers_the_same_through_the_daemon(tmp_path: Path, st
         return CliRunner().invoke(app, shlex.split(command), env=environment)
 
     try:
-        for command in ("list", "pours", f"show {directory.name}", f"compare {directory.name} {directory.name}"):
+        for command in ("list", "pours", f"show {directory.name}"):
             here, there = say(f"runs {command}"), say(f"runs {command} --daemon")
             assert there.exit_code == here.exit_code == 0, there.stderr
             assert there.stdout == here.stdout != ""
-        assert say(f"runs tag {directory.name} good --daemon").stdout == f"{directory.name}: good\n"
         assert "1 note" in say(f"runs note {directory.name} 'the tray was wet' --daemon").stdout
-        assert json.loads(say("runs list --tag good --json").stdout)["runs"][0]["run"] == directory.name
+        assert json.loads(say("runs list tray --json").stdout)["runs"][0]["run"] == directory.name
         for option in ("", "--daemon"):
             told = json.loads(say(f"runs export {tmp_path}/tables{option} {option} --format csv --json").stdout)
             assert [Path(path).name for path in told["files"]] == ["runs.csv", "pours.csv", "dictionary.csv"]
