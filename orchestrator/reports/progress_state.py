@@ -16,7 +16,7 @@ from orchestrator.records.journal_file import Header
 from orchestrator.records.run_record import RunPour, RunState
 from orchestrator.reports.loss_units import LossUnit, is_calibration, minimised_loss, unit_of_pour
 from orchestrator.reports.summarise import pour_summary
-from orchestrator.reports.time_estimate import Forecast, particles_of, work_of
+from orchestrator.reports.time_estimate import Forecast, work_of
 
 CHECKPOINT_WORDS = {
     "operator": "waiting for the operator",
@@ -55,7 +55,7 @@ class ProgressState:
     def __init__(self, plan: CampaignPlan) -> None:
         self.plan = plan
         self.run = RunState(Header(plan.name, {}), plan.parallel_simulations)
-        self.forecast = Forecast(self.run, particles_of(plan))
+        self.forecast = Forecast(self.run, plan.parameters.particles)
         self._timed: list[float] = []
         self._busy_seconds, self._load_to = 0.0, 0.0
         self._load_from: float | None = None
