@@ -39,7 +39,6 @@ from actors.interfaces import (
     LaboratoryError,
     Notice,
     Operator,
-    PourProgress,
     ProgressCallback,
     SimulatorPool,
 )
@@ -92,18 +91,10 @@ class PouringBench:
             UnknownPourError: the pour began, but did not run as planned.
         """
         async with self._one_at_a_time:
-            if dose is not None and isinstance(self.ground_truth, SimulatedBench):
-                from actors.dosing.simulated_dose import simulated_dose
-
-                loop, held = asyncio.get_running_loop(), self.ground_truth.held_tilt(seed)
-
-                def show(state: PourProgress) -> None:
-                    if progress is not None:
-                        loop.call_soon_threadsafe(progress, state)
-
-                return await asyncio.to_thread(
-                    simulated_dose, scene, dose, seed, self._dosing, held_tilt=held, progress=show
-                )
+            if dose is not None:
+                simulated = await self.ground_truth.simulated_dose(scene, dose, seed, self._dosing, progress)
+                if simulated is not None:
+                    return simulated
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)

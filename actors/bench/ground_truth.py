@@ -17,11 +17,12 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from actors.arm.arm_interface import Executed, PlannedPour
-from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, SimulatorPool
+from actors.dosing_settings import DosingSettings
+from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, ProgressCallback, SimulatorPool
 from actors.laboratory_settings import BenchSettings
 from actors.places import Role
 from sim_engine.action import Action
-from sim_engine.outcome import PourOutcome, RecordedFrames, SimulatedPour
+from sim_engine.outcome import PourMeasurement, PourOutcome, RecordedFrames, SimulatedPour
 from sim_engine.scene import PoseError, PourTask, Scene
 
 T = TypeVar("T")
@@ -229,6 +230,12 @@ class GroundTruth:
 
     async def poured_back(self, seed: int) -> None:
         """Called when the receiver was poured back into the pourer."""
+
+    async def simulated_dose(
+        self, scene: Scene, dose: DoseTarget, seed: int, dosing: DosingSettings, progress: ProgressCallback | None
+    ) -> PourMeasurement | None:
+        """The whole dose, if arm and balance need not act it out; None: they do."""
+        return None
 
     async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int) -> None:
         """Called before the operator prepares a dose.

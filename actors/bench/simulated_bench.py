@@ -19,8 +19,21 @@ from actors.balance.scale_model import Load
 from actors.balance.simulated_balance import SimulatedBalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
 from actors.bench.ground_truth import GroundTruth, PourAsk, Spill, TouchingError, draw_pose_error, stream, true_spill
-from actors.interfaces import LaboratoryError, OperatorQuestion, OperatorSettings, PourFailedError, SimulatorPool
+from actors.dosing.simulated_dose import simulated_dose
+from actors.dosing_settings import DosingSettings
+from actors.interfaces import (
+    DoseTarget,
+    LaboratoryError,
+    OperatorQuestion,
+    OperatorSettings,
+    PourFailedError,
+    PourProgress,
+    ProgressCallback,
+    SimulatorPool,
+)
 from actors.laboratory_settings import BenchSettings
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
 
 CARRYING_TIME = 2.0
 """Bench time to put an object on the balance or to remove it [s]."""
@@ -53,9 +66,17 @@ class SimulatedBench(GroundTruth):
         self._pour: PourAsk | None = None
         self._liquid: asyncio.Task[Spill] | None = None
 
-    def held_tilt(self, seed: int) -> float:
-        """Tilt by which the pourer is held more than commanded in the pour of a seed [rad]."""
-        return draw_pose_error(self._spec, seed).tilt
+    async def simulated_dose(
+        self, scene: Scene, dose: DoseTarget, seed: int, dosing: DosingSettings, progress: ProgressCallback | None
+    ) -> PourMeasurement | None:
+        """See `GroundTruth.simulated_dose`; the pourer is held as wrongly as in the pour of the same seed."""
+        loop, held = asyncio.get_running_loop(), draw_pose_error(self._spec, seed).tilt
+
+        def show(state: PourProgress) -> None:
+            if progress is not None:
+                loop.call_soon_threadsafe(progress, state)
+
+        return await asyncio.to_thread(simulated_dose, scene, dose, seed, dosing, held_tilt=held, progress=show)
 
     async def prepare(self, pour: PourAsk) -> None:
         """See `GroundTruth.prepare`; starts the simulation of the liquid."""
