@@ -48,18 +48,18 @@ from sim_engine.resources import EXTRAS, PACKAGES, cache_directory, installed
 from sim_engine.scene import Scene
 
 
-def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool = False) -> None:
+def check_laboratory(spec: LaboratorySettings, *, pours: bool, plain_processes: bool = False) -> None:
     """Check that everything a laboratory needs on this machine and others is available. Leaves nothing running.
 
     Args:
         spec: of the laboratory.
-        need_bench: whether pours will be requested.
-        brief: see `open_laboratory`.
+        pours: whether pours will be requested.
+        plain_processes: see `open_laboratory`.
 
     Raises:
         LaboratoryError: with the problem and its remedy.
     """
-    if need_bench and spec.mode == "external":
+    if pours and spec.mode == "external":
         raise LaboratoryError(
             f"laboratory {spec.name} is external: a program makes its pours and asks for them with decant.AskTell; "
             "'decant plan', and 'decant calibrate' on weighed pours, need no pours"
@@ -69,19 +69,19 @@ def check_laboratory(spec: LaboratorySettings, *, need_bench: bool, brief: bool 
         cache_directory()
     except (EngineError, OSError) as error:
         raise LaboratoryError(f"laboratory {spec.name}: simulations are impossible here: {error}") from None
-    if spec.arm is not None and need_bench and (missing := arm_kind(spec.arm).missing()) is not None:
+    if spec.arm is not None and pours and (missing := arm_kind(spec.arm).missing()) is not None:
         raise LaboratoryError(
             f"laboratory {spec.name}: {missing}. Or use a simulated bench (--laboratory configs/laboratories/twin.yaml)"
         )
-    if need_bench:
+    if pours:
         check_bench_packages(spec)
-    if not _without_ray(spec, need_bench=need_bench, brief=brief) and not installed("ray"):
+    if not _without_ray(spec, pours=pours, plain_processes=plain_processes) and not installed("ray"):
         raise LaboratoryError(
             f"laboratory {spec.name}: simulators side by side need Ray, which is not installed: pip install "
             "'decant-pouring[lab]', or run with --in-process, one simulation after the other"
         )
     if spec.ray is not None and not spec.in_process:
-        check_cluster(spec.ray, need_bench=need_bench)
+        check_cluster(spec.ray, pours=pours)
 
 
 def check_bench_packages(spec: LaboratorySettings) -> None:
@@ -158,18 +158,18 @@ def _expected_display(balance: BalanceSettings | None) -> DisplayBelief | None:
     return DisplayBelief.expected(step, interval, max(behaviour.repeat_probability, equal))
 
 
-def _without_ray(spec: LaboratorySettings, *, need_bench: bool, brief: bool) -> bool:
-    return spec.in_process or (brief and spec.ray is None and not need_bench)
+def _without_ray(spec: LaboratorySettings, *, pours: bool, plain_processes: bool) -> bool:
+    return spec.in_process or (plain_processes and spec.ray is None and not pours)
 
 
 def open_laboratory(
     spec: LaboratorySettings,
     *,
-    need_bench: bool,
-    brief: bool = False,
+    pours: bool,
+    plain_processes: bool = False,
     make: Callable[[], Simulator] = pour_simulator,
     operator: Operator | None = None,
-    kept: SimulatorPool | None = None,
+    simulators: SimulatorPool | None = None,
     optimizer: Optimizer | None = None,
     record: PlaceRecord | None = None,
 ) -> Laboratory:
@@ -177,12 +177,12 @@ def open_laboratory(
 
     Args:
         spec: of the laboratory.
-        need_bench: whether pours will be requested.
-        brief: for interactive work of a few seconds: simulators run in plain processes, which start sooner than a
-            private Ray. Ignored if a bench is needed or a cluster is named.
+        pours: whether pours will be requested.
+        plain_processes: for interactive work of a few seconds: simulators run in plain processes, which start sooner
+            than a private Ray. Ignored if a bench is needed or a cluster is named.
         make: creates simulators in their processes.
         operator: answers questions, if a person does.
-        kept: simulators to use instead of its own (`WarmSimulators.share`); they stay open. If they are on the
+        simulators: simulators to use instead of its own (`WarmSimulators.share`); they stay open. If they are on the
             cluster that `spec` names, arm, balance and bench are on this machine.
         optimizer: an optimiser to use instead of its own; it is stateless.
         record: account of what stands where, for a laboratory with places.
@@ -190,21 +190,21 @@ def open_laboratory(
     Raises:
         LaboratoryError: a bench is needed and there is none, or it has no operator, or the mode is unknown.
     """
-    assert not (need_bench and spec.mode == "external"), "refused by check_laboratory"
+    assert not (pours and spec.mode == "external"), "refused by check_laboratory"
     if spec.mode not in MODE_LABELS:
         raise LaboratoryError(f"laboratory {spec.name}: mode '{spec.mode}' is not one of {', '.join(MODE_LABELS)}")
-    if need_bench and not spec.pours:
+    if pours and not spec.pours:
         raise LaboratoryError(f"laboratory {spec.name} has no bench, but the campaign pours: add a 'bench' to it")
-    if need_bench and operator is None and spec.needs_person:
+    if pours and operator is None and spec.needs_person:
         raise LaboratoryError(
             f"laboratory {spec.name} needs a person beside it who answers questions; run the campaign in a terminal"
         )
     kind: Callable[..., InProcessLaboratory | RayLaboratory]
-    if _without_ray(spec, need_bench=need_bench, brief=brief):
+    if _without_ray(spec, pours=pours, plain_processes=plain_processes):
         kind = partial(InProcessLaboratory, processes=0 if spec.in_process else spec.simulator_count)
     else:
         kind = RayLaboratory
-    return kind(spec, make, need_bench=need_bench, operator=operator, kept=kept, optimizer=optimizer, record=record)
+    return kind(spec, make, pours=pours, operator=operator, simulators=simulators, optimizer=optimizer, record=record)
 
 
 class _OpenLaboratory:
@@ -214,7 +214,7 @@ class _OpenLaboratory:
         spec: see the subclasses.
         make: creates simulators in their processes.
         operator: a person who answers questions, if there is one.
-        kept: simulators to use instead of its own; they stay open.
+        simulators: simulators to use instead of its own; they stay open.
         optimizer: to use instead of its own; it stays open.
         record: account of what stands where.
     """
@@ -224,15 +224,15 @@ class _OpenLaboratory:
         spec: LaboratorySettings,
         make: Callable[[], Simulator] = pour_simulator,
         *,
-        need_bench: bool = False,
+        pours: bool = False,
         operator: Operator | None = None,
-        kept: SimulatorPool | None = None,
+        simulators: SimulatorPool | None = None,
         optimizer: Optimizer | None = None,
         record: PlaceRecord | None = None,
     ) -> None:
         self._spec, self._make, self._operator, self._record = spec, make, operator, record
-        self._pool, self._optimizer = kept, optimizer
-        self._needs_bench = need_bench and spec.pours
+        self._pool, self._optimizer = simulators, optimizer
+        self._pours = pours and spec.pours
         self._own_pools: list[WorkerPool] = []
         self._devices: list[Device] = []
         self._opened: OpenBench | None = None
@@ -339,7 +339,7 @@ class InProcessLaboratory(_OpenLaboratory):
         if self._optimizer is None:
             self._optimizer = self._open_optimizer(LocalDevice("optimiser", Proposer))
         try:
-            if self._needs_bench:
+            if self._pours:
                 await self._open_bench(_local, self._pool)
         except BaseException:
             await self._close_all()
@@ -372,7 +372,7 @@ class RayLaboratory(_OpenLaboratory):
         try:
             if self._spec.ray is not None:
                 self._cluster = JoinedCluster(self._spec.ray, self._report, self._lose_bench, self._lose_all)
-                await self._cluster.open(need_bench=self._needs_bench and self._pool is None)
+                await self._cluster.open(pours=self._pours and self._pool is None)
             else:
                 self._monitoring = asyncio.create_task(watch_ray(self._ray_died))
             await self._open_all()
@@ -387,7 +387,7 @@ class RayLaboratory(_OpenLaboratory):
         if self._optimizer is None:
             optimizer = RayDevice("optimiser", Proposer, node=here, looked_after=True)
             self._optimizer = self._open_optimizer(optimizer)
-        if not self._needs_bench:
+        if not self._pours:
             return
         node = None if self._cluster is None else self._cluster.bench or here
         if self._spec.bench is not None:

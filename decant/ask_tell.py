@@ -137,12 +137,12 @@ class AskTell:
             ),
         )
         if directory is not None:
-            request = replace(request, folder=Path(directory).expanduser(), resume="if begun")
+            request = replace(request, folder=Path(directory).expanduser())
         self._request = request = service.with_folder(request)
         assert request.folder is not None
         self._campaign, self._folder, self._answer = campaign, request.folder, answer
         self._names = receiver_names(campaign)
-        self._unknown = read_record(request.folder).unknown_pours if request.resume == "yes" else []
+        self._unknown = read_record(request.folder).unknown_pours if request.resume else []
         self._waiting: queue.SimpleQueue[_Waiting | None] = queue.SimpleQueue()
         self._current: _Waiting | None = None
         self._handle: RunHandle | None = None
@@ -298,8 +298,8 @@ class AskTell:
         if self._handle is not None:
             self._handle.pause()
 
-    def _external_laboratory(self, spec: LaboratorySettings, need_bench: bool) -> Laboratory:
-        return _ExternalLaboratory(open_laboratory(spec, need_bench=False), self._outcome)
+    def _external_laboratory(self, spec: LaboratorySettings, pours: bool) -> Laboratory:
+        return _ExternalLaboratory(open_laboratory(spec, pours=False), self._outcome)
 
     async def _outcome(self, scene: Scene, action: Action) -> PourMeasurement:
         """Hand a pour to the caller and wait for its outcome."""

@@ -138,7 +138,7 @@ def run(
     request = run_task(campaign)
     resources = checked(request, RunResources(in_process=in_process, subscribers=watch))
     if resume is not None:
-        request = replace(request, folder=Path(resume).expanduser(), resume="yes")
+        request = replace(request, folder=Path(resume).expanduser(), resume=True)
     return _run(request, resources)
 
 

@@ -50,10 +50,10 @@ class Attempt:
     ended: float = 0.0
     moments: list[float] = field(default_factory=list)
 
-    def may_be_late(self, attempts: Sequence[Attempt], patience: float) -> bool:
+    def may_be_late(self, attempts: Sequence[Attempt], timeout: float) -> bool:
         """Whether some received bytes may have been a late reply to this attempt's queries."""
         return self.possible and any(
-            self.began <= moment <= self.ended + patience for other in attempts for moment in other.moments
+            self.began <= moment <= self.ended + timeout for other in attempts for moment in other.moments
         )
 
     def __str__(self) -> str:
@@ -115,22 +115,22 @@ def detect(
         UnknownDialectError: no dialect was recognised; the text lists the attempts and the received bytes.
         NoConnectionError: the port cannot be opened.
     """
-    patience = max(answer_time, ANSWERING)
+    timeout = max(answer_time, ANSWERING)
     quick: list[Attempt] = []
     patient: dict[LineSettings, Attempt] = {}
     for line in candidates:
         quick.append(Attempt(line))
         last = line == candidates[-1]
-        found = _attempt(quick[-1], allowed, open_wire, interrupted, ANSWERING, late=patience if last else 0.0)
+        found = _attempt(quick[-1], allowed, open_wire, interrupted, ANSWERING, late=timeout if last else 0.0)
         if found is not None:
             return found
-        if patience == ANSWERING or not quick[-1].moments:
+        if timeout == ANSWERING or not quick[-1].moments:
             continue
         for earlier in quick:
-            if earlier.line in patient or not earlier.may_be_late(quick, patience):
+            if earlier.line in patient or not earlier.may_be_late(quick, timeout):
                 continue
             patient[earlier.line] = Attempt(earlier.line)
-            found = _attempt(patient[earlier.line], allowed, open_wire, interrupted, patience)
+            found = _attempt(patient[earlier.line], allowed, open_wire, interrupted, timeout)
             if found is not None:
                 return found
     raise UnknownDialectError(_failure(port, [patient.get(attempt.line, attempt) for attempt in quick], allowed))
@@ -141,7 +141,7 @@ def _attempt(
     allowed: Sequence[Dialect],
     open_wire: Callable[[LineSettings], Wire],
     interrupted: Callable[[], bool],
-    patience: float,
+    timeout: float,
     late: float = 0.0,
 ) -> tuple[Detected, Wire] | None:
     """Try one setting, and collect late bytes afterwards."""
@@ -154,9 +154,9 @@ def _attempt(
         attempt.possible = False
         return None
     try:
-        found = _try(wire, attempt, allowed, patience)
+        found = _try(wire, attempt, allowed, timeout)
         attempt.ended = time.monotonic()
-        if found is None and late > patience:
+        if found is None and late > timeout:
             _lines(wire, late, lambda line: True, attempt)
     except BaseException:
         wire.close()
@@ -167,15 +167,15 @@ def _attempt(
     return None
 
 
-def _try(wire: Wire, attempt: Attempt, allowed: Sequence[Dialect], patience: float) -> Detected | None:
+def _try(wire: Wire, attempt: Attempt, allowed: Sequence[Dialect], timeout: float) -> Detected | None:
     lines = _lines(wire, LISTENING, attempt=attempt)
     attempt.heard = bytes(wire.received)
     weights = {dialect: sum(_is_weight(dialect, line) for line in lines) for dialect in allowed}
     if (most := max(weights.values())) >= 2:
         alike = sorted((dialect for dialect in allowed if weights[dialect] == most), key=lambda one: one.turn)
         shared = [dialect for dialect in alike if dialect.query == alike[0].query]
-        return _recognised(wire, shared, patience, unasked=True)
-    wait = patience + _LONGEST_ANSWER * attempt.line.character_time
+        return _recognised(wire, shared, timeout, unasked=True)
+    wait = timeout + _LONGEST_ANSWER * attempt.line.character_time
     for probe, speakers in _probes(allowed).items():
         wire.flush()
         # A leading line end terminates an incomplete earlier query in the balance's input buffer.
@@ -183,7 +183,7 @@ def _try(wire: Wire, attempt: Attempt, allowed: Sequence[Dialect], patience: flo
         lines = _lines(wire, wait, lambda line, speakers=speakers: bool(_alike(speakers, [line])), attempt)  # type: ignore[misc]
         attempt.answers[probe] = bytes(wire.received)
         if alike := _alike(speakers, lines):
-            return _recognised(wire, alike, patience, unasked=False)
+            return _recognised(wire, alike, timeout, unasked=False)
     return None
 
 
@@ -200,7 +200,7 @@ def _probes(allowed: Sequence[Dialect]) -> dict[bytes, list[Dialect]]:
     return probes
 
 
-def _recognised(wire: Wire, alike: Sequence[Dialect], patience: float, *, unasked: bool) -> Detected:
+def _recognised(wire: Wire, alike: Sequence[Dialect], timeout: float, *, unasked: bool) -> Detected:
     """Identify the balance, to tell dialects with the same query and lines apart."""
     dialect = alike[0]
     if not dialect.identity:
@@ -208,13 +208,13 @@ def _recognised(wire: Wire, alike: Sequence[Dialect], patience: float, *, unaske
     if unasked and dialect.cancel is not None:
         wire.send(dialect.cancel)
         _lines(wire, ANSWERING)
-    said = {question: _identity(wire, question, patience) for question in dialect.identity}
+    said = {question: _identity(wire, question, timeout) for question in dialect.identity}
     found = max(alike, key=lambda other: other.likeness(said))
     identity = said[dialect.identity[-1]].replace('"', "")
     return Detected(found, wire.line, identity, unasked, found.commands_in(said))
 
 
-def _identity(wire: Wire, question: str, patience: float) -> str:
+def _identity(wire: Wire, question: str, timeout: float) -> str:
     """Return the reply to I0, I2 …, without the echo of the query; '' for no reply.
 
     'B' marks a line that others follow, and 'A' the last one.
@@ -222,7 +222,7 @@ def _identity(wire: Wire, question: str, patience: float) -> str:
     wire.flush()
     wire.send(question.encode("ascii") + b"\r\n")
     end = time.monotonic() + LISTING
-    wait = patience + _LONGEST_ANSWER * wire.line.character_time
+    wait = timeout + _LONGEST_ANSWER * wire.line.character_time
     last = re.compile(rf"(?:{question} (?P<state>\S)|E[STL]\s*$)(?P<text>.*)")
     texts: list[str] = []
     while time.monotonic() < end and (line := wire.line_until(min(time.monotonic() + wait, end))) is not None:

@@ -171,12 +171,12 @@ class Conversation:
             return Reading(ReadingStatus.SILENT), time.monotonic()
         return Reading(ReadingStatus.UNREADABLE, detail=self._explained(self.refused)), time.monotonic()
 
-    def command(self, data: bytes, patience: float) -> Acknowledgement | None:
+    def command(self, data: bytes, timeout: float) -> Acknowledgement | None:
         """Send tare or zero, and wait for the reply if the dialect has one.
 
         Args:
             data: the command.
-            patience: longest time for which the balance may wait for stability before it replies [s of the clock].
+            timeout: longest time for which the balance may wait for stability before it replies [s of the clock].
 
         Returns:
             The reply; None if the dialect has none, or if it is optional and none came.
@@ -190,7 +190,7 @@ class Conversation:
             if self.dialect.acknowledged is False:
                 return None
             wanted = data.strip().decode("ascii")
-            wait = max(patience, self._spec.answer_time) if self.dialect.acknowledged else self._spec.answer_time
+            wait = max(timeout, self._spec.answer_time) if self.dialect.acknowledged else self._spec.answer_time
             end = time.monotonic() + wait
             while (line := self._line(wire, end)) is not None:
                 reply = self._decoded(line)

@@ -141,11 +141,11 @@ class DigitalGripper:
 
     Args:
         settings: the signals.
-        patience: longest wait for the controller [s].
+        timeout: longest wait for the controller [s].
     """
 
-    def __init__(self, settings: DigitalSettings, patience: float = PATIENCE) -> None:
-        self._settings, self._patience = settings, patience
+    def __init__(self, settings: DigitalSettings, timeout: float = PATIENCE) -> None:
+        self._settings, self._timeout = settings, timeout
         self._where = f"gripper on digital outputs of {settings.address}"
         self._closing, self._until = Signal.of(settings.close), 0.0
         self._stopped = threading.Event()
@@ -153,7 +153,7 @@ class DigitalGripper:
     def _bits(self) -> tuple[int, int]:
         """Levels of the inputs and of the outputs."""
         try:
-            data = read_parts(self._settings.address, self._patience).get(MASTERBOARD, b"")
+            data = read_parts(self._settings.address, self._timeout).get(MASTERBOARD, b"")
         except PrimaryError as error:
             raise GripperError(f"{self._where}: {error}") from None
         if len(data) < 8:
@@ -173,10 +173,10 @@ class DigitalGripper:
         lines = [f"  set_{one.group}_digital_out({one.number}, {one.level == on})" for one, on in signals]
         program = "\n".join(["sec gripper():", *lines, "end", ""])
         try:
-            with socket.create_connection((self._settings.address, PORT), timeout=self._patience) as connection:
+            with socket.create_connection((self._settings.address, PORT), timeout=self._timeout) as connection:
                 connection.recv(1)  # the controller has accepted the connection
                 connection.sendall(program.encode())
-                end = time.monotonic() + self._patience
+                end = time.monotonic() + self._timeout
                 while not all(one.given(self._bits()[1]) == on for one, on in signals):
                     if time.monotonic() > end:
                         raise GripperError(

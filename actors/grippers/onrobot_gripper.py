@@ -108,14 +108,14 @@ class OnRobotSettings(GripperSettings):
 class _Transport(xmlrpc.client.Transport):
     """A transport that does not wait for ever."""
 
-    def __init__(self, patience: float) -> None:
+    def __init__(self, timeout: float) -> None:
         super().__init__()
-        self._patience = patience
+        self._timeout = timeout
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
         """See `xmlrpc.client.Transport`."""
         connection = super().make_connection(host)
-        connection.timeout = self._patience
+        connection.timeout = self._timeout
         return connection
 
 
@@ -124,19 +124,19 @@ class OnRobotGripper:
 
     Args:
         settings: model, address and port.
-        patience: longest wait for a reply [s].
+        timeout: longest wait for a reply [s].
     """
 
-    def __init__(self, settings: OnRobotSettings, patience: float = PATIENCE) -> None:
+    def __init__(self, settings: OnRobotSettings, timeout: float = PATIENCE) -> None:
         self._settings, self._model = settings, MODELS[settings.model]
         self._where = f"gripper {settings.model} at {settings.address}:{settings.port}"
         self._url = f"http://{settings.address}:{settings.port}/"
-        self._patience = patience
+        self._timeout = timeout
         self._server = self._proxy()
         self._one_at_a_time = threading.Lock()  # a proxy has one connection, for one request at a time
 
     def _proxy(self) -> xmlrpc.client.ServerProxy:
-        return xmlrpc.client.ServerProxy(self._url, transport=_Transport(self._patience))
+        return xmlrpc.client.ServerProxy(self._url, transport=_Transport(self._timeout))
 
     def call(self, method: str, *arguments: float) -> Any:
         """Call a method of the server.

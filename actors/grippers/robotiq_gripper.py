@@ -205,11 +205,11 @@ class RobotiqGripper:
 
     Args:
         settings: model, address and port.
-        patience: longest wait for a reply [s].
+        timeout: longest wait for a reply [s].
     """
 
-    def __init__(self, settings: RobotiqSettings, patience: float = PATIENCE) -> None:
-        self._settings, self._patience = settings, patience
+    def __init__(self, settings: RobotiqSettings, timeout: float = PATIENCE) -> None:
+        self._settings, self._timeout = settings, timeout
         self._where = f"gripper {settings.model} at {settings.address}:{settings.port}"
         self._socket: socket.socket | None = None
         self._one_at_a_time = threading.Lock()
@@ -252,12 +252,12 @@ class RobotiqGripper:
             try:
                 if self._socket is None:
                     self._socket = socket.create_connection(
-                        (self._settings.address, self._settings.port), timeout=self._patience
+                        (self._settings.address, self._settings.port), timeout=self._timeout
                     )
                 connection = self._socket
-                connection.settimeout(self._patience)
+                connection.settimeout(self._timeout)
                 connection.sendall(request)
-                data, end = b"", time.monotonic() + self._patience
+                data, end = b"", time.monotonic() + self._timeout
                 while not whole(data):
                     connection.settimeout(max(end - time.monotonic(), 1e-3))
                     more = connection.recv(4096)
@@ -268,7 +268,7 @@ class RobotiqGripper:
             except TimeoutError:
                 self._drop()
                 raise GripperError(
-                    f"{self._where}: no answer to '{request.decode().strip()}' within {self._patience:g} s; is the "
+                    f"{self._where}: no answer to '{request.decode().strip()}' within {self._timeout:g} s; is the "
                     "URCap installed, and the gripper connected?"
                 ) from None
             except OSError as error:
@@ -353,7 +353,7 @@ class RobotiqGripper:
             raise GripperError(f"{self._where} is not activated")
         self._requested = None
         self.set(POS=position, SPE=round(255.0 * self._settings.speed), FOR=force, GTO=1)
-        end = time.monotonic() + self._patience
+        end = time.monotonic() + self._timeout
         while (echo := self.get("PRE")) != position:
             if time.monotonic() > end:
                 raise GripperError(

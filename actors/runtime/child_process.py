@@ -231,14 +231,14 @@ class ChildProcess:
         """Send SIGTERM."""
         self._process.terminate()
 
-    def kill(self, patience: float = 5.0) -> None:
+    def kill(self, timeout: float = 5.0) -> None:
         """Send SIGKILL and wait for the end. May be called again.
 
         Args:
-            patience: longest wait [s]; the kernel may delay the end, e.g. during a disk access.
+            timeout: longest wait [s]; the kernel may delay the end, e.g. during a disk access.
         """
         self._process.kill()
-        self.wait(patience)
+        self.wait(timeout)
 
     def close(self, grace: float = GRACE, *, terminate: bool = False) -> None:
         """End the child: close its input, wait, kill it if it still runs, release the pipes. May be called again.

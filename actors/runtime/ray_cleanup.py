@@ -54,14 +54,14 @@ def _belongs(process: psutil.Process, folder: Path) -> bool:
     return False
 
 
-def end_cluster(folder: Path, *, patience: float = 10.0) -> None:
+def end_cluster(folder: Path, *, timeout: float = 10.0) -> None:
     """Kill the remaining processes of a cluster and remove its folder.
 
     Args:
         folder: the cluster's folder.
-        patience: longest time to continue while processes still appear or do not end [s].
+        timeout: longest time to continue while processes still appear or do not end [s].
     """
-    end = time.monotonic() + patience
+    end = time.monotonic() + timeout
     while time.monotonic() < end:
         processes = cluster_processes(folder)
         if not processes:

@@ -198,12 +198,12 @@ def _installed(package: str) -> str:
         return "not installed"
 
 
-def check_cluster(spec: RaySettings, *, need_bench: bool) -> list[Node]:
+def check_cluster(spec: RaySettings, *, pours: bool) -> list[Node]:
     """Check that a laboratory can be opened on a cluster. The check leaves nothing on the cluster.
 
     Args:
         spec: the cluster.
-        need_bench: whether arm, balance and bench need their node.
+        pours: whether arm, balance and bench need their node.
 
     Returns:
         The nodes that are alive.
@@ -220,7 +220,7 @@ def check_cluster(spec: RaySettings, *, need_bench: bool) -> list[Node]:
         for node in found["nodes"]
     ]
     _check_nodes(spec, nodes)
-    if need_bench:
+    if pours:
         _check_bench(spec, nodes, found["available"])
     return nodes
 
@@ -384,14 +384,14 @@ class JoinedCluster:
         """Cores of all nodes."""
         return sum(node.cpus for node in self._nodes.values())
 
-    async def open(self, *, need_bench: bool) -> None:
+    async def open(self, *, pours: bool) -> None:
         """Read the nodes, and reserve the bench for this program if it is needed.
 
         Raises:
             LaboratoryError: no node has the bench's resource, or another program has reserved it.
         """
         self.here = await asyncio.to_thread(this_node)
-        bench_node, options = await self._reserve() if need_bench else (None, {})
+        bench_node, options = await self._reserve() if pours else (None, {})
         self._nodes = await asyncio.to_thread(living_nodes)
         if bench_node is not None:
             if bench_node not in self._nodes:

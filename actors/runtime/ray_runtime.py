@@ -321,7 +321,7 @@ def _close(session: _Session) -> None:
     if session.keeper is not None:
         session.keeper.join(timeout=30.0)
     if session.private is not None:
-        end_cluster(session.private.folder, patience=15.0)
+        end_cluster(session.private.folder, timeout=15.0)
         session.private.lock.close()
         session.private.cleanup.close(15.0)
 

@@ -220,11 +220,11 @@ class RayDevice:
                 break
         return clock() - started
 
-    async def _answers(self, future: asyncio.Future[Any], patience: float) -> bool:
+    async def _answers(self, future: asyncio.Future[Any], timeout: float) -> bool:
         """Whether the process replies to any call, including the pending one, within a time [s]."""
         look = asyncio.wrap_future(self._actor.__ray_call__.remote(_pid).future())
         look.add_done_callback(mark_retrieved)
-        done, _ = await asyncio.wait({future, look}, timeout=patience, return_when=asyncio.FIRST_COMPLETED)
+        done, _ = await asyncio.wait({future, look}, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
         return bool(done)
 
     def abandon(self, reason: str) -> None:

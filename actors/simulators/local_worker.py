@@ -68,7 +68,7 @@ class ThreadWorker:
         """See `Worker.cancel`."""
         self._cancelled.add(number)
 
-    async def close(self, patience: float) -> None:
+    async def close(self, timeout: float) -> None:
         """See `Worker.close`; waits for cancelled jobs, since a thread cannot be ended from outside."""
         await asyncio.wrap_future(self._thread.submit(self._runner.close))
         self._thread.shutdown(wait=True)
@@ -122,21 +122,21 @@ class ProcessWorker:
         """See `Worker.cancel`."""
         self._cancelled.add(number)
 
-    async def close(self, patience: float) -> None:
+    async def close(self, timeout: float) -> None:
         """See `Worker.close`."""
         if self._child is None:
             return
-        if patience == 0.0:
+        if timeout == 0.0:
             await asyncio.to_thread(self._child.kill)  # also ends the wait for a reply
-        ended = self._thread.submit(self._end, self._child, patience)
-        done, _ = await asyncio.wait({asyncio.wrap_future(ended)}, timeout=patience or None)
+        ended = self._thread.submit(self._end, self._child, timeout)
+        done, _ = await asyncio.wait({asyncio.wrap_future(ended)}, timeout=timeout or None)
         if not done:
             await asyncio.to_thread(self._child.kill)
         self._thread.shutdown(wait=False)
 
-    def _end(self, child: ConnectedProcess, patience: float) -> None:
+    def _end(self, child: ConnectedProcess, timeout: float) -> None:
         child.connection.close()
-        child.close(patience)
+        child.close(timeout)
 
 
 def thread_pool(make: Callable[[], Simulator] = pour_simulator) -> WorkerPool:

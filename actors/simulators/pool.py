@@ -118,11 +118,11 @@ class Worker(Protocol):
         """Cancel a job: it never begins, or it stops between two time steps. Does not wait."""
         ...
 
-    async def close(self, patience: float) -> None:
+    async def close(self, timeout: float) -> None:
         """Let the worker write its compiled kernels, then end it.
 
         Args:
-            patience: longest time for writing [s]; 0 ends it at once.
+            timeout: longest time for writing [s]; 0 ends it at once.
         """
         ...
 
@@ -364,20 +364,20 @@ class WorkerPool:
         self._closed = True
         self._stop_waiting()
         error = SimulationError("the pool of simulators is closed")
-        patience = CLOSE_DEADLINE
+        timeout = CLOSE_DEADLINE
         for member in self._up:
             member.stop_timer()
             if member.sent:
-                patience = CLOSE_DEADLINE + DRAIN_DEADLINE
+                timeout = CLOSE_DEADLINE + DRAIN_DEADLINE
             for sent in [sent for sent in member.sent if not sent.recalled]:
                 member.recall(sent)
                 sent.job.fail(error)
         self._fail_waiting(error)
         members, self._members = self._members, []
         if self._abandoned is not None:
-            patience = 0.0
+            timeout = 0.0
         for member in members:
-            self._end(member, 0.0 if member.greeting is None and self._separate else patience)
+            self._end(member, 0.0 if member.greeting is None and self._separate else timeout)
         starting = [member.started for member in members if not member.started.done()]
         for started in starting:
             started.cancel()
@@ -432,8 +432,8 @@ class WorkerPool:
             self._report(problem)
         asyncio.get_running_loop().call_later(RESTART_PAUSE, self._add)
 
-    def _end(self, member: _Member, patience: float) -> None:
-        task = asyncio.ensure_future(member.worker.close(patience))
+    def _end(self, member: _Member, timeout: float) -> None:
+        task = asyncio.ensure_future(member.worker.close(timeout))
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
         task.add_done_callback(mark_retrieved)

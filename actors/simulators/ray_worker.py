@@ -156,12 +156,12 @@ class RayWorker:
         with contextlib.suppress(Exception):  # Ray has ended
             self._actor.recall.options(concurrency_group=CONTROL).remote(number)
 
-    async def close(self, patience: float) -> None:
+    async def close(self, timeout: float) -> None:
         """See `Worker.close`."""
-        if patience > 0.0:
+        if timeout > 0.0:
             closing = asyncio.wrap_future(self._actor.close.remote().future())
             closing.add_done_callback(mark_retrieved)
-            await asyncio.wait({closing}, timeout=patience)
+            await asyncio.wait({closing}, timeout=timeout)
         kill_actor(self._actor)
 
 

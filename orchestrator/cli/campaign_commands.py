@@ -192,7 +192,7 @@ def plan(
     run_result, published = run_task_at_terminal(
         request,
         in_process=in_process,
-        brief=True,
+        plain_processes=True,
         again=lambda folder: f"Plan again: decant plan {campaign}",
         not_resumed="this planning is not resumed; what was simulated",
     )

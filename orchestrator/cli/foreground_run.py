@@ -113,7 +113,7 @@ def run_task_at_terminal(
     *,
     in_process: bool,
     again: Callable[[Path], str],
-    brief: bool = False,
+    plain_processes: bool = False,
     not_resumed: str = "",
     motion: tuple[str, PathReport | None] = ("", None),
     resume: bool = False,
@@ -125,7 +125,7 @@ def run_task_at_terminal(
 
     Args:
         request: of the task, without a folder.
-        in_process, brief: see `RunResources`.
+        in_process, plain_processes: see `RunResources`.
         again: makes the command for the message after an interruption from the folder of the run.
         not_resumed, answer: see `run_in_front_of_people`.
         motion: what the operator consents to, if hardware moves; see `consent_to_motion`.
@@ -138,12 +138,12 @@ def run_task_at_terminal(
     checksum = consent_to_motion(request, *motion)
     if request.pours:
         check_somebody_is_there(request.campaign.laboratory)
-    resources = RunResources(in_process=in_process, approved_checksum=checksum, brief=brief)
+    resources = RunResources(in_process=in_process, approved_checksum=checksum, plain_processes=plain_processes)
     check_laboratory_answers(request, resources)
     view = live()
     folder = run_directory(request.campaign, resume=resume, run_id=run_id)
     return run_in_front_of_people(
-        replace(request, folder=folder, resume="yes" if resume else "no"),
+        replace(request, folder=folder, resume=resume),
         resources,
         again=again(folder),
         not_resumed=not_resumed,
@@ -200,7 +200,7 @@ def run_in_front_of_people(
     plan, directory = request.campaign, request.folder
     assert directory is not None
     print_note(f"run {directory}  ({plan.laboratory.mode} bench)" if request.pours else f"run {directory}")
-    if request.resume == "no":
+    if not request.resume:
         for line in not_simulated(plan, print_message):
             print_note(line)
 

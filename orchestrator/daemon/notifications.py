@@ -155,12 +155,12 @@ class Notifier:
         except Exception:  # a failed notification must never end anything else
             _log.exception("no word could be made of %s", kind)
 
-    def close(self, patience: float = 5.0) -> None:
+    def close(self, timeout: float = 5.0) -> None:
         """Send waiting messages for at most this long [s], and end."""
         self._ended.set()
         for one in self._receivers:
             one.end()
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + timeout
         for thread in self._threads:
             thread.join(max(deadline - time.monotonic(), 0.0))
 

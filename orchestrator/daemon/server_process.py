@@ -196,7 +196,7 @@ def serve(settings: DaemonSettings, ready: Callable[[str], None] = lambda url: N
     restart = DaemonRestart()
     if settings.ray is not None and not settings.in_process:
         try:
-            check_cluster(settings.ray, need_bench=False)
+            check_cluster(settings.ray, pours=False)
         except LaboratoryError as error:
             raise ServeError(str(error)) from None
     use_state_directory(settings.state)

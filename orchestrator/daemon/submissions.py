@@ -181,7 +181,7 @@ def run_request(
         request = plan_task(plan, theta) if item.task == "plan" else TASKS[item.task](plan)  # type: ignore[index]
     if item.run is None:
         return request
-    return replace(request, folder=settings.runs / item.run, resume="if begun")
+    return replace(request, folder=settings.runs / item.run)
 
 
 def planned_order(settings: DaemonSettings, item: QueueItem, rig: Rig) -> PlannedOrder:

@@ -103,7 +103,7 @@ def check_bench(
         checks += [replace(check, name=f"source {check.name}") for check in under_source]
     checks += device_checks(spec.source, spec.spill_sensor)
     try:
-        check_laboratory(spec.with_values(ray=None), need_bench=True)
+        check_laboratory(spec.with_values(ray=None), pours=True)
     except LaboratoryError as error:
         advice = "install them into the environment that Decant runs in"
         checks.append(DeviceCheck("packages", "fail", str(error), advice))

@@ -16,7 +16,7 @@ import asyncio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from actors.interfaces import Laboratory, Operator, Optimizer, RaySettings, Stoppable
 from actors.laboratory_settings import LaboratorySettings
@@ -61,7 +61,7 @@ class RunRequest:
         campaign: its plan, without the parts that its task leaves out.
         stages: to run.
         folder: of the run; None: a new one, which is entered in the catalogue.
-        resume: continue the run in `folder`; 'if begun': only if a run was begun there.
+        resume: continue the run in `folder`; `RunService.with_folder` sets it if a run was begun there.
         as_written: the vessels are those of the campaign's file.
         problems: finds what prevents these pours; None: the checks of the campaign do.
     """
@@ -69,7 +69,7 @@ class RunRequest:
     campaign: CampaignPlan
     stages: Sequence[StageDefinition]
     folder: Path | None = None
-    resume: Literal["no", "yes", "if begun"] = "no"
+    resume: bool = False
     as_written: bool = True
     problems: Callable[[], Sequence[str]] | None = None
 
@@ -106,7 +106,7 @@ class RunResources:
 
     Attributes:
         in_process: everything in this process, without Ray.
-        brief: simulators in plain processes; see `actors.laboratory.open_laboratory`.
+        plain_processes: simulators in plain processes; see `actors.laboratory.open_laboratory`.
         simulators: a shared pool instead of the laboratory's own.
         ray: cluster on which the shared pool runs. The cluster of the campaign's laboratory is then not used.
         optimizer: a shared one instead of the laboratory's own.
@@ -119,7 +119,7 @@ class RunResources:
     """
 
     in_process: bool = False
-    brief: bool = False
+    plain_processes: bool = False
     simulators: SimulatorPool | None = None
     ray: RaySettings | None = None
     optimizer: Optimizer | None = None
@@ -191,25 +191,23 @@ class RunService:
         """
         from actors.laboratory import check_laboratory
 
-        need_bench = request.pours and resources.laboratory is None  # another laboratory brings its own
-        check_laboratory(resources.settings(request.campaign), need_bench=need_bench, brief=resources.brief)
+        pours = request.pours and resources.laboratory is None  # another laboratory brings its own
+        check_laboratory(resources.settings(request.campaign), pours=pours, plain_processes=resources.plain_processes)
 
     def with_folder(self, request: RunRequest) -> RunRequest:
-        """The request with its folder, made if it names none, and with 'yes' or 'no' for `resume`.
+        """The request with its folder, made if it names none, and with `resume` if a run was begun there.
 
         Raises:
             JournalDamagedError: a run was begun there, and its journal is lost or damaged.
             NoSpaceError, OSError: the folder can't be made.
         """
         if request.folder is None:
-            return replace(request, folder=create_run(request.campaign), resume="no")
-        if request.resume != "if begun":
-            return request
+            return replace(request, folder=create_run(request.campaign))
         path = request.folder / JOURNAL_NAME
-        if not has_begun(path):
-            return replace(request, resume="no")
+        if request.resume or not has_begun(path):
+            return request
         check_journal(path).require()  # before anything is written: a lost journal must not look like a new run
-        return replace(request, resume="yes")
+        return replace(request, resume=True)
 
     def start(self, request: RunRequest, resources: RunResources) -> RunHandle:
         """Open what a run needs. The run proceeds while `RunHandle.wait` is awaited, in the event loop of the caller.
@@ -232,10 +230,10 @@ class RunService:
         else:
             laboratory = open_laboratory(
                 spec,
-                need_bench=request.pours,
-                brief=resources.brief,
+                pours=request.pours,
+                plain_processes=resources.plain_processes,
                 operator=resources.operator,
-                kept=resources.simulators,
+                simulators=resources.simulators,
                 optimizer=resources.optimizer,
                 record=LaboratoryPlaces(VesselAccount.open(), spec.name) if spec.places and request.pours else None,
             )
@@ -302,7 +300,7 @@ class RunHandle:
             self._request.campaign,
             self._laboratory,
             self.folder,
-            resume=self._request.resume == "yes",
+            resume=self._request.resume,
             subscribers=self._subscribers,
             ask_operator=self._ask_operator,
             stages=self._request.stages,

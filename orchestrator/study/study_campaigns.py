@@ -58,7 +58,7 @@ def campaign_of(study: StudyPlan, cell: StudyCell, load: Load, directory: Path) 
     """
     request = _task(study, cell, load, directory)
     plan = replace(request.campaign, resolved=record_of(study.base.resolved, request.campaign))
-    return replace(request, campaign=plan, folder=directory, resume="if begun")
+    return replace(request, campaign=plan, folder=directory)
 
 
 def _task(study: StudyPlan, cell: StudyCell, load: Load, directory: Path) -> RunRequest:

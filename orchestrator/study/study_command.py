@@ -82,7 +82,7 @@ def _checked_cluster(address: str) -> RaySettings:
         raise RefusalError(f"--ray: {error.errors()[0]['msg']}") from None
     print_note(f"looking at the Ray cluster at {address} …")
     with Refused(LaboratoryError, at="--ray: "):
-        check_cluster(settings, need_bench=False)
+        check_cluster(settings, pours=False)
     return settings
 
 

@@ -41,7 +41,7 @@ async def main(address, log):
     action = Action(angular_velocity=60 * DEG, x_offset=0.09, height=0.05, max_angle=100 * DEG, hold_time=0.5)
     spec = LaboratorySettings(name="far", ray=RaySettings(address=address))
     heard = []
-    laboratory = open_laboratory(spec, need_bench=False, make=fake_simulator.make_fake(0.5, Path(log)))
+    laboratory = open_laboratory(spec, pours=False, make=fake_simulator.make_fake(0.5, Path(log)))
     ray.cloudpickle.register_pickle_by_value(fake_simulator)
     async with laboratory:
         laboratory.listen(lambda notice: (heard.append(notice.text), say("notice", notice.text)))

@@ -32,21 +32,21 @@ PROBLEM = MinimumQuery(
 
 def laboratory(in_process, fake, **changes):
     return open_laboratory(
-        LaboratorySettings(name="desk", simulators=1, in_process=in_process, **changes), need_bench=False, make=fake()
+        LaboratorySettings(name="desk", simulators=1, in_process=in_process, **changes), pours=False, make=fake()
     )
 
 
 @pytest.mark.realtime
 def test_a_campaign_that_pours_is_refused_a_laboratory_without_a_bench():
     with pytest.raises(LaboratoryError, match="desk has no bench, but the campaign pours"):
-        open_laboratory(LaboratorySettings(name="desk"), need_bench=True)
+        open_laboratory(LaboratorySettings(name="desk"), pours=True)
 
 
 @pytest.mark.realtime
 def test_an_arm_of_hardware_is_not_opened_without_a_person_to_ask():
     spec = load_laboratory(Path(__file__).parents[2] / "configs" / "laboratories" / "ur10-kern.yaml")
     with pytest.raises(LaboratoryError, match="ur10-kern needs a person beside it who answers questions"):
-        open_laboratory(spec, need_bench=True)
+        open_laboratory(spec, pours=True)
 
 
 @pytest.mark.realtime
@@ -105,7 +105,7 @@ def test_the_real_simulator_gives_the_same_bits_in_a_pool_a_twin_and_the_hidden_
 
     async def play(in_process):
         spec = LaboratorySettings(name="desk", simulators=1, bench=bench, in_process=in_process)
-        async with open_laboratory(spec, need_bench=True) as opened:
+        async with open_laboratory(spec, pours=True) as opened:
             job = opened.simulators.simulate(PourTask(scene, action, coarse, 3, frame_rate=4.0))
             return await asyncio.gather(job, opened.bench.pour(scene, action, seed=5))
 
@@ -121,19 +121,19 @@ def test_an_engine_without_its_shared_libraries_is_refused_before_anything_start
     monkeypatch.setenv("DECANT_ENGINE", "taichi")
     monkeypatch.setitem(LIBRARIES, "taichi", {"libNone.so.6": "libnone-6"})
     with pytest.raises(LaboratoryError, match=r"DECANT_ENGINE=taichi: .*apt install libnone-6"):
-        check_laboratory(LaboratorySettings(name="planning"), need_bench=False, brief=True)
+        check_laboratory(LaboratorySettings(name="planning"), pours=False, plain_processes=True)
 
 
 def test_a_moments_work_needs_no_ray_and_still_simulates_side_by_side(monkeypatch, fake, task):
     """`decant plan`: a person waits, and nothing is poured."""
     monkeypatch.setattr("actors.laboratory.installed", lambda name: name != "ray")
     spec = LaboratorySettings(name="planning", simulators=2)
-    check_laboratory(spec, need_bench=False, brief=True)
+    check_laboratory(spec, pours=False, plain_processes=True)
     with pytest.raises(LaboratoryError, match="Ray, which is not installed"):
-        check_laboratory(spec, need_bench=False)
+        check_laboratory(spec, pours=False)
 
     async def play():
-        async with open_laboratory(spec, need_bench=False, brief=True, make=fake()) as laboratory:
+        async with open_laboratory(spec, pours=False, plain_processes=True, make=fake()) as laboratory:
             pool = laboratory.simulators
             results = await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(4)))
             return pool.size, pool.separate, [result.outcome.seed for result in results]

@@ -54,7 +54,7 @@ async def questions(simulators, optimizer):
 async def of_its_own():
     heard = []
     desk = LaboratorySettings(name="desk", simulators=1)
-    async with open_laboratory(desk, need_bench=False, make=Formula) as laboratory:
+    async with open_laboratory(desk, pours=False, make=Formula) as laboratory:
         laboratory.listen(heard.append)
         await questions(laboratory.simulators, laboratory.optimizer)
     print(json.dumps(" ".join(notice.text for notice in heard)))

@@ -30,7 +30,7 @@ def open_bench(fake, bench_spec):
         spec = LaboratorySettings(
             name="virtual", simulators=simulators, bench=bench_spec.with_values(**changes), in_process=not ray
         )
-        return open_laboratory(spec, need_bench=True, make=make or fake())
+        return open_laboratory(spec, pours=True, make=make or fake())
 
     return open_it
 

@@ -189,7 +189,7 @@ import sys
 from actors.runtime.ray_cluster import check_cluster
 from actors.interfaces import LaboratoryError, RaySettings
 try:
-    check_cluster(RaySettings(address=sys.argv[1]), need_bench=False)
+    check_cluster(RaySettings(address=sys.argv[1]), pours=False)
 except LaboratoryError as error:
     print(error)
 """
@@ -237,7 +237,7 @@ action = Action(angular_velocity=90 * DEG, x_offset=0.13, height=0.05, max_angle
 
 async def main():
     far = LaboratorySettings(name="far", ray=RaySettings(address=address))
-    async with open_laboratory(far, need_bench=False) as laboratory:
+    async with open_laboratory(far, pours=False) as laboratory:
         theta = SimulationParameters(particles=300)
         tasks = [PourTask(scene, action, theta, seed) for seed in range(4)]
         for result in await asyncio.gather(*map(laboratory.simulators.simulate, tasks)):

@@ -97,7 +97,7 @@ Made = Callable[[Path], RunHandle]
 
 def toy_request(folder: Path, pours: int = 2) -> RunRequest:
     script = Script(*(pour(number) for number in range(1, pours + 1)))
-    return RunRequest(toy_plan(folder), one_stage(script), folder / "run", "if begun")
+    return RunRequest(toy_plan(folder), one_stage(script), folder / "run")
 
 
 def started(folder: Path, laboratory: ToyLaboratory, **resources: Any) -> RunHandle:
@@ -234,7 +234,7 @@ class Recorder:
 
 
 def formula(**resources: Any) -> RunResources:
-    return RunResources(laboratory=lambda spec, need_bench: FormulaLaboratory(), **resources)  # type: ignore[arg-type]
+    return RunResources(laboratory=lambda spec, pours: FormulaLaboratory(), **resources)  # type: ignore[arg-type]
 
 
 def test_recorder_and_subscribers_get_every_event_and_the_run_is_published(tmp_path: Path) -> None:

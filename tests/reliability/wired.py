@@ -64,7 +64,7 @@ class WiredRig(Rig):
             operator=OperatorSettings(answers="virtual", time=2.0, reminder=60.0, deadline=300.0),
         )
         bench_operators.SCATTER = 0.0  # each refilling is one of chance, and after a restart there is one more
-        async with InProcessLaboratory(spec, Formula, need_bench=True) as opened:
+        async with InProcessLaboratory(spec, Formula, pours=True) as opened:
             attend(opened, life)
             assert opened.opened is not None
             self.emulators = opened.opened.emulators

@@ -127,7 +127,7 @@ class LocalCluster:
 
     def close(self) -> None:
         """End everything."""
-        end_cluster(self.folder, patience=15.0)
+        end_cluster(self.folder, timeout=15.0)
         assert self._warden.stdin is not None
         self._warden.stdin.close()
         self._warden.wait(timeout=30.0)

@@ -70,10 +70,10 @@ class _Optimizer:
 class ToyLaboratory:
     """In this process, without physics."""
 
-    def __init__(self, spec: LaboratorySettings, need_bench: bool) -> None:
+    def __init__(self, spec: LaboratorySettings, pours: bool) -> None:
         assert spec.bench is not None
         self.simulators, self.optimizer = _Simulators(), _Optimizer()
-        self.bench = _Bench(spec.bench.theta) if need_bench else None
+        self.bench = _Bench(spec.bench.theta) if pours else None
 
     async def __aenter__(self) -> ToyLaboratory:
         return self

@@ -218,7 +218,7 @@ async def opened_stage(
     **changes: Any,
 ) -> AsyncIterator[Stage]:
     """A wired bench around the cheap liquid, with an operator that does as it is told."""
-    laboratory = InProcessLaboratory(spec or wired_spec(**changes), Trickle, need_bench=True, record=record)
+    laboratory = InProcessLaboratory(spec or wired_spec(**changes), Trickle, pours=True, record=record)
     stage = Stage(laboratory)
     laboratory.listen(stage.notices.append)
     async with laboratory:

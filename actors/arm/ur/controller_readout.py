@@ -99,10 +99,10 @@ class Exchange:
         return max(map(abs, self.values.get("actual_qd", (math.inf,)))) < STANDSTILL
 
 
-def port_problem(address: str, port: int, patience: float = 2.0) -> str | None:
+def port_problem(address: str, port: int, timeout: float = 2.0) -> str | None:
     """Why a port cannot be reached; None if it is open."""
     try:
-        with socket.create_connection((address, port), timeout=patience):
+        with socket.create_connection((address, port), timeout=timeout):
             return None
     except ConnectionRefusedError:
         return "refused"
@@ -112,33 +112,33 @@ def port_problem(address: str, port: int, patience: float = 2.0) -> str | None:
         return error.strerror or str(error)
 
 
-def ask_dashboard(address: str, questions: Sequence[str] = QUESTIONS, patience: float = 3.0) -> dict[str, str]:
+def ask_dashboard(address: str, questions: Sequence[str] = QUESTIONS, timeout: float = 3.0) -> dict[str, str]:
     """Responses of the dashboard, by query.
 
     Raises:
         ReadoutError: it does not respond.
     """
     try:
-        with Dashboard(address, patience) as dashboard:
+        with Dashboard(address, timeout) as dashboard:
             return {question: dashboard.ask(question) for question in questions}
     except DashboardError as error:
         raise ReadoutError(str(error)) from error
 
 
-def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, patience: float = 3.0) -> Exchange:
+def read_exchange(address: str, rate: float = 125.0, seconds: float = 1.0, timeout: float = 3.0) -> Exchange:
     """Values over RTDE, round-trip times, and the regularity of packages.
 
     Args:
         address: of the controller.
         rate: requested rate of packages [Hz].
         seconds: time for which they are counted; 0 for one package, without timing.
-        patience: longest wait for a response [s].
+        timeout: longest wait for a response [s].
 
     Raises:
         ReadoutError: it does not respond, or its response cannot be understood.
     """
     try:
-        with socket.create_connection((address, RTDE), timeout=patience) as connection:
+        with socket.create_connection((address, RTDE), timeout=timeout) as connection:
             return _exchange(rtde.Requests(connection), rate, seconds)
     except (OSError, struct.error, rtde.PackageError) as error:
         raise ReadoutError(f"RTDE at {address} doesn't answer as it should: {error}") from error
@@ -250,7 +250,7 @@ def read_status(host: str) -> Findings:
 
 def _control_port(address: str) -> int:
     """The dashboard's port; on PolyScope X that of the Robot API."""
-    with contextlib.suppress(dashboard_port.DashboardError), Dashboard(address, patience=2.0) as dashboard:
+    with contextlib.suppress(dashboard_port.DashboardError), Dashboard(address, timeout=2.0) as dashboard:
         return dashboard.port
     return dashboard_port.PORT
 

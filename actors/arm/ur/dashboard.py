@@ -27,22 +27,22 @@ class Dashboard:
 
     Args:
         address: of the controller.
-        patience: for each response [s].
+        timeout: for each response [s].
 
     Raises:
         DashboardError: the dashboard cannot be reached.
     """
 
-    def __init__(self, address: str, patience: float = PATIENCE) -> None:
+    def __init__(self, address: str, timeout: float = PATIENCE) -> None:
         self._api: RobotApi | None = None
-        self._address, self._patience = address, patience
+        self._address, self._timeout = address, timeout
         try:
-            self._socket = socket.create_connection((address, PORT), timeout=patience)
+            self._socket = socket.create_connection((address, PORT), timeout=timeout)
             self._lines = self._socket.makefile("rb")
             self._read("its greeting")
         except ConnectionRefusedError as error:
             try:
-                self._api = RobotApi(address, patience)
+                self._api = RobotApi(address, timeout)
             except RobotApiError as also:
                 raise DashboardError(f"dashboard of {address}:{PORT}: {error}; {also}") from error
         except OSError as error:
@@ -80,7 +80,7 @@ class Dashboard:
             answer = self._lines.readline()
         except TimeoutError:
             raise DashboardError(
-                f"{where} accepts connections, but did not send {what} within {self._patience:g} s: the controller is "
+                f"{where} accepts connections, but did not send {what} within {self._timeout:g} s: the controller is "
                 "booting, or hangs. Wait a minute and try again; if it repeats, restart the controller"
             ) from None
         except OSError as error:
@@ -108,7 +108,7 @@ class Dashboard:
             self._socket.close()
 
 
-def stop_program(address: str, patience: float = PATIENCE) -> None:
+def stop_program(address: str, timeout: float = PATIENCE) -> None:
     """Stop the running program, whatever it is: over dashboard or Robot API, else over the primary interface.
 
     The primary interface does not reply: the caller has to watch the program's state over RTDE.
@@ -117,10 +117,10 @@ def stop_program(address: str, patience: float = PATIENCE) -> None:
         DashboardError: no interface can be reached.
     """
     try:
-        with Dashboard(address, patience) as dashboard:
+        with Dashboard(address, timeout) as dashboard:
             dashboard.demand("stop", "Stopped")
     except DashboardError as error:
         try:
-            send_command(address, "stop program", patience)
+            send_command(address, "stop program", timeout)
         except PrimaryError as also:
             raise DashboardError(f"{error}; {also}") from error

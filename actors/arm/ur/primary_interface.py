@@ -125,17 +125,17 @@ def _calibration(data: bytes) -> Calibration | None:
     return Calibration(theta, a, d, alpha, f"{zlib.crc32(data[: _KINEMATICS.size]):08X}")
 
 
-def read_state(address: str, patience: float = 3.0) -> RobotState:
+def read_state(address: str, timeout: float = 3.0) -> RobotState:
     """The robot's state; see `read_parts`."""
-    return robot_state(read_parts(address, patience))
+    return robot_state(read_parts(address, timeout))
 
 
-def read_parts(address: str, patience: float = 3.0) -> dict[int, bytes]:
+def read_parts(address: str, timeout: float = 3.0) -> dict[int, bytes]:
     """The parts of the robot's state by type, once all have arrived.
 
     Args:
         address: of the controller.
-        patience: longest wait [s]; at most half of it is spent on parts that may be missing.
+        timeout: longest wait [s]; at most half of it is spent on parts that may be missing.
 
     Raises:
         PrimaryError: no state arrived, or it cannot be read.
@@ -143,10 +143,10 @@ def read_parts(address: str, patience: float = 3.0) -> dict[int, bytes]:
     begin, rest, parts = time.monotonic(), b"", dict[int, bytes]()
     needed, welcome = {JOINTS, CARTESIAN}, {SAFETY, CONFIGURATION, KINEMATICS}
     try:
-        with socket.create_connection((address, PORT), timeout=patience) as connection:
+        with socket.create_connection((address, PORT), timeout=timeout) as connection:
             while not (needed | welcome) <= parts.keys():
                 spent = time.monotonic() - begin
-                if spent > patience or (needed <= parts.keys() and spent > patience / 2.0):
+                if spent > timeout or (needed <= parts.keys() and spent > timeout / 2.0):
                     break
                 data = connection.recv(65536)
                 if not data:
@@ -158,7 +158,7 @@ def read_parts(address: str, patience: float = 3.0) -> dict[int, bytes]:
     except (OSError, PrimaryError) as error:
         raise PrimaryError(f"the primary port at {address} can't be read: {error}") from error
     if not needed <= parts.keys():
-        raise PrimaryError(f"the primary port at {address} sent no robot state within {patience:g} s")
+        raise PrimaryError(f"the primary port at {address} sent no robot state within {timeout:g} s")
     return parts
 
 
@@ -166,7 +166,7 @@ READ_BY_THEN = 0.3
 """Time for which a connection stays open after its command [s]; the controller sends states meanwhile."""
 
 
-def send_command(address: str, command: str, patience: float = PATIENCE) -> None:
+def send_command(address: str, command: str, timeout: float = PATIENCE) -> None:
     """Send a command of the primary interface, such as 'stop program', over a connection of its own.
 
     There is no reply, and a connection in local control ignores it without a word.
@@ -174,7 +174,7 @@ def send_command(address: str, command: str, patience: float = PATIENCE) -> None
     Args:
         address: of the controller.
         command: without the end of line.
-        patience: for the connection [s].
+        timeout: for the connection [s].
 
     Raises:
         PrimaryError: the port cannot be reached.
@@ -182,7 +182,7 @@ def send_command(address: str, command: str, patience: float = PATIENCE) -> None
     Source: the manufacturer's client library, for PolyScope X. Unconfirmed on a robot.
     """
     try:
-        with socket.create_connection((address, PORT), timeout=patience) as connection:
+        with socket.create_connection((address, PORT), timeout=timeout) as connection:
             connection.recv(1)  # the controller has accepted the connection
             connection.sendall(command.encode() + b"\n")
             end = time.monotonic() + READ_BY_THEN

@@ -52,7 +52,7 @@ class RobotApi:
 
     Args:
         address: of the controller.
-        patience: for each response [s].
+        timeout: for each response [s].
 
     Attributes:
         port: at which it answers.
@@ -61,8 +61,8 @@ class RobotApi:
         RobotApiError: no port answers as a Robot API does.
     """
 
-    def __init__(self, address: str, patience: float) -> None:
-        self._address, self._patience = address, patience
+    def __init__(self, address: str, timeout: float) -> None:
+        self._address, self._timeout = address, timeout
         for port in PORTS:
             self.port = port
             try:
@@ -106,7 +106,7 @@ class RobotApi:
 
     def _request(self, method: str, path: str, body: dict[str, Any] | None = None) -> tuple[int, dict[str, Any]]:
         """Status and JSON of an answer; an empty one if it has no JSON object."""
-        connection = http.client.HTTPConnection(self._address, self.port, timeout=self._patience)
+        connection = http.client.HTTPConnection(self._address, self.port, timeout=self._timeout)
         try:
             text = None if body is None else json.dumps(body)
             connection.request(method, ROOT + path, text, {"Content-Type": "application/json"})

@@ -101,11 +101,11 @@ class RtdeClient:
 
     # ---- reading
 
-    def look(self, patience: float = 1.0) -> DataPackage:
+    def look(self, silences: float = 1.0) -> DataPackage:
         """The latest package.
 
         Args:
-            patience: longest silence, as a multiple of the usual one.
+            silences: longest silence, as a multiple of the usual one.
 
         Raises:
             TroubleError: the connection is lost, or the controller's time does not advance.
@@ -116,8 +116,8 @@ class RtdeClient:
         last = self._last
         if last is not None and values["timestamp"][0] == last.time:
             self._same_readings += 1
-            if self._same_readings >= _SAME_READINGS and time.monotonic() - last.seen > patience * self._silence:
-                raise TroubleError("lost", f"the controller has said nothing new for {patience * self._silence:g} s")
+            if self._same_readings >= _SAME_READINGS and time.monotonic() - last.seen > silences * self._silence:
+                raise TroubleError("lost", f"the controller has said nothing new for {silences * self._silence:g} s")
             return last
         self._same_readings = 0
         self._last = DataPackage(

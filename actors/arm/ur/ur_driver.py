@@ -285,10 +285,10 @@ class UrArm:
             return 0.0
         for means in (self._stop_by_dashboard, self._session.kill, None):
             # in a dose the cup is turned back upright first
-            patience = STOP_TIME
+            timeout = STOP_TIME
             if self._tilting is not None and means == self._stop_by_dashboard:
-                patience = UPRIGHT_TIME / min(self._spec.time_scale, 1.0)
-            if self._stops.wait_for_end(patience):
+                timeout = UPRIGHT_TIME / min(self._spec.time_scale, 1.0)
+            if self._stops.wait_for_end(timeout):
                 if self._stops.unseen:
                     break
                 times = self._stops.times(asked)

@@ -29,13 +29,13 @@ class PendingReply:
         done: executes the command and returns the line.
         expired: line if the display does not become stable in time, or a function that executes the command in any case
             and returns the line; None: wait without limit.
-        patience: longest wait [s of bench time]; None: the balance's limit for every command.
+        timeout: longest wait [s of bench time]; None: the balance's limit for every command.
         first: line that confirms the command before it is executed; empty for none.
     """
 
     done: Callable[[], bytes]
     expired: bytes | Callable[[], bytes] | None = None
-    patience: float | None = None
+    timeout: float | None = None
     first: bytes = b""
 
 

@@ -250,8 +250,8 @@ class Emulation:
             self._reply(reply.line, now)
         elif isinstance(reply, PendingReply):
             self._reply(reply.first, now)
-            patience = COMMAND_PATIENCE if reply.patience is None else reply.patience
-            self._waiting = (reply, now + (patience / self._time_scale if self._time_scale > 0.0 else math.inf))
+            timeout = COMMAND_PATIENCE if reply.timeout is None else reply.timeout
+            self._waiting = (reply, now + (timeout / self._time_scale if self._time_scale > 0.0 else math.inf))
             self._wait_on(now)
         elif self._display.count > seen:
             faults = self._display.faults

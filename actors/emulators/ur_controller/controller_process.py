@@ -52,7 +52,7 @@ class VirtualController:
         polyscope_x: bool = False,
         joints: Sequence[float] | None = None,
         prioritised: bool = True,
-        patience: float = START_TIME,
+        timeout: float = START_TIME,
     ) -> VirtualController:
         """Start the process and wait until all its ports are open.
 
@@ -67,7 +67,7 @@ class VirtualController:
             polyscope_x: software 10.14, with a Robot API instead of the dashboard.
             joints: six initial positions [rad]; a pose in the middle of its workspace by default.
             prioritised: raise the priority of its clock; see docs/reference/virtual-devices.md, "Control period".
-            patience: longest wait [s].
+            timeout: longest wait [s].
 
         Raises:
             VirtualControllerError: it did not get ready; the text includes its error output.
@@ -82,7 +82,7 @@ class VirtualController:
         command += [] if joints is None else ["--joints=" + ",".join(repr(degrees(q)) for q in joints)]
         process = ChildProcess(command)
         try:
-            ready = json.loads(process.read_line(patience))
+            ready = json.loads(process.read_line(timeout))
             return cls(process, address, int(ready["fault_port"]))
         except BaseException as error:
             process.kill()
@@ -91,15 +91,15 @@ class VirtualController:
             if not isinstance(error, Exception):
                 raise
             raise VirtualControllerError(
-                f"virtual controller at {address}: not ready within {patience:g} s: {reason}"
+                f"virtual controller at {address}: not ready within {timeout:g} s: {reason}"
             ) from error
 
-    def fault(self, name: str, *, patience: float = 5.0, **arguments: Any) -> dict[str, Any]:
+    def fault(self, name: str, *, timeout: float = 5.0, **arguments: Any) -> dict[str, Any]:
         """Inject a fault, or read the controller's internal state; see docs/reference/virtual-devices.md for names.
 
         Args:
             name: of the fault.
-            patience: longest wait for the reply [s].
+            timeout: longest wait for the reply [s].
             arguments: of the fault.
 
         Returns:
@@ -109,7 +109,7 @@ class VirtualController:
             VirtualControllerError: the fault is unknown, its arguments are wrong, or no reply came.
         """
         try:
-            with socket.create_connection((self.address, self.fault_port), timeout=patience) as connection:
+            with socket.create_connection((self.address, self.fault_port), timeout=timeout) as connection:
                 connection.sendall(json.dumps({"fault": name, **arguments}).encode() + b"\n")
                 with connection.makefile("rb") as lines:
                     line = lines.readline()
@@ -125,9 +125,9 @@ class VirtualController:
         """Whether its process runs."""
         return self._process.alive
 
-    def close(self, patience: float = 5.0) -> None:
+    def close(self, timeout: float = 5.0) -> None:
         """End the process."""
-        self._process.close(patience, terminate=True)
+        self._process.close(timeout, terminate=True)
 
     def __enter__(self) -> VirtualController:
         return self

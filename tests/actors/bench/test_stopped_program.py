@@ -25,7 +25,7 @@ def look(progress):
 
 async def play():
     spec = wired_spec(pace={PACE}, hurried=True)
-    async with InProcessLaboratory(spec, Trickle, need_bench=True) as laboratory:
+    async with InProcessLaboratory(spec, Trickle, pours=True) as laboratory:
         slowly = ACTION.with_values(angular_velocity=0.4, return_velocity=0.4)
         for seed in (5, 6):
             action = slowly if seed == 5 else ACTION

@@ -24,7 +24,7 @@ def laboratory(ray_running):
 
     ray.cloudpickle.register_pickle_by_value(sys.modules[Trickle.__module__])  # workers can't import test modules
     spec = wired_spec(pace=2.0, hurried=True).with_values(in_process=False, simulators=1)
-    return RayLaboratory(spec, Trickle, need_bench=True)
+    return RayLaboratory(spec, Trickle, pours=True)
 
 
 async def stopped(opened: RayLaboratory, action: Any, how: Any) -> tuple[UnknownPourError, list[Any]]:

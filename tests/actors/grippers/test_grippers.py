@@ -118,7 +118,7 @@ class Line:
 
 
 def driver_of(line: Line) -> RobotiqGripper:
-    return RobotiqGripper(RobotiqSettings(model="2F-85", address="127.0.0.1", port=line.port), patience=0.3)
+    return RobotiqGripper(RobotiqSettings(model="2F-85", address="127.0.0.1", port=line.port), timeout=0.3)
 
 
 def test_a_reply_in_pieces_is_read_to_its_end() -> None:
@@ -208,7 +208,7 @@ def test_a_slow_answer_is_not_taken_for_that_of_a_later_request(
     two_finger: tuple[RobotiqGripper, RobotiqEmulator],
 ) -> None:
     _, emulator = two_finger
-    driver = RobotiqGripper(emulator.gripper, patience=0.2)
+    driver = RobotiqGripper(emulator.gripper, timeout=0.2)
     driver.get("POS")
     emulator.fault("slow", 0.4)
     with pytest.raises(GripperError, match="no answer"):
@@ -287,7 +287,7 @@ def _page(data: bytes) -> Iterator[int]:
 )
 def test_an_answer_that_is_no_width_is_one_error(body: bytes) -> None:
     for port in _page(body):
-        driver = OnRobotGripper(OnRobotSettings(model="RG2", address="127.0.0.1", port=port), patience=1.0)
+        driver = OnRobotGripper(OnRobotSettings(model="RG2", address="127.0.0.1", port=port), timeout=1.0)
         with pytest.raises(GripperError, match=r"RG2 at 127\.0\.0\.1"):
             driver.state()
         driver.close()
@@ -353,7 +353,7 @@ def test_without_a_confirming_input_nothing_is_known(controller: VirtualControll
 
 
 def test_in_local_control_the_outputs_are_not_set(controller: VirtualController) -> None:
-    driver = DigitalGripper(digital(controller)._settings, patience=1.0)
+    driver = DigitalGripper(digital(controller)._settings, timeout=1.0)
     controller.fault("remote", active=False)
     try:
         with pytest.raises(GripperError, match="is the controller in remote control"):

@@ -184,7 +184,7 @@ def send(controller: VirtualController, text: bytes, most: float = 60.0) -> floa
     ):
         port.sendall(text)
     greeting(controller.address)
-    return float(controller.fault("state", patience=most)["timing"]["worst"])
+    return float(controller.fault("state", timeout=most)["timing"]["worst"])
 
 
 @pytest.mark.slow
@@ -204,7 +204,7 @@ def test_no_program_takes_the_clock_its_time(fresh: Callable[..., VirtualControl
     late = send(controller, text)
     end = time.monotonic() + PATIENCE
     while True:
-        state = controller.fault("state", patience=20.0)
+        state = controller.fault("state", timeout=20.0)
         late = max(late, state["timing"]["worst"])
         if any(says in message for message in state["messages"]):
             break
@@ -237,7 +237,7 @@ def test_a_program_that_can_not_be_run_is_refused_and_the_next_one_runs(
                 connection.sendall(sent)
             end = time.monotonic() + PATIENCE
             while True:
-                messages = shared.fault("state", patience=PATIENCE)["messages"]
+                messages = shared.fault("state", timeout=PATIENCE)["messages"]
                 after = messages.index(mark) + 1 if mark else 0
                 if any(wanted in message for message in messages[after:]):
                     return
@@ -300,7 +300,7 @@ def test_a_program_too_heavy_for_the_clock_does_not_keep_a_core_from_others(
     with socket.create_connection((controller.address, 30003), timeout=PATIENCE) as port:
         port.sendall(text)
         end = time.monotonic() + PATIENCE
-        while controller.fault("state", patience=PATIENCE)["timing"]["priority"] != "normal":
+        while controller.fault("state", timeout=PATIENCE)["timing"]["priority"] != "normal":
             assert time.monotonic() < end
             time.sleep(0.05)
     assert os.sched_getscheduler(controller.pid) & 0xFF == os.SCHED_OTHER

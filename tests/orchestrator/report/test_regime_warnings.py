@@ -162,7 +162,7 @@ def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.Captur
     from sim_engine.errors import DecantError
 
     request = replace(run_task(load_campaign(folder / "small.yaml")), folder=folder)
-    resumed = replace(request, resume="yes")
+    resumed = replace(request, resume=True)
     for each, times in ((request, 1), (resumed, 0)):
         with pytest.raises(DecantError, match="No space left"):
             run_in_front_of_people(each, RunResources(), again="")
