@@ -7,13 +7,15 @@ and `deploy_task`. Which stages a task has is decided here alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from orchestrator.learning.campaign_plan import CampaignPlan, DispensePlan, PlannedDose
+from orchestrator.learning.dispense import KnownSource
 from orchestrator.learning.single_action import OnePour
+from orchestrator.materials.vessel_account import VesselAccount
 from orchestrator.runs.run_service import RunRequest, RunTaskError
 from orchestrator.runs.stages import (
     POSTERIOR_DRAWS,
@@ -84,9 +86,14 @@ def read_theta(path: Path, plan: CampaignPlan) -> GivenTheta:
     return GivenTheta(load_parameters(path, plan.parameters), draws, load_discrepancy(path))
 
 
+def recorded_sources(plan: DispensePlan) -> Mapping[str, KnownSource]:
+    """What earlier doses have left in the sources of a series, by name; nothing if it begins with filled ones."""
+    return VesselAccount.open().known(plan) if plan.as_left else {}
+
+
 def run_task(plan: CampaignPlan) -> RunRequest:
     """Everything that the campaign contains."""
-    return RunRequest(plan, stages_of(plan))
+    return RunRequest(plan, stages_of(plan, recorded_sources))
 
 
 def calibrate_task(plan: CampaignPlan) -> RunRequest:
@@ -244,4 +251,4 @@ def dose_task(
     if plan.laboratory.arm is None:  # the recording shows the motions of an arm, and there is none
         outputs = outputs.model_copy(update={"recording": False})
     small = replace(plan, name=f"{plan.name}-dose", calibration=None, deployment=None, dispense=series, outputs=outputs)
-    return RunRequest(small, dispense_stages(series), as_written=not amounts)
+    return RunRequest(small, dispense_stages(series, recorded_sources), as_written=not amounts)

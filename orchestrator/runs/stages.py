@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,12 +42,11 @@ from orchestrator.learning.campaign_plan import (
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import displacement
-from orchestrator.learning.dispense import Dispense, ReadSources, SourcesRead
+from orchestrator.learning.dispense import Dispense, KnownSource, ReadSources, SourcesRead
 from orchestrator.learning.requests import Simulate
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.single_action import Confirmation, RepeatedSimulation
 from orchestrator.learning.strategy import Strategy
-from orchestrator.materials.vessel_account import VesselAccount
 from orchestrator.records.codec import Results, result_of
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import Scene
@@ -121,30 +120,41 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
     return scenes
 
 
-def stages_of(plan: CampaignPlan) -> tuple[StageDefinition, ...]:
-    """All stages of a campaign in order: pours, calibration, evaluation, then a deployment for each receiver."""
+KnownSources = Callable[[DispensePlan], Mapping[str, KnownSource]]
+"""Reads what is known of the sources of a series, by name: called once, when the first stage begins."""
+
+
+def stages_of(plan: CampaignPlan, sources: KnownSources = lambda plan: {}) -> tuple[StageDefinition, ...]:
+    """All stages of a campaign in order: pours, calibration, evaluation, then a deployment for each receiver, or doses.
+
+    Args:
+        plan: of the campaign.
+        sources: of its doses; nothing is known of them unless given.
+    """
     stages: list[StageDefinition] = []
     if plan.calibration is not None:
         stages += calibration_stages(plan.calibration, plan.deployment)
     if plan.deployment is not None:
         stages += deployment_stages(plan, plan.deployment)
     if plan.dispense is not None:
-        stages += dispense_stages(plan.dispense, plan.calibration)
+        stages += dispense_stages(plan.dispense, sources, plan.calibration)
     return tuple(stages)
 
 
-def dispense_stages(plan: DispensePlan, calibration: CalibrationPlan | None = None) -> list[StageDefinition]:
+def dispense_stages(
+    plan: DispensePlan, known_sources: KnownSources, calibration: CalibrationPlan | None = None
+) -> list[StageDefinition]:
     """The content of the sources, which is read once, and the doses.
 
     Args:
+        plan: the series.
+        known_sources: reads what is known of its sources; OSError: it can't be read.
         calibration: that precedes the doses.
     """
 
     def sources(results: Results, seed: int) -> Strategy:
-        if not plan.as_left:
-            return ReadSources({})
         try:
-            return ReadSources(VesselAccount.open().known(plan))
+            return ReadSources(known_sources(plan))
         except OSError as error:
             raise RunError(f"the content of the sources is not known: {error}; write 'start: filled'") from error
 

@@ -150,7 +150,7 @@ def first_sources(
     """Sources of the first two doses, out of two vessels, after a calibration that poured from one of them."""
     series = plan(100, 250, sources=("beaker", "jug"))
     calibration = plans.calibration_plan(scene=scene(poured_from))
-    doses = next(stage for stage in dispense_stages(series, calibration) if stage.name == DOSES)
+    doses = next(stage for stage in dispense_stages(series, lambda series: {}, calibration) if stage.name == DOSES)
     results = {CALIBRATION: calibrated, SOURCES: SourcesRead(sources=known or {})}
     strategy = doses.build(results, 5)
     assert isinstance(strategy, Dispense)
