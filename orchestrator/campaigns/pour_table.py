@@ -150,6 +150,7 @@ class _PourReader:
     loaded: float
     lip_radius: float | None
     split: str | None
+    empty: dict[str, list[TableRow]] = field(default_factory=dict)
 
     def read(self, renamed: Mapping[str, str]) -> None:
         table, saved = self.table, self.saved
@@ -174,6 +175,12 @@ class _PourReader:
             row = self._row(line, columns)
             if row is not None:
                 table.rows.append(row)
+        for name, lines in self.empty.items():
+            index = [column.standard for column in columns].index(name)
+            numbers = ", ".join(str(line.line) for line in lines[:8]) + (" …" if len(lines) > 8 else "")
+            several = f" in {len(lines)} lines ({numbers}); a merged cell has its value in the first line only"
+            message = f"is empty{several if len(lines) > 1 else ''}; every row needs a value"
+            table.problems.append(saved.problem(lines[0], index, str(saved.header.cells[index]), message))
         for lines in alike.values():
             if len(lines) > MOST_ALIKE:
                 message = (
@@ -226,8 +233,11 @@ class _PourReader:
             return None
         values: dict[str, float] = {}
         written: dict[str, float] = {}
+        gaps = [column.standard for column, cell in zip(columns, line.cells, strict=True) if cell == ""]
+        for name in gaps:
+            self.empty.setdefault(name, []).append(line)
         for column, cell in zip(columns, line.cells, strict=True):
-            if column.standard == "split":
+            if column.standard in ("split", *gaps):
                 continue
             try:
                 written[column.standard] = saved.number(cell)
@@ -235,7 +245,7 @@ class _PourReader:
             except ValueError as error:
                 add(column.standard, str(error))
         split = str(line.cells[index["split"]]) if "split" in index else str(self.split)
-        if split not in SPLITS:
+        if split not in SPLITS and "split" not in gaps:
             add("split", f"{split!r} is not known; should be one of {', '.join(SPLITS)}")
         action: dict[str, float] = {}
         for name, value in values.items():
@@ -252,7 +262,7 @@ class _PourReader:
             action[dimension.name] = si
         if all(name in values for name in MASS_COLUMNS):
             _check_masses([values[name] for name in MASS_COLUMNS], self.loaded * 1e3, add)
-        if len(problems) > before:
+        if gaps or len(problems) > before:
             return None
         poured, spilled, retained = (values[name] * 1e-3 for name in MASS_COLUMNS)
         return PourRecordRow(line.line, action, poured, spilled, retained, split)

@@ -2,7 +2,8 @@
 
 `read_saved_table` returns a `SavedTable`. It accepts a dialect only if the file leaves no doubt about it, and lists in
 `SavedTable.assumed` everything that the plain form (UTF-8, commas, decimal points, a header in the first line) does not
-have. `orchestrator.campaigns.table_columns` resolves the names and units of its header.
+have. Whatever a person does not see in a workbook is refused: a hidden first sheet, hidden rows and columns.
+`orchestrator.campaigns.table_columns` resolves the names and units of the header.
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO, Any
+from xml.etree import ElementTree
 
 from orchestrator.campaigns.yaml.file_access import SIZE_LIMIT, UnreadableError, read_bytes
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from sim_engine.resources import MissingExtraError, require
+from sim_engine.settings.quantity import QuantityError, parse_unit
 
 UNPACKED_LIMIT = 20_000_000
 """Largest content of a workbook after decompression [bytes]."""
@@ -30,6 +34,9 @@ MOST_COLUMNS = 256
 
 MOST_LINES = 20_000
 """Largest number of a line or row with values."""
+
+TITLE_LINES = 12
+"""Lines in which a header below titles is looked for."""
 
 SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas"}
 
@@ -154,6 +161,7 @@ def read_saved_table(path: Path, *, limit: int = SIZE_LIMIT) -> SavedTable:
             raise UnreadableError("is empty; it needs a header and a line for each row")
         if (last := rows[-1]).line > MOST_LINES:
             raise _RowError(f"stands beyond line {MOST_LINES:,}; is it the right file?", last)
+        _check_header(rows)
         if any(not isinstance(cell, str) or _decimals_of(cell) or _POINT.fullmatch(cell) for cell in rows[0].cells):
             raise _RowError("has no header; the first line should have the names of the columns", rows[0])
         table = _without_unnamed(SavedTable(path, rows[0], rows[1:], assumed))
@@ -236,7 +244,8 @@ def _sheet_rows(content: bytes, assumed: list[str]) -> list[TableRow]:
 
     Raises:
         MissingExtraError: the reader is not installed.
-        UnreadableError: the workbook is damaged.
+        UnreadableError: the workbook is damaged, or its first sheet hidden.
+        _RowError: a person sees another table than this reader.
     """
     try:
         require("openpyxl", "an Excel workbook")
@@ -249,6 +258,7 @@ def _sheet_rows(content: bytes, assumed: list[str]) -> list[TableRow]:
         with warnings.catch_warnings(action="ignore"):  # of styles and extensions that it does not read
             book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=True)
             sheet = book.worksheets[0]
+            _check_shown(book.worksheets)
             sheet.reset_dimensions()  # as written in the file, which other programs set wrongly
             before = None
             for number, values in enumerate(sheet.iter_rows(max_col=MOST_COLUMNS, values_only=True), start=1):
@@ -264,11 +274,94 @@ def _sheet_rows(content: bytes, assumed: list[str]) -> list[TableRow]:
                     break
             if len(book.sheetnames) > 1:
                 assumed.append(f"sheet '{sheet.title}', the first of {len(book.sheetnames)}")
+            if rows:
+                _check_header(rows)
+                with zipfile.ZipFile(io.BytesIO(content)) as archive, archive.open(sheet._worksheet_path) as part:
+                    _check_seen(part, rows)
+    except (UnreadableError, _RowError):
+        raise
     except Exception as error:  # damaged workbooks raise arbitrary errors
         raise UnreadableError(
             f"is a workbook that can't be read ({type(error).__name__}); save its first sheet as CSV"
         ) from None
     return rows
+
+
+def _check_shown(sheets: Sequence[Any]) -> None:
+    """Refuse a hidden first sheet.
+
+    Raises:
+        UnreadableError: it is hidden.
+    """
+    hidden = [f"'{sheet.title}'" for sheet in sheets if sheet.sheet_state != "visible"]
+    shown = [f"'{sheet.title}'" for sheet in sheets if sheet.sheet_state == "visible"]
+    if sheets[0].sheet_state != "visible":
+        others = f"shown: {', '.join(shown)}" if shown else "no sheet is shown"
+        raise UnreadableError(
+            f"its first sheet is hidden ({', '.join(hidden)}; {others}); move the sheet with the table to the front"
+        )
+
+
+def _check_seen(part: IO[bytes], rows: Sequence[TableRow]) -> None:
+    """Refuse cells that a person does not see, or that have no value of their own.
+
+    Args:
+        part: XML of the sheet.
+        rows: with values.
+
+    Raises:
+        _RowError: rows or columns are hidden, cells are merged, or formulas have no stored value; one error for all.
+    """
+    from openpyxl.utils import get_column_letter, range_boundaries
+
+    lines = {row.line: row for row in rows}
+    width = max(i + 1 for i, cell in enumerate(rows[0].cells) if cell != "")
+    hidden: list[str] = []
+    formulas: list[str] = []
+    columns: list[str] = []
+    merged: list[str] = []
+    places: list[int] = []
+    for _, element in ElementTree.iterparse(part):
+        match element.tag.rpartition("}")[2]:
+            case "col" if _hides(element, "width"):
+                for i in range(int(element.get("min", 1)), min(int(element.get("max", 1)), width) + 1):
+                    if any(i <= len(row.cells) and row.cells[i - 1] != "" for row in rows):
+                        columns.append(get_column_letter(i))
+            case "c":
+                # an empty text is a result, too: t="str"
+                if element.find("{*}f") is not None and element.get("t") != "str" and not element.findtext("{*}v"):
+                    formulas.append(element.get("r", "?"))
+            case "row":
+                number = element.get("r", "")
+                if _hides(element, "ht") and number.isdecimal() and int(number) in lines:
+                    hidden.append(number)
+                    places.append(int(number))
+                element.clear()
+            case "mergeCell":
+                left, top, _, bottom = range_boundaries(element.get("ref", ""))
+                if left <= width and any(line in lines for line in range(top, min(bottom, MOST_LINES) + 1)):
+                    merged.append(element.get("ref", ""))
+
+    def refused(cells: list[str], subject: str, message: str, row: TableRow = rows[0]) -> None:
+        if cells:
+            names = ", ".join(cells[:8]) + (f" and {len(cells) - 8} more" if len(cells) > 8 else "")
+            raise _RowError(f"{subject}{'s' * (len(cells) > 1)} {names} {message}", row)
+
+    verb = "are" if len(hidden) > 1 or len(columns) > 1 else "is"
+    text = f"{verb} hidden, by hand or by a filter; show what belongs to the table, and delete the others"
+    refused(hidden, "row", text, lines[places[0]] if places else rows[0])
+    refused(columns, "column", text)
+    refused(merged, "merged cells", "have a value in the first cell only; unmerge them, and give every row its values")
+    refused(
+        formulas,
+        "cell",
+        "with a formula but no stored value; open the workbook in a spreadsheet program and save it, or save it as CSV",
+    )
+
+
+def _hides(element: ElementTree.Element, size: str) -> bool:
+    """Whether a row or column is hidden, also by a height or width of 0."""
+    return element.get("hidden") in ("1", "true") or element.get(size) == "0"
 
 
 def _cell(value: object) -> Cell:
@@ -313,7 +406,8 @@ def _text_rows(text: str, assumed: list[str]) -> list[TableRow]:
             comments.remove(header)
             assumed.append(f"the header of the comment in line {header + 1}")
     if not separator:
-        separator = _separator(lines[header], lines[kept[1]] if len(kept) > 1 else "")
+        top = _top_of_table([lines[i] for i in kept[:TITLE_LINES]])
+        separator = _separator(lines[kept[top]], lines[kept[top + 1]] if len(kept) > top + 1 else "")
     if not separator:
         words = len(lines[header].split())
         if words > 1 and len(kept) > 1 and words == len(lines[kept[1]].split()):
@@ -333,6 +427,19 @@ def _number_of_cells(header: str, row: str) -> bool:
     """Whether a header and a row have the same number of cells, in any dialect."""
     separator = _separator(header, row)
     return bool(separator) and len(_cells(header, separator)) == len(_cells(row, separator))
+
+
+def _top_of_table(lines: Sequence[str]) -> int:
+    """Position of the first line that has as many cells as the next one, and more than any line before; 0 if none."""
+    pairs = [
+        [(len(_cells(line, one)), len(_cells(after, one))) for one in SEPARATORS]
+        for line, after in itertools.pairwise(lines)
+    ]
+    first = max((count for count, _ in pairs[0]), default=0) if pairs else 0
+    for k, counts in enumerate(pairs):
+        if any(count == after and count > (first if k else 1) for count, after in counts):
+            return k
+    return 0
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -377,6 +484,48 @@ def _parsed(lines: list[str], kept: list[int], separator: str) -> Iterator[Table
         row = TableRow(number + 1, tuple(map(_clean, cells)), tuple(starts), lines[number])
         if not row.empty:
             yield row
+
+
+# -- header ------------------------------------------------------------------------------------------------------------
+
+
+def _check_header(rows: Sequence[TableRow]) -> None:
+    """Refuse titles above the header, and units below it.
+
+    Raises:
+        _RowError: there is such a line.
+    """
+
+    def words(row: TableRow) -> list[str]:
+        """The filled cells of a row; none if one of them is a number."""
+        filled = [cell for cell in row.cells if cell != ""]
+        texts = [cell for cell in filled if isinstance(cell, str)]
+        numbers = len(texts) < len(filled) or any(_decimals_of(text) or _POINT.fullmatch(text) for text in texts)
+        return [] if numbers else texts
+
+    titles = sum(cell != "" for cell in rows[0].cells)
+    for row in rows[1:TITLE_LINES]:
+        if len(words(row)) > max(titles, 1):
+            text = f"stands above the header, which is in line {row.line}; remove the lines before that"
+            raise _RowError(f"{text}, or begin them with '#'", rows[0])
+    second = words(rows[1]) if len(rows) > 1 else []
+    units = [text for text in second if is_unit(text.strip("[]() "))]
+    if units and 2 * len(units) >= len(second):
+        index = rows[1].cells.index(units[0])
+        name = str(rows[0].cells[index]) if index < len(rows[0].cells) else ""
+        name = re.split(r"\s*[\[(]", name)[0]
+        example = f"'{name} [{units[0].strip('[]() ')}]'"
+        text = f"has the units of the columns; write them in the header, such as {example}, and remove this line"
+        raise _RowError(text, rows[1])
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is a unit of any kind."""
+    try:
+        parse_unit(text, "1", "1")
+    except QuantityError as error:
+        return not str(error).startswith("unknown unit")
+    return True
 
 
 # -- columns and numbers -----------------------------------------------------------------------------------------------

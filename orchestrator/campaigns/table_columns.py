@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from orchestrator.campaigns.saved_table import SavedTable
+from orchestrator.campaigns.saved_table import SavedTable, is_unit
 from orchestrator.campaigns.yaml.yaml_errors import Problem
 from sim_engine.errors import did_you_mean
 from sim_engine.settings.quantity import QuantityError, parse_unit
@@ -101,7 +101,7 @@ def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str
     column = names.get(name) or names.get(word) or next((one for one in known if word in one.aliases), None)
     alias = column is not None and word in column.aliases
     standard = column is not None and word == column.standard.lower()
-    if text in renamed and not _is_unit(unit):
+    if text in renamed and not is_unit(unit):
         unit = ""  # a part of the name: 'weight (net)'
     if column is not None and not unit:
         if column.unit and not standard:
@@ -131,12 +131,3 @@ def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str
     if standard and text not in renamed:
         raise QuantityError(f"has two units; write '{column.name} [{unit}]' or '{column.standard}'")
     return FoundColumn(column.standard, factor, alias)
-
-
-def _is_unit(text: str) -> bool:
-    """Whether a text is a unit of any kind."""
-    try:
-        parse_unit(text, "1", "1")
-    except QuantityError as error:
-        return not str(error).startswith("unknown unit")
-    return True

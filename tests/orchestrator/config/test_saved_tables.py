@@ -12,6 +12,10 @@ Every dialect holds the same pours. Sources of the dialects, all public reports 
 - NOAA-OWP/ngen#510: units in square or round brackets, with or without a space
 - Unstructured-IO/unstructured#4443: Excel's 'Unicode text' is UTF-16 with tabs; ebranlard/pyDatView#196: a degree sign
   in one byte
+- pandas-dev/pandas#42562, tidyverse/readxl#428: rows that a filter hides are read; pyexcel/pyexcel#21: hidden sheets
+- felipe-prenholato/openpyxl#69: formulas of a workbook that a library wrote have no value
+- tidyverse/readxl#355: of merged cells, the first alone has a value
+- elixir-explorer/explorer#781, tidyverse/readr#179, pandas-dev/pandas#10898: titles above the header, units below it
 - tafia/calamine#693, xberg-io/xberg#331: a workbook of 2 kB with a cell in the last row and column
 """
 
@@ -219,6 +223,64 @@ IN_DOUBT: dict[str, tuple[str | bytes, str]] = {
 }
 
 
+FORMULAS = [
+    [f"=C{i}*1" if i > 1 and j == 4 else one for j, one in enumerate(row)] for i, row in enumerate(cells(PLAIN), 1)
+]
+MERGED = [["" if i in (2, 3) and j == 1 else one for j, one in enumerate(row)] for i, row in enumerate(cells(PLAIN))]
+TITLED = [["Pours of Monday"], [], *cells(PLAIN)]
+
+IN_DOUBT |= {
+    "a hidden first sheet": (
+        workbook(cells(PLAIN), names=("Old", "Pours"), hidden=["Old"]),
+        "pours.csv: its first sheet is hidden ('Old'; shown: 'Pours'); move the sheet with the table to the front",
+    ),
+    "hidden rows": (
+        workbook(cells(PLAIN), hidden=["2", "4"]),
+        "pours.csv:2:1: rows 2, 4 are hidden, by hand or by a filter; show what belongs to the table, and delete",
+    ),
+    "a row of no height": (
+        workbook(cells(PLAIN), '<row r="9" ht="0" customHeight="1"><c r="A9"><v>1</v></c></row>'),
+        "pours.csv:9:1: row 9 is hidden",
+    ),
+    "a hidden column": (
+        workbook(cells(PLAIN), columns='<cols><col min="5" max="16384" width="0" hidden="1"/></cols>'),
+        "pours.csv:1:1: columns E, F are hidden, by hand or by a filter",
+    ),
+    "merged cells": (
+        workbook(MERGED, after='<mergeCells count="1"><mergeCell ref="B2:B4"/></mergeCells>'),
+        "pours.csv:1:1: merged cells B2:B4 have a value in the first cell only; unmerge them",
+    ),
+    "merged cells, saved as text": (
+        PLAIN.replace("60,110", "60,").replace("80,120", "80,"),
+        "pours.csv:3:4: max_angle_deg: is empty in 2 lines (3, 4); a merged cell has its value in the first line only",
+    ),
+    "formulas without a value": (
+        workbook(FORMULAS),
+        "pours.csv:1:1: cells E2, E3, E4 with a formula but no stored value; open the workbook in a spreadsheet",
+    ),
+    "a title": (
+        "Pours of Monday, bench 2\n\n" + EUROPEAN,
+        "pours.csv:1:1: stands above the header, which is in line 3; remove the lines before that, or begin them with",
+    ),
+    "a title in a workbook": (
+        workbook(TITLED, after='<mergeCells count="1"><mergeCell ref="A1:F1"/></mergeCells>'),
+        "pours.csv:1:1: stands above the header, which is in line 3",
+    ),
+    "a title, names, and units of a data logger": (
+        '"TOA5","CR3000","CPU:pours","24006"\n' + PLAIN,
+        "pours.csv:1:1: stands above the header, which is in line 2",
+    ),
+    "units below names": (
+        "\n".join(["speed,angle,poured,spilled,retained,split", "deg/s,deg,g,g,g,", *ROWS]),
+        "pours.csv:2:1: has the units of the columns; write them in the header, such as 'speed [deg/s]', and remove",
+    ),
+    "units in brackets below names with units": (
+        "\n".join([HEADER, "", "[deg/s],[deg],[g],[g],[g],-", *ROWS]),
+        "pours.csv:3:1: has the units of the columns; write them in the header",
+    ),
+}
+
+
 @pytest.mark.parametrize("case", IN_DOUBT, ids=lambda case: case.replace(" ", "-"))
 def test_a_table_in_doubt_is_refused_with_one_error(case: str, folder: Path) -> None:
     content, expected = IN_DOUBT[case]
@@ -228,6 +290,25 @@ def test_a_table_in_doubt_is_refused_with_one_error(case: str, folder: Path) -> 
     told = report(path)
     assert expected in told
     assert told.count("pours.csv:") + told.count("bad.yaml:") == 1, "one cause, one message"
+
+
+def test_what_is_hidden_beside_the_table_is_no_part_of_it(folder: Path) -> None:
+    content = workbook(
+        [*cells(PLAIN), [], ["", "", "", "", "", "", "", ""]],
+        names=("Pours", "Lists"),
+        hidden=["Lists", "5", "6"],
+        columns='<cols><col min="9" max="16384" hidden="1"/></cols>',
+        after='<autoFilter ref="A1:F4"><filterColumn colId="0"><filters blank="1"/></filterColumn></autoFilter>'
+        '<mergeCells count="1"><mergeCell ref="J8:K9"/></mergeCells>',
+    )
+    table = read(folder, content)
+    assert table.problems == []
+    assert len(table.rows) == 3
+
+
+def test_a_formula_whose_result_is_an_empty_text_is_an_empty_cell(folder: Path) -> None:
+    more = '<row r="5"><c r="A5" t="str"><f>IF(B5="","",1)</f><v></v></c></row>'
+    assert len(read(folder, workbook(cells(PLAIN), more)).rows) == 3
 
 
 def other_workbook(*names: str) -> bytes:
