@@ -165,6 +165,7 @@ class _PourReader:
             for name, dimension in ACTION_DIMENSIONS.items()
             if column_name(dimension) in names or (name == "x_offset" and LIP_COLUMN in names)
         )
+        table.problems.extend(saved.misfits())
         alike: dict[tuple[str | float, ...], list[TableRow]] = {}
         for line in saved.rows:
             if len(table.rows) == MOST_POURS:
@@ -223,13 +224,6 @@ class _PourReader:
             problems.append(saved.problem(line, at, where, message))
 
         if len(line.cells) != len(columns):
-            hint = ""
-            if line.source.count('"') % 2 or any("\n" in str(cell) for cell in line.cells):
-                hint = "; is a quote still open?"
-            elif len(line.cells) > len(columns):
-                hint = "; are there decimal commas? Then save it with semicolons or tabs between the cells"
-            cells = f"{len(line.cells)} cell{'s' * (len(line.cells) > 1)}"
-            add("", f"has {cells}, the header {len(columns)}{hint}")
             return None
         values: dict[str, float] = {}
         written: dict[str, float] = {}

@@ -33,7 +33,7 @@ MOST_COLUMNS = 256
 """Columns of a sheet that are read: some add-ins keep hidden values in the last of its 16,384 columns."""
 
 MOST_LINES = 20_000
-"""Largest number of a line or row with values."""
+"""Largest number of a line or row with values, unless a caller says otherwise."""
 
 TITLE_LINES = 12
 """Lines in which a header below titles is looked for."""
@@ -113,6 +113,21 @@ class SavedTable:
         start = row.starts[index] if index is not None and index < len(row.starts) else 1
         return Problem(self.path, row.line, start, name, message, row.source)
 
+    def misfits(self) -> list[Problem]:
+        """The problem of all rows that have more or fewer cells than the header, with its likely cause; or none."""
+        width = len(self.header.cells)
+        rows = [row for row in self.rows if len(row.cells) != width]
+        if not rows:
+            return []
+        count, hint = len(rows[0].cells), ""
+        if rows[0].source.count('"') % 2 or any("\n" in str(cell) for cell in rows[0].cells):
+            hint = "; is a quote still open?"
+        elif count > width:
+            hint = "; are there decimal commas? Then save it with semicolons or tabs between the cells"
+        others = f" ({len(rows) - 1} more lines have another number, too)" if len(rows) > 1 else ""
+        text = f"has {count} cell{'s' * (count > 1)}, the header {width}{hint}{others}"
+        return [self.problem(rows[0], None, "", text)]
+
     def number(self, cell: Cell) -> float:
         """The number in a cell.
 
@@ -131,12 +146,13 @@ class SavedTable:
         return value
 
 
-def read_saved_table(path: Path, *, limit: int = SIZE_LIMIT) -> SavedTable:
+def read_saved_table(path: Path, *, limit: int = SIZE_LIMIT, most_lines: int = MOST_LINES) -> SavedTable:
     """Read a table.
 
     Args:
         path: a text file, or an .xlsx workbook whose first sheet is read. The content decides, not the name.
         limit: largest file [bytes].
+        most_lines: largest number of a line with values.
 
     Raises:
         ConfigError: the file can't be read, or its dialect is in doubt; one problem.
@@ -152,15 +168,15 @@ def read_saved_table(path: Path, *, limit: int = SIZE_LIMIT) -> SavedTable:
         assumed: list[str] = []
         other = _other_kind(content)
         if other == "xlsx":
-            rows = _sheet_rows(content, assumed)
+            rows = _sheet_rows(content, assumed, most_lines)
         elif other:
             raise UnreadableError(other)
         else:
             rows = _text_rows(_decoded(content, assumed), assumed)
         if not rows:
             raise UnreadableError("is empty; it needs a header and a line for each row")
-        if (last := rows[-1]).line > MOST_LINES:
-            raise _RowError(f"stands beyond line {MOST_LINES:,}; is it the right file?", last)
+        if (last := rows[-1]).line > most_lines:
+            raise _RowError(f"stands beyond line {most_lines:,}; is it the right file?", last)
         _check_header(rows)
         if any(not isinstance(cell, str) or _decimals_of(cell) or _POINT.fullmatch(cell) for cell in rows[0].cells):
             raise _RowError("has no header; the first line should have the names of the columns", rows[0])
@@ -237,7 +253,7 @@ def _decoded(content: bytes, assumed: list[str]) -> str:
     return text
 
 
-def _sheet_rows(content: bytes, assumed: list[str]) -> list[TableRow]:
+def _sheet_rows(content: bytes, assumed: list[str], most_lines: int) -> list[TableRow]:
     """Rows of the first sheet of a workbook.
 
     Rows are read one by one: a table of cells from the first to the last used one may need more memory than there is.
@@ -270,7 +286,7 @@ def _sheet_rows(content: bytes, assumed: list[str]) -> list[TableRow]:
                 if not filled or (len(filled) == 1 and _COMMENT.match(str(filled[0]))):
                     continue
                 rows.append(row)
-                if number > MOST_LINES:
+                if number > most_lines:
                     break
             if len(book.sheetnames) > 1:
                 assumed.append(f"sheet '{sheet.title}', the first of {len(book.sheetnames)}")
@@ -339,7 +355,7 @@ def _check_seen(part: IO[bytes], rows: Sequence[TableRow]) -> None:
                 element.clear()
             case "mergeCell":
                 left, top, _, bottom = range_boundaries(element.get("ref", ""))
-                if left <= width and any(line in lines for line in range(top, min(bottom, MOST_LINES) + 1)):
+                if left <= width and any(line in lines for line in range(top, min(bottom, rows[-1].line) + 1)):
                     merged.append(element.get("ref", ""))
 
     def refused(cells: list[str], subject: str, message: str, row: TableRow = rows[0]) -> None:

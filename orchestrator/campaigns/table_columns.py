@@ -41,6 +41,11 @@ class KnownColumn:
         return self.name + ("_" + self.display.replace("/", "_").replace("^", "") if self.display else "")
 
 
+TILT = KnownColumn("tilt", "rad", "deg", ("angle", "tilt_angle"))
+MASS = KnownColumn("mass", "kg", "g", ("weight",))
+"""Columns that several tables have: a tilt from upright, and a mass on a balance."""
+
+
 @dataclass(frozen=True)
 class FoundColumn:
     """A column of a file.
@@ -56,15 +61,24 @@ class FoundColumn:
     alias: bool = False
 
 
+class _UnknownColumnError(QuantityError):
+    """A name that resembles none of the known ones."""
+
+
 def columns_of(
-    table: SavedTable, known: Sequence[KnownColumn], renamed: Mapping[str, str], problems: list[Problem]
+    table: SavedTable,
+    known: Sequence[KnownColumn],
+    renamed: Mapping[str, str],
+    problems: list[Problem],
+    unread: list[str] | None = None,
 ) -> list[FoundColumn | None]:
-    """The meaning of each column of the header; None for one that has a problem.
+    """The meaning of each column of the header; None for one that has a problem or is not read.
 
     Args:
         known: the columns that there may be.
         renamed: names in the file and the names that they stand for, with or without a unit.
         problems: problems are added here.
+        unread: unknown columns are added here; None: they are problems.
     """
     found: list[FoundColumn | None] = []
     for index, cell in enumerate(table.header.cells):
@@ -72,6 +86,10 @@ def columns_of(
         try:
             column = _resolved(text, known, renamed)
         except QuantityError as error:
+            if unread is not None and isinstance(error, _UnknownColumnError):
+                unread.append(text)
+                found.append(None)
+                continue
             problems.append(table.problem(table.header, index, text, str(error)))
             found.append(None)
             continue
@@ -118,8 +136,9 @@ def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str
             raise QuantityError(f"'columns' gives it the name '{renamed[text]}', which is not known")
         guess = did_you_mean(word, names) or did_you_mean(word, [one.standard for one in known])
         shown = names[guess].standard if guess else ""
-        hint = f"did you mean '{shown}'?" if guess else f"known columns: {', '.join(one.standard for one in known)}"
-        raise QuantityError(f"unknown column; {hint}")
+        if not guess:
+            raise _UnknownColumnError(f"unknown column; known columns: {', '.join(one.standard for one in known)}")
+        raise QuantityError(f"unknown column; did you mean '{shown}'?")
     if not column.unit:
         raise QuantityError(f"'{column.name}' has no unit; remove '{unit}'")
     if unit == column.display:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orchestrator.campaigns.saved_table import read_saved_table
-from orchestrator.campaigns.table_columns import KnownColumn, columns_of
+from orchestrator.campaigns.table_columns import MASS, TILT, KnownColumn, columns_of
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.cli.console import RefusalError, print_note
 from sim_engine.settings.quantity import QuantityError, parse_quantity
@@ -44,8 +44,8 @@ COLUMNS = {
     one.standard: one
     for one in (
         KnownColumn("level", "m", "mm", ("height", "fill_level")),
-        KnownColumn("tilt", "rad", "deg", ("angle", "tilt_angle")),
-        KnownColumn("mass", "kg", "g", ("weight",)),
+        TILT,
+        MASS,
     )
 }
 """Columns of tables: levels above the inner floor, tilts from upright, masses of the liquid."""

@@ -1,6 +1,6 @@
 """Recorded pours: one YAML file for each, with the vessels, the liquid, the placement and the origin, and a CSV file.
 
-- `RecordingFile` declares the YAML file, `orchestrator.recordings.time_series` the CSV file next to it.
+- `RecordingFile` declares the YAML file, `orchestrator.recordings.time_series` the table next to it.
 - `load_recording` checks both and returns a `PourRecording`; `load_recordings` reads files and folders.
 - `write_recording` writes both files.
 
@@ -117,10 +117,10 @@ class RecordingFile(Settings):
     """Origin and licence of the data."""
 
     series: FilePath | None = None
-    """CSV file of times, tilts and readings; the file of the same name with the ending .csv unless given."""
+    """Table of times, tilts and readings; the CSV file of the same name unless given."""
 
     columns: dict[str, Text] | None = None
-    """Columns that have other names in the CSV file: `{mass_g: grams}`."""
+    """Columns that have other names in that table: `{mass_g: grams}`."""
 
     pourer: Annotated[PathOr[VesselFile], Example("beaker.yaml")]
     """The tilted vessel."""

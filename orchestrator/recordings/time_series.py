@@ -1,8 +1,8 @@
-"""The CSV file of a recorded pour: time, tilt and mass as they arrived, each with its own times.
+"""The table of a recorded pour: time, tilt and mass as they arrived, each with its own times.
 
-A line has a time and values of one or more columns; a cell without a value is empty. Tilt and mass usually arrive at
-different times, so most lines have one of them. Nothing is interpolated. Columns carry their unit in their name, such
-as `time_s`, `tilt_deg`, `mass_g`; `UNITS` lists the units. `read_series` reads a file, `write_series` writes one.
+A row has a time and values of one or more columns; a cell without a value is empty. Tilt and mass usually arrive at
+different times, so most rows have one of them. Nothing is interpolated. `read_series` reads every dialect that
+`orchestrator.campaigns.saved_table` reads, with units in the header; `write_series` writes the plain one.
 
 Limitations: a file is read as a whole; one hour at 20 Hz has 2 MB.
 """
@@ -10,7 +10,6 @@ Limitations: a file is read as a whole; one hour at 20 Hz has 2 MB.
 from __future__ import annotations
 
 import csv
-import io
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -19,28 +18,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.balance.readings import KILOGRAMS
-from orchestrator.campaigns.yaml.file_access import UnreadableError, read_text
+from orchestrator.campaigns.saved_table import SavedTable, TableRow, read_saved_table
+from orchestrator.campaigns.table_columns import MASS, TILT, KnownColumn, columns_of
 from orchestrator.campaigns.yaml.yaml_errors import PROBLEMS_SHOWN, ConfigError, Problem
-from sim_engine.errors import did_you_mean
+from sim_engine.settings.quantity import parse_unit
 
 Floats = NDArray[np.float64]
 
-UNITS: Mapping[str, Mapping[str, float]] = {
-    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
-    "tilt": {"deg": math.pi / 180.0, "rad": 1.0},
-    "mass": {unit: KILOGRAMS[unit] for unit in ("g", "kg", "mg", "oz", "lb")},
-    "flow": {"g_s": 1e-3, "kg_s": 1.0},
-    "level": {"mm": 1e-3, "cm": 1e-2, "m": 1.0},
-    "stable": {"": 1.0},
-}
-"""Quantities of the columns and their units, each with its value in SI. `stable` is 1 if the balance reports a stable
-weight, else 0."""
+COLUMNS = (KnownColumn("time", "s", "s"), TILT, MASS)
+"""Columns that are read; the tilt may be missing here."""
 
-REQUIRED = ("time", "mass")
-
-SIZE_LIMIT = 50_000_000
-"""Largest file [bytes]."""
+SIZE_LIMIT, MOST_LINES = 20_000_000, 400_000
+"""Largest file [bytes], and largest number of a line."""
 
 CLOCK = 1e8
 """Times above this one [s] count from 1970; the series then starts at 0."""
@@ -69,180 +58,138 @@ class Column:
 
 @dataclass(frozen=True, eq=False)
 class TimeSeries:
-    """The columns of a file by quantity, and its text for messages.
+    """The columns of a file by quantity, and its rows for messages.
 
     Attributes:
-        path: the file.
+        table: the file.
+        places: position of each quantity in its rows.
         columns: by quantity; 'mass' is present.
-        text: lines of the file.
         warnings: what is unusual, with its place.
     """
 
-    path: Path
+    table: SavedTable
+    places: Mapping[str, int]
     columns: Mapping[str, Column]
-    text: tuple[str, ...]
     warnings: tuple[Problem, ...] = ()
 
     def problem(self, line: int, message: str, quantity: str = "") -> Problem:
-        """A problem at a line, from 1."""
-        source = self.text[line - 1].rstrip() if 0 < line <= len(self.text) else ""
-        return Problem(self.path, line, 1, quantity, message, source)
+        """A problem at a line of the file; of the header for any other number."""
+        row = next((row for row in self.table.rows if row.line == line), self.table.header)
+        return self.table.problem(row, self.places.get(quantity), quantity, message)
 
 
 def read_series(path: Path, names: Mapping[str, str] | None = None) -> TimeSeries:
     """Read a file.
 
     Args:
-        path: CSV, UTF-8, comma-separated, with a header.
+        path: a table with a header.
         names: other names in the file, {name with unit: name in the file}.
 
     Raises:
         ConfigError: a column is missing or has no known unit; a value is not a finite number; times are not sorted, or
             repeat within a column.
     """
-    try:
-        text = read_text(path, limit=SIZE_LIMIT).removeprefix("\ufeff")
-    except UnreadableError as error:
-        raise ConfigError([Problem(path, 0, 0, "", str(error))]) from None
-    lines = tuple(text.splitlines())
-    if not text.strip():
-        raise ConfigError([Problem(path, 0, 0, "", "is empty; it needs a header such as time_s,tilt_deg,mass_g")])
-    reader = csv.reader(io.StringIO(text, newline=""))
-    header = [cell.strip() for cell in next(reader)]
-    places, warnings = _places(path, header, lines[0], names or {})
-    problems: list[Problem] = []
+    table = read_saved_table(path, limit=SIZE_LIMIT, most_lines=MOST_LINES)
+    places, factors, unread = _places(table, names or {})
+    header = table.header
+    series = TimeSeries(table, places, {})
+    problems = table.misfits()
     found: dict[str, tuple[list[float], list[float], list[int]]] = {name: ([], [], []) for name in places}
-    time_place, time_unit = places.pop("time")
-    width = len(header)
     before, unsorted = -math.inf, 0
-    series = TimeSeries(path, {}, lines)
-    try:
-        for cells in reader:
-            number = reader.line_num
-            if len(problems) >= PROBLEMS_SHOWN:
-                break
-            if not cells or (len(cells) == 1 and not cells[0].strip()):
-                continue
-            if len(cells) != width:
-                problems.append(series.problem(number, f"has {len(cells)} cells, the header {width}"))
-                continue
-            time = _number(cells[time_place], series, number, header[time_place], problems, required=True)
-            if time is None:
-                continue
-            time *= time_unit
-            if time < before:
-                if not unsorted:
-                    text = f"the time goes back, from {before:g} s to {time:g} s; sort the lines by time"
-                    problems.append(series.problem(number, text, header[time_place]))
-                unsorted += 1
-                continue
-            before = time
-            for name, (place, unit) in places.items():
-                value = _number(cells[place], series, number, header[place], problems)
-                if value is not None:
-                    times, values, numbers = found[name]
-                    times.append(time)
-                    values.append(unit * value)
-                    numbers.append(number)
-    except csv.Error as error:
-        problems.append(series.problem(reader.line_num, f"is not CSV: {error}; is a quote still open?"))
+    for row in table.rows:
+        if len(problems) >= PROBLEMS_SHOWN:
+            break
+        if len(row.cells) != len(header.cells):
+            continue
+        numbers = {name: _number(table, row, place, problems, name) for name, place in places.items()}
+        time = numbers.pop("time")
+        if time is None:
+            if row.cells[places["time"]] == "":
+                problems.append(series.problem(row.line, "has no time; give every line its time", "time"))
+            continue
+        time *= factors["time"]
+        if time < before:
+            if not unsorted:
+                text = f"the time goes back, from {before:g} s to {time:g} s; sort the lines by time"
+                problems.append(series.problem(row.line, text, "time"))
+            unsorted += 1
+            continue
+        before = time
+        for name, number in numbers.items():
+            if number is not None:
+                times, values, lines = found[name]
+                times.append(time)
+                values.append(factors[name] * number)
+                lines.append(row.line)
     columns = {
-        name: Column(np.array(times), np.array(values), np.array(numbers, dtype=np.int64))
-        for name, (times, values, numbers) in found.items()
-        if name != "time" and times
+        name: Column(np.array(times), np.array(values), np.array(lines, dtype=np.int64))
+        for name, (times, values, lines) in found.items()
+        if times
     }
     for name, column in columns.items():
         problems += _repeated(series, name, column)
     if not problems and "mass" not in columns:
-        problems.append(series.problem(1, "has no reading of the mass; every cell of its column is empty", "mass"))
+        problems.append(series.problem(header.line, "has no reading of the mass; every cell is empty", "mass"))
     if problems:
         raise ConfigError(problems)
+    warnings = [series.problem(header.line, f"columns that are not read: {', '.join(unread)}")] if unread else []
+    if table.note:
+        warnings.append(series.problem(header.line, table.note))
     first = min(column.times[0] for column in columns.values())
     if first > CLOCK:
+        line = table.rows[0].line
         columns = {name: Column(one.times - first, one.values, one.lines) for name, one in columns.items()}
-        text = f"times count from 1970 ({first:.3f} s); the recording starts at 0 s"
         if first > 1e3 * CLOCK:
             text = f"{first:g} s is not a time in seconds; if it is in milliseconds, name the column time_ms"
-            raise ConfigError([series.problem(2, text, header[time_place])])
-        warnings = (*warnings, series.problem(2, text, header[time_place]))
-    return TimeSeries(path, columns, lines, warnings)
+            raise ConfigError([series.problem(line, text, "time")])
+        text = f"times count from 1970 ({first:.3f} s); the recording starts at 0 s"
+        warnings.append(series.problem(line, text, "time"))
+    return TimeSeries(table, places, columns, tuple(warnings))
 
 
-def _places(
-    path: Path, header: list[str], line: str, names: Mapping[str, str]
-) -> tuple[dict[str, tuple[int, float]], tuple[Problem, ...]]:
-    """Column number and unit by quantity, and warnings.
+def _places(table: SavedTable, names: Mapping[str, str]) -> tuple[dict[str, int], dict[str, float], list[str]]:
+    """Position and unit [SI] of each quantity, and the columns that are not read.
 
     Raises:
         ConfigError: the header is invalid.
     """
-    separator = next((s for s in ";\t" if s in line and "," not in line), None)
-    if separator is not None:
-        text = f"cells are separated by {'semicolons' if separator == ';' else 'tabs'}; save it with commas, and "
-        raise ConfigError([Problem(path, 1, 1, "", text + "numbers with a decimal point", line)])
-    known = {f"{name}_{unit}" if unit else name: (name, unit) for name, units in UNITS.items() for unit in units}
-    ours = {theirs: own for own, theirs in names.items()}
     problems: list[Problem] = []
-    found: dict[str, tuple[int, float]] = {}
     unread: list[str] = []
-
-    def add(name: str, message: str) -> None:
-        problems.append(Problem(path, 1, line.find(name) + 1 if name else 1, name, message, line))
-
+    columns = columns_of(table, COLUMNS, {theirs: own for own, theirs in names.items()}, problems, unread)
+    header = [str(cell) for cell in table.header.cells]
     for own, theirs in names.items():
-        if own not in known:
-            add(theirs, f"'columns' maps it to '{own}', which is no column; known are {', '.join(known)}")
         if theirs not in header:
-            add("", f"column '{theirs}' is missing, which 'columns' names for '{own}'")
-    for place, theirs in enumerate(header):
-        own = ours.get(theirs, theirs)
-        quantity, _, unit = own.partition("_")
-        if own in known:
-            if quantity in found:
-                add(theirs, f"is a second column of the {quantity}; keep one")
-            found[quantity] = (place, UNITS[quantity][unit])
-        elif quantity in UNITS:
-            units = ", ".join(f"{quantity}_{each}" for each in UNITS[quantity] if each) or quantity
-            add(theirs, f"has no known unit; name it by its unit: {units}")
-        elif guess := did_you_mean(own, [name for name in known if "_" in name]):
-            add(theirs, f"unknown column; did you mean '{guess}'?")
-        else:
-            unread.append(theirs)
-    for quantity in REQUIRED:
-        if quantity not in found and not any(problem.where.startswith(quantity) for problem in problems):
-            units = ", ".join(f"{quantity}_{unit}" for unit in UNITS[quantity])
+            text = f"column '{theirs}' is missing, which 'columns' names for '{own}'"
+            problems.append(table.problem(table.header, None, "", text))
+    places: dict[str, int] = {}
+    factors: dict[str, float] = {}
+    for known in COLUMNS:
+        for place, column in enumerate(columns):
+            if column is not None and column.standard == known.standard:
+                places[known.name] = place
+                factors[known.name] = column.factor * parse_unit(known.display, known.unit, f"1 {known.display}")
+        if known is not TILT and known.name not in places and not problems:
             hint = f"; or map one of {', '.join(map(repr, unread[:6]))} with 'columns'" if unread else ""
-            add("", f"has no column of the {quantity}; name one {units}{hint}")
+            text = f"has no column of the {known.name}; name one '{known.standard}' or '{known.name} [unit]'{hint}"
+            problems.append(table.problem(table.header, None, "", text))
     if problems:
         raise ConfigError(problems)
-    if not unread:
-        return found, ()
-    return found, (Problem(path, 1, 1, "", f"columns that are not read: {', '.join(unread)}", line),)
+    return places, factors, unread
 
 
-def _number(
-    cell: str, series: TimeSeries, line: int, name: str, problems: list[Problem], *, required: bool = False
-) -> float | None:
-    """A cell's number; None for an empty cell and after a problem."""
+def _number(table: SavedTable, row: TableRow, place: int, problems: list[Problem], name: str) -> float | None:
+    """A cell's number in the file's unit; None for an empty cell and after a problem."""
+    cell = row.cells[place]
+    if cell == "":
+        return None
     try:
-        value = float(cell)
-    except ValueError:
-        if not cell.strip():
-            if required:
-                problems.append(series.problem(line, "has no time; give every line its time", name))
-            return None
-        hint = "write a number"
-        if required:
+        return table.number(cell)
+    except ValueError as error:
+        hint = "leave the cell empty if there is no value"
+        if name == "time":
             hint = "write seconds from the start of the recording, not a date or a clock time"
-        elif cell.strip().lower() in ("true", "false"):
-            hint = "write 1 or 0"
-        problems.append(series.problem(line, f"{cell.strip()!r} is not a number; {hint}", name))
+        problems.append(table.problem(row, place, str(table.header.cells[place]), f"{error}; {hint}"))
         return None
-    if not math.isfinite(value):
-        text = f"{cell.strip()!r} is not a finite number; leave the cell empty if there is no value"
-        problems.append(series.problem(line, text, name))
-        return None
-    return value
 
 
 def _repeated(series: TimeSeries, name: str, column: Column) -> list[Problem]:

@@ -34,6 +34,7 @@ from sim_engine.vessel.shapes import cylinder
 from sim_engine.vessel.vessel import build_vessel
 from tests.support.output_schema import validated
 from tests.support.small_campaign import write_campaign
+from tests.support.workbooks import workbook
 
 SAMPLES = shipped("recordings/dose-1.yaml").parent
 ARRIVALS = Path(__file__).parents[2] / "data" / "balance-arrivals"
@@ -84,24 +85,28 @@ def test_a_recording_keeps_the_times_of_tilt_and_mass(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "rows", "message"),
     [
-        ("time_s,tilt_deg", [], "pour.csv:1:1: has no column of the mass; name one mass_g, mass_kg"),
+        ("time_s,tilt_deg", [], "pour.csv:1:1: has no column of the mass; name one 'mass_g' or 'mass [unit]'"),
         ("time_s,mass_g", ["0,180", "1,181"], "has no tilt; a recorded pour needs the column tilt_deg"),
-        ("time_s,tilt_deg,mass_st", [], "pour.csv:1:17: mass_st: has no known unit; name it by its unit: mass_g"),
-        ("time_s,tilt,mass_g", [], "tilt: has no known unit; name it by its unit: tilt_deg, tilt_rad"),
+        ("time_s,tilt_deg,mass_st", [], "pour.csv:1:17: mass_st: unknown unit 'st'"),
+        ("time_s,tilt,mass_g", [], "tilt: has no unit; write 'tilt_deg' or 'tilt [deg]' if that is what is meant"),
         ("time_s,tilt_deg,mas_g", [], "mas_g: unknown column; did you mean 'mass_g'?"),
-        ("time_s;tilt_deg;mass_g", [], "cells are separated by semicolons"),
-        ("time_s,tilt_deg,mass_g,mass_kg", [], "mass_kg: is a second column of the mass; keep one"),
-        ("", changed(12, "0.85,30,180"), "pour.csv:12:1: time_s: the time goes back, from 0.9 s to 0.85 s; sort"),
-        ("", changed(12, "0.9,30,180"), "pour.csv:12:1: tilt: the tilt at 0.9 s stands in line 11 already"),
-        ("", changed(12, "1.0,30,nan"), "pour.csv:12:1: mass_g: 'nan' is not a finite number; leave the cell empty"),
+        ("time_s;tilt_deg;mass_g", [], "pour.csv:2:1: has 1 cell, the header 3 (59 more lines"),
+        ("time_s,tilt_deg,mass_g,mass_kg", [], "mass_kg: stands twice in the header (as 'mass_g'); keep one"),
+        ("", changed(12, "0.85,30,180"), "pour.csv:12:1: time: the time goes back, from 0.9 s to 0.85 s; sort"),
+        ("", changed(12, "0.9,30,180"), "pour.csv:12:5: tilt: the tilt at 0.9 s stands in line 11 already"),
+        (
+            "",
+            changed(12, "1.0,30,nan"),
+            "pour.csv:12:8: mass_g: 'nan' is not a number; write it like 12.5; leave",
+        ),
         ("", changed(12, "1.0,30"), "pour.csv:12:1: has 2 cells, the header 3"),
-        ("", changed(12, "1.0,x,180"), "pour.csv:12:1: tilt_deg: 'x' is not a number"),
-        ("", changed(12, ",30,180"), "pour.csv:12:1: time_s: has no time; give every line its time"),
-        ("", changed(12, "1.0,300,180"), "pour.csv:12:1: tilt: the tilt is 300°, beyond 180°"),
+        ("", changed(12, "1.0,x,180"), "pour.csv:12:5: tilt_deg: 'x' is not a number"),
+        ("", changed(12, ",30,180"), "pour.csv:12:1: time: has no time; give every line its time"),
+        ("", changed(12, "1.0,300,180"), "pour.csv:12:5: tilt: the tilt is 300°, beyond 180°"),
         (
             "",
             changed(12, "1.0,30,1800"),
-            "pour.csv:12:1: mass: the readings have risen by 1620 g, and the pourer held 300",
+            "pour.csv:12:8: mass: the readings have risen by 1620 g, and the pourer held 300",
         ),
         ("", ["0,0,", "1,30,", "2,,180"], "has fewer than two readings of the mass"),
     ],
@@ -180,6 +185,49 @@ def test_the_clocks_and_units_of_other_programs_are_read(
     assert found.tilt_times[:3] == pytest.approx([0.0, 0.1, 0.2], abs=1e-6)
     assert found.tilts[-1] == pytest.approx(math.radians(59.0))
     assert found.readings[-1] == pytest.approx(0.239)
+
+
+TABLE = [["time_s", "tilt_deg", "mass_g"], *([float(cell) for cell in row.split(",")] for row in ROWS)]
+EUROPEAN = "\n".join(["time_s;tilt_deg;mass_g", *(row.replace(",", ";").replace(".", ",") for row in ROWS)])
+
+
+@pytest.mark.parametrize(
+    ("content", "note"),
+    [
+        (EUROPEAN.encode(), "semicolons between cells, decimal commas"),
+        (EUROPEAN.replace(";", "\t").encode("utf-16"), "text in UTF-16, tabs between cells, decimal commas"),
+        ("\n".join(["# bench 2", "Time [s],Tilt (deg),weight [g]", *ROWS]).encode(), "1 comment line left out"),
+        (workbook(TABLE, names=("Pour", "Notes")), "sheet 'Pour', the first of 2"),
+    ],
+    ids=["Excel in Europe", "Unicode text", "comments and units", "workbook"],
+)
+def test_a_recording_is_read_in_the_dialects_of_all_tables(tmp_path: Path, content: bytes, note: str) -> None:
+    plain = load_recording(written(tmp_path, ROWS))
+    (tmp_path / "pour.csv").write_bytes(content)
+    read = load_recording(tmp_path / "pour.yaml")
+    assert read.tilts.tolist() == plain.tilts.tolist()
+    assert read.readings == pytest.approx(plain.readings)
+    assert read.read_times.tolist() == plain.read_times.tolist()
+    assert note in "\n".join(map(str, read.warnings))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("time_s;tilt_deg;mass_g\n0;0;1,180\n1;50;1,191", "pour.csv:2:5: mass_g: '1,180' may be 1.180 or 1180"),
+        (workbook(TABLE, hidden=["9"]), "pour.csv:9:1: row 9 is hidden"),
+        ("Pour 7\n\n" + "\n".join(["time_s,tilt_deg,mass_g", *ROWS]), "stands above the header, which is in line 3"),
+        ("\n".join(["time,tilt,mass", "s,deg,g", *ROWS]), "pour.csv:2:1: has the units of the columns; write them in"),
+    ],
+    ids=["thousands", "hidden row", "title", "units below"],
+)
+def test_a_recording_in_doubt_is_refused_with_one_error(tmp_path: Path, content: str | bytes, message: str) -> None:
+    written(tmp_path, ROWS)
+    (tmp_path / "pour.csv").write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(ConfigError) as error:
+        load_recording(tmp_path / "pour.yaml")
+    assert message in str(error.value)
+    assert len(error.value.problems) == 1, "one cause, one message"
 
 
 @pytest.mark.parametrize(
