@@ -236,16 +236,16 @@ def first_contact(pourer: Vessel, receiver: Vessel, poses: Floats) -> Contact | 
     into_receiver, into_pourer, turn = _directions(pourer, receiver, poses[candidates])
     possible = [(d, d.centre_distances() < 0.0) for d in (into_receiver, into_pourer)]
     for row, index in enumerate(candidates):
-        found = None
+        contact = None
         for direction, close in possible:
             patches = np.flatnonzero(close[row])
             if not patches.size:
                 continue
             away, own = direction.nearest(row, patches)
-            if away < -TOLERANCE and (found is None or away < found[0]):
-                found = (away, own, direction)
-        if found is not None:
-            away, own, direction = found
+            if away < -TOLERANCE and (contact is None or away < contact[0]):
+                contact = (away, own, direction)
+        if contact is not None:
+            away, own, direction = contact
             if direction is into_receiver:
                 point, in_pourer = turn[row] @ own + poses[index, :3], own
             else:

@@ -230,13 +230,13 @@ def _drain(
     per_volume, steps = (last_cell + 1) / vessel.capacity, np.diff(times, append=times[-1]).tolist()
     inside, outflow, heads = [0.0] * len(steps), [0.0] * len(steps), [0.0] * len(steps)
     v = volume
-    for k, (dt, first, part) in enumerate(zip(steps, firsts.tolist(), parts, strict=True)):
+    for k, (dt, first, fraction) in enumerate(zip(steps, firsts.tolist(), parts, strict=True)):
         inside[k] = v
         place = v * per_volume
         cell = min(int(place), last_cell)
-        rest, row, after = 1.0 - part, levels[first], levels[first + 1]
-        low = row[cell] * rest + after[cell] * part
-        slope = row[cell + 1] * rest + after[cell + 1] * part - low
+        rest, row, after = 1.0 - fraction, levels[first], levels[first + 1]
+        low = row[cell] * rest + after[cell] * fraction
+        slope = row[cell + 1] * rest + after[cell + 1] * fraction - low
         head = low + (place - cell) * slope
         if head <= 0.0:
             continue
@@ -244,8 +244,8 @@ def _drain(
         place = math.sqrt(min(head / table.head, 1.0)) * (last_flow + 1)
         at = min(int(place), last_flow)
         row, after = flows[first], flows[first + 1]
-        low = row[at] * rest + after[at] * part
-        q = low + (place - at) * (row[at + 1] * rest + after[at + 1] * part - low)
+        low = row[at] * rest + after[at] * fraction
+        q = low + (place - at) * (row[at + 1] * rest + after[at + 1] * fraction - low)
         # at most the volume above the spill point: head divided by d(head)/dV, and at most the whole volume
         above = min(head / max(slope * per_volume, 1e-12), v)
         lost = min(discharge * q * dt, above)

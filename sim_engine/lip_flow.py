@@ -132,10 +132,10 @@ class FlowCourse:
         """Fraction of the poured liquid for which a condition holds."""
         return float(self.volume[where].sum() / self.volume.sum())
 
-    def quantile(self, values: Floats, part: float) -> float:
+    def quantile(self, values: Floats, probability: float) -> float:
         """Value that this fraction of the poured liquid does not exceed."""
         order = np.argsort(values)
-        place = np.searchsorted(np.cumsum(self.volume[order]), part * self.volume.sum())
+        place = np.searchsorted(np.cumsum(self.volume[order]), probability * self.volume.sum())
         return float(values[order][min(int(place), len(order) - 1)])
 
     def lip_numbers(self, liquid: Liquid) -> FlowNumbers:

@@ -458,10 +458,10 @@ def look_up(name: str, temperature: float = ROOM) -> Properties | None:
     Raises:
         ValueError: a share or a temperature outside the data; the text gives the valid range.
     """
-    found = find(name)
-    if found is None:
+    known = find(name)
+    if known is None:
         return None
-    liquid, share = found
+    liquid, share = known
     low, high = liquid.temperatures
     if not low <= temperature <= high:
         raise ValueError(f"{liquid.name} is known from {low:g} to {high:g} °C, not at {temperature:g} °C")
@@ -545,11 +545,11 @@ class LiquidSettings(Settings):
 
 def _not_in_table(name: str) -> str:
     plain, share = split_share(name)
-    meant = did_you_mean(plain, [one.name for one in KNOWN])
+    meant = did_you_mean(plain, [liquid.name for liquid in KNOWN])
     if meant is not None:
-        solution = next(one.share for one in KNOWN if one.name == meant) is not None
+        solution = next(liquid.share for liquid in KNOWN if liquid.name == meant) is not None
         guess = f" Did you mean '{meant}{f' {60.0 if share is None else share:g} %' if solution else ''}'?"
     else:
         guess = ""
-    names = ", ".join(f"'{one.name}{' 60 %' if one.share else ''}'" for one in KNOWN)
+    names = ", ".join(f"'{liquid.name}{' 60 %' if liquid.share else ''}'" for liquid in KNOWN)
     return f"'{name}' is not in the table of liquids.{guess} The table has {names}."

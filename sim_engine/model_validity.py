@@ -106,7 +106,7 @@ class ModelValidity:
             "poured": self.poured,
             "lip": None if self.lip is None else self.lip.as_json(),
             "stream": None if self.stream is None else self.stream.as_json(),
-            "not_covered": [one.as_json() for one in self.not_covered],
+            "not_covered": [regime.as_json() for regime in self.not_covered],
         }
 
 
@@ -138,7 +138,7 @@ def regimes(
     course = flow_course(motion, liquid, pourer, receiver)
     if course is None:
         return ModelValidity(0.0)
-    found = [
+    regimes_of_pour = [
         *([_dribbling(course, liquid)] if adhesion == 0.0 else []),
         _wetting(course, liquid),
         _viscous(course, liquid, spacing),
@@ -149,7 +149,7 @@ def regimes(
         float(course.volume.sum()) / liquid.volume,
         course.lip_numbers(liquid),
         course.stream_numbers(liquid),
-        tuple(one for one in found if one.share > EDGE),
+        tuple(regime for regime in regimes_of_pour if regime.share > EDGE),
     )
 
 

@@ -72,7 +72,7 @@ class CalibrationResidual:
     @classmethod
     def of(cls, shift: float, scenes: Iterable[Scene]) -> CalibrationResidual:
         """The residual of pours in some scenes."""
-        return cls(shift, tuple(sorted({found for scene in scenes if (found := scene_digest(scene)) is not None})))
+        return cls(shift, tuple(sorted({digest for scene in scenes if (digest := scene_digest(scene)) is not None})))
 
     def at(self, scene: Scene) -> CalibrationResidual:
         """The residual for predictions of pours in a scene. It reads the mesh files of the vessels."""
@@ -276,5 +276,5 @@ def spreads(outcomes: Sequence[PourOutcome]) -> dict[str, SampleStatistics]:
     valid = [outcome for outcome in outcomes if outcome.invalid is None]
     values = {name: [float(getattr(outcome, name)) for outcome in valid] for name in FRACTIONS}
     values["spillage"] = [r for outcome in valid if (r := outcome.fractions.spillage) is not None]
-    found = {name: SampleStatistics.of(seeds) for name, seeds in values.items()}
-    return {name: spread for name, spread in found.items() if spread is not None}
+    statistics = {name: SampleStatistics.of(seeds) for name, seeds in values.items()}
+    return {name: spread for name, spread in statistics.items() if spread is not None}

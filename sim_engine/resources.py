@@ -71,11 +71,13 @@ def _temporary(cause: str) -> Path:
     directory = Path(tempfile.gettempdir()) / f"decant-cache-{getpass.getuser() if os.name == 'nt' else os.getuid()}"
     try:
         directory.mkdir(mode=0o700, exist_ok=True)
-        found = directory.lstat()
+        status = directory.lstat()
     except OSError as error:
         text = f"the cache directory {cause}, and {directory} can't be made ({error.strerror}); set {_CURE}"
         raise OSError(error.errno, text) from None
-    if not stat.S_ISDIR(found.st_mode) or (os.name != "nt" and (found.st_uid != os.getuid() or found.st_mode & 0o022)):
+    if not stat.S_ISDIR(status.st_mode) or (
+        os.name != "nt" and (status.st_uid != os.getuid() or status.st_mode & 0o022)
+    ):
         text = f"the cache directory {cause}, and {directory} belongs to another user; set {_CURE}"
         raise OSError(errno.EPERM, text)
     return directory

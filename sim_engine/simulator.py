@@ -228,8 +228,8 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
     counts, spilled_then, dribbled = fluid.census(), course.spilled, 0
     if course.dribbling is not None:
         states = np.array(course.states)
-        found = course.dribbling.select(states)
-        placed, dribbled = found.placed(states), len(found.particles)
+        dribbling = course.dribbling.select(states)
+        placed, dribbled = dribbling.placed(states), len(dribbling.particles)
         counts = np.bincount(placed[-1], minlength=len(ParticleState)).astype(np.int32)
         spilled_then = list((placed == ParticleState.SPILLED).mean(axis=1))
     received, spilled, retained, in_flight, escaped = (
@@ -384,9 +384,9 @@ def check_motion(
     Raises:
         InvalidSceneError: with position, depth and tilt.
     """
-    found = contact_during(motion, pourer, receiver, receiver_at=(error.x, error.y, error.z))
-    if found is not None:
-        contact, tilt = found
+    touching = contact_during(motion, pourer, receiver, receiver_at=(error.x, error.y, error.z))
+    if touching is not None:
+        contact, tilt = touching
         text = describe_contact(contact, tilt=tilt)
         raise InvalidSceneError(f"{text} ({action.display('x_offset', 'y_offset', 'height')})")
 
@@ -418,7 +418,7 @@ class PourSimulator:
                 oldest = next(iter(self._vessels))
                 del self._vessels[oldest]
                 self._masks.pop(oldest, None)
-                self._planes = {key: kept for key, kept in self._planes.items() if key[0] != oldest}
+                self._planes = {key: planes for key, planes in self._planes.items() if key[0] != oldest}
             self._vessels[spec] = build_vessel(spec)
         return self._vessels[spec]
 
@@ -476,9 +476,9 @@ class PourSimulator:
         if task.frame_rate > 0.0:
             course.frames[:0] = self._level_frames(task, motion, course.start)
             if course.dribbling is not None:
-                found = course.dribbling.select(np.array(course.states))
+                dribbling = course.dribbling.select(np.array(course.states))
                 times = np.array(course.times)
-                course.frames = rivulet_frames(course.dribbling, found, motion, times, course.frames)
+                course.frames = rivulet_frames(course.dribbling, dribbling, motion, times, course.frames)
         return SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
 
     def _dribbling(self, task: PourTask, motion: Motion) -> DribblingCourse | None:

@@ -39,14 +39,14 @@ def folder_digest(folder: Path) -> str:
 
 def _modules(root: Path) -> dict[str, ast.Module]:
     """The modules that `BEGINNINGS` import from this project, directly or indirectly, without docstrings."""
-    found: dict[str, ast.Module] = {}
+    trees: dict[str, ast.Module] = {}
     waiting = list(BEGINNINGS)
     while waiting:
         name = waiting.pop()
         path = root.joinpath(*name.split(".")).with_suffix(".py")
-        if name in found or not path.exists():
+        if name in trees or not path.exists():
             continue
-        found[name] = tree = ast.parse(path.read_text(encoding="utf-8"))
+        trees[name] = tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node.level == 0 and node.module is not None:
                 waiting += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
@@ -56,7 +56,7 @@ def _modules(root: Path) -> dict[str, ast.Module]:
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
                 # A string expression has no effect: it is a docstring, or explains the name above it.
                 node.body = [each for each in node.body if not _is_text(each)] or [ast.Pass()]
-    return found
+    return trees
 
 
 def _is_text(node: ast.stmt) -> bool:

@@ -172,15 +172,15 @@ class FluidEngine:
         """Particles in each `ParticleState`, shape (5,)."""
         counts = np.zeros((scene + 1, len(ParticleState)), np.int32)
         self.stepper.look(scene, scene + 1, counts, self._facts)
-        found: NDArray[np.int32] = counts[scene]
-        return found
+        counted: NDArray[np.int32] = counts[scene]
+        return counted
 
     def _copies(self, scene: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
         begin, end = self._begins[scene : scene + 2]
         n = end - begin
-        found = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
-        self._get(begin, n, *found)
-        return found
+        copies = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
+        self._get(begin, n, *copies)
+        return copies
 
     def particles(self, scene: int = 0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Positions (N, 3) in the world [m] and states (N,), in the order in which they were loaded."""

@@ -101,10 +101,10 @@ def look_up_quickly(package: str) -> None:
     """
     if as_it_is():
         return
-    part = functools.partial(_part, package)
+    look_up_part = functools.partial(_part, package)
     with imports(package):
-        part("matrix_ops")  # the first kernel would import it, more slowly
-    expr, impl, builder = (part(name) for name in ("expr", "impl", "ast.ast_transformer_utils"))
+        look_up_part("matrix_ops")  # the first kernel would import it, more slowly
+    expr, impl, builder = (look_up_part(name) for name in ("expr", "impl", "ast.ast_transformer_utils"))
     # For each of a kernel's thousands of nodes Taichi finds the method by name, stores the position, …
     # (Quadrants' builder has more to do for a node, so it stays.)
     context = getattr(builder, "ASTTransformerContext", None)
@@ -115,20 +115,20 @@ def look_up_quickly(package: str) -> None:
     _replace(context, "get_pos_info", lambda _: _nothing)
     _replace(getattr(builder, "ASTTransformerFuncContext", None), "memoized_get_pos_info", lambda _: _nothing)
     # … stores the stack for each field, for the case that it is not placed, …
-    for module in impl, part("snode"):
+    for module in impl, look_up_part("snode"):
         _replace(module, "get_traceback", lambda _: _nothing)
     # … searches a function's source again for every call, and wraps each of its lines at 9,999 characters.
-    for module in part("kernel_impl"), part("_wrap_inspect"):
+    for module in look_up_part("kernel_impl"), look_up_part("_wrap_inspect"):
         # Taichi calls the names that its first module has imported; its second one must keep its own.
         if module is not None and (hasattr(module, "textwrap") or hasattr(module, "get_source_info_and_src")):
             _replace(module, "getsourcefile", functools.cache)
             _replace(module, "getsourcelines", lambda search: functools.cache(functools.partial(_source, search)))
-    for module in part("kernel_impl"), part("_func_base"):
+    for module in look_up_part("kernel_impl"), look_up_part("_func_base"):
         _replace(module, "textwrap", lambda _: _Text)
     # For each integer it queries the range of its type from numpy, …
     _replace(expr, "_check_in_range", lambda _: _in_range)
     # … and its objects for a kernel form cycles, none of which ends before the kernel is built.
-    for module in part("kernel_impl"), part("kernel"):
+    for module in look_up_part("kernel_impl"), look_up_part("kernel"):
         _replace(getattr(module, "Kernel", None), "materialize", _uncollected_call)
 
 

@@ -76,12 +76,12 @@ class Example:
 def marks_of(cls: type[Any]) -> dict[str, FieldMark | None]:
     """The fields of a dataclass or a pydantic model, in order, each with its mark."""
     if issubclass(cls, BaseModel):
-        found = {name: info.metadata for name, info in cls.model_fields.items()}
+        marks = {name: info.metadata for name, info in cls.model_fields.items()}
     else:
         hints = typing.get_type_hints(cls, include_extras=True)
         names = [field.name for field in dataclasses.fields(cls)]
-        found = {name: list(getattr(hints[name], "__metadata__", ())) for name in names}
-    return {name: next((m for m in metadata if isinstance(m, FieldMark)), None) for name, metadata in found.items()}
+        marks = {name: list(getattr(hints[name], "__metadata__", ())) for name in names}
+    return {name: next((m for m in metadata if isinstance(m, FieldMark)), None) for name, metadata in marks.items()}
 
 
 Count = Annotated[int, Strict(), Field(ge=0)]
@@ -303,13 +303,13 @@ class Settings(BaseModel):
     @classmethod
     def required_keys(cls) -> dict[str, str]:
         """Keys that are mandatory in files, each with an example."""
-        found = dict(cls.required)
+        needed = dict(cls.required)
         if cls.tag in cls.model_fields and not cls.variant and (word := cls.tag_word()) != cls.default_tag:
-            found.setdefault(cls.tag, word)
+            needed.setdefault(cls.tag, word)
         for key, name in cls.written_keys().items():
             if (field := cls.model_fields[name]).is_required():
-                found.setdefault(key, _example(field.metadata))
-        return found
+                needed.setdefault(key, _example(field.metadata))
+        return needed
 
     def check_values(self, problems: Problems) -> None:
         """Add a problem for each combination of values in a file that is invalid.
@@ -381,8 +381,8 @@ def tagged(variants: Mapping[str, type[Settings]]) -> Any:
     key, default = first.tag, first.default_tag
 
     def word(value: Any) -> str | None:
-        found = value.get(key, default) if isinstance(value, Mapping) else getattr(value, key, None)
-        return found if isinstance(found, str) else ""
+        text = value.get(key, default) if isinstance(value, Mapping) else getattr(value, key, None)
+        return text if isinstance(text, str) else ""
 
     union = functools.reduce(operator.or_, (Annotated[model, Tag(name)] for name, model in variants.items()))
     return Annotated[union, Discriminator(word)]
@@ -417,25 +417,25 @@ def meanings(model: type[BaseModel]) -> dict[str, str]:
     Schemas and tables need them. Pydantic's `use_attribute_docstrings` would read and parse the source of every model
     whenever a program starts, which takes a quarter of its start.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for each in reversed(model.__mro__):
         if issubclass(each, BaseModel) and each is not BaseModel:
-            found |= _texts(each)
+            texts |= _texts(each)
     own = {name: field.description for name, field in model.model_fields.items() if field.description}
-    return {name: inspect.cleandoc(own.get(name) or found.get(name, "")) for name in model.model_fields}
+    return {name: inspect.cleandoc(own.get(name) or texts.get(name, "")) for name in model.model_fields}
 
 
 def _texts(model: type) -> dict[str, str]:
     """The texts below the fields that a class itself declares; none if a program has made the class."""
     node = _classes(model.__module__).get(model.__qualname__)
     body = [] if node is None else node.body
-    found = {}
+    texts = {}
     for each, after in itertools.zip_longest(body, body[1:]):
         if isinstance(each, ast.AnnAssign) and isinstance(each.target, ast.Name):
             is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
             value = after.value.value if is_text else ""  # type: ignore[union-attr]
-            found[each.target.id] = value if isinstance(value, str) else ""
-    return found
+            texts[each.target.id] = value if isinstance(value, str) else ""
+    return texts
 
 
 @functools.cache
@@ -460,9 +460,9 @@ class DescribedSchema(GenerateJsonSchema):
         form = super().model_schema(schema)
         texts = meanings(schema["cls"])
         for name, field in schema["cls"].model_fields.items():
-            part = form.get("properties", {}).get(field.alias or name)
-            if texts[name] and part is not None:
-                part["description"] = texts[name]
+            form_field = form.get("properties", {}).get(field.alias or name)
+            if texts[name] and form_field is not None:
+                form_field["description"] = texts[name]
         return form
 
 

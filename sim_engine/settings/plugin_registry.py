@@ -151,21 +151,21 @@ def settings_kind(base: type[Any]) -> Callable[[object, str], Any]:
     return accept
 
 
-def _whole(found: T) -> T:
+def _whole(plugin: T) -> T:
     """Return a loaded object, unless it is a class with missing abstract members.
 
     Raises:
         TypeError: members are missing; the text names them.
     """
-    if missing := sorted(getattr(found, "__abstractmethods__", ())) if isinstance(found, type) else []:
-        raise TypeError(f"its class {found} lacks {', '.join(f'{name!r}' for name in missing)}")
-    return found
+    if missing := sorted(getattr(plugin, "__abstractmethods__", ())) if isinstance(plugin, type) else []:
+        raise TypeError(f"its class {plugin} lacks {', '.join(f'{name!r}' for name in missing)}")
+    return plugin
 
 
 def entries_of(group: str) -> EntryPoints:
     """The entry points of a group in all installed packages."""
-    found: EntryPoints = _on_path(tuple(sys.path)).select(group=group)
-    return found
+    entries: EntryPoints = _on_path(tuple(sys.path)).select(group=group)
+    return entries
 
 
 def own_extras(group: str, name: str | None = None) -> dict[str, Any]:

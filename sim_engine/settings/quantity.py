@@ -159,14 +159,14 @@ def parse_unit(text: str, unit: str, example: str) -> float:
     return _converted(1.0, text, f"the unit '{text}'", unit, example)
 
 
-def _converted(number: float, text: str, what: str, unit: str, example: str) -> float:
+def _converted(number: float, text: str, subject: str, unit: str, example: str) -> float:
     """A number of a unit in another one; `what` begins the message about another dimension."""
     kind = KINDS.get(unit, f"a quantity in {unit}")
     source, target = _unit(text, kind, example), registry().parse_units(unit if unit != "1" else "")
     if source.dimensionality != target.dimensionality:
-        found = _kind_of(source)
-        ounces = "; a fluid ounce is written 'fl oz'" if (found, unit) == ("a mass", "m^3") and "oz" in text else ""
-        raise QuantityError(f"{what} is {found}; should be {kind}, for example '{example}'{ounces}")
+        dimension = _kind_of(source)
+        ounces = "; a fluid ounce is written 'fl oz'" if (dimension, unit) == ("a mass", "m^3") and "oz" in text else ""
+        raise QuantityError(f"{subject} is {dimension}; should be {kind}, for example '{example}'{ounces}")
     return float(registry().convert(number, source, target))
 
 

@@ -69,8 +69,8 @@ def surface_radii(points: Floats, directions: int = 300) -> Floats:
     centred = points - points.mean(axis=0)
     radii = np.linalg.norm(centred, axis=1)
     cosines = (centred @ ways.T) / np.maximum(radii, 1e-12)[:, None]
-    found: Floats = np.where(cosines > math.cos(math.radians(15.0)), radii[:, None], 0.0).max(axis=0)
-    return found
+    surface: Floats = np.where(cosines > math.cos(math.radians(15.0)), radii[:, None], 0.0).max(axis=0)
+    return surface
 
 
 def cube_to_sphere(particles: int, parameters: SimulationParameters) -> list[Measurement]:
@@ -210,7 +210,7 @@ def puddle(particles: int, angle: float) -> tuple[float, float, int]:
 def wetting(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
     """Puddles of several contact angles."""
     angles = (60.0, 90.0, 120.0, 150.0) if full else (60.0, 120.0)
-    found: list[Measurement] = []
+    measurements: list[Measurement] = []
     curves: list[Series] = []
     for particles in (250, 2_000):
         values = []
@@ -220,11 +220,13 @@ def wetting(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Fi
             values.append(1e3 * value)
             name = f"height at {degrees:g}°, d = {1e3 * d:.1f} mm"
             if d < 0.8 * right:
-                found.append(within(name, value, right, 0.2 * right, unit="m", criterion="within 20 %", particles=n))
+                measurements.append(
+                    within(name, value, right, 0.2 * right, unit="m", criterion="within 20 %", particles=n)
+                )
             else:
-                found.append(reported(name, value, unit="m", reference=right, particles=n))
+                measurements.append(reported(name, value, unit="m", reference=right, particles=n))
         curves.append(Series(f"{particles:,} particles", angles, tuple(values)))
     fine = np.linspace(0.0, 180.0, 60)
     theory = tuple(1e3 * height(math.radians(a)) for a in fine)
     curves.append(Series("theory", tuple(fine.tolist()), theory, "reference"))
-    return found, Figure(("Puddles",), ("contact angle [°]",), ("height [mm]",), tuple(curves))
+    return measurements, Figure(("Puddles",), ("contact angle [°]",), ("height [mm]",), tuple(curves))

@@ -130,8 +130,8 @@ def collected(
     """Measurements and curves of several runs; a curve that several of them have is drawn only once."""
     measurements: list[Measurement] = []
     curves: dict[tuple[str, str], Series] = {}
-    for found, series in runs:
-        measurements += found
+    for of_run, series in runs:
+        measurements += of_run
         for curve in series:
             curves.setdefault((curve.name, curve.kind), curve)
     return measurements, list(curves.values())

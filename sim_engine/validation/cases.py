@@ -91,8 +91,8 @@ def describe(parameters: SimulationParameters) -> str:
 
 def _at_rest(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     runs = [hydrostatic_cases.at_rest(n, PLAIN) for n in ((2_000, 5_000) if effort.full else (2_000,))]
-    found, curves = collected((measurements, figure.series) for measurements, figure in runs)
-    return found, replace(runs[-1][1], series=tuple(curves))
+    outcome, curves = collected((measurements, figure.series) for measurements, figure in runs)
+    return outcome, replace(runs[-1][1], series=tuple(curves))
 
 
 def _retention(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
@@ -108,16 +108,18 @@ def _retention(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measu
     else:
         runs = [(hydrostatic_cases.straight_cup(), 500, hydrostatic_cases.ANGLES[:1])]
     seeds = SEEDS if effort.full else 1
-    found, curves = collected(
+    measurements, curves = collected(
         hydrostatic_cases.slow_tilt(vessel, LOAD, n, PLAIN, angles, seeds) for vessel, n, angles in runs
     )
-    return found, hydrostatic_cases.retention_figure(curves)
+    return measurements, hydrostatic_cases.retention_figure(curves)
 
 
 def _outflow(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     numbers = (500, 1_000, 2_000, 5_000) if effort.full else (500, 1_000)
-    found, curves = collected(whole_pours.outflow(simulator, n, PLAIN, seeds=3 if n <= 2_000 else 1) for n in numbers)
-    return found, whole_pours.outflow_figure(curves)
+    measurements, curves = collected(
+        whole_pours.outflow(simulator, n, PLAIN, seeds=3 if n <= 2_000 else 1) for n in numbers
+    )
+    return measurements, whole_pours.outflow_figure(curves)
 
 
 def _delivered(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
@@ -135,32 +137,32 @@ def _column(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurem
 
 def _sloshing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     numbers = (2_000, 5_000, 10_000) if effort.full else (2_000,)
-    found, curves = collected(sloshing.sloshing(n, PLAIN) for n in numbers)
-    return found, sloshing.sloshing_figure(curves)
+    measurements, curves = collected(sloshing.sloshing(n, PLAIN) for n in numbers)
+    return measurements, sloshing.sloshing_figure(curves)
 
 
 def _torricelli(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     runs = {n: torricelli.torricelli(n, PLAIN) for n in ((6_000, 12_000) if effort.full else (6_000,))}
-    found, curves = collected(run[:2] for run in runs.values())
+    measurements, curves = collected(run[:2] for run in runs.values())
     if len(runs) > 1:
-        found.append(torricelli.steadiness({n: discharge for n, (_, _, discharge) in runs.items()}))
-    return found, torricelli.torricelli_figure(curves)
+        measurements.append(torricelli.steadiness({n: discharge for n, (_, _, discharge) in runs.items()}))
+    return measurements, torricelli.torricelli_figure(curves)
 
 
 def _dam_break(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     across = 16 if effort.full else 12
-    found, curves = collected(dam_break.dam_break(width, across, PLAIN) for width in dam_break.MEASURED)
-    return found, dam_break.dam_figure(curves)
+    measurements, curves = collected(dam_break.dam_break(width, across, PLAIN) for width in dam_break.MEASURED)
+    return measurements, dam_break.dam_figure(curves)
 
 
 def _cohesion(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     free = PLAIN.model_copy(update={"xsph_rate": 0.0})
     sphere = capillarity.cube_to_sphere(2_000, free)
     runs = {n: capillarity.oscillation(n, free) for n in ((2_000, 10_000) if effort.full else (2_000,))}
-    found, curves = collected([(sphere, []), *(run[:2] for run in runs.values())])
+    measurements, curves = collected([(sphere, []), *(run[:2] for run in runs.values())])
     if len(runs) > 1:
-        found.append(capillarity.same_tension({n: tension for n, (_, _, tension) in runs.items()}))
-    return found, capillarity.droplet_figure(curves)
+        measurements.append(capillarity.same_tension({n: tension for n, (_, _, tension) in runs.items()}))
+    return measurements, capillarity.droplet_figure(curves)
 
 
 def _landing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:

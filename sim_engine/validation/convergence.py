@@ -173,7 +173,7 @@ def convergence(
     """
     measurements: list[Measurement] = []
     curves: list[Series] = []
-    found = np.array(
+    spillages = np.array(
         [
             [
                 np.mean(
@@ -190,12 +190,12 @@ def convergence(
     fine, finest = np.array([FINE[pour.name] for pour in chosen]).T
     judged = np.array([has_converged(pour) for pour in chosen])
     for column, n in enumerate(numbers):
-        off, further = (np.abs(found[:, column] - reference)[judged] for reference in (fine, finest))
+        off, further = (np.abs(spillages[:, column] - reference)[judged] for reference in (fine, finest))
         for row, pour in enumerate(chosen):
             measurements.append(
                 reported(
                     f"spilled over poured, {pour.name}",
-                    float(found[row, column]),
+                    float(spillages[row, column]),
                     reference=float(fine[row]),
                     particles=n,
                 )
@@ -211,7 +211,7 @@ def convergence(
         measurements.append(reported("distance from 40,000 particles, mean", float(further.mean()), particles=n))
         measurements.append(reported(name, float(further.max()), particles=n))
     shares = tuple((np.arange(judged.sum()) + 1.0) / judged.sum())
-    for n, column in zip(numbers, found.T, strict=True):
+    for n, column in zip(numbers, spillages.T, strict=True):
         curves.append(Series(f"{n:,} particles", tuple(np.sort(np.abs(column - fine)[judged]).tolist()), shares))
     figure = Figure(
         ("How far pours are from 10,000 particles",),

@@ -288,21 +288,21 @@ def slow_tilt(
     motion, readings = slow_turn(vessel, volume, angles)
     poses = motion.sample(np.arange(0.0, motion.duration + 0.1, POSE_STEP))
     times = np.arange(0.02, motion.duration, 0.02)
-    kept = np.zeros(len(times))
+    retained = np.zeros(len(times))
     bottom = LIP_HEIGHT - 2.0 * vessel.bounding_sphere[1]
     cup = Container.of(vessel)
     for seed in range(1, seeds + 1):
         local = fill(vessel, volume, particles, seed, parameters.wall_distance).astype(float)
         start = local + poses[0, :3]  # upright at first
         for k in run(start, d, cup, parameters, times, poses=poses, settling=0.15, spill_level=bottom):
-            kept[k] += engine().census()[ParticleState.IN_POURER] * d**3 / seeds
+            retained[k] += engine().census()[ParticleState.IN_POURER] * d**3 / seeds
     measurements = []
     for angle, reading in zip(angles, readings, strict=True):
         now = (times >= reading) & (times <= reading + READING)
         measurements.append(
             within(
                 f"kept by the {vessel.name} at {math.degrees(angle):.0f}°",
-                float(np.mean(kept[now])),
+                float(np.mean(retained[now])),
                 retained_volume(vessel, angle),
                 TOLERANCE * vessel.capacity,
                 unit="m³",
@@ -318,7 +318,7 @@ def slow_tilt(
         Series(
             f"{vessel.name}, {particles:,} particles",
             tuple(np.degrees(tilts[late]).tolist()),
-            tuple((1e6 * kept[late]).tolist()),
+            tuple((1e6 * retained[late]).tolist()),
         ),
         Series(
             f"{vessel.name}, at rest", tuple(np.degrees(shown).tolist()), tuple((1e6 * exact).tolist()), "reference"

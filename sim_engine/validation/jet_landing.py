@@ -65,7 +65,7 @@ class Landing:
 
     def over_time(self) -> Floats:
         """Median distance in each of `PARTS` parts of the pour of equal volume, (PARTS,) [m]."""
-        return np.array([np.median(part) for part in np.array_split(self.away, PARTS)])
+        return np.array([np.median(section) for section in np.array_split(self.away, PARTS)])
 
 
 def landing(simulator: PourSimulator, speed: float, parameters: SimulationParameters, seeds: int = 1) -> Landing:
@@ -122,27 +122,27 @@ def compared(
     measurements: list[Measurement] = []
     curves: list[Series] = []
     for panel, speed in enumerate(SPEEDS):
-        found = {
+        landings = {
             n: landing(simulator, speed, parameters.model_copy(update={"particles": n}), seeds)
             for n in (*numbers, finest)
         }
-        reference = found[finest]
+        reference = landings[finest]
         for n in numbers:
-            here = found[n]
-            for what, value, expected in (
+            here = landings[n]
+            for title, value, expected in (
                 ("median", here.median, reference.median),
                 ("10 … 90 % spread", here.spread, reference.spread),
             ):
-                name = f"{what} of the landing at {speed:g} °/s"
+                name = f"{title} of the landing at {speed:g} °/s"
                 measurements.append(
                     within(name, value, expected, TOLERANCE, unit="m", criterion="within 1 mm", particles=n)
                 )
             off = float(np.abs(here.over_time() - reference.over_time()).max())
             name = f"largest error of the median over {PARTS} parts of the pour at {speed:g} °/s"
             measurements.append(reported(name, off, unit="m", particles=n))
-        for n, here in found.items():
-            middles = [float(np.median(part)) for part in np.array_split(here.times, 12)]
-            places = [1e3 * float(np.median(part)) for part in np.array_split(here.away, 12)]
+        for n, here in landings.items():
+            middles = [float(np.median(section)) for section in np.array_split(here.times, 12)]
+            places = [1e3 * float(np.median(section)) for section in np.array_split(here.away, 12)]
             curves.append(Series(f"{n:,} particles", tuple(middles), tuple(places), panel=panel))
     figure = Figure(
         tuple(f"Turned at {speed:g} °/s" for speed in SPEEDS),

@@ -154,7 +154,7 @@ def _widest(means: Floats, errors: Floats) -> tuple[int, int, int]:
     """Direction, first and last point of the longest interval with a monotone fit; among equals, the largest change."""
     from scipy.optimize import isotonic_regression
 
-    found = []
+    widest = []
     for first in range(len(means) - 1):
         for last in range(first + 1, len(means)):
             inside = slice(first, last + 1)
@@ -162,8 +162,8 @@ def _widest(means: Floats, errors: Floats) -> tuple[int, int, int]:
                 fit = isotonic_regression(means[inside], weights=errors[inside] ** -2, increasing=direction > 0).x
                 change = direction * float(fit[-1] - fit[0])
                 if _explained(means[inside] - fit, errors[inside]):
-                    found.append((last - first, change, direction, first, last))
-    _, _, direction, first, last = max(found)
+                    widest.append((last - first, change, direction, first, last))
+    _, _, direction, first, last = max(widest)
     return direction, first, last
 
 
@@ -222,15 +222,17 @@ def sensitivity(
             spilled.setdefault((pour, theta), []).append(spillage)
     if progress is not None:
         progress(len(jobs), len(jobs))
-    found = []
+    sensitivities = []
     for name, values in grids.items():
         for pour in extent.pours:
             samples = [(v, np.array(spilled.get((pour, _turned(base, name, v)), []))) for v in values]
             usable = [(v, s) for v, s in samples if len(s) >= 2]
             if len(usable) >= 3:
                 at, seeds = np.array([v for v, _ in usable]), [s for _, s in usable]
-                found.append(analyse(name, pour, at, seeds, 1.0 / extent.particles))
-    return [*_spreads(base, spilled, extent), *_measurements(found, extent)], sensitivity_figure(found, base)
+                sensitivities.append(analyse(name, pour, at, seeds, 1.0 / extent.particles))
+    return [*_spreads(base, spilled, extent), *_measurements(sensitivities, extent)], sensitivity_figure(
+        sensitivities, base
+    )
 
 
 def _turned(base: SimulationParameters, name: str, value: float) -> SimulationParameters:
@@ -252,13 +254,13 @@ def _spreads(
     base: SimulationParameters, spilled: dict[tuple[str, SimulationParameters], list[float]], extent: Extent
 ) -> list[Measurement]:
     """Spillage of the defaults in each pour."""
-    found = []
+    spreads = []
     for pour in extent.pours:
         seeds = np.array(spilled.get((pour, base), [math.nan, math.nan]))
         n = extent.particles
-        found.append(reported(f"{pour} pour with the defaults: spilled / poured", float(seeds.mean()), particles=n))
-        found.append(reported("… and the standard deviation of its seeds", float(seeds.std(ddof=1)), particles=n))
-    return found
+        spreads.append(reported(f"{pour} pour with the defaults: spilled / poured", float(seeds.mean()), particles=n))
+        spreads.append(reported("… and the standard deviation of its seeds", float(seeds.std(ddof=1)), particles=n))
+    return spreads
 
 
 WORDS = {1: "spillage rises", -1: "spillage falls", 0: "no effect beyond the seeds' noise"}
@@ -268,17 +270,17 @@ _CHANGE = re.compile(
 )
 
 
-def _measurements(found: list[Sensitivity], extent: Extent) -> list[Measurement]:
+def _measurements(sensitivities: list[Sensitivity], extent: Extent) -> list[Measurement]:
     infos = SimulationParameters.info()
     rows = []
-    for one in found:
-        unit = "" if infos[one.parameter].unit == "1" else infos[one.parameter].unit
-        where = f"{one.parameter} {one.lower:g} … {one.upper:g} {unit}".rstrip()
-        change = f"{where}, {one.pour} pour: {WORDS[one.direction]}; change (± {one.change_error:.2g})"
-        per = "doubling" if one.parameter == "particles" else unit or "1"
-        slope = f"… mean slope, per {per} (± {one.slope_error:.2g})"
-        rows.append(reported(change, one.change, particles=extent.particles))
-        rows.append(reported(slope, one.slope, particles=extent.particles))
+    for row in sensitivities:
+        unit = "" if infos[row.parameter].unit == "1" else infos[row.parameter].unit
+        where = f"{row.parameter} {row.lower:g} … {row.upper:g} {unit}".rstrip()
+        change = f"{where}, {row.pour} pour: {WORDS[row.direction]}; change (± {row.change_error:.2g})"
+        per = "doubling" if row.parameter == "particles" else unit or "1"
+        slope = f"… mean slope, per {per} (± {row.slope_error:.2g})"
+        rows.append(reported(change, row.change, particles=extent.particles))
+        rows.append(reported(slope, row.slope, particles=extent.particles))
     return rows
 
 
@@ -302,28 +304,34 @@ class ParameterEffect:
 
 def effects(records: Sequence[Mapping[str, Any]]) -> list[ParameterEffect]:
     """Effects of parameters, from the measurements as a page stores them (`Measurement.as_json`)."""
-    found = []
+    effects_of_parameters = []
     for record in records:
         match = _CHANGE.fullmatch(str(record["name"]))
         if match is not None and record["value"] is not None:
-            found.append(ParameterEffect(**match.groupdict(), change=float(record["value"])))
-    return found
+            effects_of_parameters.append(ParameterEffect(**match.groupdict(), change=float(record["value"])))
+    return effects_of_parameters
 
 
-def sensitivity_figure(found: list[Sensitivity], base: SimulationParameters) -> Figure:
+def sensitivity_figure(sensitivities: list[Sensitivity], base: SimulationParameters) -> Figure:
     """A panel for each parameter, a curve for each pour, with the standard deviation of its seeds as a band.
 
     Args:
         base: value of each parameter while another one is varied.
     """
     infos = SimulationParameters.info()
-    names = [name for name in infos if any(one.parameter == name for one in found)]
+    names = [name for name in infos if any(row.parameter == name for row in sensitivities)]
     curves = []
-    for one in found:
+    for row in sensitivities:
         curves.append(
-            Series(f"{one.pour} pour", one.values, one.means, panel=names.index(one.parameter), spread=one.deviations)
+            Series(
+                f"{row.pour} pour",
+                row.values,
+                row.means,
+                panel=names.index(row.parameter),
+                spread=row.deviations,
+            )
         )
-    top = max((mean for one in found for mean in one.means), default=1.0)
+    top = max((mean for row in sensitivities for mean in row.means), default=1.0)
     for panel, name in enumerate(names):
         held = float(getattr(base, name))
         curves.append(Series("held at", (held, held), (0.0, top), "reference", panel))

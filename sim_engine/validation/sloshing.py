@@ -58,12 +58,12 @@ def fit_oscillation(t: Floats, y: Floats, guess: float) -> tuple[float, float]:
         for factor in (0.8, 1.0, 1.2):
             start = (0.0, 2.0, 1.0, guess * factor, phase)
             try:
-                found, _ = curve_fit(_damped, t, (y - y.mean()) / scale, p0=start, maxfev=4000)
+                coefficients, _ = curve_fit(_damped, t, (y - y.mean()) / scale, p0=start, maxfev=4000)
             except RuntimeError:
                 continue
-            error = float(np.sum((_damped(t, *found) - (y - y.mean()) / scale) ** 2))
+            error = float(np.sum((_damped(t, *coefficients) - (y - y.mean()) / scale) ** 2))
             if best is None or error < best[0]:
-                best = error, abs(float(found[3])), float(found[2])
+                best = error, abs(float(coefficients[3])), float(coefficients[2])
     return (math.nan, math.nan) if best is None else best[1:]
 
 

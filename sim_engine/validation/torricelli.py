@@ -66,8 +66,8 @@ def torricelli(particles: int, parameters: SimulationParameters) -> tuple[list[M
     cup = holed_cup(RADIUS, 0.10, HOLE, FLOOR, GRID)
     for k in run(start, d, cup, parameters, times, spill_level=-0.02):
         left[k] = np.count_nonzero(engine().particles()[0][:, 2] > 0.0) / count
-    part = (left <= FIT[0]) & (left >= FIT[1])
-    slope = float(np.polyfit(times[part], np.sqrt(left[part]), 1)[0]) if part.sum() > 2 else math.nan
+    fitted = (left <= FIT[0]) & (left >= FIT[1])
+    slope = float(np.polyfit(times[fitted], np.sqrt(left[fitted]), 1)[0]) if fitted.sum() > 2 else math.nan
     duration = -1.0 / slope
     discharge = FASTEST / duration
     measurements = [

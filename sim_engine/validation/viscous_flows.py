@@ -106,8 +106,8 @@ def ring(inner: float, outer: float, low: float, high: float, d: float, seed: in
             angle = 2.0 * math.pi * (np.arange(many) + 0.5 * (level % 2)) / many
             height = np.full(many, low + (level + 0.5) * (high - low) / levels)
             points.append(np.column_stack([r * np.cos(angle), r * np.sin(angle), height]))
-    found = np.concatenate(points)
-    return np.asarray(found + np.random.default_rng(seed).uniform(-0.05, 0.05, found.shape) * d)
+    positions = np.concatenate(points)
+    return np.asarray(positions + np.random.default_rng(seed).uniform(-0.05, 0.05, positions.shape) * d)
 
 
 def down_a_tube(
@@ -206,12 +206,12 @@ def _fall(
         places.append(from_middle(x[measured]))
         speeds.append(-v[measured, 2])
     r, u = np.concatenate(places), np.concatenate(speeds)
-    found = within(f"mean velocity, {name}", float(u.mean()), mean, 0.10 * mean, unit="m/s", criterion="within 10 %",
+    velocity = within(f"mean velocity, {name}", float(u.mean()), mean, 0.10 * mean, unit="m/s", criterion="within 10 %",
                    particles=len(start))  # fmt: skip
     bins = (np.arange(round(half / d)) + 0.5) * d
     profile = [float(u[np.abs(r - b) < 0.5 * d].mean()) / mean for b in bins]
     fine = np.linspace(0.0, 1.0, 40)
-    return [found], [
+    return [velocity], [
         Series(f"{round(half / d)} spacings", tuple((bins / half).tolist()), tuple(profile)),
         Series("Poiseuille", tuple(fine.tolist()), tuple((fastest * (1.0 - fine**2)).tolist()), "reference"),
     ]
@@ -259,7 +259,7 @@ def down_an_incline(
     z, u = np.concatenate(heights), np.concatenate(speeds)
     e = float(np.mean(deep))
     wanted = pull * e**2 / (3.0 * viscosity)
-    found = within(
+    measurement = within(
         f"mean velocity of a film of {layers} spacings, ν = {_mm2(viscosity)}",
         float(u.mean()),
         wanted,
@@ -272,7 +272,7 @@ def down_an_incline(
     profile = [float(u[np.abs(z - b) < 0.5 * d].mean()) / wanted if np.any(np.abs(z - b) < 0.5 * d) else math.nan
                for b in bins]  # fmt: skip
     fine = np.linspace(0.0, 1.0, 40)
-    return [found], [
+    return [measurement], [
         Series(f"{layers} spacings", tuple((bins / e).tolist()), tuple(profile)),
         Series("Nusselt", tuple(fine.tolist()), tuple((3.0 * (fine - fine**2 / 2.0)).tolist()), "reference"),
     ]
@@ -429,14 +429,14 @@ def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float
         return np.column_stack([np.sin(a) * np.cos(b), -np.cos(a) * np.sin(b), 0.0 * a])
 
     times = 0.3 + np.linspace(0.0, lasts, 21)
-    found = []
+    measurements = []
     for step in run(start, d, tank, THETA, times, viscosity=viscosity, no_slip=False):
         if step == 0:
             stir(lambda x: speed * vortices(x))
         x, v = engine().particles()[0].astype(float), engine().velocities().astype(float)
         w = vortices(x)
-        found.append(float((v * w).sum() / (w * w).sum()))
-    left = np.array(found) / found[0]
+        measurements.append(float((v * w).sum() / (w * w).sum()))
+    left = np.array(measurements) / measurements[0]
     clear = left > 0.1
     rate = -float(np.polyfit(times[clear], np.log(left[clear]), 1)[0])
     return rate / (2.0 * k**2), d, len(start)
@@ -445,7 +445,7 @@ def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float
 def floor(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
     """Viscosity that the solver adds to that of a liquid, by spacing and speed."""
     speed = 0.2
-    found: list[Measurement] = []
+    measurements: list[Measurement] = []
     curves: list[Series] = []
     given = (1e-5, 1e-4, 5e-4, 2e-3) if full else (1e-4, 2e-3)
     for wanted in (2_000, 8_000) if full else (2_000,):
@@ -453,7 +453,7 @@ def floor(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figu
         for nu in given:
             value, d, n = own_viscosity(wanted, nu, speed)
             values.append(value)
-            found.append(
+            measurements.append(
                 reported(f"viscosity by decay at U = {speed:g} m/s, d = {1e3 * d:.1f} mm, given {1e6 * nu:.0f} mm²/s",
                          value, unit="m²/s", reference=nu, particles=n)
             )  # fmt: skip
@@ -461,12 +461,12 @@ def floor(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figu
     curves.append(Series("given", tuple(1e6 * nu for nu in given), tuple(1e6 * nu for nu in given), "reference"))
     if full:
         value, d, n = own_viscosity(2_000, 1e-4, 0.05)
-        found.append(reported("the same at U = 0.05 m/s, given 100 mm²/s", value, unit="m²/s", reference=1e-4,
+        measurements.append(reported("the same at U = 0.05 m/s, given 100 mm²/s", value, unit="m²/s", reference=1e-4,
                               particles=n))  # fmt: skip
-    thick = next(m for m in found if "given 2000" in m.name)
-    found.append(within("what it adds to 2,000 mm²/s, over it", thick.value / 2e-3 - 1.0, 0.0, 0.2,
+    thick = next(m for m in measurements if "given 2000" in m.name)
+    measurements.append(within("what it adds to 2,000 mm²/s, over it", thick.value / 2e-3 - 1.0, 0.0, 0.2,
                         criterion="within 20 %", particles=thick.particles))  # fmt: skip
-    return found, Figure(
+    return measurements, Figure(
         ("The solver's own viscosity",), ("given [mm²/s]",), ("by decay [mm²/s]",), tuple(curves), log_x=True
     )
 
@@ -512,9 +512,9 @@ def puddle(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Fig
 def _figure(
     runs: list[tuple[list[Measurement], list[Series]]], words: tuple[str, str, str]
 ) -> tuple[list[Measurement], Figure]:
-    found, curves = collected(runs)
+    measurements, curves = collected(runs)
     title, x, y = words
-    return found, Figure((title,), (x,), (y,), tuple(curves))
+    return measurements, Figure((title,), (x,), (y,), tuple(curves))
 
 
 GRID: dict[float, tuple[float, ...]] = {
@@ -536,7 +536,7 @@ FAR = 0.05
 
 def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
     """The standard pour with increasingly viscous liquids."""
-    found: list[Measurement] = []
+    measurements: list[Measurement] = []
     curves: list[Series] = []
     scene = Scene(
         "standard",
@@ -557,15 +557,15 @@ def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure
             name = f"{nu * 1e3:g} Pa s"
             curves.append(Series(f"{name}, {particles:,} particles", TIMES, tuple(left.tolist())))
             far, peer = (float(np.max(np.abs(left - np.array(other[nu])))) for other in (GRID, PEER))
-            found.append(
+            measurements.append(
                 within(f"largest difference of the rest from the grid's, {name}", far, 0.0, FAR,
                        criterion=f"within {FAR:g}", particles=particles)
             )  # fmt: skip
-            found.append(reported(f"… from SPlisHSPlasH's, {name}", peer, particles=particles))
-            found.append(reported(f"left at 3.1 s, {name}", float(left[TIMES.index(3.1)]), particles=particles))
+            measurements.append(reported(f"… from SPlisHSPlasH's, {name}", peer, particles=particles))
+            measurements.append(reported(f"left at 3.1 s, {name}", float(left[TIMES.index(3.1)]), particles=particles))
     for solver, fractions in (("grid", GRID), ("SPlisHSPlasH", PEER)):
         curves += [Series(f"{solver}, {nu * 1e3:g} Pa s", TIMES, left, "reference") for nu, left in fractions.items()]
-    return found, Figure(("Thick liquids leave a cup",), ("time [s]",), ("left in the pourer",), tuple(curves))
+    return measurements, Figure(("Thick liquids leave a cup",), ("time [s]",), ("left in the pourer",), tuple(curves))
 
 
 Work = Callable[[PourSimulator, bool], tuple[list[Measurement], Figure | None]]

@@ -107,10 +107,12 @@ def random_pours(pours: int, most_particles: int, seed: int = 1) -> Escapes:
 
 def walls(pours: int, most_particles: int, seed: int = 1) -> list[Measurement]:
     """Random pours with their criteria."""
-    found = random_pours(pours, most_particles, seed)
+    pours_made = random_pours(pours, most_particles, seed)
     return [
-        reported(f"particles in {pours} random pours", found.particles, particles=most_particles),
-        at_most("escaped particles", found.escaped, 0.0, criterion="none", particles=most_particles),
-        at_most("pours that failed", found.invalid, 0.0, criterion="none", particles=most_particles),
-        at_most("volume unaccounted for, largest", found.unaccounted, 1e-9, criterion="none", particles=most_particles),
+        reported(f"particles in {pours} random pours", pours_made.particles, particles=most_particles),
+        at_most("escaped particles", pours_made.escaped, 0.0, criterion="none", particles=most_particles),
+        at_most("pours that failed", pours_made.invalid, 0.0, criterion="none", particles=most_particles),
+        at_most(
+            "volume unaccounted for, largest", pours_made.unaccounted, 1e-9, criterion="none", particles=most_particles
+        ),
     ]

@@ -64,9 +64,9 @@ def flood(free: NDArray[np.bool_], sealed: NDArray[np.bool_] | None = None) -> C
         labels[:, :, k], count = ndimage.label(free[:, :, k])
         layer = labels[:, :, k]
         number = np.bincount(layer.ravel(), minlength=count + 1)
-        sizes.update({(k, part): int(number[part]) for part in range(1, count + 1)})
+        sizes.update({(k, component): int(number[component]) for component in range(1, count + 1)})
         border = np.concatenate([layer[0], layer[-1], layer[:, 0], layer[:, -1]])
-        open_parts |= {(k, int(part)) for part in np.unique(border) if part}
+        open_parts |= {(k, int(component)) for component in np.unique(border) if component}
         if k:
             below = labels[:, :, k - 1]
             both = (layer > 0) & (below > 0)
@@ -76,32 +76,34 @@ def flood(free: NDArray[np.bool_], sealed: NDArray[np.bool_] | None = None) -> C
                 neighbours[(k, upper)].add((k - 1, lower))
                 neighbours[(k - 1, lower)].add((k, upper))
     levels = _levels(open_parts, neighbours)
-    wet = {part for part in sizes if part[0] < levels.get(part, -1)}
+    wet = {component for component in sizes if component[0] < levels.get(component, -1)}
     best = _largest_pool(wet, neighbours, sizes)
     brim = levels[next(iter(best))] if best else 0
-    drained = [part for part in sizes if part not in open_parts and part in levels and part not in wet]
-    outside = {part for part, level in levels.items() if level < brim}
+    drained = [
+        component for component in sizes if component not in open_parts and component in levels and component not in wet
+    ]
+    outside = {component for component, level in levels.items() if level < brim}
     return CavityFill(
         pool=_nodes(labels, best),
         brim=brim,
         outside=_nodes(labels, outside),
-        enclosed=sum(size for part, size in sizes.items() if part not in levels),
-        drained=sum(sizes[part] for part in drained),
-        drain=min((part[0] for part in drained), default=-1),
+        enclosed=sum(size for component, size in sizes.items() if component not in levels),
+        drained=sum(sizes[component] for component in drained),
+        drain=min((component[0] for component in drained), default=-1),
     )
 
 
 def _levels(open_parts: set[Part], neighbours: dict[Part, set[Part]]) -> dict[Part, int]:
     """Level of every part that has a path to the outside (Dijkstra's method with the highest slice as length)."""
     levels: dict[Part, int] = {}
-    queue = [(part[0], part) for part in open_parts]
+    queue = [(component[0], component) for component in open_parts]
     heapq.heapify(queue)
     while queue:
-        level, part = heapq.heappop(queue)
-        if part in levels:
+        level, component = heapq.heappop(queue)
+        if component in levels:
             continue
-        levels[part] = level
-        for other in neighbours[part]:
+        levels[component] = level
+        for other in neighbours[component]:
             if other not in levels:
                 heapq.heappush(queue, (max(level, other[0]), other))
     return levels
@@ -113,12 +115,12 @@ def _largest_pool(wet: set[Part], neighbours: dict[Part, set[Part]], sizes: dict
     while left:
         pool, stack = set(), [left.pop()]
         while stack:
-            part = stack.pop()
-            pool.add(part)
-            found = neighbours[part] & left
-            left -= found
-            stack.extend(found)
-        size = sum(sizes[part] for part in pool)
+            component = stack.pop()
+            pool.add(component)
+            connected = neighbours[component] & left
+            left -= connected
+            stack.extend(connected)
+        size = sum(sizes[component] for component in pool)
         if size > best_size:
             best, best_size = pool, size
     return best
@@ -127,18 +129,18 @@ def _largest_pool(wet: set[Part], neighbours: dict[Part, set[Part]], sizes: dict
 def _nodes(labels: NDArray[np.int32], parts: set[Part]) -> NDArray[np.bool_]:
     mask = np.zeros(labels.shape, dtype=bool)
     by_slice: dict[int, list[int]] = defaultdict(list)
-    for k, part in parts:
-        by_slice[k].append(part)
+    for k, label in parts:
+        by_slice[k].append(label)
     for k, chosen in by_slice.items():
         mask[:, :, k] = np.isin(labels[:, :, k], chosen)
     return mask
 
 
-def brim_height(found: CavityFill, free: NDArray[np.bool_], layout: GridLayout, hits: Crossings) -> float:
+def brim_height(fill: CavityFill, free: NDArray[np.bool_], layout: GridLayout, hits: Crossings) -> float:
     """Exact height of the brim: the lowest saddle of the rim between the last dry slice and the first that overflows.
 
     Args:
-        found: with a pool.
+        fill: with a pool.
         free: as given to `flood`.
         layout: of the grid.
         hits: crossings of columns with the surface.
@@ -148,7 +150,7 @@ def brim_height(found: CavityFill, free: NDArray[np.bool_], layout: GridLayout, 
     """
     from scipy import ndimage
 
-    k = found.brim
+    k = fill.brim
     below, above = (layout.origin[2] + layout.spacing * (k - 1), layout.origin[2] + layout.spacing * k)
     height = np.where(free[:, :, k - 1], -math.inf, math.inf)
     within = (hits.z > below) & (hits.z <= above)
@@ -161,7 +163,7 @@ def brim_height(found: CavityFill, free: NDArray[np.bool_], layout: GridLayout, 
     while first < last:
         middle = (first + last) // 2
         labels, _ = ndimage.label(height <= candidates[middle])
-        joined = np.intersect1d(labels[found.pool[:, :, k - 1]], labels[found.outside[:, :, k - 1]])
+        joined = np.intersect1d(labels[fill.pool[:, :, k - 1]], labels[fill.outside[:, :, k - 1]])
         if joined.any():
             last = middle
         else:
@@ -169,10 +171,10 @@ def brim_height(found: CavityFill, free: NDArray[np.bool_], layout: GridLayout, 
     return float(candidates[last]) if len(candidates) else above
 
 
-def floor_height(found: CavityFill, layout: GridLayout, hits: Crossings) -> float:
+def floor_height(fill: CavityFill, layout: GridLayout, hits: Crossings) -> float:
     """Lowest z of the pool, where its columns meet the solid below them [m]."""
-    wet = found.pool.any(axis=2)
-    lowest = layout.origin[2] + layout.spacing * np.argmax(found.pool, axis=2)
+    wet = fill.pool.any(axis=2)
+    lowest = layout.origin[2] + layout.spacing * np.argmax(fill.pool, axis=2)
     floor = np.full(wet.shape, -math.inf)
     under = (hits.z <= lowest[hits.i, hits.j]) & (hits.z > lowest[hits.i, hits.j] - layout.spacing)
     np.maximum.at(floor, (hits.i[under], hits.j[under]), hits.z[under])

@@ -84,11 +84,11 @@ def exact_cavity(vertices: Floats, faces: Integers) -> ExactCavity:
     lowest, highest = _between(hits, layout)
     sealed = np.ones_like(free)
     sealed[::2, ::2] = np.isfinite(lowest)
-    found = flood(free, sealed)
-    pool = found.pool[::2, ::2]
+    fill = flood(free, sealed)
+    pool = fill.pool[::2, ::2]
     if not pool.any():
         return ExactCavity(0.0, float(heights[0]), layout, pool, solid)
-    brim = _brim(found, corners, layout, solid)
+    brim = _brim(fill, corners, layout, solid)
     return ExactCavity(_volume(pool, lowest, highest, layout, brim), brim, layout, pool, solid)
 
 
@@ -117,15 +117,15 @@ def fillers(vertices: Floats, faces: Integers, *, together: bool = False) -> Ite
         faces: normals outwards, shape (F, 3).
         together: whether a body is compared with a mesh that lacks the bodies found before.
     """
-    part = components(faces)
-    bodies = np.unique(part)
+    component = components(faces)
+    bodies = np.unique(component)
     if not 1 < len(bodies) <= MOST_BODIES:
         return
-    kept = np.ones(len(faces), dtype=bool)
+    remaining = np.ones(len(faces), dtype=bool)
     whole = _held(vertices, faces)
     for body in bodies:
-        chosen = part == body
-        rest = kept & ~chosen
+        chosen = component == body
+        rest = remaining & ~chosen
         corners, others = vertices[faces[chosen]], vertices[faces[rest]]
         within = np.all(corners.min(axis=(0, 1)) >= others.min(axis=(0, 1))) and np.all(
             corners.max(axis=(0, 1)) <= others.max(axis=(0, 1))
@@ -139,7 +139,7 @@ def fillers(vertices: Floats, faces: Integers, *, together: bool = False) -> Ite
         both = f"it holds {1e6 * whole:.0f} mL with it and {1e6 * without:.0f} mL without it"
         yield Filler(chosen, f"{size} mm", both)
         if together:
-            kept, whole = rest, without
+            remaining, whole = rest, without
 
 
 def _held(vertices: Floats, faces: Integers) -> float | None:
@@ -166,8 +166,8 @@ def _plane(corners: Floats, z: float, layout: GridLayout, free: Flags) -> Flags:
     ends = []
     for turn in (1, 2):
         other = corners[row, (alone + turn) % 3]
-        part = (z - top[:, 2]) / (other[:, 2] - top[:, 2])
-        ends.append((top + part[:, None] * (other - top))[:, :2])
+        fraction = (z - top[:, 2]) / (other[:, 2] - top[:, 2])
+        ends.append((top + fraction[:, None] * (other - top))[:, :2])
     # slightly displaced, so that no row of nodes runs exactly along a wall
     first, second = ((end - layout.origin[:2]) / layout.spacing - 1e-5 * math.sqrt(2.0) for end in ends)
     for across in (0, 1):  # rows of nodes along the other axis cross the segments
@@ -192,18 +192,18 @@ def _between(hits: Crossings, layout: GridLayout) -> tuple[Floats, Floats]:
     shape = layout.shape
     lowest, highest = np.full(shape, np.inf), np.full(shape, -np.inf)
     k = np.floor((hits.z - layout.origin[2]) / layout.spacing).astype(np.int64)
-    kept = (k >= 0) & (k < shape[2])
-    at = (hits.i[kept], hits.j[kept], k[kept])
-    np.minimum.at(lowest, at, hits.z[kept])
-    np.maximum.at(highest, at, hits.z[kept])
+    inside = (k >= 0) & (k < shape[2])
+    at = (hits.i[inside], hits.j[inside], k[inside])
+    np.minimum.at(lowest, at, hits.z[inside])
+    np.maximum.at(highest, at, hits.z[inside])
     return lowest, highest
 
 
-def _brim(found: CavityFill, corners: Floats, layout: GridLayout, solid: Flags) -> float:
+def _brim(fill: CavityFill, corners: Floats, layout: GridLayout, solid: Flags) -> float:
     from scipy import ndimage
 
-    k = found.brim
-    pool, outside = found.pool[:, :, k - 1], found.outside[:, :, k - 1]
+    k = fill.brim
+    pool, outside = fill.pool[:, :, k - 1], fill.outside[:, :, k - 1]
     high = layout.origin[2] + layout.spacing * k
     low = high - layout.spacing
     bottom, top = corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1)

@@ -264,14 +264,14 @@ def _measure(spec: VesselSpec, shape: MeshFile) -> Vessel:
     hits, inside = crossings(vertices, faces, layout)
     _check_one_body(vertices, faces, inside, layout, shape)
     warnings = _doubts(vertices, faces, inside, layout, shape)
-    found = flood(~inside)
+    fill = flood(~inside)
     if refusal is not None:
-        _check_walls(found, layout, exact_cavity(vertices, faces), refusal)
-    _check_cavity(found, shape, layout.spacing, vertices, layout.origin[2])
-    rim = brim_height(found, ~inside, layout, hits)
-    floor = floor_height(found, layout, hits)
+        _check_walls(fill, layout, exact_cavity(vertices, faces), refusal)
+    _check_cavity(fill, shape, layout.spacing, vertices, layout.origin[2])
+    rim = brim_height(fill, ~inside, layout, hits)
+    floor = floor_height(fill, layout, hits)
     values = signed_distance(vertices, faces, layout, inside)
-    grid = SignedDistanceGrid(layout.origin, layout.spacing, values, found.pool.astype(np.uint8))
+    grid = SignedDistanceGrid(layout.origin, layout.spacing, values, fill.pool.astype(np.uint8))
     centre, radius = measure_opening(grid, vertices[faces], rim, wall)
     if radius < 0.002:
         raise VesselError(f"{shape.path.name}: its opening of {2e3 * radius:.2g} mm is too narrow to pour from")
@@ -320,9 +320,9 @@ def _spacing(vertices: Floats, faces: Integers) -> tuple[float, float, VesselErr
         raise refusal from None
 
 
-def _check_walls(found: CavityFill, layout: GridLayout, cavity: ExactCavity, refusal: VesselError) -> None:
+def _check_walls(fill: CavityFill, layout: GridLayout, cavity: ExactCavity, refusal: VesselError) -> None:
     """Refuse walls with gaps on the grid: the cavity drains there, or is lower than the mesh's."""
-    held = float(np.count_nonzero(found.pool)) * layout.spacing**3
+    held = float(np.count_nonzero(fill.pool)) * layout.spacing**3
     if abs(held - cavity.volume) > SAME_CAVITY * cavity.volume:
         raise refusal
 
@@ -392,8 +392,8 @@ def _check_one_body(
     if count < 2:
         return
     shown = []
-    for part in ndimage.find_objects(labels):
-        size = " × ".join(f"{1e3 * layout.spacing * max(s.stop - s.start - 2, 1):.0f}" for s in part)
+    for body in ndimage.find_objects(labels):
+        size = " × ".join(f"{1e3 * layout.spacing * max(s.stop - s.start - 2, 1):.0f}" for s in body)
         shown.append(f"{size} mm")
     raise VesselError(
         f"{shape.path.name}: {count} bodies that don't touch ({', '.join(shown[:4])}{', …' if count > 4 else ''}); a "
@@ -411,7 +411,7 @@ def _doubts(
     """
     name = shape.path.name
     repair = f"decant vessel mesh {name} NEW.yaml"
-    found = [
+    doubts = [
         f"a separate body of {body.size} fills a part of the cavity and counts as solid: {body.capacities}. If it is "
         f"the liquid, leave it out: {repair} --drop-bodies"
         for body in fillers(vertices, faces)
@@ -427,29 +427,29 @@ def _doubts(
                 f"{name}: {len(shared)} faces are there twice and bound no solid: a sheet without thickness, such as "
                 f"the surface of a liquid; leave it out, or let 'decant vessel' repair it: {repair}"
             )
-        found.append(
+        doubts.append(
             f"{len(shared)} faces are shared by two bodies, which both count as solid; if one of them is the liquid, "
             "save the vessel alone"
         )
-    return tuple(found)
+    return tuple(doubts)
 
 
-def _check_cavity(found: CavityFill, shape: MeshFile, spacing: float, vertices: Floats, bottom: float) -> None:
+def _check_cavity(fill: CavityFill, shape: MeshFile, spacing: float, vertices: Floats, bottom: float) -> None:
     """Refuse a shape that holds no liquid, with the most likely reason."""
     box = float(np.prod(np.ptp(vertices, axis=0)))
     least = SMALLEST_SHARE * box
     cell = spacing**3
-    pool = float(np.count_nonzero(found.pool)) * cell
+    pool = float(np.count_nonzero(fill.pool)) * cell
     if pool >= least:
         return
     name = shape.path.name
-    if found.enclosed * cell >= least:
+    if fill.enclosed * cell >= least:
         raise VesselError(
-            f"{name}: no opening: a cavity of {1e6 * found.enclosed * cell:.3g} mL is closed on all sides; "
+            f"{name}: no opening: a cavity of {1e6 * fill.enclosed * cell:.3g} mL is closed on all sides; "
             "cut the lid away"
         )
-    if found.drained * cell >= least:
-        at = max(bottom + spacing * (found.drain - 1), 0.0)  # the hole begins between two slices
+    if fill.drained * cell >= least:
+        at = max(bottom + spacing * (fill.drain - 1), 0.0)  # the hole begins between two slices
         raise VesselError(
             f"{name}: holds nothing: what is poured in runs out {1e3 * at:.0f} mm above the underside; "
             f"close the hole in its floor or wall, or state which axis is up (now '{shape.up}')"

@@ -83,8 +83,8 @@ def _pairs(low: Integers, high: Integers) -> Iterator[tuple[Integers, Integers]]
         rest = np.arange(len(box)) + (ends[start] - count[start]) - np.repeat(before, count[start:stop])
         point = np.empty((len(box), size.shape[1]), dtype=np.int64)
         for axis in range(size.shape[1] - 1, -1, -1):
-            rest, part = np.divmod(rest, size[box, axis])
-            point[:, axis] = low[box, axis] + part
+            rest, digit = np.divmod(rest, size[box, axis])
+            point[:, axis] = low[box, axis] + digit
         if len(box):
             yield box, point
         start = stop
@@ -107,14 +107,14 @@ def crossings(vertices: Floats, faces: Integers, layout: GridLayout) -> tuple[Cr
     for attempt in range(4):
         # Columns are slightly displaced from the nodes, so that none runs exactly along an edge of an aligned mesh.
         jitter = layout.spacing * 1e-5 * np.array([np.sqrt(2.0) + attempt, np.sqrt(3.0) + 0.7 * attempt])
-        found, sign = _cross_columns(vertices, faces, layout, layout.origin[:2] + jitter)
+        heights, sign = _cross_columns(vertices, faces, layout, layout.origin[:2] + jitter)
         nx, ny, nz = layout.shape
         winding = np.zeros((nx, ny, nz + 1), dtype=np.int16)
-        first_above = np.clip(np.ceil((found.z - layout.origin[2]) / layout.spacing).astype(np.int64), 0, nz)
-        np.add.at(winding, (found.i, found.j, first_above), sign)
+        first_above = np.clip(np.ceil((heights.z - layout.origin[2]) / layout.spacing).astype(np.int64), 0, nz)
+        np.add.at(winding, (heights.i, heights.j, first_above), sign)
         np.cumsum(winding, axis=2, out=winding)
         if not winding[:, :, -1].any():
-            return found, winding[:, :, :-1] > 0
+            return heights, winding[:, :, :-1] > 0
     raise VesselError("the mesh's surface is not closed: a vertical line enters its solid and does not leave it")
 
 
@@ -212,8 +212,8 @@ def signed_distance(
     coarse = (slice(None, None, 2),) * 3
     rough = _square_distance(nearest[coarse], closest, layout, coarse)
     far = np.argwhere(~exact[coarse] & (rough < (MIDDLE * layout.spacing) ** 2)) * 2
-    _, found = spatial.cKDTree(closest[carriers]).query(layout.origin + layout.spacing * far)
-    nearest[tuple(far.T)] = carriers[found]
+    _, carrier = spatial.cKDTree(closest[carriers]).query(layout.origin + layout.spacing * far)
+    nearest[tuple(far.T)] = carriers[carrier]
     values = np.sqrt(_relax(nearest, closest, layout))
     values[exact] = np.sqrt(square.reshape(shape)[exact])
     values[inside] *= -1.0
@@ -221,12 +221,12 @@ def signed_distance(
 
 
 def _square_distance(
-    index: NDArray[np.int32], closest: NDArray[np.float32], layout: GridLayout, part: tuple[slice, ...]
+    index: NDArray[np.int32], closest: NDArray[np.float32], layout: GridLayout, block: tuple[slice, ...]
 ) -> NDArray[np.float32]:
     """Squared distance of some nodes to the surface points of the nodes in `index` [m²]."""
     point = closest[index]
     for axis, count in enumerate(layout.shape):
-        coordinate = (layout.origin[axis] + layout.spacing * np.arange(count))[part[axis]].astype(np.float32)
+        coordinate = (layout.origin[axis] + layout.spacing * np.arange(count))[block[axis]].astype(np.float32)
         point[..., axis] -= coordinate.reshape([-1 if k == axis else 1 for k in range(3)])
     result: NDArray[np.float32] = np.einsum("xyzk,xyzk->xyz", point, point)
     return result

@@ -136,8 +136,8 @@ def _inner_radius(grid: SignedDistanceGrid, ray: Floats, levels: Floats) -> Floa
     last = np.minimum(last, len(r) - 2)
     here = np.take_along_axis(away, last[..., None], axis=2)[..., 0]
     there = np.take_along_axis(away, last[..., None] + 1, axis=2)[..., 0]
-    part = np.where(there < here, np.clip(here / np.maximum(here - there, 1e-12), 0.0, 1.0), 0.0)
-    result: Floats = np.where(wet.any(axis=2), r[last] + part * step, 0.0)
+    fraction = np.where(there < here, np.clip(here / np.maximum(here - there, 1e-12), 0.0, 1.0), 0.0)
+    result: Floats = np.where(wet.any(axis=2), r[last] + fraction * step, 0.0)
     return result
 
 
@@ -176,8 +176,8 @@ def components(faces: Integers) -> Integers:
     size = count + len(edges)
     joined = coo_array((np.ones(len(owner), dtype=bool), (owner, count + index)), shape=(size, size))
     number = connected_components(joined, directed=False)[1][:count]
-    _, part = np.unique(number, return_inverse=True)
-    return np.asarray(part, dtype=np.int64).reshape(-1)
+    _, component = np.unique(number, return_inverse=True)
+    return np.asarray(component, dtype=np.int64).reshape(-1)
 
 
 def sharp_edges(vertices: Floats, faces: Integers) -> Integers:

@@ -147,9 +147,9 @@ def outer_profile(inner: Floats, wall: float, floor: float) -> Floats:
     radius = np.where(reach >= 0.0, points[:, 0] + np.sqrt(np.maximum(reach, 0.0)), 0.0).max(axis=1)
     for start, end in shifted:
         rise = end[:, 1] - start[:, 1]
-        part = (levels[:, None] - start[:, 1]) / np.where(np.abs(rise) < 1e-12, np.inf, rise)
-        within = (part >= 0.0) & (part <= 1.0) & (np.abs(rise) >= 1e-12)
-        on = start[:, 0] + part * (end[:, 0] - start[:, 0])
+        fraction = (levels[:, None] - start[:, 1]) / np.where(np.abs(rise) < 1e-12, np.inf, rise)
+        within = (fraction >= 0.0) & (fraction <= 1.0) & (np.abs(rise) >= 1e-12)
+        on = start[:, 0] + fraction * (end[:, 0] - start[:, 0])
         radius = np.maximum(radius, np.where(within, on, 0.0).max(axis=1))
     curve = simplified(np.column_stack([radius, levels]), 2e-6)
     return np.vstack([[curve[0, 0], -floor], curve])

@@ -79,10 +79,10 @@ class Vessel:
         place = (direction / (2.0 * np.pi)) % 1.0 * len(crest)
         first = int(place) % len(crest)
         second = (first + 1) % len(crest)
-        part = place - int(place)
+        fraction = place - int(place)
         radius = np.hypot(crest[:, 0], crest[:, 1])
-        r = (1.0 - part) * radius[first] + part * radius[second]
-        z = (1.0 - part) * crest[first, 2] + part * crest[second, 2]
+        r = (1.0 - fraction) * radius[first] + fraction * radius[second]
+        z = (1.0 - fraction) * crest[first, 2] + fraction * crest[second, 2]
         return np.array([r * np.cos(direction), r * np.sin(direction), z])
 
     def width_at(self, height: float) -> float:
@@ -103,8 +103,8 @@ class Vessel:
             if not cut.any():
                 continue
             start, end, low, high = start[cut], end[cut], low[cut], high[cut]
-            part = np.where(low == high, 0.0, low / np.where(low == high, 1.0, low - high))[:, None]
-            points = start + part * (end - start)
+            fraction = np.where(low == high, 0.0, low / np.where(low == high, 1.0, low - high))[:, None]
+            points = start + fraction * (end - start)
             widest = max(widest, float(np.hypot(points[:, 0], points[:, 1]).max()))
         return 2.0 * widest
 

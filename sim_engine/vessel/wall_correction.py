@@ -121,13 +121,13 @@ def equivalent_distance(
     about = repr((EDITION, np.__version__, grid.shape, step, grid.origin.tolist(), rim_height, support))
     digest = hashlib.sha256(about.encode() + grid.values.tobytes() + inside.tobytes()).digest()
     name = f"plane-{digest[0] % PLACES:02}"
-    found = np.ascontiguousarray(grid.values, np.float32).copy()
-    kept = _kept_planes(name, digest, int(near.sum()))
-    if kept is None:
-        kept = _planes(grid, inside, near, rim_height, support)[near]
-        store_arrays(name, {"digest": np.frombuffer(digest, np.uint8), "plane": kept}, compressed=False)
-    found[near] = kept
-    return found
+    distances = np.ascontiguousarray(grid.values, np.float32).copy()
+    corrected = _kept_planes(name, digest, int(near.sum()))
+    if corrected is None:
+        corrected = _planes(grid, inside, near, rim_height, support)[near]
+        store_arrays(name, {"digest": np.frombuffer(digest, np.uint8), "plane": corrected}, compressed=False)
+    distances[near] = corrected
+    return distances
 
 
 def _kept_planes(name: str, digest: bytes, count: int) -> NDArray[np.float32] | None:
@@ -168,6 +168,8 @@ def _planes(
     q = np.linspace(-1.0, 1.0, 801)
     plane = support * np.interp(-share, -half_space(q), q)
     plane = np.where(share > 1e-4, plane, np.maximum(grid.values[box], support))
-    found = grid.values.astype(np.float64)
-    found[box] = np.where(near[box], weight[box[2]] * plane + (1.0 - weight[box[2]]) * found[box], found[box])
-    return np.ascontiguousarray(found, dtype=np.float32)
+    distances = grid.values.astype(np.float64)
+    distances[box] = np.where(
+        near[box], weight[box[2]] * plane + (1.0 - weight[box[2]]) * distances[box], distances[box]
+    )
+    return np.ascontiguousarray(distances, dtype=np.float32)

@@ -104,12 +104,12 @@ class _Log:
         except VesselError:
             return None
 
-    def compare(self, what: str, before: float | None, after: float | None) -> None:
+    def compare(self, quantity: str, before: float | None, after: float | None) -> None:
         """Add a note of a repair, or a warning with both capacities if it changed the cavity."""
         if before is None or after is None or abs(after - before) <= CHANGED * max(before, after):
-            self.notes.append(what)
+            self.notes.append(quantity)
         else:
-            self.warnings.append(f"{what}: that changed the cavity from {1e6 * before:.0f} to {1e6 * after:.0f} mL")
+            self.warnings.append(f"{quantity}: that changed the cavity from {1e6 * before:.0f} to {1e6 * after:.0f} mL")
 
 
 def mended(
@@ -136,10 +136,12 @@ def mended(
     extent = float(np.max(mesh.extents))
     if unit is not None:
         scale_of(extent, MeshShape(path=path, unit=unit))
-    found = unit or likely_unit(extent, path)
+    length_unit = unit or likely_unit(extent, path)
     if unit is None:
-        log.notes.append(f"its numbers are taken for {found}: it is {1e3 * UNITS[found] * extent:.0f} mm large")
-    mesh.apply_scale(UNITS[found])
+        log.notes.append(
+            f"its numbers are taken for {length_unit}: it is {1e3 * UNITS[length_unit] * extent:.0f} mm large"
+        )
+    mesh.apply_scale(UNITS[length_unit])
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     if not len(mesh.faces):
@@ -159,7 +161,7 @@ def mended(
         _require_igl()
         joined = _remade(vertices, faces, log)
     vertices, faces = joined
-    return RepairedMesh(_thick_enough(vertices, faces, log), faces, found, tuple(log.notes), tuple(log.warnings))
+    return RepairedMesh(_thick_enough(vertices, faces, log), faces, length_unit, tuple(log.notes), tuple(log.warnings))
 
 
 def _require_igl() -> None:
@@ -219,11 +221,11 @@ def _one_body(mesh: Any, path: Path, notes: list[str]) -> Any:
     parts = mesh.split(only_watertight=False)
     if len(parts) <= 1:
         return mesh
-    large = [part for part in parts if part.area >= CRUMB * mesh.area]
+    large = [body for body in parts if body.area >= CRUMB * mesh.area]
     crumbs = len(parts) - len(large)
-    apart = [part for part in large[1:] if not _boxes_meet(part.bounds, large[0].bounds)]
+    apart = [body for body in large[1:] if not _boxes_meet(body.bounds, large[0].bounds)]
     if apart:
-        sizes = ", ".join(" × ".join(f"{1e3 * x:.0f}" for x in part.extents) + " mm" for part in large[:4])
+        sizes = ", ".join(" × ".join(f"{1e3 * x:.0f}" for x in body.extents) + " mm" for body in large[:4])
         raise VesselError(f"{path.name}: {len(large)} bodies ({sizes}); a vessel is one: save it alone")
     if crumbs:
         notes.append(f"{crumbs} loose crumb(s) dropped")
@@ -273,19 +275,19 @@ def _mesh(vertices: Floats, faces: Integers) -> Any:
 
 
 def _without_crumbs(vertices: Floats, faces: Integers, log: _Log) -> Integers:
-    part = components(faces)
+    component = components(faces)
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    share = np.bincount(part, area) / area.sum()
+    share = np.bincount(component, area) / area.sum()
     large = np.flatnonzero(share >= min(CRUMB, share.max()))
-    bounds = [(corners[part == k].min(axis=(0, 1)), corners[part == k].max(axis=(0, 1))) for k in large]
+    bounds = [(corners[component == k].min(axis=(0, 1)), corners[component == k].max(axis=(0, 1))) for k in large]
     largest = bounds[int(np.argmax(share[large]))]
     if any(not _boxes_meet(np.array(each), np.array(largest)) for each in bounds):
         sizes = ", ".join(" × ".join(f"{1e3 * x:.0f}" for x in high - low) + " mm" for low, high in bounds[:4])
         raise VesselError(f"{log.path.name}: {len(large)} bodies ({sizes}); a vessel is one: save it alone")
     if len(large) < len(share):
         log.notes.append(f"{len(share) - len(large)} loose crumb(s) dropped")
-    return faces[np.isin(part, large)]
+    return faces[np.isin(component, large)]
 
 
 def _without_holes(vertices: Floats, faces: Integers, wall: float | None, log: _Log) -> tuple[Floats, Integers]:
@@ -365,17 +367,17 @@ def _thickened(mesh: Any, wall: float) -> Any:
 
 def _without_fillers(vertices: Floats, faces: Integers, drop: bool, log: _Log) -> Integers:
     """Find separate bodies that fill a part of the cavity, and leave them out if that is wanted."""
-    kept = np.ones(len(faces), dtype=bool)
+    remaining = np.ones(len(faces), dtype=bool)
     for body in fillers(vertices @ log.turn.T, faces, together=drop):
         if drop:
             log.notes.append(f"a separate body of {body.size} in the cavity was left out: {body.capacities}")
-            kept &= ~body.faces
+            remaining &= ~body.faces
         else:
             log.warnings.append(
                 f"a separate body of {body.size} fills a part of the cavity and counts as solid: {body.capacities}. "
                 "If it is the liquid, leave it out with --drop-bodies"
             )
-    return faces[kept]
+    return faces[remaining]
 
 
 def _solid(vertices: Floats, faces: Integers) -> Any:
@@ -425,12 +427,12 @@ def _remade(vertices: Floats, faces: Integers, log: _Log) -> tuple[Floats, Integ
         )
     remade = _arrays(solid.simplify(FLATNESS))
     before = log.capacity(vertices, faces) if is_closed(faces) else None
-    what = f"its triangles do not close: a new surface was made on a grid of {1e3 * spacing:.2g} mm"
+    repair = f"its triangles do not close: a new surface was made on a grid of {1e3 * spacing:.2g} mm"
     after = log.capacity(*remade)
     if before is None and after:
-        log.warnings.append(f"{what}; it holds {1e6 * after:.0f} mL: compare that with the vessel (--brimful)")
+        log.warnings.append(f"{repair}; it holds {1e6 * after:.0f} mL: compare that with the vessel (--brimful)")
     else:
-        log.compare(what, before, after)
+        log.compare(repair, before, after)
     return remade
 
 

@@ -196,12 +196,12 @@ def find_outline(
     middle = _first_guess(height, evidence, heights)
     problem = _Problem(predict, observed, deviations, middle)
     gaps = np.abs(share[:, None] - share[None, :])
-    found = max(
+    best = max(
         (problem.solve(length, bend, gaps) for length in LENGTHS for bend in BENDS), key=lambda each: each.likelihood
     )
-    excess = float(found.residual @ found.residual) / max(len(observed) - found.determined, 1.0)
-    fits = tuple(_fits(evidence, found.residual))
-    return FittedOutline(heights, found.radii, found.covariance * max(excess, 1.0), wall, floor, fits, height_deviation)
+    excess = float(best.residual @ best.residual) / max(len(observed) - best.determined, 1.0)
+    fits = tuple(_fits(evidence, best.residual))
+    return FittedOutline(heights, best.radii, best.covariance * max(excess, 1.0), wall, floor, fits, height_deviation)
 
 
 @dataclass(frozen=True)
@@ -246,13 +246,13 @@ class _Problem:
             pull = slope.T @ residual - precision @ (radii - self.middle)
             step = np.linalg.solve(slope.T @ slope + precision, pull)
             damping = min(1.0, 4.0 * damping)
-            while (found := self._cost(tried := np.maximum(radii + damping * step, NARROWEST), precision)) > cost:
+            while (tried_cost := self._cost(tried := np.maximum(radii + damping * step, NARROWEST), precision)) > cost:
                 damping /= 2.0
                 if damping < 1e-4:
                     break
             if damping < 1e-4:
                 break
-            change, radii, cost = float(np.abs(tried - radii).max()), tried, found
+            change, radii, cost = float(np.abs(tried - radii).max()), tried, tried_cost
             if change < 1e-6:
                 break
         slope = self._slope(radii)
@@ -277,8 +277,8 @@ def _fits(evidence: Sequence[Evidence], residual: Floats) -> list[Fit]:
     fits, begin = [], 0
     for piece in evidence:
         count = len(piece.observed)
-        part = residual[begin : begin + count]
-        fits.append(Fit(piece.name, count, float(np.sqrt(np.mean(part**2))) if count else 0.0))
+        residual_of_source = residual[begin : begin + count]
+        fits.append(Fit(piece.name, count, float(np.sqrt(np.mean(residual_of_source**2))) if count else 0.0))
         begin += count
     return fits
 
@@ -318,10 +318,10 @@ def volume_below(heights: Floats, radii: Floats, levels: Floats) -> Floats:
     Returns:
         Shape (n,).
     """
-    found = np.empty(len(levels))
+    volumes = np.empty(len(levels))
     for i, level in enumerate(np.clip(levels, 0.0, heights[-1])):
         inside = heights < level
         z = np.append(heights[inside], level)
         r = np.append(radii[inside], np.interp(level, heights, radii))
-        found[i] = volume(np.column_stack([r, z])) if len(z) > 1 else 0.0
-    return found
+        volumes[i] = volume(np.column_stack([r, z])) if len(z) > 1 else 0.0
+    return volumes

@@ -116,8 +116,8 @@ def _lean(grey: Floats) -> float:
     step = float(angles[1] - angles[0])
     near = float(angles[int(np.argmin([crooked(angle) for angle in angles]))])
     around = (near - step, near + step)
-    found = minimize_scalar(crooked, bounds=around, method="bounded", options={"xatol": UPRIGHT / 4.0})
-    return float(found.x)
+    minimum = minimize_scalar(crooked, bounds=around, method="bounded", options={"xatol": UPRIGHT / 4.0})
+    return float(minimum.x)
 
 
 def _turned(grey: Floats, lean: float) -> Floats:
@@ -210,7 +210,7 @@ def radii_within(outer: Silhouette, wall: float, floor: float) -> Radii:
     slope /= (2 * smooth + 1) * np.gradient(outer.heights)
     inner = outer.radii - wall * np.sqrt(1.0 + np.clip(slope, -3.0, 3.0) ** 2)
     z = outer.heights - floor
-    kept = np.flatnonzero((z >= 0.0) & (inner > 0.0))
-    chosen = kept[np.unique(np.linspace(0, len(kept) - 1, ROWS_KEPT).round().astype(int))]
+    rows = np.flatnonzero((z >= 0.0) & (inner > 0.0))
+    chosen = rows[np.unique(np.linspace(0, len(rows) - 1, ROWS_KEPT).round().astype(int))]
     deviations = np.hypot(PIXEL * outer.pixel, SCALE_DEVIATION * inner[chosen])
     return Radii("photograph", np.clip(z[chosen], 0.0, height), inner[chosen], deviations)

@@ -167,12 +167,12 @@ def _ends(points: Floats, scatter: float) -> tuple[float, float]:
         points: about their axis.
         scatter: of a point, standard deviation [m].
     """
-    found = []
+    ends = []
     for z in (points[:, 2], -points[:, 2]):
         first, second = np.quantile(z, [0.01, 0.02])
         flat = second - first < scatter  # many points at one height: these are the tail of a plane's distribution
-        found.append(float(2.0 * first - second + (1.7 * scatter if flat else 0.0)))
-    return found[0], -found[1]
+        ends.append(float(2.0 * first - second + (1.7 * scatter if flat else 0.0)))
+    return ends[0], -ends[1]
 
 
 def _slices(points: Floats) -> list[Floats]:
@@ -214,10 +214,10 @@ def _scatter(points: Floats) -> float:
     gaps = np.where(may_cut, np.diff(radii, append=np.inf), 0.0)
     widest = np.maximum.reduceat(gaps, starts)
     first = np.minimum.reduceat(np.where(gaps == widest[index], place, len(layer)), starts)
-    part = 2 * index + ((widest >= APART)[index] & (place > first[index]))
-    number = np.bincount(part)
-    means = np.bincount(part, radii) / np.maximum(number, 1)
-    squares = np.bincount(part, (radii - means[part]) ** 2)
+    bin_index = 2 * index + ((widest >= APART)[index] & (place > first[index]))
+    number = np.bincount(bin_index)
+    means = np.bincount(bin_index, radii) / np.maximum(number, 1)
+    squares = np.bincount(bin_index, (radii - means[bin_index]) ** 2)
     return float(np.sqrt(squares * number).sum()) / len(points)
 
 
@@ -225,14 +225,18 @@ def surfaces(radii: Floats) -> list[Floats]:
     """The radii of one or of two surfaces, from inside; radii farther out, or of few points, belong to a handle."""
     ordered = np.sort(radii)
     parts = np.split(ordered, 1 + np.flatnonzero(np.diff(ordered) > APART))
-    return [part for part in parts if len(part) >= max(len(ordered) // 8, 3)][:2] or [ordered]
+    return [surface for surface in parts if len(surface) >= max(len(ordered) // 8, 3)][:2] or [ordered]
 
 
 def _layers(points: Floats, surface: str) -> tuple[list[Layer], Literal["inner", "outer", "both"]]:
-    found: list[Layer] = []
-    slices = [(part, surfaces(np.hypot(part[:, 0], part[:, 1]))) for part in _slices(points) if len(part) >= 6]
+    layers: list[Layer] = []
+    slices = [
+        (points_of_slice, surfaces(np.hypot(points_of_slice[:, 0], points_of_slice[:, 1])))
+        for points_of_slice in _slices(points)
+        if len(points_of_slice) >= 6
+    ]
     twice = sum(len(parts) == 2 for _, parts in slices) > len(slices) // 2 and surface == "auto"
-    for part, parts in slices:
+    for points_of_slice, parts in slices:
         if twice and len(parts) < 2:
             continue
         radii = [float(np.median(each)) for each in parts]
@@ -241,8 +245,8 @@ def _layers(points: Floats, surface: str) -> tuple[list[Layer], Literal["inner",
         scatter = float(np.median([1.4826 * np.median(np.abs(each - np.median(each))) for each in parts]))
         inner = radii[0] if twice or surface == "inner" else None
         outer = radii[-1] if surface != "inner" else None
-        found.append(Layer(float(part[:, 2].mean()), inner, outer, scatter, len(part)))
-    return found, "both" if twice else "inner" if surface == "inner" else "outer"
+        layers.append(Layer(float(points_of_slice[:, 2].mean()), inner, outer, scatter, len(points_of_slice)))
+    return layers, "both" if twice else "inner" if surface == "inner" else "outer"
 
 
 def _out_of_round(points: Floats, layers: list[Layer]) -> float:
@@ -260,10 +264,10 @@ def _out_of_round(points: Floats, layers: list[Layer]) -> float:
     place = np.floor((angle + np.pi) / (2.0 * np.pi) * 24.0).astype(int) % 24
     means, errors = [], []
     for sector in range(24):
-        part = offset[near][place == sector]
-        if len(part) >= 12:
-            means.append(float(part.mean()))
-            errors.append(float(part.var()) / len(part))
+        offsets_of_sector = offset[near][place == sector]
+        if len(offsets_of_sector) >= 12:
+            means.append(float(offsets_of_sector.mean()))
+            errors.append(float(offsets_of_sector.var()) / len(offsets_of_sector))
     return float(np.sqrt(max(float(np.var(means) - np.mean(errors)), 0.0))) if len(means) >= 4 else 0.0
 
 
@@ -284,8 +288,8 @@ def radii_of(scan: Scan, wall: float, floor: float) -> Radii:
     scatter = np.array([layer.scatter for layer in scan.layers])
     deviations = np.hypot(scatter / np.sqrt(counts), max(LEAST_DEVIATION, 0.3 * scan.out_of_round))
     below = 0.0 if scan.seen == "inner" else floor  # an inner surface begins at the inner floor
-    kept = (z >= below) & (inner > 0.0)
-    return Radii("points", z[kept] - below, inner[kept], deviations[kept])
+    usable = (z >= below) & (inner > 0.0)
+    return Radii("points", z[usable] - below, inner[usable], deviations[usable])
 
 
 def wall_between(scan: Scan) -> float | None:
@@ -330,7 +334,7 @@ def mesh_of(scan: Scan, wall: float | None, floor: float | None) -> tuple[Floats
         radius[order], np.searchsorted((row * directions + column)[order], np.arange(1, rows * directions))
     )
     parts = [surfaces(cell) if len(cell) >= 3 else [] for cell in cells]
-    seen = [len(part) for part in parts if part]
+    seen = [len(radii_of_slice) for radii_of_slice in parts if radii_of_slice]
     if len(seen) < 0.75 * len(cells):
         raise VesselError(
             f"only {len(seen) / len(cells):.0%} of the surface was seen, and the vessel is not round: scan it from all "
@@ -338,12 +342,22 @@ def mesh_of(scan: Scan, wall: float | None, floor: float | None) -> tuple[Floats
         )
     both = float(np.mean([count == 2 for count in seen])) > 0.5
     if both and wall is None:
-        wall = float(np.median([np.median(part[1]) - np.median(part[0]) for part in parts if len(part) == 2]))
+        wall = float(
+            np.median(
+                [
+                    np.median(radii_of_slice[1]) - np.median(radii_of_slice[0])
+                    for radii_of_slice in parts
+                    if len(radii_of_slice) == 2
+                ]
+            )
+        )
     if wall is None:
         raise VesselError(
             "the points are of one surface: how thick is the wall? Say it with --wall, such as --wall 3mm"
         )
-    grid = np.array([np.median(part[0]) if len(part) == 1 + both else np.nan for part in parts])
+    grid = np.array(
+        [np.median(radii_of_slice[0]) if len(radii_of_slice) == 1 + both else np.nan for radii_of_slice in parts]
+    )
     inner = _whole(grid.reshape(rows, directions)) - (0.0 if both or scan.seen == "inner" else wall)
     below = wall if floor is None else floor
     levels = np.linspace(0.0, scan.height - (0.0 if scan.seen == "inner" else below), rows)
@@ -445,11 +459,11 @@ def points_on_table(depth: Floats, focal: float, centre: tuple[float, float] | N
         )
     across = np.cross([0.0, 1.0, 0.0], up)
     across /= np.linalg.norm(across)
-    found: Floats = points[body == int(np.argmax(sizes))] @ np.column_stack([across, np.cross(up, across), up])
-    found[:, 2] -= level
-    low, high = np.quantile(found[:, 0], [0.01, 0.99])
-    axis = float(np.quantile(found[:, 1], 0.01)) + 0.5 * float(high - low)
-    near: Floats = found[found[:, 1] < axis]
+    aligned: Floats = points[body == int(np.argmax(sizes))] @ np.column_stack([across, np.cross(up, across), up])
+    aligned[:, 2] -= level
+    low, high = np.quantile(aligned[:, 0], [0.01, 0.99])
+    axis = float(np.quantile(aligned[:, 1], 0.01)) + 0.5 * float(high - low)
+    near: Floats = aligned[aligned[:, 1] < axis]
     return near
 
 

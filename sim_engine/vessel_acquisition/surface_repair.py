@@ -99,8 +99,8 @@ def _joined_corners(vertices: Floats, faces: Integers, tolerance: float) -> Inte
 
 def distinct(faces: Integers) -> Integers:
     """Faces with three different corners, each once."""
-    kept = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    faces = faces[kept]
+    nondegenerate = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = faces[nondegenerate]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     return faces[np.sort(first)]
 
@@ -125,9 +125,9 @@ def outwards(vertices: Floats, faces: Integers) -> Integers:
     """Faces with normals outwards: each connected part encloses a positive volume, if it is closed."""
     faces, _ = oriented(faces)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    part = components(faces)
-    volume = np.bincount(part, np.einsum("ij,ij->i", a, np.cross(b, c)))
-    return np.where((volume[part] < 0.0)[:, None], faces[:, ::-1], faces)
+    component = components(faces)
+    volume = np.bincount(component, np.einsum("ij,ij->i", a, np.cross(b, c)))
+    return np.where((volume[component] < 0.0)[:, None], faces[:, ::-1], faces)
 
 
 def _even(a: Integers, b: Integers) -> bool:
@@ -141,8 +141,8 @@ def winding_numbers(vertices: Floats, faces: Integers, points: Floats) -> Floats
     import igl
 
     used, index = np.unique(faces, return_inverse=True)  # corners without a face would enlarge the search tree
-    found = igl.fast_winding_number(vertices[used], index.reshape(-1, 3).astype(np.int64), points)
-    return np.asarray(found, dtype=float)
+    winding = igl.fast_winding_number(vertices[used], index.reshape(-1, 3).astype(np.int64), points)
+    return np.asarray(winding, dtype=float)
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ def _judgements(vertices: Floats, faces: Integers, patch: Integers) -> dict[int,
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double = np.linalg.norm(cross, axis=1)
-    found: dict[int, float] = {}
+    judgements: dict[int, float] = {}
     chosen, points = [], []
     rng = np.random.default_rng(0)
     for number in np.unique(patch):
@@ -210,7 +210,7 @@ def _judgements(vertices: Floats, faces: Integers, patch: Integers) -> dict[int,
         chosen.append((int(number), members))
         points.append(np.concatenate([centre + BESIDE * normal, centre - BESIDE * normal]))
     if not chosen:
-        return found
+        return judgements
     values = winding_numbers(vertices, faces, np.concatenate(points))
     start = 0
     for number, members in chosen:
@@ -218,8 +218,8 @@ def _judgements(vertices: Floats, faces: Integers, patch: Integers) -> dict[int,
         start += 2 * len(members)
         order = np.argsort(sides)
         weight = np.cumsum(double[members][order])
-        found[number] = float(sides[order][np.searchsorted(weight, 0.5 * weight[-1])])
-    return found
+        judgements[number] = float(sides[order][np.searchsorted(weight, 0.5 * weight[-1])])
+    return judgements
 
 
 def boundary_loops(faces: Integers) -> list[Integers]:
@@ -330,16 +330,16 @@ def rebuilt(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, float]
     if not inside.any():
         return vertices, np.zeros((0, 3), dtype=np.int64), spacing
     corners, triangles, _, _ = marching_cubes(inside.astype(np.float32), 0.5, spacing=(spacing,) * 3)
-    found = np.asarray(triangles, dtype=np.int64)
+    remaining_faces = np.asarray(triangles, dtype=np.int64)
     points = np.asarray(corners, dtype=float) + origin
     # half a spacing off at most, except next to gaps
     square, _, foot = igl.point_mesh_squared_distance(points, vertices, turned)
     near = np.asarray(square) < spacing**2
     points[near] = np.asarray(foot)[near]
-    a, b, c = (points[found[:, i]] for i in range(3))
+    a, b, c = (points[remaining_faces[:, i]] for i in range(3))
     if np.einsum("ij,ij->", a, np.cross(b, c)) < 0.0:
-        found = found[:, ::-1]
-    return points, found, spacing
+        remaining_faces = remaining_faces[:, ::-1]
+    return points, remaining_faces, spacing
 
 
 def _inside(vertices: Floats, faces: Integers, nodes: Floats, counts: Integers, spacing: float) -> Flags:
@@ -364,11 +364,11 @@ def _inside(vertices: Floats, faces: Integers, nodes: Floats, counts: Integers, 
     flat = regions.ravel()
     _, first = np.unique(flat, return_index=True)
     chosen = np.concatenate([np.flatnonzero(near.ravel()), first[1:] if near.any() else first])
-    found = winding_numbers(vertices, faces, nodes[chosen]) > 0.5
+    enclosed = winding_numbers(vertices, faces, nodes[chosen]) > 0.5
     inside = np.zeros(len(nodes), dtype=bool)
     beside = int(np.count_nonzero(near))
-    inside[chosen[:beside]] = found[:beside]
-    whole = np.concatenate([[False], found[beside:]])
+    inside[chosen[:beside]] = enclosed[:beside]
+    whole = np.concatenate([[False], enclosed[beside:]])
     inside |= whole[flat]
     return inside.reshape(counts)
 
