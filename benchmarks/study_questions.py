@@ -86,7 +86,7 @@ def deployed(
     for level in levels:
         differences = []
         for receiver in receivers:
-            ours, theirs = (value(Key(level, receiver, arm)) for arm in ("D3", "D2"))
+            ours, theirs = (value(Key(level, receiver, strategy)) for strategy in ("D3", "D2"))
             differences += [ours[n] - theirs[n] for n in ours.keys() & theirs.keys()]
         if differences:
             by_world[level] = mean(differences)
@@ -103,7 +103,9 @@ def answers(found: Gathered, levels: list[str], receivers: list[str]) -> list[An
         return dict(zip(found.numbers.get(key, []), map(mean, found.losses.get(key, [])), strict=True))
 
     def until_near(key: Key) -> dict[int, float]:
-        both = [run for arm in ("D2", "D3") for run in found.losses.get(Key(key.level, key.receiver, arm), [])]
+        both = [
+            run for strategy in ("D2", "D3") for run in found.losses.get(Key(key.level, key.receiver, strategy), [])
+        ]
         least = min((loss for run in both for loss in run if not math.isnan(loss)), default=math.nan)
         curves = [running_least(run) for run in found.losses.get(key, [])]
         pours = [next((i for i, b in enumerate(c, start=1) if b <= least + NEAR), len(c) + 1) for c in curves]
@@ -142,8 +144,9 @@ def table(found: Gathered, levels: list[str], receivers: list[str]) -> str:
     shares = {name: 100.0 * mean(list(tests_of(found, name).values())) for name in found.calibrated}
     means = ", ".join(f"{name} {share:.1f}" for name, share in shares.items())
     lost = {
-        arm: 100.0 * mean([mean(run) for key, runs in found.losses.items() if key.arm == arm for run in runs])
-        for arm in ("D2", "D3")
+        strategy: 100.0
+        * mean([mean(run) for key, runs in found.losses.items() if key.strategy == strategy for run in runs])
+        for strategy in ("D2", "D3")
     }
     return "\n".join(
         [
@@ -192,7 +195,7 @@ def main() -> None:
     found = gather(study, results)
     if not (found.finals and {"C4", "C4-active", UNCALIBRATED, RANDOM} <= found.calibrated.keys()):
         parser.error(f"{asked.folder}: too few cells are finished; first: decant study run {asked.study}")
-    receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})
+    receivers = sorted({scene.receiver.name for strategy in study.deployments for scene in strategy.plan.scenes})
     text = table(found, [level.name for level in study.levels], receivers)
     print(text)
     if asked.write:

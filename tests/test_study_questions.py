@@ -28,8 +28,8 @@ def found(ours: float, active: float) -> Gathered:
     for name, score in scores.items():
         made.calibrated[name] = Found(test=[[score], [score + 0.01]], numbers=[1, 1 + LEVEL])
     for level in LEVELS:
-        for arm, losses in {"D2": [0.9, 0.5, 0.1], "D3": [0.1, 0.1, 0.1]}.items():
-            key = Key(level, CUPS[0], arm)
+        for strategy, losses in {"D2": [0.9, 0.5, 0.1], "D3": [0.1, 0.1, 0.1]}.items():
+            key = Key(level, CUPS[0], strategy)
             made.losses[key], made.numbers[key] = [losses], [1]
             made.finals[key] = {1: [Final(0.1, 0.1, True)]}
     return made

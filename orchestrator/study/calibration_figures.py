@@ -1,8 +1,8 @@
 """Figures of a study's calibrations, and what all figures of a study share.
 
 - `draw_calibrations`: 3b test discrepancy, 3c discrepancy against simulations, 4 discrepancy over θ.
-- `Drawn` is a figure with its caption and numbers; `series_style` is the style of an arm; `level_panels` and `legend`
-  make panels and a legend.
+- `Drawn` is a figure with its caption and numbers; `series_style` is the style of a strategy; `level_panels` and
+  `legend` make panels and a legend.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ PALEST, DARKEST = 0.45, -0.35
 
 @dataclass(frozen=True)
 class SeriesStyle:
-    """Style of one arm. The styles of a figure are distinct; related arms differ in more than colour.
+    """Style of one strategy. The styles of a figure are distinct; related strategies differ in more than colour.
 
     Attributes:
         colour: colour of lines and markers.
@@ -119,44 +119,44 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
         writer.writerows(rows)
 
 
-def colour(arm: str) -> str:
+def colour(label: str) -> str:
     """Colour of a strategy; all D1 share one, and strategies of packages have one by their name."""
-    return COLOURS.get(arm) or COLOURS.get(strategy_of(arm)) or OTHERS[sum(arm.encode()) % len(OTHERS)]
+    return COLOURS.get(label) or COLOURS.get(strategy_of(label)) or OTHERS[sum(label.encode()) % len(OTHERS)]
 
 
-def is_ours(arm: str) -> bool:
-    """Whether an arm is a built-in strategy or the uncalibrated simulator."""
-    return arm in COLOURS or strategy_of(arm) in COLOURS
+def is_ours(label: str) -> bool:
+    """Whether a label is that of a built-in strategy or of the uncalibrated simulator."""
+    return label in COLOURS or strategy_of(label) in COLOURS
 
 
-def strategy_of(arm: str) -> str:
-    """Strategy of an arm's label: 'D1' of 'D1-15', 'D3' of 'D3-paper'."""
-    return arm.split("-", maxsplit=1)[0]
+def strategy_of(label: str) -> str:
+    """Strategy of a label: 'D1' of 'D1-15', 'D3' of 'D3-paper'."""
+    return label.split("-", maxsplit=1)[0]
 
 
-def series_style(arm: str, arms: Sequence[str]) -> SeriesStyle:
-    """Style of an arm in a figure with other arms.
+def series_style(strategy: str, strategies: Sequence[str]) -> SeriesStyle:
+    """Style of a strategy in a figure with other strategies.
 
     Args:
-        arm: label of the arm.
-        arms: labels of all arms of the figure, including this one.
+        strategy: label of the strategy.
+        strategies: labels of all strategies of the figure, including this one.
     """
-    marker = MARKER.get(arm) or MARKER.get(strategy_of(arm), "D")
-    if arm.endswith(PAPER):
-        return SeriesStyle(colour(arm), "--", marker, filled=False)
+    marker = MARKER.get(strategy) or MARKER.get(strategy_of(strategy), "D")
+    if strategy.endswith(PAPER):
+        return SeriesStyle(colour(strategy), "--", marker, filled=False)
     kin = sorted(
-        (other for other in arms if d1_iterations(other) is not None), key=lambda other: d1_iterations(other) or 0
+        (other for other in strategies if d1_iterations(other) is not None), key=lambda other: d1_iterations(other) or 0
     )
-    if arm not in kin or len(kin) == 1:
-        return SeriesStyle(colour(arm), "-", marker)
-    place = kin.index(arm)
+    if strategy not in kin or len(kin) == 1:
+        return SeriesStyle(colour(strategy), "-", marker)
+    place = kin.index(strategy)
     share = PALEST + (DARKEST - PALEST) * place / (len(kin) - 1)
-    return SeriesStyle(_shade(colour(arm), share), LINES[place % len(LINES)], MARKERS[place % len(MARKERS)])
+    return SeriesStyle(_shade(colour(strategy), share), LINES[place % len(LINES)], MARKERS[place % len(MARKERS)])
 
 
-def d1_iterations(arm: str) -> int | None:
-    """Iterations of an arm with D1: 15 of 'D1-15'; None for all others."""
-    strategy, _, number = arm.partition("-")
+def d1_iterations(label: str) -> int | None:
+    """Iterations of a label with D1: 15 of 'D1-15'; None for all others."""
+    strategy, _, number = label.partition("-")
     return int(number) if strategy == "D1" and number.isdigit() else None
 
 
@@ -211,10 +211,13 @@ def is_first(axes: Axes) -> bool:
     return place is None or place.is_first_col()
 
 
-def legend(figure: Figure, arms: Sequence[str]) -> None:
-    """Add one legend for all panels below them, in the order of the arms; an arm may be missing in some panels."""
+def legend(figure: Figure, strategies: Sequence[str]) -> None:
+    """Add one legend for all panels below them, in the order of the strategies; some panels may lack one."""
     handles = {name: h for axes in figure.axes for h, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    names = [*(arm for arm in arms if arm in handles), *(name for name in handles if name not in arms)]
+    names = [
+        *(name for name in strategies if name in handles),
+        *(name for name in handles if name not in strategies),
+    ]
     columns = -(-len(names) // -(-len(names) // MOST_ABREAST))
     figure.legend([handles[n] for n in names], names, loc="outside lower center", ncols=columns, frameon=False)
 

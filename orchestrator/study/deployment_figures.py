@@ -47,7 +47,7 @@ class Losses:
         final: select the pours of recommended actions, instead of the deployments' own pours.
 
     Attributes:
-        levels, receivers, arms: those with data, in the order of the study.
+        levels, receivers, strategies: those with data, in the order of the study.
         unit: display unit of the loss.
         range: from 0 to the largest loss.
         pours: number of pours of the longest deployment.
@@ -55,13 +55,15 @@ class Losses:
 
     def __init__(self, study: StudyPlan, found: Gathered, *, final: bool = False) -> None:
         keys = (found.finals if final else found.losses).keys()
-        names = [scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes]
+        names = [scene.receiver.name for compared in study.deployments for scene in compared.plan.scenes]
         self.levels = [level.name for level in study.levels if any(key.level == level.name for key in keys)]
         self.receivers = [name for name in dict.fromkeys(names) if any(key.receiver == name for key in keys)]
-        self.arms = [arm.label for arm in study.deployments if any(key.arm == arm.label for key in keys)]
+        self.strategies = [
+            compared.label for compared in study.deployments if any(key.strategy == compared.label for key in keys)
+        ]
         self.unit = deployment_unit(study.deployments[0].plan)
         self.range = (0.0, largest_loss(study.deployments[0].plan))
-        self.pours = max(arm.plan.pours for arm in study.deployments)
+        self.pours = max(compared.plan.pours for compared in study.deployments)
         self._found = found
 
     @property
@@ -77,13 +79,13 @@ class Losses:
         """The checkpoints that are reached, and the last pour."""
         return sorted({min(pour, self.pours) for pour in wanted})
 
-    def after(self, level: str, receivers: Sequence[str], arm: str, pour: int) -> dict[int, float]:
+    def after(self, level: str, receivers: Sequence[str], strategy: str, pour: int) -> dict[int, float]:
         """Smallest loss up to a pour by repetition; mean over receivers, if the repetition has all of them."""
-        return _mean_of([self._found.by_repetition(Key(level, receiver, arm), pour) for receiver in receivers])
+        return _mean_of([self._found.by_repetition(Key(level, receiver, strategy), pour) for receiver in receivers])
 
-    def final(self, level: str, receivers: Sequence[str], arm: str) -> dict[int, float]:
+    def final(self, level: str, receivers: Sequence[str], strategy: str) -> dict[int, float]:
         """Loss of the recommended action by repetition; mean over receivers, if the repetition has all of them."""
-        each = [self._found.finals.get(Key(level, receiver, arm), {}) for receiver in receivers]
+        each = [self._found.finals.get(Key(level, receiver, strategy), {}) for receiver in receivers]
         return _mean_of([{n: mean([pour.loss for pour in pours]) for n, pours in one.items()} for one in each])
 
 
@@ -107,23 +109,23 @@ def draw_deployments(study: StudyPlan, found: Gathered) -> list[Drawn]:
 
 
 def means(
-    axes: Axes, groups: Sequence[str], arms: Sequence[str], of: Callable[[int, str], Estimate], least: float
+    axes: Axes, groups: Sequence[str], strategies: Sequence[str], of: Callable[[int, str], Estimate], least: float
 ) -> list[tuple[int, str, list[float]]]:
-    """Draw a group of means for each name, with one mean per arm and its interval, on a logarithmic axis.
+    """Draw a group of means for each name, with one mean per strategy and its interval, on a logarithmic axis.
 
     Args:
-        of: returns the estimate for the index of a group and an arm.
+        of: returns the estimate for the index of a group and a strategy.
         least: smaller values are drawn at this value.
 
     Returns:
-        Index of the group, arm, and numbers of each mean.
+        Index of the group, strategy, and numbers of each mean.
     """
-    width, rows = 0.8 / len(arms), []
+    width, rows = 0.8 / len(strategies), []
     for i in range(len(groups)):
-        for j, arm in enumerate(arms):
-            one = of(i, arm)
-            _mean(axes, i + (j + 0.5) * width - 0.4, one, series_style(arm, arms), least, arm)
-            rows.append((i, arm, [one.count, one.mean, one.low, one.high]))
+        for j, strategy in enumerate(strategies):
+            one = of(i, strategy)
+            _mean(axes, i + (j + 0.5) * width - 0.4, one, series_style(strategy, strategies), least, strategy)
+            rows.append((i, strategy, [one.count, one.mean, one.low, one.high]))
         if i:
             axes.axvline(i - 0.5, color=style.PALE, linewidth=0.8, zorder=0)
     axes.set_xlim(-0.5, len(groups) - 0.5)
@@ -192,22 +194,22 @@ def _grouped(
     """Draw a panel for each level, with a group of means for each name.
 
     Args:
-        of: returns one loss per repetition for a level, the index of a group, and an arm.
+        of: returns one loss per repetition for a level, the index of a group, and a strategy.
         title: label of the vertical axis.
 
     Returns:
-        The figure; level, index of the group, arm, and numbers of each mean.
+        The figure; level, index of the group, strategy, and numbers of each mean.
     """
     figure, panels = level_panels(losses.levels, height=height)
     rows = []
     for (axes,), level in zip(panels, losses.levels, strict=True):
 
-        def one(i: int, arm: str, level: str = level) -> Estimate:
-            return losses.mean(of(level, i, arm))
+        def one(i: int, strategy: str, level: str = level) -> Estimate:
+            return losses.mean(of(level, i, strategy))
 
-        rows += [(level, *row) for row in means(axes, groups, losses.arms, one, losses.least_shown)]
+        rows += [(level, *row) for row in means(axes, groups, losses.strategies, one, losses.least_shown)]
         style.dress(axes, title=_level_title(study, level), x=x, y=title if is_first(axes) else "")
-    legend(figure, losses.arms)
+    legend(figure, losses.strategies)
     return figure, rows
 
 
@@ -217,7 +219,7 @@ def _after_pours(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
         study,
         losses,
         [str(pour) for pour in pours],
-        lambda level, i, arm: at_pour(found.best_so_far(Key(level, receiver, arm)), pours[i]),
+        lambda level, i, strategy: at_pour(found.best_so_far(Key(level, receiver, strategy)), pours[i]),
         title=f"least {unit.label}",
         x="pours",
     )
@@ -229,7 +231,7 @@ def _after_pours(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
         f"{losses.least_shown:g} {unit.unit}. D1 pours once: its number stays. {LEVELS}",
         figure,
         ("level", "receiver", "strategy", "pours", "repetitions", f"least_{unit.unit}", "low", "high"),
-        [[level, receiver, arm, pours[i], *numbers] for level, i, arm, numbers in rows],
+        [[level, receiver, strategy, pours[i], *numbers] for level, i, strategy, numbers in rows],
     )
 
 
@@ -239,7 +241,7 @@ def _mean_of_pours(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
         study,
         losses,
         receivers,
-        lambda level, i, arm: [mean(pours) for pours in found.losses.get(Key(level, receivers[i], arm), [])],
+        lambda level, i, strategy: [mean(pours) for pours in found.losses.get(Key(level, receivers[i], strategy), [])],
         title=f"mean {unit.label}",
         height=4.0,
     )
@@ -251,38 +253,39 @@ def _mean_of_pours(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
         f"interval goes on below {losses.least_shown:g} {unit.unit}. {LEVELS}",
         figure,
         ("level", "receiver", "strategy", "repetitions", f"mean_{unit.unit}", "low", "high"),
-        [[level, receivers[i], arm, *numbers] for level, i, arm, numbers in rows],
+        [[level, receivers[i], strategy, *numbers] for level, i, strategy, numbers in rows],
     )
 
 
 def _best_so_far(found: Gathered, losses: Losses) -> Drawn:
     from matplotlib.ticker import MaxNLocator
 
-    levels, receivers, arms = losses.levels, losses.receivers, losses.arms
+    levels, receivers, strategies = losses.levels, losses.receivers, losses.strategies
     unit, numbers, least = losses.unit, list(range(1, losses.pours + 1)), losses.least_shown
     figure, panels = level_panels(levels, len(receivers), width=3.4, height=2.9)
     rows: list[list[object]] = []
     for i, level in enumerate(levels):
         for j, receiver in enumerate(receivers):
             axes = panels[i][j]
-            for arm in arms:
-                curves = found.best_so_far(Key(level, receiver, arm))
+            for strategy in strategies:
+                curves = found.best_so_far(Key(level, receiver, strategy))
                 if not curves:
                     continue
                 points = [losses.mean(at_pour(curves, pour)) for pour in numbers]
-                rows += [[level, receiver, arm, n, e.count, e.mean, e.low, e.high] for n, e in zip(numbers, points)]  # noqa: B905
-                shown = series_style(arm, arms)
+                place = [level, receiver, strategy]
+                rows += [[*place, n, e.count, e.mean, e.low, e.high] for n, e in zip(numbers, points, strict=True)]
+                shown = series_style(strategy, strategies)
                 middle = [max(one.mean, least) for one in points]
-                axes.plot(numbers, middle, shown.line, color=shown.colour, label=arm, linewidth=1.7)
+                axes.plot(numbers, middle, shown.line, color=shown.colour, label=strategy, linewidth=1.7)
                 for pour in losses.checkpoints():
                     # Bars next to each other instead of bands: bands of several strategies would fill the panel.
-                    aside = 0.6 * ((arms.index(arm) + 0.5) / len(arms) - 0.5)
+                    aside = 0.6 * ((strategies.index(strategy) + 0.5) / len(strategies) - 0.5)
                     _mean(axes, pour + aside, points[pour - 1], shown, least, "")
             x, y = "pours" if i == len(levels) - 1 else "", f"least {unit.label}" if is_first(axes) else ""
             style.dress(axes, title=f"{receiver}, {level_words(level)}", x=x, y=y, grid="both")
             log_axis(axes.yaxis, decades=True)
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    legend(figure, arms)
+    legend(figure, strategies)
     return Drawn(
         "figure-6",
         "6",
@@ -297,7 +300,7 @@ def _best_so_far(found: Gathered, losses: Losses) -> Drawn:
 
 
 def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
-    arms, unit, least = losses.arms, losses.unit, losses.least_shown
+    strategies, unit, least = losses.strategies, losses.unit, losses.least_shown
     level = study.compared if study.compared in losses.levels else losses.levels[0]
     shape = (len(SECONDS_OF_SIMULATION), len(SECONDS_OF_POUR))
     figure, grid = style.new_figure(*shape, size=(11.0, 8.6), squeeze=False, sharey=True)
@@ -305,22 +308,20 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
     for i, simulation in enumerate(SECONDS_OF_SIMULATION):
         for j, pour in enumerate(SECONDS_OF_POUR):
             axes, planned = grid[i][j], []
-            for arm in arms:
-                times, values = _spent(study, found, level, losses.receivers, arm, simulation, pour)
+            for strategy in strategies:
+                times, values = _spent(study, found, level, losses.receivers, strategy, simulation, pour)
                 if not times:
                     continue
-                rows += [[level, simulation, pour, arm, t, unit.factor * v] for t, v in zip(times, values)]  # noqa: B905
+                rows += [[level, simulation, pour, strategy, t, unit.factor * v] for t, v in zip(times, values)]  # noqa: B905
                 shown = [max(unit.factor * value, least) for value in values]
-                if d1_iterations(arm) is not None:
+                if d1_iterations(strategy) is not None:
                     planned += list(zip(times, shown))  # noqa: B905
                 else:
-                    style_of = series_style(arm, arms)
+                    style_of = series_style(strategy, strategies)
                     # A single point, of a strategy that pours once, is above the lines.
                     marker, size, order = (".", 4, 2) if len(times) > 1 else (style_of.marker, 7, 4)
-                    axes.plot(
-                        times, shown, style_of.line, marker=marker, color=style_of.colour, label=arm, markersize=size,
-                        zorder=order,
-                    )  # fmt: skip
+                    look = {"marker": marker, "markersize": size, "color": style_of.colour, "zorder": order}
+                    axes.plot(times, shown, style_of.line, label=strategy, **look)
             if planned:
                 planned.sort()
                 axes.plot(*np.transpose(planned), "s--", color=colour("D1"), label="D1", markersize=5)
@@ -328,7 +329,7 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
                 log_axis(axis)
             x, y = "total time [s]" if i == shape[0] - 1 else "", f"least {unit.label}" if j == 0 else ""
             style.dress(axes, title=f"{simulation:g} s a simulation, {pour:g} s a pour", x=x, y=y, grid="both")
-    legend(figure, ["D1", *arms])
+    legend(figure, ["D1", *strategies])
     return Drawn(
         "figure-7",
         "7",
@@ -344,11 +345,11 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
 
 
 def _spent(
-    study: StudyPlan, found: Gathered, level: str, receivers: list[str], arm: str, simulation: float, pour: float
+    study: StudyPlan, found: Gathered, level: str, receivers: list[str], strategy: str, simulation: float, pour: float
 ) -> tuple[list[float], list[float]]:
     """Total time after each pour, and the smallest loss so far, averaged over receivers."""
-    settings = study.deployment(arm).plan.settings
-    curves = [curve for name in receivers for curve in found.best_so_far(Key(level, name, arm))]
+    settings = study.deployment(strategy).plan.settings
+    curves = [curve for name in receivers for curve in found.best_so_far(Key(level, name, strategy))]
     length = max((len(curve) for curve in curves), default=0)
     before, each = settings.simulations_before * simulation, max(pour, settings.simulations_beside * simulation)
     numbers = range(1, length + 1)
@@ -369,7 +370,7 @@ def _finals(study: StudyPlan, losses: Losses) -> Drawn:
         study,
         losses,
         receivers,
-        lambda level, i, arm: list(losses.final(level, [receivers[i]], arm).values()),
+        lambda level, i, strategy: list(losses.final(level, [receivers[i]], strategy).values()),
         title=unit.label,
     )
     return Drawn(
@@ -379,5 +380,5 @@ def _finals(study: StudyPlan, losses: Losses) -> Drawn:
         f"{CAPTION} Arrows: the interval goes on below {losses.least_shown:g} {unit.unit}. {LEVELS}",
         figure,
         ("level", "receiver", "strategy", "repetitions", f"final_{unit.unit}", "low", "high"),
-        [[level, receivers[i], arm, *numbers] for level, i, arm, numbers in rows],
+        [[level, receivers[i], strategy, *numbers] for level, i, strategy, numbers in rows],
     )

@@ -75,10 +75,12 @@ def _task(study: StudyPlan, cell: StudyCell, load: Load, directory: Path) -> Run
         on_unknown="repeat",
     )
     match cell.kind:
-        case "pours" if cell.arm:
-            arm = study.calibration(cell.arm)
+        case "pours" if cell.strategy:
+            compared = study.calibration(cell.strategy)
             wanted = study.deployments[0].plan if study.deployments else None
-            plan = replace(plan, calibration=replace(arm.plan, pour_count=arm.pours, holdout=0), deployment=wanted)
+            plan = replace(
+                plan, calibration=replace(compared.plan, pour_count=compared.pours, holdout=0), deployment=wanted
+            )
         case "grid" | "pours" if plan.calibration is not None:
             designed = replace(plan.calibration, pour_count=study.pour_count, holdout=study.holdout)
             plan = replace(plan, calibration=designed)
@@ -129,20 +131,20 @@ def _table(study: StudyPlan, seed: int) -> Strategy:
 def _pours(study: StudyPlan, campaign: CampaignPlan, cell: StudyCell, seed: int) -> Strategy:
     plan = campaign.calibration
     assert plan is not None
-    if cell.arm:
+    if cell.strategy:
         return ActivePours(plan, campaign.deployment, seed)
     points = calibration_actions(study)
     return DesignedPours(plan.scenes, plan.actions, len(points), study.holdout, seed, points=points, tested=plan.tested)
 
 
 def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path) -> CampaignPlan:
-    """The plan with the repetition's weighed pours as records. An arm with its own pours uses only the test split of
-    them."""
-    calibration = plan.calibration if not cell.arm else study.calibration(cell.arm).plan
+    """The plan with the repetition's weighed pours as records. A strategy with its own pours uses only
+    their test split."""
+    calibration = plan.calibration if not cell.strategy else study.calibration(cell.strategy).plan
     assert calibration is not None
     mass, pours = calibration.scene.liquid.mass, []
     scenes = {scene.name: scene for scene in calibration.poured}
-    own = study.calibration(cell.arm).pours if cell.arm else 0
+    own = study.calibration(cell.strategy).pours if cell.strategy else 0
     weighed = result_of(load(cell.needs[0]), POURS, DesignPoured).measured
     if own:
         chosen = load(cell.needs[1])
@@ -159,7 +161,7 @@ def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Loa
 
 def _calibration(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path) -> RunRequest:
     request = calibrate_task(_with_pours(study, cell, plan, load, directory))
-    if cell.arm != "C1":
+    if cell.strategy != "C1":
         return request
     found = answers(directory.parent / GRID, Simulate)
     table = [(one.request, one.outcome) for one in found if isinstance(one.request, Simulate)]
@@ -180,8 +182,8 @@ def _score_of_default(plan: CampaignPlan, seed: int) -> Strategy:
 def _deployment(
     study: StudyPlan, cell: StudyCell, plan: CampaignPlan, calibrations: Sequence[str], load: Load
 ) -> RunRequest:
-    arm = study.deployment(cell.arm).plan
-    deployment = replace(arm, scenes=tuple(scene for scene in arm.scenes if scene.name == cell.receiver))
+    compared = study.deployment(cell.strategy).plan
+    deployment = replace(compared, scenes=tuple(scene for scene in compared.scenes if scene.name == cell.receiver))
     for calibration in calibrations:
         found = load(calibration)
         deployment = with_posterior(deployment, found)

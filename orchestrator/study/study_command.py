@@ -158,7 +158,7 @@ def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: boo
         return
     groups: dict[str, list[StudyCell]] = {}
     for cell in cells:
-        groups.setdefault(" ".join(filter(None, (cell.kind, cell.level, cell.arm))), []).append(cell)
+        groups.setdefault(" ".join(filter(None, (cell.kind, cell.level, cell.strategy))), []).append(cell)
     missing = {cell.id for cell in left}
     for name, members in groups.items():
         todo = [cell for cell in members if cell.id in missing]

@@ -37,7 +37,7 @@ from orchestrator.learning.deployment.d1 import D1Settings
 from orchestrator.learning.deployment.d2 import D2Settings
 from orchestrator.learning.deployment.d3 import D3Settings
 from orchestrator.learning.strategy_registry import calibrations, deployments
-from orchestrator.study.study_plan import ALL, CalibrationArm, DeploymentArm, Level, StudyPlan
+from orchestrator.study.study_plan import ALL, ComparedCalibration, ComparedDeployment, Level, StudyPlan
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.search_space import Space
@@ -59,7 +59,7 @@ from sim_engine.settings.model import (
 )
 
 
-class ArmSettings(Settings):
+class StrategyBudget(Settings):
     """A compared strategy: its number of repetitions and its budget."""
 
     repetitions: Annotated[PositiveCount, Field(le=10_000), Example("10")]
@@ -71,13 +71,13 @@ class ArmSettings(Settings):
         return all(self.value(key) is not None for key in self.required_keys() if key != "repetitions")
 
     def changes(self) -> dict[str, Any]:
-        """Settings of the strategy that the arm gives."""
-        own = type(self).model_fields.keys() - ArmSettings.model_fields.keys()
+        """Settings of the strategy that the file gives."""
+        own = type(self).model_fields.keys() - StrategyBudget.model_fields.keys()
         return {name: value for name in own if (value := getattr(self, name)) is not None}
 
 
-def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
-    """Make the settings of an arm from some of its strategy's settings.
+def _budget_of(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
+    """Make the section of a compared strategy from some of its settings.
 
     Args:
         keys: names of those that may be left out.
@@ -92,27 +92,29 @@ def _arm(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
         else:
             fields[key] = (value | None, Field(None, description=meaning))
     strategy = settings.model_fields["strategy"].default
-    model = create_model(f"{strategy}ArmSettings", __base__=ArmSettings, __doc__=ArmSettings.__doc__, **fields)
+    model = create_model(f"{strategy}Budget", __base__=StrategyBudget, __doc__=StrategyBudget.__doc__, **fields)
     model.variant = strategy
     return model
 
 
-C1Arm: Any = _arm(C1Settings, points_per_axis="10")
-C2Arm: Any = _arm(C2Settings, samples="18")
-C3Arm: Any = _arm(C3Settings, "initial_samples", "kappa", iterations="59")
-C4Arm: Any = _arm(C4Settings, "initial_samples", "kappa", simulations="108")
-D2Arm: Any = _arm(D2Settings, "mean", "initial_samples", "kappa", pours="15")
-D3Arm: Any = _arm(D3Settings, "prior_simulations", "simulations_per_pour", "initial_samples", "kappa", pours="15")
+C1Budget: Any = _budget_of(C1Settings, points_per_axis="10")
+C2Budget: Any = _budget_of(C2Settings, samples="18")
+C3Budget: Any = _budget_of(C3Settings, "initial_samples", "kappa", iterations="59")
+C4Budget: Any = _budget_of(C4Settings, "initial_samples", "kappa", simulations="108")
+D2Budget: Any = _budget_of(D2Settings, "mean", "initial_samples", "kappa", pours="15")
+D3Budget: Any = _budget_of(
+    D3Settings, "prior_simulations", "simulations_per_pour", "initial_samples", "kappa", pours="15"
+)
 
 
-class D1ArmSettings(_arm(D1Settings, "simulations_per_iteration", "initial_samples", "kappa")):  # type: ignore[misc]
+class D1Budget(_budget_of(D1Settings, "simulations_per_iteration", "initial_samples", "kappa")):  # type: ignore[misc]
     """A compared strategy: its number of repetitions and its budget."""
 
     iterations: list[PositiveSimulationCount] = Field(default=[15], min_length=1)
     """Iterations of the optimiser, one campaign for each number: [5, 10, 15]."""
 
 
-class C4ActiveArmSettings(_arm(C4Settings, "initial_samples", "kappa", simulations="108")):  # type: ignore[misc]
+class C4ActiveBudget(_budget_of(C4Settings, "initial_samples", "kappa", simulations="108")):  # type: ignore[misc]
     """C4 with pours that it chooses itself, each by its expected information about the deployments."""
 
     pours: Annotated[PositivePourCount, Example("6")]
@@ -122,52 +124,52 @@ class C4ActiveArmSettings(_arm(C4Settings, "initial_samples", "kappa", simulatio
     """Number of simulations for the choice."""
 
     def changes(self) -> dict[str, Any]:
-        """Settings of C4 that the arm gives."""
+        """Settings of C4 that the file gives."""
         return {name: value for name, value in super().changes().items() if name in C4Settings.model_fields}
 
 
 class CalibrationsBase(Settings):
     """The compared calibrations."""
 
-    C1: C1Arm | None = None
+    C1: C1Budget | None = None
     """Uniform grid."""
 
-    C2: C2Arm | None = None
+    C2: C2Budget | None = None
     """Stratified sampling."""
 
-    C3: C3Arm | None = None
+    C3: C3Budget | None = None
     """Bayesian optimisation, each θ on all training pours."""
 
-    C4: C4Arm | None = None
+    C4: C4Budget | None = None
     """Bayesian optimisation, one simulation per iteration; D1 and D3 simulate with the θ that it recommends."""
 
-    C4_paper: C4Arm | None = None
+    C4_paper: C4Budget | None = None
     """C4 as in the paper: the surrogate treats the action's influence as noise. It is compared only; no deployment uses
     it."""
 
-    C4_active: C4ActiveArmSettings | None = None
+    C4_active: C4ActiveBudget | None = None
     """C4 on fewer pours that are chosen actively. It is compared only; no deployment uses it."""
 
 
 class DeploymentsBase(Settings):
     """The compared deployments, into each of the base campaign's receivers."""
 
-    D1: D1ArmSettings | None = None
+    D1: D1Budget | None = None
     """Plan in simulation, pour once."""
 
-    D1_uncalibrated: D1ArmSettings | None = None
+    D1_uncalibrated: D1Budget | None = None
     """D1 in the simulator with its defaults instead of C4's parameters: the baseline of every deployment."""
 
-    D2: D2Arm | None = None
+    D2: D2Budget | None = None
     """Learn from real pours."""
 
-    D2_paper: D2Arm | None = None
+    D2_paper: D2Budget | None = None
     """D2 as in the paper: a surrogate with a zero mean."""
 
-    D3: D3Arm | None = None
+    D3: D3Budget | None = None
     """Real pours with a simulated prior; the campaign selects the model of the prior."""
 
-    D3_paper: D3Arm | None = None
+    D3_paper: D3Budget | None = None
     """D3 as in the paper: a GP of the residual around the simulations' mean, without a check."""
 
 
@@ -178,7 +180,7 @@ def _with_others(base: type[Settings], installed: Mapping[str, type[StrategySett
         if name not in base.model_fields:
             own = settings.model_fields.keys() - {"strategy"}
             meaning = meanings(settings)["strategy"]
-            fields[name] = (_arm(settings, *sorted(own)) | None, Field(None, description=meaning))
+            fields[name] = (_budget_of(settings, *sorted(own)) | None, Field(None, description=meaning))
     name = base.__name__.replace("Base", "Settings")
     return create_model(name, __base__=base, __doc__=base.__doc__, **fields)
 
@@ -321,9 +323,9 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         random_baseline=file.random_baseline,
         fixed_parameters=base.parameters.fixed_values(searched.names),
     )
-    arms = _calibration_arms(file.calibration, plan, count - holdout, names, compared, root, report)
-    poured = _deployment_arms(file.deployment, base.deployment, arms, root, report)
-    if not arms and not poured and not report.problems:
+    strategies = _compared_calibrations(file.calibration, plan, count - holdout, names, compared, root, report)
+    poured = _compared_deployments(file.deployment, base.deployment, strategies, root, report)
+    if not strategies and not poured and not report.problems:
         empty = next(key for key in ("calibration", "deployment") if file.value(key) is not None)
         examples = {
             "calibration": "C4: {repetitions: 10, simulations: 108}",
@@ -338,7 +340,7 @@ def _resolve(file: StudyFile, root: Place, report: Report) -> StudyPlan | None:
         source=root.document.path,
         base=replace(base, name=file.name, seed=file.seed, calibration=plan, deployment=None),
         levels=levels,
-        calibrations=arms,
+        calibrations=strategies,
         deployments=poured,
         pour_count=count,
         holdout=holdout,
@@ -426,7 +428,7 @@ BUDGETS = (
     *("pours", "iterations", "simulations_per_iteration", "prior_simulations", "simulations_per_pour", "mean"),
     *("risk_limit", "stop", "good_enough"),
 )
-"""Settings that an arm does not take from the base campaign, because the study defines each budget."""
+"""Settings that a strategy does not take from the base campaign, because the study defines each budget."""
 
 AS_IN_THE_PAPER: dict[str, dict[str, Any]] = {
     "D2_paper": {"mean": "zero"},
@@ -475,7 +477,7 @@ def _levels(written: Iterable[LevelSettings] | None, laboratory: str, bench: Ben
     )
 
 
-def _calibration_arms(
+def _compared_calibrations(
     section: Settings | None,
     base: CalibrationPlan,
     train: int,
@@ -483,7 +485,7 @@ def _calibration_arms(
     compared: str,
     root: Place,
     report: Report,
-) -> tuple[CalibrationArm, ...]:
+) -> tuple[ComparedCalibration, ...]:
     """The calibrations of a study; problems are added to the report.
 
     Args:
@@ -491,12 +493,12 @@ def _calibration_arms(
         train: number of pours on which every θ of C1 to C3 is simulated.
         levels: names of all levels; C4 runs at all of them, the others at `compared`.
     """
-    arms = []
-    for key, arm in _arms(section):
-        at, kind = root.at("calibration", key), calibrations()[arm.variant]
-        if not arm.complete:
+    strategies = []
+    for key, strategy in _strategies_in(section):
+        at, kind = root.at("calibration", key), calibrations()[strategy.variant]
+        if not strategy.complete:
             continue
-        changes = arm.changes()
+        changes = strategy.changes()
         if "averaging" in kind.model_fields:
             shared = getattr(base.settings, "averaging", "context")
             changes["averaging"] = "noise" if key == "C4_paper" else shared
@@ -512,44 +514,44 @@ def _calibration_arms(
             continue
         prior, known = (base.prior, base.parameter_prior) if kind.has_prior else ((), ())
         plan = replace(base, settings=settled, prior=prior, parameter_prior=known)
-        own = getattr(arm, "pours", 0)  # only an arm that chooses its pours has the key
+        own = getattr(strategy, "pours", 0)  # only a strategy that chooses its pours has the key
         if own:
-            plan = replace(plan, design="active", design_simulations=arm.design_simulations)
+            plan = replace(plan, design="active", design_simulations=strategy.design_simulations)
         where = levels if key == "C4" or compared == ALL else (compared,)
-        arms.append(CalibrationArm(_label(key), plan, arm.repetitions or 1, where, own))
-    return tuple(arms)
+        strategies.append(ComparedCalibration(_label(key), plan, strategy.repetitions or 1, where, own))
+    return tuple(strategies)
 
 
-def _deployment_arms(
+def _compared_deployments(
     section: Settings | None,
     base: DeploymentPlan | None,
-    calibrated: tuple[CalibrationArm, ...],
+    calibrated: tuple[ComparedCalibration, ...],
     root: Place,
     report: Report,
-) -> tuple[DeploymentArm, ...]:
+) -> tuple[ComparedDeployment, ...]:
     """The deployments of a study; problems are added to the report."""
     if section is None:
         return ()
     if base is None:
         report.add(root.at("deployment"), "the base campaign has no 'deployment' section to take receivers from")
         return ()
-    most = max((arm.repetitions for arm in calibrated if arm.label == "C4"), default=0)
-    arms: list[DeploymentArm] = []
-    for key, arm in _arms(section):
-        at, kind = root.at("deployment", key), deployments()[arm.variant]
-        if key == "D2_paper" and arm.mean == "constant":
+    most = max((strategy.repetitions for strategy in calibrated if strategy.label == "C4"), default=0)
+    strategies: list[ComparedDeployment] = []
+    for key, strategy in _strategies_in(section):
+        at, kind = root.at("deployment", key), deployments()[strategy.variant]
+        if key == "D2_paper" and strategy.mean == "constant":
             report.add(at.at("mean"), "D2_paper has the paper's mean, 'zero'; remove the key, or compare with D2")
-        repetitions = arm.repetitions or 1
+        repetitions = strategy.repetitions or 1
         after_calibration = key != UNCALIBRATED_KEY
         if kind.simulates and after_calibration and repetitions > most:
             report.add(
-                at.at("repetitions") if arm.repetitions is not None else at,
-                f"{arm.variant} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
+                at.at("repetitions") if strategy.repetitions is not None else at,
+                f"{strategy.variant} simulates with the θ* that C4 finds in the same repetition, and C4 has {most}; "
                 f"add 'calibration: {{C4: {{repetitions: {repetitions}, simulations: 108}}}}'",
             )
-        if not arm.complete:
+        if not strategy.complete:
             continue
-        changes = arm.changes() | AS_IN_THE_PAPER.get(key, {})
+        changes = strategy.changes() | AS_IN_THE_PAPER.get(key, {})
         rounds = changes.pop("iterations", None)
         if not after_calibration and len(rounds) > 1:
             report.add(at.at("iterations"), f"{len(rounds)} numbers, but the baseline is one plan; give one: [15]")
@@ -557,20 +559,20 @@ def _deployment_arms(
         settings.check(Premises(base.actions, base.objectives is not None), PlacedProblems(at, report))
         common = replace(base, settings=settings, data=None, confirm=0)  # a study has its own 'confirm'
         if rounds is None:
-            arms.append(DeploymentArm(_label(key), common, repetitions))
+            strategies.append(ComparedDeployment(_label(key), common, repetitions))
         for n in sorted(set(rounds or ())):
             plan = common.with_settings(iterations=n)
             label = f"{key}-{n}" if after_calibration else _label(key)
-            arms.append(DeploymentArm(label, plan, repetitions, after_calibration))
-    return tuple(arms)
+            strategies.append(ComparedDeployment(label, plan, repetitions, after_calibration))
+    return tuple(strategies)
 
 
-def _arms(section: Settings | None) -> list[tuple[str, Any]]:
-    """The arms that a file has, by their keys."""
+def _strategies_in(section: Settings | None) -> list[tuple[str, Any]]:
+    """The strategies that a file has, by their keys."""
     keys = () if section is None else type(section).model_fields
-    return [(key, arm) for key in keys if (arm := getattr(section, key)) is not None]
+    return [(key, strategy) for key in keys if (strategy := getattr(section, key)) is not None]
 
 
 def _label(key: str) -> str:
-    """Name of an arm in figures and folders."""
+    """Name of a strategy in figures and folders."""
     return key.replace("_", "-")

@@ -166,7 +166,7 @@ ARMS = (("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3-paper", "D2-p
 
 FINAL_PAIRS = (
     *(("D3", "D2"), ("D3", "D3-paper"), ("D3-paper", "D2"), ("D3", "D1")),
-    *((arm, "D1-uncalibrated") for arm in ("D1", "D2", "D3")),
+    *((strategy, "D1-uncalibrated") for strategy in ("D1", "D2", "D3")),
 )
 """Pairs whose recommended actions are compared, as `ARMS`; D1 is the one with the most iterations."""
 
@@ -185,10 +185,12 @@ def _deployment_effects(study: StudyPlan, found: Gathered) -> Iterator[TableRow]
         if not (found.finals if final else found.losses):
             continue
         losses = Losses(study, found, final=final)
-        longest = max(filter(d1_iterations, losses.arms), key=lambda arm: d1_iterations(arm) or 0, default="")
+        longest = max(
+            filter(d1_iterations, losses.strategies), key=lambda strategy: d1_iterations(strategy) or 0, default=""
+        )
         named = {"D1": longest}
         known = [(named.get(first, first), named.get(second, second)) for first, second in pairs]
-        known += [(arm, "D2") for arm in losses.arms if not is_ours(arm)]
+        known += [(strategy, "D2") for strategy in losses.strategies if not is_ours(strategy)]
         shown: list[tuple[str, Callable[[str, Sequence[str], str], Mapping[int, float]]]] = [
             (f"least {losses.unit.label} after {pour}", functools.partial(losses.after, pour=pour))
             for pour in losses.checkpoints(TABLE_POURS)
@@ -201,7 +203,7 @@ def _deployment_effects(study: StudyPlan, found: Gathered) -> Iterator[TableRow]
         for (first, second), level, (of, values), (name, group) in itertools.product(
             known, losses.levels, shown, groups.items()
         ):
-            if first in losses.arms and second in losses.arms:
+            if first in losses.strategies and second in losses.strategies:
                 one = effect(values(level, group, first), values(level, group, second), losses.range)
                 if one.difference.count:
                     yield _effect_row(f"{first} − {second}", of, level, name, one, losses.unit.factor)
@@ -224,7 +226,7 @@ def _thetas(results: Sequence[Calibrated]) -> str:
 def _deployments(found: Gathered, losses: Losses) -> StudyTable:
     pours = losses.checkpoints(TABLE_POURS)
     rows: list[TableRow] = []
-    for place in itertools.product(losses.levels, losses.receivers, losses.arms):
+    for place in itertools.product(losses.levels, losses.receivers, losses.strategies):
         if curves := found.best_so_far(Key(*place)):
             rows.append([*place, len(curves), *(losses.mean(at_pour(curves, pour)) for pour in pours)])
     return StudyTable(
@@ -239,13 +241,13 @@ def _deployments(found: Gathered, losses: Losses) -> StudyTable:
 
 def _finals(found: Gathered, losses: Losses) -> StudyTable:
     rows: list[TableRow] = []
-    for level, receiver, arm in itertools.product(losses.levels, losses.receivers, losses.arms):
-        if by_repetition := found.finals.get(Key(level, receiver, arm)):
+    for level, receiver, strategy in itertools.product(losses.levels, losses.receivers, losses.strategies):
+        if by_repetition := found.finals.get(Key(level, receiver, strategy)):
             pours = [pour for some in by_repetition.values() for pour in some]
             spilled = estimate([mean([pour.spillage for pour in some]) for some in by_repetition.values()], SHARE)
-            loss = losses.mean(list(losses.final(level, [receiver], arm).values()))
+            loss = losses.mean(list(losses.final(level, [receiver], strategy).values()))
             lost = f"{sum(not pour.made for pour in pours)} of {len(pours)}"
-            rows.append([level, receiver, arm, len(by_repetition), loss, spilled.scaled(100.0), lost])
+            rows.append([level, receiver, strategy, len(by_repetition), loss, spilled.scaled(100.0), lost])
     header = ("mismatch", "receiver", "strategy", "repetitions", losses.unit.label, "spilled / poured [%]", "not made")
     return StudyTable("table-final", "The recommended action, poured again", CAPTION, header, rows)
 
@@ -254,12 +256,12 @@ def _needed(found: Gathered, losses: Losses) -> list[TableRow]:
     rows: list[TableRow] = []
     for level, receiver in itertools.product(losses.levels, losses.receivers):
         curves = {
-            arm: [
+            strategy: [
                 [math.inf if math.isnan(v) else v for v in (at_pour([curve], n)[0] for n in range(1, losses.pours + 1))]
-                for curve in found.best_so_far(Key(level, receiver, arm))
+                for curve in found.best_so_far(Key(level, receiver, strategy))
                 if curve
             ]
-            for arm in ("D2", "D3")
+            for strategy in ("D2", "D3")
         }
         if all(curves.values()):
             loss = max(float(np.mean([curve[-1] for curve in each])) for each in curves.values())
@@ -385,7 +387,9 @@ def _caption(one: Drawn) -> str:
 
 def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
     """Limitations that a reader must consider."""
-    counts = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
+    counts = [compared.repetitions for compared in study.calibrations] + [
+        compared.repetitions for compared in study.deployments
+    ]
     notes = ["All benches are VIRTUAL: what a real robot, cup and liquid would do is not in these numbers."]
     if counts and min(counts) < FEWEST:
         notes.append(
@@ -394,7 +398,7 @@ def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
         )
     if found.finished < found.cells:
         notes.append("Cells are missing: what is compared may change when they are there.")
-    receivers = sorted({scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes})
+    receivers = sorted({scene.receiver.name for compared in study.deployments for scene in compared.plan.scenes})
     if receivers:
         notes.append(f"It holds for these receivers ({', '.join(receivers)}), this liquid and these ranges of actions.")
     return notes
@@ -414,11 +418,12 @@ def _summary(study: StudyPlan, found: Gathered) -> str:
 def _settings(study: StudyPlan) -> list[str]:
     lines = [f"Seed {study.seed}; {study.pour_count} calibration pours, {study.holdout} of them for testing."]
     train = study.pour_count - study.holdout
-    for arm in study.calibrations:
-        axes = ", ".join(f"{axis.name} {axis.lower:g} to {axis.upper:g}" for axis in arm.plan.parameters.axes)
+    for compared in study.calibrations:
+        axes = ", ".join(f"{axis.name} {axis.lower:g} to {axis.upper:g}" for axis in compared.plan.parameters.axes)
         lines.append(
-            f"{arm.label}: {arm.plan.settings.simulations_on(train)} simulations, {arm.repetitions} repetitions, "
-            f"searching {axes}; at {level_words(*arm.levels)}{_FORMS.get(arm.label, '')}."
+            f"{compared.label}: {compared.plan.settings.simulations_on(train)} simulations, "
+            f"{compared.repetitions} repetitions, searching {axes}; "
+            f"at {level_words(*compared.levels)}{_FORMS.get(compared.label, '')}."
         )
     for each in study.deployments:
         paper = _FORMS.get(each.label, "")

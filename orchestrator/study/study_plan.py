@@ -44,13 +44,13 @@ class Level:
 
 
 @dataclass(frozen=True)
-class CalibrationArm:
+class ComparedCalibration:
     """A compared calibration with its budget (in `plan`, which has no pours yet).
 
     Attributes:
         label: the strategy; 'C4-paper' for C4 as in the paper.
         levels: names of the levels that it is run at.
-        pours: number of pours that the arm chooses itself, actively, instead of the repetition's; 0: it uses the
+        pours: number of pours that the strategy chooses itself, actively, instead of the repetition's; 0: it uses the
             repetition's.
     """
 
@@ -62,7 +62,7 @@ class CalibrationArm:
 
 
 @dataclass(frozen=True)
-class DeploymentArm:
+class ComparedDeployment:
     """A compared deployment with its budget (in `plan`, which has all receivers).
 
     Attributes:
@@ -101,8 +101,8 @@ class StudyPlan:
     source: Path
     base: CampaignPlan
     levels: tuple[Level, ...]
-    calibrations: tuple[CalibrationArm, ...]
-    deployments: tuple[DeploymentArm, ...]
+    calibrations: tuple[ComparedCalibration, ...]
+    deployments: tuple[ComparedDeployment, ...]
     pour_count: int
     holdout: int
     compared: str
@@ -122,13 +122,13 @@ class StudyPlan:
         """Whether calibrations are compared at a level."""
         return self.compared in (ALL, level)
 
-    def calibration(self, label: str) -> CalibrationArm:
-        """Calibration arm by label. Raises KeyError."""
-        return {arm.label: arm for arm in self.calibrations}[label]
+    def calibration(self, label: str) -> ComparedCalibration:
+        """Compared calibration by label. Raises KeyError."""
+        return {compared.label: compared for compared in self.calibrations}[label]
 
-    def deployment(self, label: str) -> DeploymentArm:
-        """Deployment arm by label. Raises KeyError."""
-        return {arm.label: arm for arm in self.deployments}[label]
+    def deployment(self, label: str) -> ComparedDeployment:
+        """Compared deployment by label. Raises KeyError."""
+        return {compared.label: compared for compared in self.deployments}[label]
 
 
 def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
@@ -146,8 +146,8 @@ def study_fingerprint(study: StudyPlan) -> dict[str, Any]:
         "seed": study.seed,
         "base": base,
         "levels": {level.name: deciding(level.bench) for level in study.levels},
-        "calibrations": {arm.label: deciding(arm.plan) for arm in study.calibrations},
-        "deployments": {arm.label: deciding(arm.plan) for arm in study.deployments},
+        "calibrations": {compared.label: deciding(compared.plan) for compared in study.calibrations},
+        "deployments": {compared.label: deciding(compared.plan) for compared in study.deployments},
         "pours": [study.pour_count, study.holdout],
         "compared": study.compared,
     }
@@ -171,7 +171,7 @@ class StudyCell:
         kind: content: C1's grid, calibration pours, a calibration, the score of the uncalibrated θ, a deployment, or
             one more pour of the action that a deployment recommends.
         level: level of mismatch; '' for the grid, which does not depend on the bench.
-        arm: label of a calibration or deployment; '' otherwise.
+        strategy: label of a calibration or deployment; '' otherwise.
         receiver: name of a deployment's scene.
         repetition: number from 1; 0 for the grid.
         again: number of a final action's pour, from 1; 0 for all others. Each has its own cell, so that pours can be
@@ -188,7 +188,7 @@ class StudyCell:
     pours: int
     seed: int
     level: str = ""
-    arm: str = ""
+    strategy: str = ""
     receiver: str = ""
     repetition: int = 0
     again: int = 0
@@ -201,40 +201,47 @@ def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
     cells: list[StudyCell] = []
 
     def add(kind: Kind, simulations: int, pours: int, *needs: str, **place: str | int) -> str:
-        parts = [str(place[key]) for key in ("level", "arm", "receiver") if place.get(key)]
+        parts = [str(place[key]) for key in ("level", "strategy", "receiver") if place.get(key)]
         numbers = [int(place[key]) for key in ("repetition", "again") if place.get(key)]
         name = _name(kind, *parts, numbers=numbers)
-        # Arms of a repetition share a seed: their scores then differ only by their results.
+        # Strategies of a repetition share a seed: their scores then differ only by their results.
         shared = [str(place[key]) for key in ("level", "receiver") if place.get(key)]
         family = "calibration" if kind == "uncalibrated" else kind
         seed = stage_seed(study.seed, _name(family, *shared, numbers=numbers))
         cells.append(StudyCell(name, kind, needs, simulations, pours, seed, **place))  # type: ignore[arg-type]
         return name
 
-    if any(arm.plan.strategy == "C1" for arm in study.calibrations):
+    if any(compared.plan.strategy == "C1" for compared in study.calibrations):
         add("grid", study.calibration("C1").plan.settings.simulations_on(study.pour_count), 0)
-    numbers = [arm.repetitions for arm in study.calibrations] + [arm.repetitions for arm in study.deployments]
+    numbers = [compared.repetitions for compared in study.calibrations] + [
+        compared.repetitions for compared in study.deployments
+    ]
     for number in range(1, max(numbers) + 1):
         for level in study.levels:
             place: dict[str, str | int] = {"level": level.name, "repetition": number}
-            arms = [a for a in study.calibrations if number <= a.repetitions and level.name in a.levels]
-            if arms:
+            calibrations = [a for a in study.calibrations if number <= a.repetitions and level.name in a.levels]
+            if calibrations:
                 pours = add("pours", 0, study.pour_count, **place)
                 if study.compares(level.name):
                     add("uncalibrated", study.pour_count, 0, pours, **place)
-            for arm in arms:
-                known = arm.plan.strategy == "C1"
-                spent = 0 if known else arm.plan.settings.simulations_on(train)
+            for compared in calibrations:
+                known = compared.plan.strategy == "C1"
+                spent = 0 if known else compared.plan.settings.simulations_on(train)
                 made_of = (pours, GRID) if known else (pours,)
-                if arm.pours:
-                    made_of = (pours, add("pours", arm.plan.design_simulations, arm.pours, **place, arm=arm.label))
-                add("calibration", spent + study.pour_count, 0, *made_of, **place, arm=arm.label)
+                if compared.pours:
+                    made_of = (
+                        pours,
+                        add(
+                            "pours", compared.plan.design_simulations, compared.pours, **place, strategy=compared.label
+                        ),
+                    )
+                add("calibration", spent + study.pour_count, 0, *made_of, **place, strategy=compared.label)
             for deployment in (a for a in study.deployments if number <= a.repetitions):
                 plan = deployment.plan
                 theta = f"calibration.{level.name}.C4.{number:02d}"
                 needs = (theta,) if deployment.needs_calibration else ()
                 for scene in plan.scenes:
-                    there: dict[str, str | int] = {**place, "arm": deployment.label, "receiver": scene.name}
+                    there: dict[str, str | int] = {**place, "strategy": deployment.label, "receiver": scene.name}
                     deployed = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)
                     for again in range(1, study.confirm + 1):
                         add("final", 0, 1, deployed, *needs, **there, again=again)
@@ -247,7 +254,7 @@ def _name(*parts: str, numbers: Sequence[int]) -> str:
 
 def estimated_seconds(study: StudyPlan, cell: StudyCell) -> float:
     """Estimate the CPU time of a cell from its number of particles [s]; accurate within a factor of two."""
-    axes = {axis.name: axis for arm in study.calibrations for axis in arm.plan.parameters.axes}
+    axes = {axis.name: axis for compared in study.calibrations for axis in compared.plan.parameters.axes}
     usual = float(study.base.parameters.particles)
     if "particles" in axes:
         usual = math.sqrt(axes["particles"].lower * axes["particles"].upper)

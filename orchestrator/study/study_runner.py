@@ -298,7 +298,7 @@ def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, resources: RunReso
         pours=result.pours,
         cpu_s=result.cpu_s,
         seconds=result.seconds,
-        expected=tuple(_expected(directory)) if cell.arm.startswith("C4") else (),
+        expected=tuple(_expected(directory)) if cell.strategy.startswith("C4") else (),
         code=code_now(),
     )
     write_result(folder, cell.id, kept)

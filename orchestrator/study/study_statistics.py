@@ -65,7 +65,7 @@ class Key:
 
     level: str
     receiver: str
-    arm: str
+    strategy: str
 
 
 @dataclass(frozen=True)
@@ -121,8 +121,8 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
     cells = cells_of(study)
     found = Gathered(cells=len(cells))
     levels = [level.name for level in study.levels]
-    order = [UNCALIBRATED, RANDOM, *(arm.label for arm in study.calibrations)]
-    receivers = {scene.name: scene.receiver.name for arm in study.deployments for scene in arm.plan.scenes}
+    order = [UNCALIBRATED, RANDOM, *(compared.label for compared in study.calibrations)]
+    receivers = {scene.name: scene.receiver.name for compared in study.deployments for scene in compared.plan.scenes}
     for cell in cells:
         if cell.id not in results:
             continue
@@ -137,13 +137,13 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
             number = cell.repetition + LEVEL * levels.index(cell.level)
             if _differences(data, "test", random=True):
                 _add(found.calibrated.setdefault(RANDOM, Found()), number, data, random=True)
-            _add(found.calibrated.setdefault(cell.arm or UNCALIBRATED, Found()), number, data)
+            _add(found.calibrated.setdefault(cell.strategy or UNCALIBRATED, Found()), number, data)
         elif cell.kind == "deployment":
-            key = Key(cell.level, receivers[cell.receiver], cell.arm)
+            key = Key(cell.level, receivers[cell.receiver], cell.strategy)
             found.losses.setdefault(key, []).append(_losses(data))
             found.numbers.setdefault(key, []).append(cell.repetition)
         elif cell.kind == "final":
-            key = Key(cell.level, receivers[cell.receiver], cell.arm)
+            key = Key(cell.level, receivers[cell.receiver], cell.strategy)
             one = result_of(data.results, FINAL, FinalPoured)
             pour = Final(one.loss, 1.0 if one.spillage is None else one.spillage, one.made)
             found.finals.setdefault(key, {}).setdefault(cell.repetition, []).append(pour)
@@ -163,15 +163,15 @@ def _differences(data: CellResult, split: str, *, random: bool) -> list[float]:
     ]
 
 
-def _add(arm: Found, number: int, data: CellResult, *, random: bool = False) -> None:
-    arm.numbers.append(number)
-    arm.test.append(_differences(data, "test", random=random))
-    arm.train.append([] if random else _differences(data, "train", random=False))
+def _add(found: Found, number: int, data: CellResult, *, random: bool = False) -> None:
+    found.numbers.append(number)
+    found.test.append(_differences(data, "test", random=random))
+    found.train.append([] if random else _differences(data, "train", random=False))
     result = None if random or CALIBRATION not in data.results else result_of(data.results, CALIBRATION, Calibrated)
-    arm.simulations.append(0 if result is None else result.simulations)
+    found.simulations.append(0 if result is None else result.simulations)
     if result is not None:
-        arm.results.append(result)
-        arm.expected.append(data.expected)
+        found.results.append(result)
+        found.expected.append(data.expected)
 
 
 def _losses(data: CellResult) -> list[float]:

@@ -79,9 +79,9 @@ def _imports(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.realtime
 @pytest.mark.slow
 def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_comes_to(tmp_path: Path) -> None:
-    arms = read("quick")["calibration"]
+    strategies = read("quick")["calibration"]
     changes = {
-        "calibration": {"C1": arms["C1"], "C4": {**arms["C4"], "repetitions": 1}},
+        "calibration": {"C1": strategies["C1"], "C4": {**strategies["C4"], "repetitions": 1}},
         "deployment": {"D3": {**read("quick")["deployment"]["D3"], "pours": 2, "repetitions": 1}},
         "mismatch": read("quick")["mismatch"][:1],
     }
@@ -128,9 +128,12 @@ def test_killed_in_the_middle_it_goes_on_and_comes_to_what_an_undisturbed_one_co
 @pytest.mark.realtime
 @pytest.mark.slow
 def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None:
-    arms, levels = {"C4": {"repetitions": 1, "simulations": 4, "initial_samples": 4}}, read("quick")["mismatch"][:1]
+    strategies, levels = (
+        {"C4": {"repetitions": 1, "simulations": 4, "initial_samples": 4}},
+        read("quick")["mismatch"][:1],
+    )
     deployment = {"D3": {**read("quick")["deployment"]["D3"], "pours": 1, "repetitions": 1}}
-    study = replace(small(tmp_path, calibration=arms, deployment=deployment, mismatch=levels), confirm=0)
+    study = replace(small(tmp_path, calibration=strategies, deployment=deployment, mismatch=levels), confirm=0)
     blocked = run_folder(study.folder, "calibration.small.C4.01")
     blocked.mkdir(parents=True)
     (blocked / "journal.sqlite").write_bytes(b"no journal at all, but as long as one" * 40)
@@ -170,7 +173,7 @@ def test_what_is_recommended_may_be_poured_again_later_and_changes_no_other_cell
     assert {cell.id for cell in cells_of(replace(twice, confirm=1))} < {cell.id for cell in cells}
     shared: dict[tuple[str, str, int, int], set[int]] = {}
     for cell in final:
-        assert cell.needs[0] == f"deployment.{cell.level}.{cell.arm}.{cell.receiver}.{cell.repetition:02d}"
+        assert cell.needs[0] == f"deployment.{cell.level}.{cell.strategy}.{cell.receiver}.{cell.repetition:02d}"
         assert cell.pours == 1
         shared.setdefault((cell.level, cell.receiver, cell.repetition, cell.again), set()).add(cell.seed)
     assert all(len(seeds) == 1 for seeds in shared.values()), "strategies of a repetition have the same chance"

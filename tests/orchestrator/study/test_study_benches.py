@@ -51,7 +51,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[StudyPlan, Any]:
 def test_every_bench_has_every_arm_as_often_as_promised() -> None:
     study = load_study(STUDIES / "benches.yaml")
     assert len(study.levels) >= 8
-    count = Counter((cell.kind, cell.arm, cell.level) for cell in cells_of(study))
+    count = Counter((cell.kind, cell.strategy, cell.level) for cell in cells_of(study))
     for level in study.levels:
         assert count["calibration", "C4", level.name] == count["calibration", "C4-active", level.name] == 3
         assert count["uncalibrated", "", level.name] == 3
@@ -77,10 +77,10 @@ def test_no_bench_lets_the_cups_touch_where_calibration_and_deployment_pour() ->
 @pytest.mark.slow
 def test_calibrations_are_scored_in_vessels_that_they_did_not_learn_in(played: tuple[StudyPlan, Any]) -> None:
     _, results = played
-    for arm in ("C4", "C4-active"):
-        scores = result_of(results[f"calibration.bench1.{arm}.01"].results, EVALUATION, Scores)
+    for strategy in ("C4", "C4-active"):
+        scores = result_of(results[f"calibration.bench1.{strategy}.01"].results, EVALUATION, Scores)
         tested = {pair.scene for pair in scores.pairs if pair.split == "test"}
-        assert tested == {"calibration-narrow", "calibration-cone"}, arm
+        assert tested == {"calibration-narrow", "calibration-cone"}, strategy
         assert not tested & {pair.scene for pair in scores.pairs if pair.split == "train"}
 
 
@@ -93,7 +93,8 @@ def test_the_active_arm_learns_on_its_own_few_pours_and_is_scored_on_the_same_on
     assert len(own.measured) == 4
     assert own.simulated
     even, active = (
-        result_of(results[f"calibration.bench1.{arm}.01"].results, EVALUATION, Scores) for arm in ("C4", "C4-active")
+        result_of(results[f"calibration.bench1.{strategy}.01"].results, EVALUATION, Scores)
+        for strategy in ("C4", "C4-active")
     )
     weighed = [
         [pair.measured for pair in one.pairs if pair.split == "test" and pair.theta == "theta"]

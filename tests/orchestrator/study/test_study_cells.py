@@ -25,34 +25,35 @@ from tests.support.study_files import ROOT, STUDIES, read, small, without, writt
 
 def test_the_paper_study_has_the_repetitions_that_it_promises() -> None:
     cells = cells_of(load_study(STUDIES / "paper.yaml"))
-    count = Counter((cell.kind, cell.arm, cell.level) for cell in cells)
-    assert [count["calibration", arm, "moderate"] for arm in ("C1", "C2", "C3", "C4")] == [6, 3, 3, 6]
+    count = Counter((cell.kind, cell.strategy, cell.level) for cell in cells)
+    assert [count["calibration", strategy, "moderate"] for strategy in ("C1", "C2", "C3", "C4")] == [6, 3, 3, 6]
     for level in ("small", "moderate", "large"):
         assert count["pours", "", level] == 6
-        for arm in ("D1-uncalibrated", "D1-15", "D2", "D3"):
-            assert count["deployment", arm, level] == 3 * 6
-    spent = {arm: sum(c.simulations - 32 for c in cells if c.arm == arm) for arm in ("C2", "C3")}
+        for strategy in ("D1-uncalibrated", "D1-15", "D2", "D3"):
+            assert count["deployment", strategy, level] == 3 * 6
+    spent = {strategy: sum(c.simulations - 32 for c in cells if c.strategy == strategy) for strategy in ("C2", "C3")}
     assert spent == {"C2": 3 * 504, "C3": 3 * 1652}
     assert [c.simulations for c in cells if c.kind == "grid"] == [100 * 32]
 
 
 def test_the_uncalibrated_baseline_plans_with_the_defaults_and_needs_no_calibration(tmp_path: Path) -> None:
-    arm = {"repetitions": 2, "simulations_per_iteration": 1}
-    arms = {"D1": {**arm, "iterations": [2]}, "D1_uncalibrated": {**arm, "iterations": [2]}}
-    study = load_study(written(tmp_path, {**read("quick"), "deployment": arms}))
-    cells = {cell.arm: cell for cell in cells_of(study) if cell.kind == "deployment" and cell.repetition == 1}
+    strategy = {"repetitions": 2, "simulations_per_iteration": 1}
+    strategies = {"D1": {**strategy, "iterations": [2]}, "D1_uncalibrated": {**strategy, "iterations": [2]}}
+    study = load_study(written(tmp_path, {**read("quick"), "deployment": strategies}))
+    cells = {cell.strategy: cell for cell in cells_of(study) if cell.kind == "deployment" and cell.repetition == 1}
     assert cells["D1-2"].needs == ("calibration.large.C4.01",)
     assert cells["D1-uncalibrated"].needs == ()
     assert cells["D1-2"].seed == cells["D1-uncalibrated"].seed, "they differ in θ alone"
     request = campaign_of(study, cells["D1-uncalibrated"], lambda _: pytest.fail("it loads no results"), tmp_path)
     assert request.campaign.parameters == study.base.parameters
     without_c4 = {key: value for key, value in read("quick").items() if key != "calibration"}
-    alone = load_study(written(tmp_path / "alone", {**without_c4, "deployment": {"D1_uncalibrated": arm}}))
+    alone = load_study(written(tmp_path / "alone", {**without_c4, "deployment": {"D1_uncalibrated": strategy}}))
     assert {cell.kind for cell in cells_of(alone)} == {"deployment", "final"}
     with pytest.raises(ConfigError, match=r"D1_uncalibrated.iterations: 2 numbers, but the baseline is one plan"):
         load_study(
             written(
-                tmp_path / "two", {**read("quick"), "deployment": {"D1_uncalibrated": {**arm, "iterations": [2, 3]}}}
+                tmp_path / "two",
+                {**read("quick"), "deployment": {"D1_uncalibrated": {**strategy, "iterations": [2, 3]}}},
             )
         )
 
@@ -120,7 +121,7 @@ def test_without_levels_a_study_pours_on_its_laboratory_as_it_is(tmp_path: Path)
     assert study.levels[0].bench == study.base.laboratory.bench, "an arm over wires needs its time"
 
 
-def risky(folder: Path, **arm: Any) -> Path:
+def risky(folder: Path, **strategy: Any) -> Path:
     """The quick study of a campaign that plans under risk."""
     campaign = YAML(typ="safe").load((ROOT / "configs/campaigns/quickstart.yaml").read_text(encoding="utf-8"))
     for section, key in (("calibration", "receiver"), ("deployment", "receiver")):
@@ -133,7 +134,7 @@ def risky(folder: Path, **arm: Any) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "campaign.yaml").write_text(json.dumps(campaign), encoding="utf-8")
     data = read("quick")
-    data["deployment"]["D1"]["simulations_per_iteration"] = arm.get("simulations_per_iteration", 2)
+    data["deployment"]["D1"]["simulations_per_iteration"] = strategy.get("simulations_per_iteration", 2)
     return written(folder, {**data, "campaign": str(folder / "campaign.yaml")})
 
 
@@ -149,11 +150,15 @@ def test_risk_of_the_campaign_is_that_of_d1_and_what_simulates_draws_from_the_po
     for cell in cells_of(study):
         if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":
             request = campaign_of(study, cell, lambda name: known, tmp_path)
-            made[cell.arm], plan = request.stages[0].build({}, 1), request.campaign
+            made[cell.strategy], plan = request.stages[0].build({}, 1), request.campaign
             assert plan.deployment is not None
             drawn = [one.cohesion for one in plan.deployment.thetas]
-            assert drawn == ([] if cell.arm == "D2" else [0.0, 0.01, 0.02])  # D2 simulates nothing
-    assert {arm: type(one) for arm, one in made.items()} == {"D1-2": OneShotPlanning, "D2": RealOnly, "D3": Hybrid}
+            assert drawn == ([] if cell.strategy == "D2" else [0.0, 0.01, 0.02])  # D2 simulates nothing
+    assert {strategy: type(one) for strategy, one in made.items()} == {
+        "D1-2": OneShotPlanning,
+        "D2": RealOnly,
+        "D3": Hybrid,
+    }
     with pytest.raises(ConfigError, match="at least 2 are needed"):
         load_study(risky(tmp_path / "few", simulations_per_iteration=1))
 

@@ -47,7 +47,7 @@ def made_up(cell: StudyCell) -> CellResult:
     """A cell's result as the worker would have written it."""
     results: dict[str, Any] = {}
     if cell.kind in ("calibration", "uncalibrated"):
-        off = DISCREPANCY[cell.arm][cell.repetition - 1]
+        off = DISCREPANCY[cell.strategy][cell.repetition - 1]
         pairs = [(split, 0.3 + sign * off) for split, sign in (("test", 1), ("test", -1), ("train", 1))]
         results["evaluation"] = Scores(
             simulations=4,
@@ -83,16 +83,16 @@ def made_up(cell: StudyCell) -> CellResult:
             for i, d in enumerate((0.2, None, 0.1, 0.3))
         )
         results["calibration"] = Calibrated(
-            strategy=cell.arm, simulations=12, lost=0, undefined=0, training_pours=4, trials=trials, found=found
+            strategy=cell.strategy, simulations=12, lost=0, undefined=0, training_pours=4, trials=trials, found=found
         )
     if cell.kind == "deployment":
-        losses = {"D1": [0.08], "D2": [0.5, 0.2, 0.1], "D3": [0.1, 0.3, 0.05]}[cell.arm.split("-")[0]]
+        losses = {"D1": [0.08], "D2": [0.5, 0.2, 0.1], "D3": [0.1, 0.3, 0.05]}[cell.strategy.split("-")[0]]
         off = 0.02 if cell.repetition == 1 else 0.0
         rows = [*(("weighed", loss + off) for loss in losses), ("refused", 1.0)]
-        results["deployment:narrow"] = poured(cell.arm, rows)
+        results["deployment:narrow"] = poured(cell.strategy, rows)
     if cell.kind == "final":
-        loss = {"D1": 0.09, "D2": 0.2, "D3": 0.06}[cell.arm.split("-")[0]] + 0.02 * (cell.repetition == 1)
-        made = (cell.level, cell.arm, cell.repetition) != ("large", "D2", 2)
+        loss = {"D1": 0.09, "D2": 0.2, "D3": 0.06}[cell.strategy.split("-")[0]] + 0.02 * (cell.repetition == 1)
+        made = (cell.level, cell.strategy, cell.repetition) != ("large", "D2", 2)
         loss, spillage = (loss, loss / 2) if made else (1.0, 1.0)
         results["final"] = FinalPoured(action_si=None, loss=loss, spillage=spillage, made=made, reason="")
     return CellResult(
@@ -106,7 +106,7 @@ def made_up(cell: StudyCell) -> CellResult:
     )
 
 
-def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
+def poured(strategy: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
     """A deployment of which only its pours matter."""
     pours = [
         PourRow(
@@ -124,7 +124,7 @@ def poured(arm: str, rows: Sequence[tuple[Any, float]]) -> Deployed:
         for number, (status, loss) in enumerate(rows, start=1)
     ]
     return Deployed(
-        strategy=arm,
+        strategy=strategy,
         scene="narrow",
         loss="normalised",
         simulations=0,
@@ -195,15 +195,17 @@ def test_every_figure_is_drawn_with_its_numbers_and_the_page_needs_nothing_else(
 
 
 def test_no_two_arms_of_a_figure_look_alike() -> None:
-    arms = ["D1-uncalibrated", "D1-5", "D1-15", "D1-10", "D2", "D2-paper", "D3", "D3-paper"]
-    looks = [series_style(arm, arms) for arm in arms]
-    assert len({one.colour for one in looks}) == len(arms)
-    planned = [series_style(arm, arms) for arm in ("D1-5", "D1-10", "D1-15")]
+    strategies = ["D1-uncalibrated", "D1-5", "D1-15", "D1-10", "D2", "D2-paper", "D3", "D3-paper"]
+    looks = [series_style(strategy, strategies) for strategy in strategies]
+    assert len({one.colour for one in looks}) == len(strategies)
+    planned = [series_style(strategy, strategies) for strategy in ("D1-5", "D1-10", "D1-15")]
     assert len({one.marker for one in planned}) == len({one.line for one in planned}) == 3, (
         "in print without colours too"
     )
     brightness = [sum(bytes.fromhex(one.colour[1:])) for one in planned]
-    assert brightness == sorted(brightness, reverse=True), "darker with more iterations, whatever the order of the arms"
+    assert brightness == sorted(brightness, reverse=True), (
+        "darker with more iterations, whatever the order of the strategies"
+    )
     for name in ("C4", "D2", "D3"):
         ours, theirs = (
             series_style(name, [name, f"{name}-paper"]),
@@ -211,7 +213,7 @@ def test_no_two_arms_of_a_figure_look_alike() -> None:
         )
         assert ours.colour != theirs.colour
         assert (theirs.line, theirs.filled, theirs.marker) == ("--", False, ours.marker)
-    assert len({series_style(arm, ["D1-5", "D2", "D3"]).marker for arm in ("D1-5", "D2", "D3")}) == 3
+    assert len({series_style(strategy, ["D1-5", "D2", "D3"]).marker for strategy in ("D1-5", "D2", "D3")}) == 3
 
 
 def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: StudyPlan) -> None:
@@ -219,7 +221,7 @@ def test_small_losses_can_be_told_apart_and_none_is_drawn_at_the_floor(study: St
     for key in [key for key in found.losses if key.level == "small"]:
         del found.losses[key]
     for key in found.losses:
-        if key.arm == "D3":
+        if key.strategy == "D3":
             found.losses[key] = [[0.004, 0.0, 0.0], [0.004, 0.0, 0.0]]
     figure = next(one for one in draw_deployments(study, found) if one.number == "6")
     for axes in figure.figure.axes:
@@ -263,7 +265,7 @@ def test_an_interval_that_goes_on_below_the_axis_ends_in_an_arrow(study: StudyPl
 
 def test_an_arm_that_its_first_panel_lacks_is_in_the_legend(study: StudyPlan) -> None:
     found = gather(study, {cell.id: made_up(cell) for cell in cells_of(study)})
-    lacking = next(key for key in found.losses if key.arm == "D3")
+    lacking = next(key for key in found.losses if key.strategy == "D3")
     found.losses[lacking] = []
     for one in draw_deployments(study, found):
         if one.number != "7":  # of one level only
@@ -320,7 +322,7 @@ def test_effects_are_differences_within_repetitions() -> None:
 @pytest.mark.slow
 def test_half_a_study_shows_what_is_there(study: StudyPlan, tmp_path: Path) -> None:
     for cell in cells_of(study):
-        if cell.repetition == 1 and cell.arm in ("C4", "D2"):
+        if cell.repetition == 1 and cell.strategy in ("C4", "D2"):
             run_folder(tmp_path, cell.id).mkdir(parents=True)
             write_result(tmp_path, cell.id, made_up(cell))
     page = write_report(study, tmp_path).read_text(encoding="utf-8")
