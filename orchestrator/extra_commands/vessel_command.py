@@ -377,22 +377,22 @@ def _measured(sizes: Sizes, vessel: Vessel, height: float) -> list[Evidence]:
     if sizes.diameters is not None:
         heights, widths = read_diameters(sizes.diameters, height)
         found.append(Radii("callipers", heights, widths / 2.0, np.full(len(heights), CALLIPERS)))
-    balance = vessel.volume(BALANCE)
+    volume_error = vessel.volume(BALANCE)
     if sizes.fill is not None:
         levels, masses = read_fill_table(
             sizes.fill,
             height=1e3 * height,
-            density=1e-6 * BALANCE / balance,
+            density=1e-6 * BALANCE / volume_error,
             ruler=1e3 * RULER,
             balance=1e3 * BALANCE,
         )
         volumes = np.array([vessel.volume(mass) for mass in masses / 1e3])
         radius = float(np.sqrt(volumes.max() / (np.pi * levels.max() / 1e3)))
-        found.append(FillTable(levels / 1e3, volumes, RULER, balance, radius))
+        found.append(FillTable(levels / 1e3, volumes, RULER, volume_error, radius))
     if sizes.tilt is not None:
         tilts, masses = read_tilt_table(sizes.tilt, angle=float(np.degrees(ANGLE)), balance=1e3 * BALANCE)
         volumes = np.array([vessel.volume(mass) for mass in masses / 1e3])
-        found.append(TiltTable(np.radians(tilts), volumes, ANGLE, balance))
+        found.append(TiltTable(np.radians(tilts), volumes, ANGLE, volume_error))
     return found
 
 

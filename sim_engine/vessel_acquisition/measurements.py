@@ -47,21 +47,21 @@ class FillTable:
         levels: above the inner floor, shape (n,) [m].
         observed: volumes, shape (n,) [m³].
         ruler: standard deviation of a level [m].
-        balance: standard deviation of a volume [m³].
+        volume_error: standard deviation of a volume [m³].
         radius: approximate radius of the vessel, which converts an error of level into one of volume [m].
     """
 
     levels: Floats
     observed: Floats
     ruler: float
-    balance: float
+    volume_error: float
     radius: float
     name: str = "fill table"
 
     @property
     def deviations(self) -> Floats:
         """See `Evidence.deviations`."""
-        return np.full(len(self.levels), np.hypot(self.balance, np.pi * self.radius**2 * self.ruler))
+        return np.full(len(self.levels), np.hypot(self.volume_error, np.pi * self.radius**2 * self.ruler))
 
     def predict(self, heights: Floats, radii: Floats) -> Floats:
         """See `Evidence.predict`."""
@@ -76,22 +76,22 @@ class TiltTable:
         tilts: from upright, in (0, π/2], shape (n,) [rad].
         observed: volumes left, shape (n,) [m³].
         angle: standard deviation of a tilt [rad].
-        balance: standard deviation of a volume [m³].
+        volume_error: standard deviation of a volume [m³].
     """
 
     tilts: Floats
     observed: Floats
     angle: float
-    balance: float
+    volume_error: float
     name: str = "tilt table"
 
     @property
     def deviations(self) -> Floats:
         """See `Evidence.deviations`; the effect of an error of angle is computed from the table itself."""
         if len(self.tilts) < 2:
-            return np.full(len(self.tilts), self.balance)
+            return np.full(len(self.tilts), self.volume_error)
         slope = np.gradient(self.observed, self.tilts)
-        return np.hypot(self.balance, slope * self.angle)
+        return np.hypot(self.volume_error, slope * self.angle)
 
     def predict(self, heights: Floats, radii: Floats) -> Floats:
         """See `Evidence.predict`."""
