@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from actors.balance.readings import OTHER_UNITS, Reading, ReadingStatus, kilograms
+from actors.balance.readings import IN_TURN, OTHER_UNITS, Reading, ReadingStatus, in_turn, kilograms
 from actors.interfaces import LaboratoryError
 
 
@@ -157,7 +158,9 @@ WITHOUT_EFFECT = (
 )
 
 
-def unsettled(seen: Reading, shown: str, within: float, damaged: int) -> tuple[type[BalanceError], str]:
+def unsettled(
+    seen: Reading, shown: str, within: float, damaged: int, masses: Sequence[float] = ()
+) -> tuple[type[BalanceError], str]:
     """Return the error for a weight that did not settle before the deadline.
 
     Args:
@@ -165,6 +168,7 @@ def unsettled(seen: Reading, shown: str, within: float, damaged: int) -> tuple[t
         shown: last weight on the display, '' for none.
         within: the time limit [s].
         damaged: number of invalid lines so far.
+        masses: the last weights, stable or not [kg].
 
     Returns:
         Class and text of the error.
@@ -187,6 +191,8 @@ def unsettled(seen: Reading, shown: str, within: float, damaged: int) -> tuple[t
                 f"no answer within {within:g} s. Is it switched on and in weighing mode? If it prints only 'at "
                 f"stability', nothing may have come to rest; set it to print without stability.{cable}",
             )
+    if in_turn(masses):
+        return NotStableError, f"no stable weight within {within:g} s: {IN_TURN}"
     return (
         NotStableError,
         f"no stable weight within {within:g} s (last {shown or 'nothing'}, {seen.status}). Is something touching the "

@@ -15,7 +15,7 @@ from actors.balance.balance_interface import LineSettingsError, UnknownDialectEr
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.line_explanation import explain_line, is_text, most_telling, shown_bytes
 from actors.balance.readings import LineError, Reading
-from actors.balance.serial_port import Wire
+from actors.balance.serial_port import Wire, tcp_address
 
 LISTENING = 0.3
 """Wait for unsolicited lines at each setting [s]."""
@@ -285,9 +285,8 @@ def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect])
             "without a handshake ('handshake: hardware'), others with DTR or RTS on ('dtr: false', 'rts: false')."
         )
     elif not is_text(everything):
-        advice = (
-            "What came is not text: speed or parity differ; read them in the balance's menu, and set 'baud' and "
-            "'format'."
+        advice = "What came is not text: speed or parity differ; read them in the balance's menu, and set " + (
+            "'baud' and 'format'." if tcp_address(port) is None else "them in the serial server's settings."
         )
     elif b"\r" in everything and b"\n" not in everything:
         advice = "Its lines end with CR alone; choose CR LF as their end in its menu."

@@ -14,13 +14,14 @@ from dataclasses import dataclass, field
 from actors.balance.dialect_registry import dialects
 from actors.balance.dialects.dialect import Dialect
 from actors.balance.line_recording import Capture
-from actors.balance.readings import LineError, OtherQuantityError, Reading, ReadingStatus, WeightMark
+from actors.balance.readings import IN_TURN, LineError, OtherQuantityError, Reading, ReadingStatus, WeightMark, in_turn
 
 _LONGEST = 60
 _MOST = 4
 """Weights and other lines that are printed of a capture."""
 
 _COUNTED = re.compile(r"(?i)(?:%|\b(?:pcs?|stk|lb:oz|pcs/\w+)\b|\blb +[0-9.]+ *oz\b)")
+_LABEL = re.compile(rb"\s*(?:(G|GS|GROSS|B)|(N|NT|NET)|(T|TR|PT|TARE))\b[\s:.,#]*[-+]?\s*[0-9.]+", re.IGNORECASE)
 _TEXT = frozenset((*range(0x20, 0x7F), 0x0A, 0x0D))
 
 
@@ -74,14 +75,37 @@ def _remedy(line: bytes, allowed: Sequence[Dialect]) -> str:
     if elsewhere:
         titles = " or ".join(dialect.title for dialect in elsewhere)
         return f"It resembles {titles}: set 'dialect: {elsewhere[0].name}' or 'dialect: auto'"
+    if (framed := _framed(line)) is not None:
+        return framed
     if not is_text(line):
-        return "It is not text: speed or parity differ ('baud', 'format'), or the cable is damaged"
+        return (
+            "It is not text: speed or parity differ ('baud', 'format'; over TCP, those of the serial server), or the "
+            "cable is damaged"
+        )
     if _COUNTED.search(line.decode("ascii", "replace")):
         return "Set its display to weighing in g"
     return (
         "Set its display and its print-out to the weight in g alone, with its unit; 'decant balance record' shows "
         "which protocol fits"
     )
+
+
+def _framed(line: bytes) -> str | None:
+    """Return the remedy for a line with STX or ETX; None for other lines."""
+    if not is_text(line) or not {0x02, 0x03} & {*line}:
+        return None
+    return (
+        "Its lines stand between STX and ETX (\\x02, \\x03), as in no protocol here: switch these off in the balance's "
+        "menu, or choose a plain text print-out"
+    )
+
+
+def _parity(lines: Sequence[bytes]) -> str | None:
+    """Return the format of 7 data bits in which lines that were received with 8 are weights; None if there is none."""
+    if not best_fits([bytes(byte & 0x7F for byte in line).rstrip(b"\r") for line in lines]):
+        return None
+    odd = {byte.bit_count() % 2 for line in lines for byte in line}
+    return "7E1" if odd == {0} else "7O1" if odd == {1} else None
 
 
 @dataclass
@@ -93,6 +117,7 @@ class DialectFit:
         weights: number of lines with a mass, stable or not.
         understood: number of all lines that are valid in this dialect.
         reads: the stable masses, each as long as it stays.
+        masses: all masses [kg].
         marks: whether lines are marked as net or gross.
         others: what other lines hold ('over range', a tare, '12 pcs', an invalid line and the reason) → their number.
     """
@@ -101,6 +126,7 @@ class DialectFit:
     weights: int = 0
     understood: int = 0
     reads: list[str] = field(default_factory=list)
+    masses: list[float] = field(default_factory=list)
     marks: set[WeightMark] = field(default_factory=set)
     others: Counter[str] = field(default_factory=Counter)
 
@@ -121,6 +147,7 @@ class DialectFit:
             self.others[str(reading)] += 1
             return
         self.weights += 1
+        self.masses += [] if (mass := reading.mass()) is None else [mass]
         self.marks |= {reading.mark} - {None}  # type: ignore[arg-type]
         shown = f"{reading.value} {reading.unit}"
         if reading.status is ReadingStatus.STABLE and self.reads[-1:] != [shown]:
@@ -166,8 +193,19 @@ def explain_capture(capture: Capture) -> tuple[list[str], str | None]:
     if not fits:
         line = most_telling(lines, list(dialects().values())) or lines[0]
         problem = f"no dialect reads a weight in these lines, such as {shown_bytes(line)}. "
-        if not is_text(b"".join(lines)):
-            problem += "They are not text: speed or parity differ; set 'baud' and 'format' as in the balance's menu"
+        framed = next(filter(None, map(_framed, lines)), None)
+        labels = {match.lastindex for match in map(_LABEL.match, lines) if match}
+        if framed is not None:
+            problem += framed
+        elif not is_text(b"".join(lines)):
+            problem += (
+                "They are not text: speed or parity differ; set 'baud' and 'format' as in the balance's menu, over "
+                "TCP in the serial server"
+            )
+            if (form := _parity(lines)) is not None:
+                problem += f". As '{form}' they are weights: set 'format: {form}', also in a terminal program"
+        elif len(labels) > 1:
+            problem += f"As their letters show, {IN_TURN}, with its unit"
         else:
             problem += "Set the balance to print the weight in g with its unit, or choose another protocol in its menu"
             if not capture.about:
@@ -185,6 +223,8 @@ def explain_capture(capture: Capture) -> tuple[list[str], str | None]:
     line_settings = capture.about.get("line")
     origin = f"recorded with {line_settings}" if line_settings else "baud and format: see its menu"
     text.append(f"  dialect: {fit.dialect.name}   # {origin}")
+    if not fit.marks and in_turn(fit.masses):
+        text.append(f"  {IN_TURN}")
     if len(fit.marks) > 1:
         text.append("  weight: net   # or gross; it sends both")
     return text, None

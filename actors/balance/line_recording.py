@@ -168,7 +168,15 @@ LARGEST_CAPTURE = 4 << 20
 """Bytes of a foreign file that are read; hours of traffic."""
 
 _HEX_LINE = re.compile(rb"\s*(?:[0-9A-Fa-f]{2}[ :,]?)*[0-9A-Fa-f]{2}\s*")
-_BYTES_LINE = re.compile(rb"\s*b(['\"]).*\1\s*")
+_DUMP_LINE = re.compile(rb"[0-9A-Fa-f]{6,8}(?::((?: [0-9A-Fa-f]{2,4})+)  .*|((?: +[0-9A-Fa-f]{2,4})+)(?: *[|>].*| *)|)")
+"""A line of xxd (1), or of hexdump or od (2)."""
+
+_TIME = rb"(?:\d{4}-\d\d-\d\d[ T])?\d{1,2}:\d\d:\d\d(?:[.,]\d+)?(?:Z|[-+]\d\d:?\d\d)?"
+_TIMED_LINE = re.compile(rb"(?:\[" + _TIME + rb"\]|" + _TIME + rb")(?: (?:->|<-|[<>|]))?[ \t](.*)")
+_BYTES_LINE = re.compile(rb".*?\b(b(['\"]).*\2)\s*")
+_QUOTED_LINE = re.compile(rb'[^"]*[,;\t]"([^"]*)"\s*')
+_NAMES = {name: bytes([number]) for number, name in ((2, b"STX"), (3, b"ETX"), (10, b"LF"), (13, b"CR"))}
+_ESCAPED = re.compile(rb"\\r|\\n|\\x[0-9A-Fa-f]{2}|<(?:STX|ETX|CR|LF)>", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -214,14 +222,16 @@ class Capture:
     def _of(cls, data: bytes, about: dict[str, Any], notes: list[str]) -> Capture:
         if b"\r" in data and b"\n" not in data:
             notes = [*notes, "the lines end with CR alone; choose CR LF as their end in the balance's menu"]
+        if b"\r\r\n" in data:
+            notes = [*notes, "lines end with CR CR LF: read as CR LF"]
         return cls(tuple(line for line in split_lines(data) if line.strip()), about, tuple(notes))
 
 
 def split_lines(data: bytes) -> list[bytes]:
-    """Return the lines of received bytes, without their ends (CR LF, LF, or CR alone), the unfinished last one too."""
+    """Return the lines of received bytes, without their ends (CR LF, CR CR LF, LF, or CR alone), the last one, too."""
     if b"\n" not in data:
         return data.split(b"\r")
-    return [line.removesuffix(b"\r") for line in data.split(b"\n")]
+    return [line.rstrip(b"\r") for line in data.split(b"\n")]
 
 
 def _unwrapped(data: bytes, notes: list[str]) -> bytes:
@@ -231,19 +241,46 @@ def _unwrapped(data: bytes, notes: list[str]) -> bytes:
         data = data.decode("utf-16", "replace").encode("utf-8")
     data = data.removeprefix(b"\xef\xbb\xbf")
     lines = [line for line in data.splitlines() if line.strip()]
-    if all(_BYTES_LINE.fullmatch(line) for line in lines):
-        try:
-            shown = [ast.literal_eval(line.strip().decode("ascii")) for line in lines]
-        except (ValueError, SyntaxError):
-            return data
-        notes.append("read as printed Python bytes")
-        return b"".join(one if one.endswith((b"\n", b"\r")) else one + b"\n" for one in shown)
-    if all(_HEX_LINE.fullmatch(line) for line in lines):
+    if (rows := [_DUMP_LINE.fullmatch(line) for line in lines]) and all(rows):
+        notes.append("read as a hexadecimal dump")
+        return b"".join(_undumped(row) for row in rows if row)
+    if (timed := [_TIMED_LINE.fullmatch(line) for line in lines]) and all(timed):
+        notes.append("the times before the lines are left out")
+        lines = [match[1] for match in timed if match]
+        data = b"\n".join(lines) + b"\n"
+    quoted = [match[1] for match in map(_QUOTED_LINE.fullmatch, lines[1:]) if match]
+    if quoted and len(quoted) == len(lines) - 1:
+        notes.append("read as a table: the last column")
+        return b"\n".join(quoted) + b"\n"
+    if printed := [match[1] for match in map(_BYTES_LINE.fullmatch, lines) if match]:
+        if len(printed) == len(lines):
+            try:
+                shown = [ast.literal_eval(line.decode("ascii")) for line in printed]
+            except (ValueError, SyntaxError):
+                return data
+            notes.append("read as printed Python bytes")
+            return b"".join(line if line.endswith((b"\n", b"\r")) else line + b"\n" for line in shown)
+    elif all(map(_ESCAPED.search, lines)):
+        notes.append("read with its escaped control characters")
+        return b"".join(_ESCAPED.sub(_unescaped, line) for line in lines)
+    if all(map(_HEX_LINE.fullmatch, lines)):
         plain = bytes.fromhex(re.sub(rb"[^0-9A-Fa-f]", b"", data).decode("ascii"))
         if plain.rstrip().count(b"\r") or plain.endswith((b"\r", b"\n")):
             notes.append("read as hexadecimal digits")
             return plain
     return data
+
+
+def _undumped(row: re.Match[bytes]) -> bytes:
+    words = [bytes.fromhex(word.decode("ascii")) for word in (row[1] or row[2] or b"").split()]
+    return b"".join(word if row[1] else word[::-1] for word in words)  # hexdump's words have the low byte first
+
+
+def _unescaped(match: re.Match[bytes]) -> bytes:
+    text = match[0]
+    if text.startswith(b"<"):
+        return _NAMES[text[1:-1].upper()]
+    return {b"r": b"\r", b"n": b"\n"}.get(text[1:2]) or bytes.fromhex(text[2:].decode("ascii"))
 
 
 def header(source: Source, about: dict[str, Any]) -> str:

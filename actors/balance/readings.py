@@ -8,6 +8,7 @@ parses '12.34 g'. The meaning of a reading for a pour belongs to `weighing_plan`
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from enum import StrEnum
@@ -47,6 +48,16 @@ OTHER_UNITS = {
 }
 """Units of numbers that are no mass, in lower case, and what they count. No unit of mass that lost a letter is one of
 them."""
+
+
+IN_TURN = "it sends gross, net and tare in turn: set its print-out to the net weight alone"
+
+
+def in_turn(masses: Sequence[float]) -> bool:
+    """Whether the last nine masses [kg] are gross, net and tare in turn: three, of which one is a sum."""
+    last = list(masses)[-9:]
+    tare, net, gross = sorted(last[:3]) if len(last) == 9 else (0.0, 0.0, 0.0)
+    return tare < gross and last[:3] == last[3:6] == last[6:] and abs(gross - net - tare) <= 2e-3 * abs(gross)
 
 
 class LineError(ValueError):

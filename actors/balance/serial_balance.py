@@ -14,6 +14,7 @@ import contextlib
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -504,7 +505,7 @@ class SerialBalance:
         settling = Settling(self._rule)
         deadline = time.monotonic() + self._rule.deadline
         outside_since: float | None = None
-        seen = Reading(ReadingStatus.SILENT)
+        seen, masses = Reading(ReadingStatus.SILENT), deque[float](maxlen=9)
         while time.monotonic() < deadline:
             self._check_interrupted()
             if reference_needed:
@@ -515,6 +516,8 @@ class SerialBalance:
                 continue
             reading, moment = exchanged
             seen = reading if reading.status is not ReadingStatus.SILENT else seen
+            if (mass := reading.mass()) is not None:
+                masses.append(mass)
             self._check_unit(reading)
             of_tare = self._check_mark(reading, needed=reference_needed)
             if reading.status in (ReadingStatus.OVER, ReadingStatus.UNDER, ReadingStatus.ERROR):
@@ -530,7 +533,7 @@ class SerialBalance:
                 return settled
         self._check_interrupted()
         damaged = self._conversation.counters.damaged
-        raise self._error(*unsettled(seen, self._display.last.shown, self._spec.settling.deadline, damaged))
+        raise self._error(*unsettled(seen, self._display.last.shown, self._spec.settling.deadline, damaged, masses))
 
     def _exchange(self) -> tuple[Reading, float] | None:
         """Send one query and return its reply; None after a lost connection was restored."""

@@ -140,7 +140,7 @@ class Wire:
             if end >= 0:
                 line = bytes(self._buffer[:end])
                 del self._buffer[: end + 1]
-                return line.removesuffix(b"\r")
+                return line.rstrip(b"\r")  # also CR CR LF, as some printers and serial servers send
             if moment <= time.monotonic():
                 return None
             self._pull()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import socket
 import termios
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 
@@ -16,9 +18,10 @@ from actors.balance.dialect_registry import dialects
 from actors.balance.dialects.dialect import LineSettings
 from actors.balance.line_recording import LineEvent, LineRecording
 from actors.balance.serial_balance import SerialBalance
-from actors.balance.serial_port import port_advice, tcp_address
+from actors.balance.serial_port import Wire, port_advice, tcp_address
 from actors.emulators.serial_balance.balance_process import RecordedBalance, VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import BalanceFaults
+from tests.support.waiting import PATIENCE
 
 from .conftest import OF_VOICE, PACE
 
@@ -149,6 +152,16 @@ def test_lines_that_end_with_a_carriage_return_alone_are_named(tmp_path):
         assert r"'SI\r\n' → 'ST,+00123.45  g\r'" in str(caught.value)
     finally:
         far.close()
+
+
+def test_lines_that_end_with_cr_cr_lf_are_weights():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        wire = Wire(f"127.0.0.1:{server.getsockname()[1]}", LineSettings(0))
+        with server.accept()[0] as connection:
+            connection.sendall(b"ST,+00123.45  g\r\r\nUS,+00124.10  g\r\r\n")
+            lines = [wire.line_until(time.monotonic() + PATIENCE) for _ in range(2)]
+        wire.close()
+    assert lines == [b"ST,+00123.45  g", b"US,+00124.10  g"]
 
 
 @pytest.mark.realtime

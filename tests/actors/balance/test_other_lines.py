@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from collections.abc import Callable
 
 import pytest
 
-from actors.balance.balance_interface import CommandError, UnitError, UnknownDialectError
+from actors.balance.balance_interface import CommandError, NotStableError, UnitError, UnknownDialectError
 from actors.balance.balance_settings import SerialBalanceSettings, SettlingRule
 from actors.balance.dialect_detection import Attempt, _failure
 from actors.balance.dialect_registry import dialects
@@ -96,6 +97,7 @@ def test_a_tray_that_drifts_below_zero_is_weighed_and_keeps_its_tare(balance):
         ),
         ("kcp", b"12 pcs", "Set its display to weighing in g"),
         ("kcp", b"\x00\xf8\x80\xfe", r"'\\x00\\xf8\\x80\\xfe': .*It is not text: speed or parity differ"),
+        ("a-and-d", b"\x02ST,+00123.45  g\x03", "Its lines stand between STX and ETX"),
         ("kcp", b"S S  100.0", "'S S  100.0': not a weight"),
     ],
 )
@@ -116,6 +118,23 @@ def test_lines_without_a_weight_are_not_a_lost_connection(balance):
     driver.tare()
     driver._conversation.command(b"t", 0.0)  # from here on the lines are odd
     with pytest.raises(UnknownDialectError, match="it answers, but no weight came"):
+        driver.weigh()
+
+
+def test_gross_net_and_tare_in_turn_are_not_taken_for_a_draught(balance):
+    lines = itertools.cycle([b"ST,+00123.45  g", b"ST,+00100.00  g", b"ST,+00023.45  g"])
+    driver, _ = balance("a-and-d", lambda _: [next(lines)])
+    said = (
+        "no stable weight within 8 s: it sends gross, net and tare in turn: set its print-out to the net weight alone"
+    )
+    with pytest.raises(NotStableError, match=said):
+        driver.weigh()
+
+
+def test_a_display_that_flickers_is_not_taken_for_gross_net_and_tare(balance):
+    lines = itertools.cycle([b"ST,+00100.00  g", b"ST,+00100.10  g", b"ST,+00100.20  g"])
+    driver, _ = balance("a-and-d", lambda _: [next(lines)])
+    with pytest.raises(NotStableError, match="is there a draught"):
         driver.weigh()
 
 
@@ -182,6 +201,14 @@ def test_a_count_while_moving_is_not_read_in_the_unit_of_the_last_weight(balance
     sent[0] = b"          13    "  # unstable: its unit is left out
     seen = wait_for(lambda: now if (now := driver.read()).status == "unstable" else None, "unstable line")
     assert math.isnan(seen.mass)
+
+
+def test_over_tcp_no_speed_is_advised_that_is_refused_there():
+    attempt = Attempt(LineSettings(0), heard=b"\x00\xf8\x80\xfe")
+    said = _failure("192.168.1.20:4001", [attempt], list(dialects().values()))
+    assert "speed or parity differ; read them in the balance's menu, and set them in the serial server" in said
+    assert "'baud'" not in said
+    assert "'baud' and 'format'" in _failure("/dev/ttyS0", [attempt], list(dialects().values()))
 
 
 def test_a_wrong_dialect_is_named_when_nothing_is_recognised():

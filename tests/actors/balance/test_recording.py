@@ -262,6 +262,25 @@ def test_a_file_is_explained_without_a_balance(tmp_path):
 SARTORIUS = b"G#    +   213.56 g  \r\nT     +    90.00 g  \r\nN     +   123.56 g  \r\nStat     ERR 054    \r\n"
 
 
+def each_line(form: str) -> bytes:
+    """The lines as a program logs them."""
+    raw = "{!r}" in form
+    lines = SARTORIUS.splitlines(keepends=raw)
+    return "".join(form.format(line if raw else line.decode()) + "\n" for line in lines).encode()
+
+
+def dump(offset: str, word: int, form: str) -> bytes:
+    """The bytes as a program dumps them, in words of so many bytes; negative: the low byte first."""
+    rows = []
+    for at in range(0, len(SARTORIUS), 16):
+        row = SARTORIUS[at : at + 16]
+        words = [row[i : i + abs(word)] for i in range(0, len(row), abs(word))]
+        digits = " ".join((one if word > 0 else one[::-1]).hex() for one in words)
+        text = "".join(chr(byte) if 32 <= byte < 127 else "." for byte in row)
+        rows.append(offset.format(at) + form.format(f"{digits:47}" if word == 1 else digits, text))
+    return "\n".join([*rows, offset.format(len(SARTORIUS)).rstrip(" :")][: -1 if ":" in offset else None]).encode()
+
+
 @pytest.mark.parametrize(
     ("content", "note"),
     [
@@ -272,6 +291,18 @@ SARTORIUS = b"G#    +   213.56 g  \r\nT     +    90.00 g  \r\nN     +   123.56 g
         (SARTORIUS.decode().encode("utf-16"), "read as UTF-16"),
         (SARTORIUS.hex(" ").encode(), "read as hexadecimal digits"),
         ("".join(f"{line!r}\n" for line in SARTORIUS.splitlines(keepends=True)).encode(), "printed Python bytes"),
+        (SARTORIUS.replace(b"\r\n", b"\r\r\n"), "lines end with CR CR LF"),
+        (each_line("2026-11-26 10:11:12,123 DEBUG serial rx: {!r}"), "printed Python bytes"),
+        (each_line("[2026-11-26 10:11:00.120] {}"), "the times before the lines are left out"),
+        (each_line("10:11:00.120 -> {}"), "the times before the lines are left out"),
+        (each_line("2026-11-26T10:11:00Z\t{}"), "the times before the lines are left out"),
+        (each_line("{}\\r\\n"), "its escaped control characters"),
+        (each_line("{}<CR><LF>"), "its escaped control characters"),
+        (b'"Nr","Time","Data"\n' + each_line('7,10:11:00,"{}"'), "the last column"),
+        (dump("{:08x}: ", 2, "{}  {}"), "a hexadecimal dump"),  # xxd
+        (dump("{:08x}  ", 1, "{}  |{}|"), "a hexadecimal dump"),  # hexdump -C
+        (dump("{:07x} ", -2, "{}"), "a hexadecimal dump"),  # hexdump
+        (dump("{:07o} ", 1, "{}  >{}<"), "a hexadecimal dump"),  # od -t x1z
         (b"=~=~= PuTTY log 2026.05.04 10:11:12 =~=~=\r\n" + SARTORIUS + b"N     +   12", None),
     ],
 )
@@ -291,6 +322,13 @@ def test_the_files_of_other_programs_are_explained(tmp_path, content, note):
     ("content", "said"),
     [
         (bytes(range(128, 256)) * 20, "They are not text: speed or parity differ"),
+        (b"\x02ST,+00123.45  g\x03\r\n" * 3, "Its lines stand between STX and ETX"),
+        (b"  123.45 g\x03\n\x02" * 3, "Its lines stand between STX and ETX"),
+        (b"G  123.45 g\r\nN  100.00 g\r\nT   23.45 g\r\n", "it sends gross, net and tare in turn"),
+        (
+            bytes(b | b.bit_count() % 2 << 7 for b in b"ST,+00123.45  g\r\n"),
+            "As '7E1' they are weights: set 'format: 7E1'",
+        ),
         (b"12 pcs\r\n", "Set the balance to print the weight in g with its unit"),
         (b"S S 12 PCS\r\n", "no dialect reads a weight"),
         (b"dear colleague,\nthe balance does not work\n", "no dialect reads a weight"),
