@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from orchestrator.records.events import Event as Event
     from orchestrator.reports.publishing import Published as Published
     from orchestrator.runs.added_pours import add_pour as add_pour
+    from orchestrator.runs.added_pours import correct_pour as correct_pour
     from orchestrator.runs.bench_check import BenchReport as BenchReport
     from orchestrator.runs.run_service import CheckReport as CheckReport
     from sim_engine.errors import DecantError as DecantError

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, SupportsFloat
 
 from actors.interfaces import (
     Bench,
@@ -200,10 +200,10 @@ class AskTell:
         self,
         pour: AskedPour,
         *,
-        spilled_g: float,
-        received_g: float | None = None,
-        retained_g: float | None = None,
-        loaded_g: float | None = None,
+        spilled_g: SupportsFloat,
+        received_g: SupportsFloat | None = None,
+        retained_g: SupportsFloat | None = None,
+        loaded_g: SupportsFloat | None = None,
         notes: dict[str, Any] | None = None,
     ) -> None:
         """Tell what was weighed. Give the mass that was received, or the mass that was left in the pourer.

@@ -8,10 +8,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import decant
 from orchestrator.cli.app import main
+from orchestrator.learning.deployment.deployment_result import Deployed
 from tests.support.waiting import PATIENCE
 
 ROOT = Path(__file__).parents[1]
@@ -109,6 +111,19 @@ def test_a_pour_that_nothing_was_told_of_is_never_asked_for_as_a_new_one(tmp_pat
     assert run.pours["spilled_g"].dropna().tolist() == pytest.approx([2.0])
 
 
+NOT_MEANT: list[tuple[dict[str, Any], str]] = [
+    ({"spilled_g": 0.001, "received_g": 0.098}, r"may be grams, .* or kilograms \(98 g received\).*retained_g=99.9"),
+    ({"spilled_g": 1.0, "received_g": 0.098}, "or kilograms"),
+    ({"spilled_g": float("nan"), "received_g": 98.0}, "spilled_g: nan is not a finite number; is a value missing"),
+    ({"spilled_g": 1.0, "retained_g": np.inf}, "retained_g: inf is not a finite number"),
+    ({"spilled_g": "1,5", "received_g": 98.0}, "spilled_g: should be a number such as 12.5, and is '1,5'"),
+    ({"spilled_g": None, "received_g": 98.0}, "spilled_g: should be a number"),
+    ({"spilled_g": True, "received_g": 98.0}, "spilled_g: should be a number"),
+    ({"spilled_g": np.array([1.0, 2.0]), "received_g": 98.0}, r"one number, and is a ndarray of shape \(2,\)"),
+]
+"""Arguments of `tell`, with 100 g loaded."""
+
+
 def test_what_can_not_be_is_refused_and_nothing_is_told(tmp_path: Path) -> None:
     with decant.AskTell(campaign(), tmp_path / "run") as session:
         pour = session.ask()
@@ -119,11 +134,75 @@ def test_what_can_not_be_is_refused_and_nothing_is_told(tmp_path: Path) -> None:
             session.tell(pour, spilled_g=3.0)
         with pytest.raises(decant.InvalidArgumentError, match="the pour was to have a load of 100 g"):
             session.tell(pour, spilled_g=3.0, received_g=300.0, loaded_g=310.0)
+        for masses, reason in NOT_MEANT:
+            with pytest.raises(decant.InvalidArgumentError, match=reason):
+                session.tell(pour, **masses)
         session.tell(pour, spilled_g=3.0, received_g=97.4)  # more than was loaded, by the noise of a balance
         with pytest.raises(decant.InvalidArgumentError, match="told once"):
             session.tell(pour, spilled_g=3.0, received_g=96.0)
     with pytest.raises(decant.InvalidArgumentError, match="mode: external"):
         decant.AskTell(decant.load_campaign(decant.shipped("campaigns/quickstart.yaml")))
+
+
+def test_numbers_of_numpy_and_pandas_are_told_as_they_are(tmp_path: Path) -> None:
+    import pandas as pd
+
+    row = pd.DataFrame({"spilled": [1.5], "received": [95]}).iloc[0]
+    told: list[dict[str, Any]] = [
+        {"spilled_g": np.float64(1.5), "received_g": np.int64(95)},
+        {"spilled_g": np.array(1.5), "retained_g": np.float32(3.5)},
+        {"spilled_g": row["spilled"], "received_g": row["received"], "loaded_g": pd.Series([100.0])[0]},
+        {"spilled_g": 1.234, "retained_g": 98.0},  # little was poured, and a text '1.234' could be misread
+    ]
+    with decant.AskTell(campaign(), tmp_path / "run") as session:
+        for masses in told:
+            pour = session.ask()
+            assert pour is not None
+            session.tell(pour, **masses)
+        assert session.ask() is None
+    assert session.run is not None
+    assert session.run.pours["spilled_g"].tolist() == pytest.approx([1.5, 1.5, 1.5, 1.234])
+    assert session.run.pours["retained_g"].tolist() == pytest.approx([3.5, 3.5, 3.5, 98.0])
+
+
+def test_a_mass_that_was_told_wrongly_is_corrected_and_both_stay_in_the_journal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    with decant.AskTell(campaign(), folder) as session:
+        for spilled in (3.0, 60.0, 5.0):
+            pour = session.ask()
+            assert pour is not None
+            if pour.number == 2:
+                with pytest.raises(decant.RunError, match="is running this campaign"):
+                    decant.correct_pour(folder, 1, spilled_g=2.0, received_g=95.0)
+            session.tell(pour, spilled_g=spilled, retained_g=1.0)
+        session.ask()
+    for number, reason in ((4, "no pour 4 has an outcome"), (2, "don't fit a load")):
+        with pytest.raises(decant.InvalidArgumentError, match=reason):
+            decant.correct_pour(folder, number, spilled_g=260.0, retained_g=1.0)
+    with pytest.raises(decant.InvalidArgumentError, match=r"'6,0' may be 6.0, or the masses 6 and 0"):
+        decant.correct_pour(folder, 2, answer="weighed 6,0 1")
+    assert decant.correct_pour(folder, 2, spilled_g=6.0, retained_g=1.0, by="Ada")
+    with decant.AskTell(campaign(), folder) as session:
+        while (pour := session.ask()) is not None:
+            session.tell(pour, spilled_g=4.0, retained_g=1.0)
+    assert session.run is not None
+    result = session.run.result.results["deployment:bowl"]
+    assert isinstance(result, Deployed)
+    assert [pour.spilled_g for pour in result.pours] == pytest.approx([3.0, 6.0, 5.0, 4.0]), "what it has learned from"
+    assert session.run.pours["spilled_g"].tolist() == pytest.approx([3.0, 6.0, 5.0, 4.0])
+    remarks = [pour.remark for pour in session.run.summary.outcome.pours_made]
+    assert remarks[1] == "corrected by Ada, before: 60 g spilled and 1 g retained"
+    journal = (folder / "journal.sqlite").read_bytes()
+    assert b"pour.corrected" in journal
+    # its result stays now, and the record of the pour is right
+    monkeypatch.setattr("sys.argv", ["decant", "runs", "correct", str(folder), "4", "weighed 2.0 1.0"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code in (0, None)
+    assert "pour 4 is corrected; its stage has ended, and its result stays" in capsys.readouterr().out
+    assert decant.open_run(folder).pours["spilled_g"].tolist() == pytest.approx([3.0, 6.0, 5.0, 2.0])
 
 
 def test_no_other_program_pours_in_an_external_laboratory(

@@ -7,11 +7,12 @@ parses '12.34 g'. The meaning of a reading for a pour belongs to `weighing_plan`
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
 from enum import StrEnum
+
+from sim_engine.settings.quantity import LARGEST, split_typed, typed_number
 
 KILOGRAMS = {
     "kg": 1.0,
@@ -183,9 +184,6 @@ Reply = Reading | Acknowledgement
 """A decoded line."""
 
 
-_TYPED = re.compile(r"\s*(?P<number>[+−-]?\s*[0-9]+(?:[.,][0-9]+)?)\s*(?P<unit>[A-Za-zµ%]*)\s*")
-
-
 @dataclass(frozen=True)
 class TypedWeight:
     """A weight as typed.
@@ -206,16 +204,18 @@ def typed_weight(text: str) -> TypedWeight:
         text: a number with a point or a comma, and a unit.
 
     Raises:
-        ValueError: any other text; the message gives a valid form.
+        ValueError: any other text, a number with two meanings, or a weight that no bench has; the message gives a valid
+            form.
     """
-    match = _TYPED.fullmatch(text)
-    if match is None:
+    digits, unit = split_typed(text)
+    if not digits:
         raise ValueError(f"'{text.strip()}' is not a weight; type a number and a unit, for example '203.4 g'")
-    number = Decimal(match["number"].replace(",", ".").replace("−", "-").replace(" ", ""))
-    if not match["unit"]:
+    if not unit:
+        number = typed_number(digits)
         raise ValueError(f"'{text.strip()}' has no unit; type '{number} g' if that is what is meant")
-    factor = kilograms(match["unit"])
+    factor = kilograms(unit)
     if factor is None:
-        raise ValueError(f"'{match['unit']}' is not a unit of mass that is known; there are {', '.join(KILOGRAMS)}")
+        raise ValueError(f"'{unit}' is not a unit of mass that is known; there are {', '.join(KILOGRAMS)}")
+    number = typed_number(digits, unit, largest=LARGEST["kg"] / factor)
     exponent = int(number.as_tuple().exponent)
     return TypedWeight(float(number) * factor, float(Decimal(1).scaleb(exponent)) * factor)

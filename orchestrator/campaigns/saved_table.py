@@ -24,7 +24,7 @@ from xml.etree import ElementTree
 from orchestrator.campaigns.yaml.file_access import SIZE_LIMIT, UnreadableError, read_bytes
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from sim_engine.resources import MissingExtraError, require
-from sim_engine.settings.quantity import QuantityError, parse_unit
+from sim_engine.settings.quantity import QuantityError, decimals_of, number_readings, parse_unit, plain_number
 
 UNPACKED_LIMIT = 20_000_000
 """Largest content of a workbook after decompression [bytes]."""
@@ -39,15 +39,6 @@ TITLE_LINES = 12
 """Lines in which a header below titles is looked for."""
 
 SEPARATORS = {";": "semicolons", "\t": "tabs", ",": "commas"}
-
-_POINT = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
-_COMMA = re.compile(r"[-+]?[0-9]*,[0-9]+([eE][-+]?[0-9]+)?")
-_IN_THOUSANDS = {
-    ",": re.compile(r"[-+]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?"),
-    ".": re.compile(r"[-+]?[1-9][0-9]{0,2}(\.[0-9]{3})+(,[0-9]*)?"),
-}
-_SPACED = re.compile(r"[-+]?[1-9][0-9]{0,2}([ \u00a0\u2009\u202f'’][0-9]{3})+([.,][0-9]*)?")
-"""Groups of three digits that a space or an apostrophe separates, as in France and Switzerland."""
 
 _INVISIBLE = "\ufeff\u200b\u200c\u200d\u2060"
 _UNNAMED = re.compile(r"(Unnamed: [0-9]+(\.[0-9]+)*)?")
@@ -137,8 +128,7 @@ class SavedTable:
         if isinstance(cell, str):
             if not cell:
                 raise ValueError("is empty; every row needs a value")
-            text = _ungrouped(cell, self.decimal_comma)
-            value = float(text) if _POINT.fullmatch(text) else math.nan
+            value = float(plain_number(cell, decimal_comma=self.decimal_comma) or math.nan)
         else:
             value = cell
         if not math.isfinite(value):
@@ -178,7 +168,7 @@ def read_saved_table(path: Path, *, limit: int = SIZE_LIMIT, most_lines: int = M
         if (last := rows[-1]).line > most_lines:
             raise _RowError(f"stands beyond line {most_lines:,}; is it the right file?", last)
         _check_header(rows)
-        if any(not isinstance(cell, str) or _decimals_of(cell) or _POINT.fullmatch(cell) for cell in rows[0].cells):
+        if any(not isinstance(cell, str) or decimals_of(cell) or plain_number(cell) for cell in rows[0].cells):
             raise _RowError("has no header; the first line should have the names of the columns", rows[0])
         table = _without_unnamed(SavedTable(path, rows[0], rows[1:], assumed))
         _find_decimals(table)
@@ -412,7 +402,7 @@ def _text_rows(text: str, assumed: list[str]) -> list[TableRow]:
         return []
     header = kept[0]
     before = [i for i in comments if i < header]
-    if before and any(_POINT.fullmatch(one.strip()) for one in re.split(r"[;,\t]", lines[header])):
+    if before and any(plain_number(one.strip()) for one in re.split(r"[;,\t]", lines[header])):
         # numpy.savetxt writes the header as a comment
         commented = lines[before[-1]].lstrip().lstrip("#").lstrip(" ")
         if _number_of_cells(commented, lines[header]):
@@ -516,7 +506,7 @@ def _check_header(rows: Sequence[TableRow]) -> None:
         """The filled cells of a row; none if one of them is a number."""
         filled = [cell for cell in row.cells if cell != ""]
         texts = [cell for cell in filled if isinstance(cell, str)]
-        numbers = len(texts) < len(filled) or any(_decimals_of(text) or _POINT.fullmatch(text) for text in texts)
+        numbers = len(texts) < len(filled) or any(decimals_of(text) or plain_number(text) for text in texts)
         return [] if numbers else texts
 
     titles = sum(cell != "" for cell in rows[0].cells)
@@ -604,7 +594,7 @@ def _find_decimals(table: SavedTable) -> None:
     first: dict[str, tuple[TableRow, int]] = {}
     for row in table.rows:
         for index, cell in enumerate(row.cells):
-            if isinstance(cell, str) and (kind := _decimals_of(cell)):
+            if isinstance(cell, str) and (kind := decimals_of(cell)):
                 first.setdefault(kind, (row, index))
 
     def refused(kind: str, message: str) -> _RowError:
@@ -624,38 +614,10 @@ def _find_decimals(table: SavedTable) -> None:
     for weak, strong in ((",?", ","), (".?", ".")):
         doubtful = weak in first and strong not in first and (weak == ",?" or "," in first)
         if doubtful:
-            text = shown(weak)
-            mark = weak[0]
-            one, all_digits = text.replace(mark, "."), text.replace(mark, "")
-            raise refused(weak, f"{text!r} may be {one} or {all_digits}; write one of these")
+            readings = " or ".join(number_readings(shown(weak)))
+            raise refused(weak, f"{shown(weak)!r} may be {readings}; write one of these")
     if "," in first:
         table.decimal_comma = True
         table.assumed.append("decimal commas")
     if "spaced" in first:
         table.assumed.append(f"{shown('spaced')!r} as one number")
-
-
-def _decimals_of(text: str) -> str:
-    """',' or '.': the decimal sign that a number shows; with '?' if it may separate thousands; '' if it has none."""
-    if _SPACED.fullmatch(text):
-        return "spaced"
-    for sign, other, pattern in ((",", ".", _COMMA), (".", ",", _POINT)):
-        if sign not in text:
-            continue
-        if _IN_THOUSANDS[sign].fullmatch(text):
-            if other in text or text.count(sign) > 1:
-                return other  # 1,234.5 and 1,234,567 have decimal points
-            return f"{sign}?"
-        if pattern.fullmatch(text):
-            return sign
-    return ""
-
-
-def _ungrouped(text: str, decimal_comma: bool) -> str:
-    """A number without separators of thousands, and with a decimal point."""
-    if _SPACED.fullmatch(text):
-        return re.sub(r"[^-+0-9.,]", "", text).replace(",", ".")
-    if decimal_comma:
-        grouped = _IN_THOUSANDS["."].fullmatch(text)
-        return (text.replace(".", "") if grouped else text).replace(",", ".") if "," in text or grouped else text
-    return text.replace(",", "") if _IN_THOUSANDS[","].fullmatch(text) else text

@@ -91,7 +91,7 @@ def _dose_request(
     """
     from orchestrator.cli.foreground_run import read_campaign
     from orchestrator.runs.run_tasks import dose_scenes, dose_task
-    from sim_engine.settings.quantity import QuantityError, parse_quantity
+    from sim_engine.settings.quantity import QuantityError, typed_quantity
 
     plan = read_campaign(path, laboratory)
     if not plan.laboratory.pours:
@@ -106,9 +106,9 @@ def _dose_request(
         known = ", ".join(reversed(scenes))
         raise RefusalError(f"--receiver {receiver}: the campaign has no such receiver; there are {known}")
     with Refused(QuantityError, at="--tolerance: "):
-        limit = parse_quantity(tolerance, "kg", "1 g")
+        limit = typed_quantity(tolerance, "kg", "1 g")
     with Refused(QuantityError, at="--amount: "):
-        wanted = [parse_quantity(text, "kg", "50 g") for text in amounts]
+        wanted = [typed_quantity(text, "kg", "50 g") for text in amounts]
     if limit <= 0.0 or min(wanted) <= limit:
         raise RefusalError("--amount: every amount should be larger than the tolerance, and both above 0")
     return dose_task(plan, wanted, limit, None if receiver is None else scenes[receiver], as_left=as_left)

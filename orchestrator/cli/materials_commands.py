@@ -66,13 +66,17 @@ def _daemon_answers(folder: Path) -> bool:
 
 
 def _mass(text: str, option: str) -> float:
-    from sim_engine.settings.quantity import QuantityError, parse_quantity
+    from sim_engine.settings.quantity import QuantityError, typed_quantity
 
     with Refused(QuantityError, at=f"{option}: "):
-        found = parse_quantity(text, "kg", "412.3 g")
-    if found < 0.0:
+        mass = typed_quantity(text, "kg", "412.3 g")
+    if mass < 0.0:
         raise RefusalError(f"{option}: {text} should be 0 g or more")
-    return found
+    return mass
+
+
+def _grams(mass: float) -> str:
+    return f"{1e3 * mass:.9g} g"
 
 
 def _of_campaign(vessel: str) -> str:
@@ -164,12 +168,12 @@ def weigh(
     kilograms, spread = _mass(mass, "MASS"), _mass(deviation, "--deviation")
     with _opened(url, state) as where:
         if not isinstance(where, VesselAccount):
-            body = {"mass": mass, "liquid": liquid, "deviation": deviation, "note": note}
+            body = {"mass": _grams(kilograms), "liquid": liquid, "deviation": _grams(spread), "note": note}
             where.post(f"/materials/vessels/{vessel}/weighed", body)
         else:
             name = _of_campaign(vessel)
             where.weigh(name, kilograms, spread, liquid=liquid, by=getpass.getuser(), note=note)
-    print(f"{vessel}: {mass}")
+    print(f"{vessel}: {_grams(kilograms)}")
 
 
 def poured(
@@ -185,17 +189,21 @@ def poured(
     state: State = None,
 ) -> None:
     """Enter a pour that you made by hand and weighed: the source holds less, the receiver more."""
-    from orchestrator.materials.vessel_account import Transfer, VesselAccount
+    from orchestrator.materials.vessel_account import VesselAccount
 
     moved = _mass(mass, "--weighed"), _mass(deviation, "--deviation")
+    text, new = _grams(moved[0]), True
     with _opened(url, state) as where:
         if not isinstance(where, VesselAccount):
-            body = {"id": key, "source": source, "receiver": receiver, "mass": mass, "deviation": deviation}
+            body = {"id": key, "source": source, "receiver": receiver, "mass": text, "deviation": _grams(moved[1])}
             where.post("/materials/pours", {**body, "note": note})
         else:
             names = _of_campaign(source), _of_campaign(receiver)
-            where.transfer(f"by hand {key}", *names, Transfer(moved, moved), by=getpass.getuser(), note=note)
-    print(f"{key}: {mass} from {source} into {receiver}")
+            new = where.pour_by_hand(key, *names, *moved, by=getpass.getuser(), note=note)
+    if not new:
+        print_message(f"{key}: is entered already, and nothing was changed; to correct it, weigh both vessels")
+        return
+    print(f"{key}: {text} from {source} into {receiver}")
 
 
 def place(

@@ -24,6 +24,7 @@ from actors.arm.arm_interface import NotAcceptedError
 from actors.interfaces import LaboratoryError
 from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message, print_note
 from orchestrator.runs.motion_approval import required_checksum
+from sim_engine.settings.quantity import QuantityError, typed_number
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm, ArmFacts, Executed, PathReport, PlannedPour
@@ -257,9 +258,12 @@ def parse_step(text: str) -> JogStep:
         raise JogError(f"'{text.strip()}' is not a step; for example 'j5 +2' (deg) or 'z -5' (mm); 'help' shows all")
     axis = match["axis"]
     unit = "mm" if axis in ("x", "y", "z") else "deg"
-    amount = float(match["amount"].replace(",", ".").replace("−", "-").replace(" ", ""))
-    if not 0.0 < abs(amount) <= FARTHEST[unit]:
-        raise JogError(f"{amount:g} {unit} is not a small step; at most {FARTHEST[unit]:g} {unit}, and not 0")
+    try:
+        amount = float(typed_number(match["amount"], unit, largest=FARTHEST[unit]))
+    except QuantityError as error:
+        raise JogError(f"not a small step: {error}") from None
+    if not amount:
+        raise JogError("0 is not a step; it should be above or below 0")
     return JogStep(f"joint {axis[1]}" if axis[0] == "j" else axis, amount, unit)
 
 

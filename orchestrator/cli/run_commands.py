@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import getpass
 import inspect
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -290,15 +291,9 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
     Exit code 0: complete and unchanged. 1: damaged or incomplete. 2: there is no run, or one of another version.
     """
     from orchestrator.records.journal import JOURNAL_NAME
-    from orchestrator.records.journal_check import check_journal, has_begun
+    from orchestrator.records.journal_check import check_journal
 
-    folder = Path(run)
-    if folder.is_dir():
-        if not has_begun(folder / JOURNAL_NAME):
-            raise RefusalError(f"{folder}: there is no run in this folder")
-    else:
-        with _client() as client:
-            folder = Path(client.run(run)["path"])
+    folder = _folder(run)
     with _refusing():
         found = check_journal(folder / JOURNAL_NAME)
     if as_json:
@@ -312,6 +307,44 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
             print(f"  {pour}")
     if found.problems:
         raise RefusalError(f"{folder}: {len(found.problems)} problem(s) found", FAILED)
+
+
+def _folder(run: str) -> Path:
+    from orchestrator.records.journal import JOURNAL_NAME
+    from orchestrator.records.journal_check import has_begun
+
+    folder = Path(run)
+    if not folder.is_dir():
+        with _client() as client:
+            return Path(client.run(run)["path"])
+    if not has_begun(folder / JOURNAL_NAME):
+        raise RefusalError(f"{folder}: there is no run in this folder")
+    return folder
+
+
+@_command(
+    "decant runs correct quickstart-20300301-1 3 'weighed 3.2 0.4'",
+    "decant runs correct RUN 3 lost --stage deployment:bowl",
+)
+def correct(
+    run: Which,
+    number: Annotated[int, typer.Argument(help="Number of the pour within its stage.")],
+    answer: Annotated[
+        str, typer.Argument(metavar="OUTCOME", help="'weighed SPILLED RETAINED [LOADED]' in grams, or 'lost'.")
+    ],
+    stage: Annotated[str | None, typer.Option(help="Stage of the pour, if several have one of this number.")] = None,
+    state: State = None,
+) -> None:
+    """Correct the outcome of a pour that was told wrongly, in a run that is not running now.
+
+    The first outcome stays in the journal, with your name. When the run is resumed, it learns from the corrected one.
+    """
+    from orchestrator.runs.added_pours import correct_pour
+
+    folder = _folder(run)
+    learned = correct_pour(folder, number, stage=stage, answer=answer, by=getpass.getuser())
+    later = "the run learns from it when it is resumed" if learned else "its stage has ended, and its result stays"
+    print(f"{folder}: pour {number} is corrected; {later}")
 
 
 @_command("decant runs note quickstart-20300301-1 'the tray was wet from the first pour on'")

@@ -22,7 +22,7 @@ from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.daemon.daemon_store import ENDED, Store
 from orchestrator.learning.dispense import ENOUGH
 from orchestrator.learning.run_errors import RunError
-from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, Transfer, VesselAccount, VesselContent
+from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, VesselAccount, VesselContent
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 from sim_engine.settings.quantity import QuantityError, parse_quantity
@@ -195,14 +195,16 @@ class Materials:
             note: text of the account's entries.
 
         Raises:
-            MaterialError: a vessel is unknown, or both are the same one.
+            MaterialError: a vessel is unknown, both are the same one, or the source holds less.
             OSError: the account can't be written.
         """
         source, receiver = (name if "/" in name else self.vessel(name).id for name in (source, receiver))
         if source == receiver:
             raise MaterialError(f"{source}: is source and receiver at once")
-        moved = Transfer((mass, deviation), (mass, deviation))
-        self.account.transfer(f"by hand {pour}", source, receiver, moved, by=by, note=note)
+        try:
+            self.account.pour_by_hand(pour, source, receiver, mass, deviation, by=by, note=note)
+        except InvalidArgumentError as error:
+            raise MaterialError(str(error)) from None
 
     def content(self, vessel: str) -> VesselContent:
         """Return the content of a registered vessel. Raises MaterialError if it is unknown."""

@@ -295,10 +295,10 @@ def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
 def _quantity(text: str | None, what: str, unit: str, example: str) -> float | None:
     if text is None:
         return None
-    from sim_engine.settings.quantity import QuantityError, parse_quantity
+    from sim_engine.settings.quantity import QuantityError, typed_quantity
 
     try:
-        return parse_quantity(text, unit, example)
+        return typed_quantity(text, unit, example)
     except QuantityError as error:
         raise RefusalError(f"{what} {text!r}: {error}") from None
 

@@ -17,7 +17,7 @@ from orchestrator.campaigns.saved_table import read_saved_table
 from orchestrator.campaigns.table_columns import MASS, TILT, KnownColumn, columns_of
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.cli.console import RefusalError, print_note
-from sim_engine.settings.quantity import QuantityError, parse_quantity
+from sim_engine.settings.quantity import QuantityError, typed_quantity
 from sim_engine.vessel.mesh import UNITS, scale_of, to_z
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import LengthUnit, VesselError
@@ -63,8 +63,8 @@ def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
         try:
             if not colon:
                 raise QuantityError("should be a height and a diameter, such as '95 mm: 72 mm'")
-            heights.append(parse_quantity(at.strip(), "m", "95 mm"))
-            widths.append(parse_quantity(wide.strip(), "m", "72 mm"))
+            heights.append(typed_quantity(at.strip(), "m", "95 mm"))
+            widths.append(typed_quantity(wide.strip(), "m", "72 mm"))
         except QuantityError as error:
             raise RefusalError(f"--diameters: '{pair}': {error}") from None
         if not 0.0 <= heights[-1] <= height + 1e-9:

@@ -30,11 +30,13 @@ from typing import Any, Literal
 
 from actors.interfaces import LaboratoryError
 from orchestrator.learning.campaign_plan import DispensePlan
-from orchestrator.learning.dispense import KnownSource, left_after
+from orchestrator.learning.dispense import ENOUGH, KnownSource, left_after
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured
 from orchestrator.records.events import CampaignOpened, Event, RequestFinished, RequestStarted
 from orchestrator.records.run_registry import make_state_directory, state_directory
 from sim_engine.errors import InvalidArgumentError
+from sim_engine.settings.quantity import LARGEST
+from sim_engine.vessel.vessel import build_vessel
 
 FILE_NAME = "vessels.sqlite"
 
@@ -208,12 +210,21 @@ class VesselAccount:
         are. The lag of the balance is measured again.
 
         Raises:
+            InvalidArgumentError: a source can't hold what was entered for it.
             OSError: the file can't be read.
         """
         found: dict[str, KnownSource] = {}
         for name in plan.sources if plan.as_left else ():
             entry = self.content(plan.tracked(name))
             if entry is not None and entry.mass is not None and entry.liquid == plan.liquid(name):
+                scene = next(scene for scene in plan.scenes if scene.pourer.name == name)
+                full = scene.liquid.density * build_vessel(scene.pourer).capacity
+                if entry.mass - ENOUGH * entry.deviation > 1.02 * full:
+                    raise InvalidArgumentError(
+                        f"{plan.tracked(name)}: holds {1e3 * entry.mass:.4g} g of {entry.liquid} by its account, and "
+                        f"there is room for {1e3 * full:.4g} g; correct it: decant materials weigh {plan.tracked(name)}"
+                        " 'MASS'"
+                    )
                 knowledge = None if entry.knowledge is None else {**entry.knowledge, "lag": None}
                 found[name] = KnownSource(mass=entry.mass, deviation=entry.deviation, knowledge=knowledge)
         return found
@@ -251,9 +262,7 @@ class VesselAccount:
     def _set(
         self, kind: EntryKind, vessel: str, mass: float, deviation: float, liquid: str, by: str, note: str, key: str
     ) -> None:
-        for name, value in (("mass", mass), ("deviation", deviation)):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise InvalidArgumentError(f"{name}: {value} kg should be a number of 0 or more")
+        _check_stated(mass, deviation)
         with self._writing() as connection:
             before = _last(connection, vessel)
             held = liquid or ("" if before is None else before.liquid)
@@ -277,6 +286,40 @@ class VesselAccount:
             before = _last(connection, vessel) or _empty(vessel)
             entry = replace(before, time=time.time(), kind="unknown", mass=None, deviation=0.0, pour="", note="")
             _write(connection, f"unknown {vessel} {time.time_ns()}", entry)
+
+    def pour_by_hand(
+        self, pour: str, source: str, receiver: str, mass: float, deviation: float, *, by: str = "", note: str = ""
+    ) -> bool:
+        """Enter a pour that a person has made and weighed, once.
+
+        Args:
+            pour: its id, chosen by the person.
+            source, receiver: names of the vessels.
+            mass: weighed [kg].
+            deviation: its standard deviation [kg].
+            by: who made it.
+            note: for people.
+
+        Returns:
+            Whether it is a new entry; a second call with the same id changes nothing.
+
+        Raises:
+            InvalidArgumentError: the mass can't be meant, or the source holds less.
+            OSError: the file can't be read or written.
+        """
+        _check_stated(mass, deviation)
+        pour, held = f"by hand {pour}", self.content(source)
+        if self._entries("where key = ?", (f"{pour} from",)):
+            return False
+        if held is not None and held.mass is not None:
+            most = held.mass + ENOUGH * math.hypot(held.deviation, deviation)
+            if mass > most:
+                raise InvalidArgumentError(
+                    f"{source}: holds {1e3 * held.mass:.4g} g by its account, and {1e3 * mass:.4g} g were poured from "
+                    "it; weigh it first if it holds more"
+                )
+        self.transfer(pour, source, receiver, Transfer((mass, deviation), (mass, deviation)), by=by, note=note)
+        return True
 
     def transfer(self, pour: str, source: str, receiver: str, moved: Transfer, *, by: str = "", note: str = "") -> None:
         """Enter a pour in the account of both vessels, once: a second call for the same pour changes nothing.
@@ -477,6 +520,15 @@ def _writable() -> Iterator[None]:
         yield
     except (OSError, InvalidArgumentError) as error:
         raise LaboratoryError(f"the account of vessels: {error}") from error
+
+
+def _check_stated(mass: float, deviation: float) -> None:
+    """Raise InvalidArgumentError for a mass [kg] that a person can't mean."""
+    for name, value in (("mass", mass), ("deviation", deviation)):
+        if not (math.isfinite(value) and value >= 0.0):
+            raise InvalidArgumentError(f"{name}: {value} kg should be a number of 0 or more")
+        if value > LARGEST["kg"]:
+            raise InvalidArgumentError(f"{name}: {value:g} kg is more than {LARGEST['kg']:g} kg; is it in grams?")
 
 
 def _empty(vessel: str) -> VesselContent:

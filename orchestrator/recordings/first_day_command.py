@@ -66,14 +66,14 @@ def first_day(
     from orchestrator.recordings.rig_diagnosis import diagnose
     from sim_engine.errors import DecantError
     from sim_engine.liquids import SimulationParameters
-    from sim_engine.settings.quantity import QuantityError, parse_quantity
+    from sim_engine.settings.quantity import QuantityError, typed_quantity
 
     if practise and campaign is not None:
         raise RefusalError("--practise: has a bench of its own; leave out --campaign")
     if wrong is not None and not practise:
         raise RefusalError("--wrong: goes with --practise; a real rig is as it is")
     with Refused(QuantityError, at="--lag: "):
-        expected = parse_quantity(lag, "s", "0.35 s")
+        expected = typed_quantity(lag, "s", "0.35 s")
     if not 0.0 < expected <= 10.0:
         raise RefusalError(f"--lag: {lag}: should be above 0 and at most 10 s")
     if folder.exists() and not folder.is_dir():

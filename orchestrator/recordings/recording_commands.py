@@ -148,10 +148,10 @@ def fit(
     the recordings of '--judge', and with '--until' the later readings of the fitted ones.
     """
     from orchestrator.recordings.recording_fit import fit_recordings, judge_recording
-    from sim_engine.settings.quantity import QuantityError, parse_quantity
+    from sim_engine.settings.quantity import QuantityError, typed_quantity
 
     with Refused(QuantityError, at="--until: "):
-        seconds = None if until is None else parse_quantity(until, "s", "6 s")
+        seconds = None if until is None else typed_quantity(until, "s", "6 s")
     if output is not None and (output.suffix != ".json" or not output.parent.is_dir()):
         raise RefusalError(f"--output {output}: should be a .json file in a folder that exists")
     loaded = _loaded(recordings)

@@ -55,6 +55,7 @@ class Kind(StrEnum):
     DECISION = "decision"
     OPERATOR_ASKED = "operator.asked"
     OPERATOR_ANSWERED = "operator.answered"
+    POUR_CORRECTED = "pour.corrected"
     NOTE = "note"
 
 
@@ -298,6 +299,21 @@ class OperatorAnswered(JournalEvent):
     id: int
     answer: str
     outcome: Outcome | None = field(default=None, metadata=WRITTEN_IF_SET)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PourCorrected(JournalEvent):
+    """A person corrected the outcome of a pour, which was told wrongly. The first outcome stays in the journal.
+
+    Attributes:
+        by: who corrected it.
+    """
+
+    KIND = Kind.POUR_CORRECTED
+
+    id: int
+    outcome: Outcome
+    by: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -32,6 +32,7 @@ from orchestrator.records.events import (
     LogLine,
     OperatorAnswered,
     OperatorAsked,
+    PourCorrected,
     PourProgressed,
     PourWithdrawn,
     Requested,
@@ -63,7 +64,7 @@ class RunPour:
     Attributes:
         state: 'under way': it has begun; 'unknown': the run ended during the pour, so it has no outcome.
         outcome: as recorded; None without one.
-        answer: the operator's answer about it; '' without one.
+        answer: the operator's answer about it, or the correction of its outcome; '' without one.
         time: when it began, or ended; None before (seconds since 1970).
         seconds: duration, operator and balance included; None if unknown.
         progress: last reported, while the run is followed.
@@ -105,8 +106,21 @@ class RunPour:
 
     def finish(self, event: RequestFinished) -> None:
         """Take the outcome."""
-        self.time, self.seconds, self.outcome = event.time, event.seconds, event.outcome
-        self.state = "weighed" if isinstance(event.outcome, Poured) else "failed"
+        self.time, self.seconds = event.time, event.seconds
+        self._take(event.outcome)
+
+    def correct(self, event: PourCorrected) -> None:
+        """Take the outcome that a person states instead; `answer` keeps the former one."""
+        before = self.outcome
+        was = f"failed ({before.reason})" if isinstance(before, Failed) else "without an outcome"
+        if isinstance(before, Poured):
+            told = before.measurement
+            was = f"{1e3 * told.spilled:.5g} g spilled and {1e3 * told.retained:.5g} g retained"
+        self.answer = f"corrected{' by ' * bool(event.by)}{event.by}, before: {was}"
+        self._take(event.outcome)
+
+    def _take(self, outcome: Outcome) -> None:
+        self.outcome, self.state = outcome, "weighed" if isinstance(outcome, Poured) else "failed"
 
 
 @dataclass
@@ -383,6 +397,8 @@ class RunState:
                 self._pour(event).finish(event)
             case RequestFinished():
                 self._finished(stage, event)
+            case PourCorrected():
+                self._pours[event.id].correct(event)
             case OperatorAsked():
                 self._ask(event, event.question)
             case OperatorAnswered():

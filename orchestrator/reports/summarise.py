@@ -287,7 +287,8 @@ def _remark(state: str, pour: RunPour) -> str:
         "asked": "requested, not started",
         "failed": f"failed: {pour.reason}",
     }.get(state, "")
-    answer = f"the operator answered: {pour.answer}" if pour.answer else ""
+    corrected = pour.answer.startswith("corrected")
+    answer = pour.answer if corrected or not pour.answer else f"the operator answered: {pour.answer}"
     return "; ".join(filter(None, (said, answer)))
 
 

@@ -1,7 +1,8 @@
-"""Pours that somebody made and weighed without being asked, added to a run that goes on learning.
+"""Entries of people in the journal of a run that nobody runs now: pours that were not asked for, and corrections.
 
-`add_pour` writes one to the journal of a run that nobody runs now. The strategy receives it when the run is resumed,
-at the same place of its history every time. It does not resume the run, and it changes no pour of the run.
+`add_pour` adds a pour that was made and weighed without being asked, and `correct_pour` replaces an outcome that was
+told wrongly. The strategy receives them when the run is resumed, at the same place of its history every time. Neither
+resumes the run, and what was written stays in the journal.
 """
 
 from __future__ import annotations
@@ -10,24 +11,35 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
 from orchestrator.campaigns.action_assignments import assigned_action
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.prior_data import fitting
 from orchestrator.learning.campaign_plan import CampaignPlan, RecordedPour
 from orchestrator.learning.requests import ADDED, Outcome, Pour, Poured
+from orchestrator.learning.strategy import Strategy
 from orchestrator.records.codec import Results, decode_outcome, encode_outcome
-from orchestrator.records.events import Requested, RequestFinished, Told
+from orchestrator.records.events import PourCorrected, Requested, RequestFinished, Told
 from orchestrator.records.journal import JOURNAL_NAME, Journal
-from orchestrator.records.run_record import read_header
-from orchestrator.runs.resume import StageHistory, parse_answer, read_history, replay
+from orchestrator.records.run_record import read_header, read_record
+from orchestrator.runs.resume import (
+    LOST,
+    WEIGHED,
+    StageHistory,
+    correct,
+    parse_answer,
+    read_history,
+    replay,
+    weighed_pour,
+)
 from orchestrator.runs.run_folder import RESOLVED
-from orchestrator.runs.stages import DEPLOYMENT, by_receiver, stages_of
+from orchestrator.runs.stages import DEPLOYMENT, by_receiver, scenes_of, stages_of
 from sim_engine.action import Action
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
+from sim_engine.settings.quantity import finite_number
 
 SOURCE = "added by hand"
 """Note of the measurement of an added pour."""
@@ -37,10 +49,10 @@ def add_pour(
     directory: Path | str,
     action: Mapping[str, float | str],
     *,
-    spilled_g: float,
-    received_g: float | None = None,
-    retained_g: float | None = None,
-    loaded_g: float | None = None,
+    spilled_g: SupportsFloat,
+    received_g: SupportsFloat | None = None,
+    retained_g: SupportsFloat | None = None,
+    loaded_g: SupportsFloat | None = None,
     receiver: str | None = None,
     notes: Mapping[str, Any] | None = None,
 ) -> None:
@@ -65,8 +77,7 @@ def add_pour(
         RunError: another process runs it, or its journal is damaged.
         ConfigError: a file of the campaign has changed or is missing.
     """
-    folder = Path(directory).expanduser()
-    campaign = load_campaign(folder / RESOLVED)
+    folder, campaign = _opened(directory)
     name, scene = _named(campaign, receiver)
     pour = Pour(scene.name, _action(campaign, scene, action), number=0, seed=0, purpose=ADDED)
     measured, _ = weighed_by_hand(
@@ -88,7 +99,14 @@ def add_pour(
                 "'deployment: {data: {run: …}}' to learn from pours that were made before it"
             )
         outcome = decode_outcome(encode_outcome(Poured(measured)))
-        _try(campaign, stage, history, journal.stage_results(), pour, outcome)
+        strategy = _replayed(campaign, stage, history, journal.stage_results())
+        try:
+            strategy.tell(pour, outcome)
+        except ValueError:
+            assert campaign.deployment is not None
+            raise InvalidArgumentError(
+                f"strategy {campaign.deployment.strategy} takes no pours that it has not asked for"
+            ) from None
         key = journal.last_id() + 1
         journal.append(
             Requested(stage=stage, id=key, request=pour),
@@ -97,53 +115,138 @@ def add_pour(
         )
 
 
-def _try(
-    campaign: CampaignPlan, stage: str, history: StageHistory, results: Results, pour: Pour, outcome: Outcome
-) -> None:
-    """Replay the run with the pour: what a strategy refuses must not be written, or no run could continue."""
+def correct_pour(
+    directory: Path | str,
+    number: int,
+    *,
+    stage: str | None = None,
+    spilled_g: SupportsFloat | None = None,
+    received_g: SupportsFloat | None = None,
+    retained_g: SupportsFloat | None = None,
+    loaded_g: SupportsFloat | None = None,
+    answer: str | None = None,
+    by: str = "",
+) -> bool:
+    """Correct the outcome of a pour that was told wrongly, in a run that nobody runs now.
+
+    Both outcomes stay in the journal. The pours that were decided in between stay as they are.
+
+    Args:
+        directory: folder of the run.
+        number: of the pour within its stage.
+        stage: its stage; needed if several have a pour of this number.
+        spilled_g, received_g, retained_g, loaded_g: as in `add_pour`.
+        answer: instead of masses, the text that an operator types: 'weighed 3.2 0.4', or 'lost'.
+        by: who corrects it; kept with it.
+
+    Returns:
+        Whether the run learns from the correction when it goes on. Otherwise its stage has ended: the result of the
+        stage stays, and a campaign that learns from this run takes the corrected pour.
+
+    Raises:
+        InvalidArgumentError: there is no such pour with an outcome, the masses do not fit its load, or its stage can't
+            replace an outcome.
+        RunError: another process runs it, or its journal is damaged.
+        ConfigError: a file of the campaign has changed or is missing.
+    """
+    folder, campaign = _opened(directory)
+    same = [pour for pour in read_record(folder).pours if pour.request.number == number and pour.outcome is not None]
+    if stage is not None:
+        same = [pour for pour in same if pour.stage == stage]
+    if len({pour.stage for pour in same}) != 1:
+        stages = ", ".join(sorted({pour.stage for pour in same}))
+        text = (
+            f"several stages have a pour {number}; name one: {stages}" if same else f"no pour {number} has an outcome"
+        )
+        raise InvalidArgumentError(f"{folder}: {text}")
+    pour = same[-1]
+    load_g = 1e3 * scenes_of(campaign)[pour.request.scene].liquid.mass
+    notes = {"source": "corrected by hand"}
+    if answer is None:
+        masses = {"received_g": received_g, "retained_g": retained_g, "loaded_g": loaded_g}
+        outcome: Outcome = Poured(weighed_by_hand(load_g, spilled_g=spilled_g, **masses, notes=notes)[0])
+    else:
+        try:
+            parsed = parse_answer(answer, (LOST, WEIGHED), 1e-3 * load_g)
+        except ValueError as error:
+            raise InvalidArgumentError(str(error)) from None
+        assert parsed is not None
+        outcome = parsed
+    with closing(Journal.resume(folder / JOURNAL_NAME, read_header(folder))) as journal:
+        history = read_history(journal, pour.stage)
+        outcome = decode_outcome(encode_outcome(outcome))
+        if history.result is None:
+            strategy = _replayed(campaign, pour.stage, history, journal.stage_results())
+            try:
+                correct(strategy, pour.request, outcome)
+            except ValueError as error:
+                raise InvalidArgumentError(f"pour {number} of stage {pour.stage}: {error}") from None
+        journal.append(PourCorrected(stage=pour.stage, id=pour.id, outcome=outcome, by=by))
+    return history.result is None
+
+
+def _opened(directory: Path | str) -> tuple[Path, CampaignPlan]:
+    folder = Path(directory).expanduser()
+    return folder, load_campaign(folder / RESOLVED)
+
+
+def _replayed(campaign: CampaignPlan, stage: str, history: StageHistory, results: Results) -> Strategy:
+    """The strategy of a stage after its history: what it refuses must not be written, or no run could continue."""
     definition = next(one for one in stages_of(campaign) if one.name == stage)
     strategy = definition.build(results, history.seed or 0)
     replay(strategy, history, stage)
-    try:
-        strategy.tell(pour, outcome)
-    except ValueError:
-        assert campaign.deployment is not None
-        raise InvalidArgumentError(
-            f"strategy {campaign.deployment.strategy} takes no pours that it has not asked for"
-        ) from None
+    return strategy
 
 
 def weighed_by_hand(
     load_g: float,
     *,
-    spilled_g: float,
-    received_g: float | None,
-    retained_g: float | None,
-    loaded_g: float | None,
+    spilled_g: SupportsFloat | None,
+    received_g: SupportsFloat | None,
+    retained_g: SupportsFloat | None,
+    loaded_g: SupportsFloat | None,
     notes: Mapping[str, Any],
 ) -> tuple[PourMeasurement, str]:
     """The measurement of weighed masses [g], and the same as the answer of an operator.
 
     Args:
         load_g: nominal load.
+        spilled_g, received_g, retained_g, loaded_g: numbers of Python, numpy or pandas; None if not given.
         notes: of the measurement.
 
     Raises:
-        InvalidArgumentError: the masses do not fit the load.
+        InvalidArgumentError: a mass is not a finite number, or the masses do not fit the load.
     """
-    loaded = load_g if loaded_g is None else loaded_g
     if (received_g is None) == (retained_g is None):
         raise InvalidArgumentError("give either received_g or retained_g")
-    retained = loaded - float(received_g or 0.0) - spilled_g if retained_g is None else retained_g
-    # within the balance's noise, a pourer that was emptied may seem to hold less than nothing
-    retained = 0.0 if -0.02 * loaded <= retained < 0.0 and retained_g is None else retained
-    answer = f"weighed {spilled_g!r} {retained!r} {loaded!r}"
     try:
-        outcome = parse_answer(answer, (), 1e-3 * load_g)
+        spilled = finite_number(spilled_g, "spilled_g")
+        loaded = load_g if loaded_g is None else finite_number(loaded_g, "loaded_g")
+        if received_g is None:
+            retained = finite_number(retained_g, "retained_g")
+        else:
+            received = finite_number(received_g, "received_g")
+            _check_grams(spilled, received, loaded)
+            retained = loaded - received - spilled
+            # within the balance's noise, a pourer that was emptied may seem to hold less than nothing
+            retained = 0.0 if -0.02 * loaded <= retained < 0.0 else retained
+        weighed = weighed_pour(1e-3 * spilled, 1e-3 * retained, 1e-3 * loaded, nominal=1e-3 * load_g)
     except ValueError as error:
-        raise InvalidArgumentError(str(error).removeprefix(f"'{answer}': ")) from None
-    assert isinstance(outcome, Poured)
-    return replace(outcome.measurement, notes=dict(notes)), answer
+        raise InvalidArgumentError(str(error)) from None
+    answer = f"weighed {spilled:.9f} {retained:.9f} {loaded:.9f}"
+    return replace(weighed.measurement, notes=dict(notes)), answer
+
+
+def _check_grams(spilled: float, received: float, loaded: float) -> None:
+    """Raise ValueError for masses [g] that may as well be kilograms: as grams, next to nothing was poured."""
+    heavy = 1e3 * received
+    alone = heavy >= 0.5 * loaded and heavy + spilled <= 1.02 * loaded
+    if alone or 0.5 * loaded <= heavy + 1e3 * spilled <= 1.02 * loaded:
+        raise ValueError(
+            f"of {loaded:g} g loaded, received_g={received:g} and spilled_g={spilled:g} may be grams, so that nearly "
+            f"nothing was poured, or kilograms ({heavy:g} g received). Give grams; if it is grams, give "
+            f"retained_g={loaded - received - spilled:g} instead of received_g"
+        )
 
 
 def _named(campaign: CampaignPlan, receiver: str | None) -> tuple[str, Scene]:

@@ -10,9 +10,12 @@
 from __future__ import annotations
 
 import inspect
+import math
+import re
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from actors.balance.readings import KILOGRAMS
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.requests import Answered, Ask, Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.learning.run_errors import RunError
@@ -25,6 +28,7 @@ from orchestrator.records.events import (
     Event,
     OperatorAnswered,
     OperatorAsked,
+    PourCorrected,
     PourWithdrawn,
     Requested,
     RequestFinished,
@@ -36,6 +40,7 @@ from orchestrator.records.events import (
 from orchestrator.records.journal import Journal, JournalReader
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
+from sim_engine.settings.quantity import number_readings, typed_number
 
 
 class ReplayError(RunError):
@@ -48,10 +53,10 @@ class StageHistory:
 
     Attributes:
         seed: seed of the stage; None if the stage was never opened.
-        steps: asks and tells in their order.
+        steps: asks, tells and corrections in their order.
         requests: by id, in the order in which they were made.
         outcomes: by id, in the order in which the requests finished.
-        finished: the finished requests to the laboratory, in the same order.
+        finished: the finished requests to the laboratory, and corrections, in the same order.
         pour_attempts: how often each pour was begun.
         withdrawn: pours whose last attempt ended without pouring anything.
         decisions: number of decisions written.
@@ -59,10 +64,10 @@ class StageHistory:
     """
 
     seed: int | None = None
-    steps: list[Asked | Told] = field(default_factory=list)
+    steps: list[Asked | Told | PourCorrected] = field(default_factory=list)
     requests: dict[int, Request] = field(default_factory=dict)
     outcomes: dict[int, Outcome] = field(default_factory=dict)
-    finished: list[RequestFinished] = field(default_factory=list)
+    finished: list[RequestFinished | PourCorrected] = field(default_factory=list)
     pour_attempts: dict[int, int] = field(default_factory=dict)
     withdrawn: set[int] = field(default_factory=set)
     decisions: int = 0
@@ -71,7 +76,7 @@ class StageHistory:
     @property
     def ask_is_due(self) -> bool:
         """Whether the next step is `ask`: the last step was a tell, or there is no step yet."""
-        return not self.steps or isinstance(self.steps[-1], Told)
+        return not self.steps or not isinstance(self.steps[-1], Asked)
 
     def unknown_pours(self) -> list[int]:
         """Pours that had begun and have no outcome."""
@@ -95,6 +100,9 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
                 history.seed = event.seed
             case Asked() | Told():
                 history.steps.append(event)
+            case PourCorrected():
+                history.steps.append(event)
+                history.finished.append(event)
             case Requested():
                 history.requests[event.id] = event.request
             case RequestStarted(request=Pour()):
@@ -129,6 +137,9 @@ def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, R
             request = undelivered.pop(step.id, None) or history.requests[step.id]
             strategy.tell(request, history.outcomes[step.id])
             continue
+        if isinstance(step, PourCorrected):
+            correct(strategy, history.requests[step.id], step.outcome)
+            continue
         requests = strategy.ask(Slots(step.simulations, step.pours))
         for key, request in zip(step.ids, requests, strict=False):
             _check_same(history.requests[key], request, key, stage)
@@ -139,6 +150,18 @@ def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, R
                 f"the replayed strategy asks for {len(requests)}. {_ADVICE}"
             )
     return undelivered
+
+
+def correct(strategy: Strategy, request: Request, outcome: Outcome) -> None:
+    """Give a strategy the right outcome of a pour, in place of the one that it was told.
+
+    Raises:
+        ValueError: it is not a pour whose outcome the strategy can replace.
+    """
+    replace_outcome = getattr(strategy, "correct", None)
+    if replace_outcome is None:
+        raise ValueError("the outcomes of this stage can't be replaced")
+    replace_outcome(request, outcome)
 
 
 _ADVICE = (
@@ -267,7 +290,8 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
     """Convert an operator's answer to an outcome.
 
     Args:
-        answer: 'repeat', 'lost', or 'weighed' with the masses spilled, retained and optionally loaded [g].
+        answer: 'repeat', 'lost', or 'weighed' with the masses spilled, retained and optionally loaded: in g, or with
+            units. Spaces or semicolons separate them.
         options: allowed answers.
         loaded: nominal load of the pourer [kg].
 
@@ -277,34 +301,86 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
     Raises:
         ValueError: the answer is invalid; the text gives the reason.
     """
-    words = answer.lower().replace(",", " ").split()
     text = answer.strip().lower()
     if text == REPEAT and REPEAT in options:
         return None
     if text == LOST:
         return Failed("pour_unknown", "declared lost by the operator")
-    if not words or words[0] != "weighed":
+    word, _, masses = text.partition(" ")
+    if word != "weighed":
         raise ValueError(f"'{answer}' is not an answer; answer with one of: {'; '.join(options)} (masses in grams)")
     try:
-        masses = [float(word) * 1e-3 for word in words[1:] if word != "g"]
-    except ValueError:
-        raise ValueError(f"'{answer}': after 'weighed' there must be numbers in grams, e.g. weighed 3.2 0.4") from None
+        weighed = weighed_pour(*_typed_masses(masses, loaded), nominal=loaded)
+    except ValueError as error:
+        raise ValueError(f"'{answer}': {error}") from None
+    return replace(weighed, measurement=replace(weighed.measurement, notes=dict(_BY_OPERATOR)))
+
+
+_BY_OPERATOR = {"source": "weighed by the operator after a restart"}
+_MASS = re.compile(r"([-+−–]?[.,]?[0-9]+(?:[.,'’][0-9]+)*\.?(?:e-?[0-9]+)?)\s*([a-zµ]+)?\s*(?:;|,?(?=\s|$))\s*")
+
+
+def _typed_masses(text: str, loaded: float) -> tuple[float, ...]:
+    """Spilled and retained mass, and the load if it is there [kg], as an operator types them.
+
+    A comma between digits is a decimal sign, unless it may as well separate two masses; then the text is refused.
+
+    Raises:
+        ValueError: the text is something else, or has two meanings.
+    """
+    masses = _MASS.findall(text)
+    units = {unit for _, unit in masses} - {""}
+    if _MASS.sub("", text).strip() or not units <= set(KILOGRAMS):
+        raise ValueError("after 'weighed' there must be numbers in grams, e.g. weighed 3.2 0.4")
+    if not units and ";" not in text:
+        separate = [(number, "") for listed, _ in masses for number in listed.split(",")]
+        doubtful = [number for number, _ in masses if "," in number and "." not in number]
+        if doubtful and len(separate) in (2, 3):
+            readings = "".join(f"{reading}, or " for reading in number_readings(doubtful[0]))
+            raise ValueError(
+                f"'{doubtful[0]}' may be {readings}the masses {' and '.join(doubtful[0].split(','))}, since a comma "
+                "may be a decimal sign; type decimal points, and a space between two masses, e.g. weighed 3.2 0.4"
+            )
+        masses = masses if doubtful else separate
     if len(masses) not in (2, 3):
-        raise ValueError(f"'{answer}': two masses are needed, spilled and retained, e.g. weighed 3.2 0.4 (grams)")
-    spilled, retained = masses[:2]
-    slack = max(LOAD_WITHIN * loaded, LOAD_WITHIN_MASS) + 1e-9
-    if len(masses) == 3 and not abs(masses[2] - loaded) <= slack:
+        raise ValueError("two masses are needed, spilled and retained, e.g. weighed 3.2 0.4 (grams)")
+    if units - {"g"} and not all(unit for _, unit in masses):
+        raise ValueError("write the unit of each mass, e.g. weighed 3.2 g 0.4 g")
+    kilograms = []
+    for number, unit in masses:
+        factor = KILOGRAMS[unit or "g"]
+        possible = (loaded + _load_slack(loaded)) / factor if len(number_readings(number)) > 1 else math.inf
+        kilograms.append(float(typed_number(number, unit or "g", largest=possible)) * factor)
+    return tuple(kilograms)
+
+
+def _load_slack(nominal: float) -> float:
+    return max(LOAD_WITHIN * nominal, LOAD_WITHIN_MASS) + 1e-9
+
+
+def weighed_pour(spilled: float, retained: float, loaded: float | None = None, *, nominal: float) -> Poured:
+    """The outcome of a pour that a person or another program has weighed.
+
+    Args:
+        spilled, retained: masses next to the receiver, and left in the pourer [kg].
+        loaded: mass in the pourer before [kg]; None for the nominal load.
+        nominal: load that the pour was to have [kg].
+
+    Raises:
+        ValueError: the masses don't fit each other or the load.
+    """
+    slack = _load_slack(nominal)
+    if loaded is not None and not abs(loaded - nominal) <= slack:
         raise ValueError(
-            f"'{answer}': the pour was to have a load of {loaded * 1e3:g} g, and {masses[2] * 1e3:g} g is more than "
+            f"the pour was to have a load of {nominal * 1e3:g} g, and {loaded * 1e3:g} g is more than "
             f"{slack * 1e3:g} g away from that"
         )
-    loaded = masses[2] if len(masses) == 3 else loaded
+    loaded = nominal if loaded is None else loaded
     if not (min(spilled, retained) >= 0.0 and loaded > 0.0 and spilled + retained <= 1.02 * loaded):
         raise ValueError(
-            f"'{answer}': {spilled * 1e3:g} g spilled and {retained * 1e3:g} g retained don't fit a load of "
-            f"{loaded * 1e3:g} g"
+            f"{spilled * 1e3:g} g spilled and {retained * 1e3:g} g retained don't fit a load of {loaded * 1e3:g} g"
         )
-    return Poured(PourMeasurement(loaded, spilled, retained, {"source": "weighed by the operator after a restart"}))
+    return Poured(PourMeasurement(loaded, spilled, retained))
 
 
 def weighed_by_hand(pour: Pour, measured: PourMeasurement) -> str:

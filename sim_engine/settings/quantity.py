@@ -3,6 +3,10 @@
 `parse_quantity` and the pydantic annotation `Quantity` require a unit in files, because confusing degrees with radians
 can break equipment. Angle is a separate dimension here: in pint's default registry it is a pure number, so that '15 Hz'
 would be accepted as an angular velocity.
+
+`typed_quantity` and `typed_number` read what a person types. They accept decimal commas, and refuse a number with two
+meanings: '1,234 g' and '1.234 g' are 1.234 g, or 1234 g where that sign separates thousands. In files, and in requests
+of programs, a point is always the decimal sign. `finite_number` takes the numbers that a program passes.
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -94,8 +99,138 @@ _UNIT = re.compile(rf"{_TERM}(?:\s*[*/·\s]\s*{_TERM})*")
 """Products of units with exponents of one digit: the parser would evaluate '9**9**9' first."""
 
 
+LARGEST = {"kg": 20.0, "m": 2.0, "s": 3600.0, "m^3": 0.02}
+"""Largest quantity that can be meant at a pouring bench, by its SI unit; no arm of a bench carries a larger mass."""
+
+_POINT = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
+_COMMA = re.compile(r"[-+]?[0-9]*,[0-9]+([eE][-+]?[0-9]+)?")
+_IN_THOUSANDS = {
+    ",": re.compile(r"[-+]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?"),
+    ".": re.compile(r"[-+]?[1-9][0-9]{0,2}(\.[0-9]{3})+(,[0-9]*)?"),
+}
+_SPACED = re.compile(r"[-+]?[1-9][0-9]{0,2}([ \u00a0\u2009\u202f'’][0-9]{3})+([.,][0-9]*)?")
+"""Groups of three digits that a space or an apostrophe separates, as in France and Switzerland."""
+
+_TYPED = re.compile(
+    r"\s*([-+−–]?\s*[0-9.,](?:[ \u00a0\u2009\u202f'’]?[0-9.,])*(?:[eE][-+]?[0-9]+)?)\s*(.*?)\s*", re.DOTALL
+)
+
+
 class QuantityError(ValueError):
     """A text is not the required quantity; the message gives a valid example."""
+
+
+def decimals_of(text: str) -> str:
+    """',' or '.': the decimal sign that a number shows; with '?' if it may separate thousands; '' if it has none.
+
+    'spaced' for a number in groups of three digits.
+    """
+    if _SPACED.fullmatch(text):
+        return "spaced"
+    for sign, other, pattern in ((",", ".", _COMMA), (".", ",", _POINT)):
+        if sign not in text:
+            continue
+        if _IN_THOUSANDS[sign].fullmatch(text):
+            if other in text or text.count(sign) > 1:
+                return other  # 1,234.5 and 1,234,567 have decimal points
+            return f"{sign}?"
+        if pattern.fullmatch(text):
+            return sign
+    return ""
+
+
+def plain_number(text: str, *, decimal_comma: bool = False) -> str:
+    """A number without separators of thousands, and with a decimal point; '' if the text is not a number.
+
+    Args:
+        decimal_comma: whether a comma is the decimal sign; else it separates thousands.
+    """
+    if _SPACED.fullmatch(text):
+        text = re.sub(r"[^-+0-9.,]", "", text).replace(",", ".")
+    elif decimal_comma:
+        grouped = _IN_THOUSANDS["."].fullmatch(text)
+        text = (text.replace(".", "") if grouped else text).replace(",", ".") if "," in text or grouped else text
+    elif _IN_THOUSANDS[","].fullmatch(text):
+        text = text.replace(",", "")
+    return text if _POINT.fullmatch(text) else ""
+
+
+def number_readings(text: str) -> tuple[str, ...]:
+    """The numbers that a text may stand for, with decimal points: none, one, or two (first the one with decimals)."""
+    kind = decimals_of(text)
+    if kind.endswith("?"):
+        return text.replace(kind[0], "."), text.replace(kind[0], "")
+    return tuple(filter(None, [plain_number(text, decimal_comma=kind == ",")]))
+
+
+def typed_number(text: str, unit: str = "", *, largest: float = math.inf) -> Decimal:
+    """The number that a person typed, with its digits.
+
+    Args:
+        text: with a decimal point or comma; thousands may be separated.
+        unit: as typed, for messages.
+        largest: possible magnitude in that unit; a reading beyond it can't be meant.
+
+    Raises:
+        QuantityError: it is not a number, too large, or has two possible meanings; the message shows both.
+    """
+    unit = f" {unit}" if unit else ""
+    readings = number_readings(re.sub(r"^([-+])\s+", r"\1", re.sub("[−–]", "-", text.strip())))
+    possible = [reading for reading in readings if abs(Decimal(reading)) <= largest]
+    if len(possible) == 1:
+        return Decimal(possible[0])
+    if not readings:
+        raise QuantityError(f"'{text}' is not a number; type it like 12.5{unit}")
+    if not possible:
+        raise QuantityError(f"'{text}{unit}' is too much: at most {largest:g}{unit} is possible. Is the unit right?")
+    fine, coarse = possible
+    raise QuantityError(
+        f"'{text}{unit}' may be {fine}{unit} or {coarse}{unit}; type '{fine}0{unit}' or '{coarse}{unit}'"
+    )
+
+
+def split_typed(text: str) -> tuple[str, str]:
+    """Number and unit of a typed quantity, not yet checked; ('', '') if it does not begin with a number."""
+    match = _TYPED.fullmatch(text)
+    return ("", "") if match is None or len(text) > LONGEST else (match[1], match[2])
+
+
+def typed_quantity(text: str, unit: str, example: str) -> float:
+    """Magnitude of '12,5 g' in a unit, as a person types it.
+
+    Args:
+        text: a number and a unit.
+        unit: SI unit of the result. A magnitude above that of `LARGEST` is refused.
+        example: a valid quantity, for messages; its unit is the suggested one.
+
+    Raises:
+        QuantityError: as `parse_quantity` and `typed_number`.
+    """
+    number, written = split_typed(text)
+    if not number or not written:
+        return parse_quantity(text, unit, example)
+    factor = _converted(1.0, written, repr(text), unit, example)
+    return float(typed_number(number, written, largest=LARGEST.get(unit, math.inf) / factor)) * factor
+
+
+def finite_number(value: Any, name: str) -> float:
+    """A number that a program passes: of Python, numpy or pandas, also an array without dimensions.
+
+    Raises:
+        QuantityError: it is not a number, or not finite; the message begins with the name.
+    """
+    kind = type(value).__name__
+    if getattr(value, "shape", ()) != ():
+        raise QuantityError(f"{name}: should be one number, and is a {kind} of shape {value.shape}")
+    if value is None or isinstance(value, str | bytes) or kind in ("bool", "bool_"):
+        raise QuantityError(f"{name}: should be a number such as 12.5, and is {value!r}")
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise QuantityError(f"{name}: should be a number such as 12.5, and is {value!r}") from None
+    if not math.isfinite(number):
+        raise QuantityError(f"{name}: {number} is not a finite number; is a value missing?")
+    return number
 
 
 @cache
@@ -138,8 +273,11 @@ def parse_quantity(value: Any, unit: str, example: str) -> float:
         raise QuantityError(f"{value} has no unit; write '{value} {preferred}' if that is what is meant")
     if text == unit:
         return number
-    if re.match(r",\d", text):
-        raise QuantityError(f"{value!r} has a decimal comma; write '{str(value).replace(',', '.', 1)}'")
+    typed, written = split_typed(str(value))
+    if readings := number_readings(typed) if "," in typed else ():
+        corrected = " or ".join(f"'{reading} {written}'" for reading in readings)
+        doubt = "has a decimal comma" if len(readings) == 1 else "has two meanings"
+        raise QuantityError(f"{value!r} {doubt}; write {corrected}")
     return _converted(number, text, repr(value), unit, example)
 
 

@@ -119,10 +119,19 @@ def test_matter_is_not_repeated_on_a_real_bench(tmp_path: Path) -> None:
         ("weighed one two", "numbers in grams"),
         ("weighed -1 0", "don't fit a load"),
         ("weighed 150 60", "don't fit a load of 200 g"),
-        ("weighed nan 0", "don't fit a load"),
+        ("weighed nan 0", "numbers in grams"),
         ("weighed 500 0", "don't fit a load of 200 g"),
         ("weighed 500 0 600", "was to have a load of 200 g, and 600 g is more than 20 g away"),
-        ("weighed 1 0 nan", "was to have a load of 200 g"),
+        ("weighed 1 0 nan", "numbers in grams"),
+        ("weighed 0,0 200", "'0,0' may be 0.0, or the masses 0 and 0"),
+        ("weighed 0,0,200", "'0,0,200' may be the masses 0 and 0 and 200, since a comma may be a decimal sign"),
+        ("weighed 12,5 200", "'12,5' may be 12.5, or the masses 12 and 5"),
+        ("weighed 12,5 180", "'12,5' may be 12.5, or the masses 12 and 5"),
+        ("weighed 3,2", "'3,2' may be 3.2, or the masses 3 and 2"),
+        ("weighed 1,234 0", "'1,234' may be 1.234, or 1234, or the masses 1 and 234"),
+        ("weighed 12,5 g 200 g", "12.5 g spilled and 200 g retained don't fit a load of 200 g"),
+        ("weighed 0.2 kg 0.4", "the unit of each mass"),
+        ("weighed 3.2 ml 0.4 ml", "numbers in grams"),
     ],
 )
 def test_an_answer_that_makes_no_sense_is_explained(answer: str, complaint: str) -> None:
@@ -138,3 +147,31 @@ def test_sensible_answers_are_understood() -> None:
     measurement = outcome.measurement
     assert (measurement.loaded, measurement.spilled, measurement.retained) == pytest.approx((0.18, 0.0035, 0.0015))
     assert decode_outcome(encode_outcome(outcome)) == outcome
+
+
+@pytest.mark.parametrize(
+    ("answer", "spilled", "retained"),
+    [
+        ("weighed 0.0 200", 0.0, 200.0),
+        ("weighed 3.2, 0.4", 3.2, 0.4),
+        ("weighed 3.2,0.4", 3.2, 0.4),
+        ("weighed 3,2 0,4", 3.2, 0.4),
+        ("weighed 3,2; 0,4", 3.2, 0.4),
+        ("weighed 3,2, 0,4", 3.2, 0.4),
+        ("weighed 3.2 g 0.4 g", 3.2, 0.4),
+        ("weighed 12,5 g 180 g", 12.5, 180.0),
+        ("weighed 12,5; 180", 12.5, 180.0),
+        ("weighed 0.0032 kg 400 mg", 3.2, 0.4),
+        ("weighed 1.234 0.4", 1.234, 0.4),  # 1234 g are more than the load
+    ],
+)
+def test_masses_are_read_as_they_were_typed(answer: str, spilled: float, retained: float) -> None:
+    outcome = parse_answer(answer, (LOST, WEIGHED), 0.2)
+    assert isinstance(outcome, Poured)
+    masses = outcome.measurement.spilled, outcome.measurement.retained
+    assert masses == pytest.approx((1e-3 * spilled, 1e-3 * retained))
+
+
+def test_a_mass_that_may_have_thousands_is_asked_for_again_if_the_load_allows_both() -> None:
+    with pytest.raises(ValueError, match=r"may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'"):
+        parse_answer("weighed 1.234 0.4", (LOST, WEIGHED), 2.0)

@@ -190,3 +190,52 @@ def test_a_person_weighs_a_source_on_the_command_line_and_sees_what_is_left(
     refused = invoke("materials weigh beaker '200 g'")  # a vessel of the station: its daemon checks the entry
     assert refused.exit_code == 2
     assert "write LABORATORY/VESSEL" in refused.stderr
+
+
+@pytest.mark.parametrize("mass", ["100000 kg", "1,234 g", "12.345 g", "-1 g", "5 mL", "5"])
+def test_a_content_that_can_not_be_meant_is_not_entered(mass: str, tmp_path: Path) -> None:
+    expected = {
+        "100000 kg": "'100000 kg' is too much: at most 20 kg is possible. Is the unit right?",
+        "1,234 g": "'1,234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'",
+        "12.345 g": "'12.345 g' may be 12.345 g or 12345 g; type '12.3450 g' or '12345 g'",
+        "-1 g": "should be 0 g or more",
+        "5 mL": "is a volume; should be a mass",
+        "5": "has no unit",
+    }
+    result = invoke(f'materials weigh --state {tmp_path} --liquid water -- virtual/beaker "{mass}"')
+    assert result.exit_code == 2
+    assert expected[mass] in result.stderr
+    assert VesselAccount(tmp_path / FILE_NAME).content("virtual/beaker") is None
+
+
+def test_a_content_is_read_as_it_was_typed_and_the_reading_is_shown(tmp_path: Path) -> None:
+    for typed, grams in (("412,3 g", 412.3), ("1.234,5 g", 1234.5), ("0,198 kg", 198.0), ("312.345 g", 312.345)):
+        result = invoke(f'materials weigh --state {tmp_path} virtual/beaker "{typed}" --liquid water')
+        assert result.stdout == f"virtual/beaker: {grams:.6g} g\n"
+        entry = VesselAccount(tmp_path / FILE_NAME).content("virtual/beaker")
+        assert entry is not None
+        assert entry.mass == pytest.approx(1e-3 * grams)
+
+
+def test_a_pour_by_hand_is_checked_against_its_source_and_a_repetition_is_told(tmp_path: Path) -> None:
+    def poured(key: str, mass: str) -> Any:
+        return invoke(f'materials poured --state {tmp_path} {key} --from lab/jug --into lab/cup --weighed "{mass}"')
+
+    VesselAccount(tmp_path / FILE_NAME).weigh("lab/jug", 0.2, 1e-3, liquid="water")
+    result = poured("1", "1230 g")
+    assert result.exit_code == 2
+    assert "lab/jug: holds 200 g by its account, and 1230 g were poured from it" in result.stderr
+    assert poured("1", "123,0 g").stdout == "1: 123 g from lab/jug into lab/cup\n"
+    assert "is entered already, and nothing was changed" in poured("1", "12,3 g").stderr
+    assert masses(VesselAccount(tmp_path / FILE_NAME)) == pytest.approx({"lab/cup": 0.123, "lab/jug": 0.077})
+
+
+def test_a_source_that_can_not_hold_what_was_entered_is_not_used(tmp_path: Path) -> None:
+    account = VesselAccount(tmp_path / FILE_NAME)
+    account.weigh("bench/beaker", 0.49, 1e-3, liquid="water")
+    assert account.known(series())["beaker"].mass == pytest.approx(0.49)
+    account.weigh("bench/beaker", 1.0, 1e-3, liquid="water")
+    with pytest.raises(InvalidArgumentError, match="holds 1000 g of water by its account, and there is room for 50"):
+        account.known(series())
+    with pytest.raises(InvalidArgumentError, match="mass: 412 kg is more than 20 kg; is it in grams"):
+        account.weigh("bench/beaker", 412.0, 1e-3, liquid="water")

@@ -164,7 +164,7 @@ function answers(question, answer) {
   if (question.wants === "yes or no") return [big("yes"), big("no")];
   if (question.wants === "weight") return weights(question, ["Weight"], ([weight]) => answer(`${weight} g`));
   return question.options.map((option) => option.startsWith("weighed") ?
-    weights(question, ["Spilled", "Left in the pourer"], (found) => answer(`weighed ${found.join(" ")}`)) : big(option));
+    weights(question, ["Spilled", "Left in the pourer"], (found) => answer(`weighed ${found.map((mass) => `${mass} g`).join("; ")}`)) : big(option));
 }
 
 function weights(question, names, send) {
@@ -174,7 +174,7 @@ function weights(question, names, send) {
   }));
   return el("form", {
     class: "weights",
-    onsubmit: (event) => { event.preventDefault(); send(inputs.map((input) => input.value.trim().replace(",", "."))); },
+    onsubmit: (event) => { event.preventDefault(); send(inputs.map((input) => input.value.trim())); },
   }, inputs.map((input, index) => el("label", {}, names[index], el("span", {}, input, " g"))),
   el("button", { class: "big go" }, names.length > 1 ? "It was weighed" : "Send the weight"));
 }

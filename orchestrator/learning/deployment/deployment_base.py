@@ -197,6 +197,10 @@ class Deployment(ABC, Generic[S]):
         else:
             self._ledger.add(request, outcome)
 
+    def correct(self, request: Request, outcome: Outcome) -> None:
+        """Replace the outcome of a pour that was told wrongly. Raises ValueError for any other request."""
+        self._ledger.correct(request, outcome)
+
     @property
     def _may_think(self) -> bool:
         """Whether nothing is queued and no query is pending, so that the next query can be made."""

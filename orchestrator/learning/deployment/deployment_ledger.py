@@ -19,7 +19,7 @@ from orchestrator.learning.campaign_plan import DeploymentPlan, DeploymentSettin
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.objectives import Vector
 from orchestrator.learning.deployment.real_pours import PourTrial, point_of, prior_pours
-from orchestrator.learning.requests import ADDED, Decision, Failed, Outcome, Pour, Prediction, Simulate
+from orchestrator.learning.requests import ADDED, Decision, Failed, Outcome, Pour, Prediction, Request, Simulate
 from orchestrator.learning.trials import SeedStream, Trials
 from sim_engine.action import Action, described
 from sim_engine.liquids import SimulationParameters
@@ -97,7 +97,22 @@ class DeploymentLedger:
 
     def take(self, outcome: Outcome) -> None:
         """Record the outcome of the latest pour."""
-        trial = self.pours[-1]
+        self._settle(self.pours[-1], outcome)
+
+    def correct(self, request: Request, outcome: Outcome) -> None:
+        """Replace the outcome of a pour.
+
+        Raises:
+            ValueError: the strategy has no outcome of this request.
+        """
+        number = request.number if isinstance(request, Pour) else None
+        known = [trial for trial in self.pours if trial.number == number and trial.status in ("weighed", "failed")]
+        if not known:
+            raise ValueError("the strategy has no outcome of this pour")
+        self.decisions.append(Decision(f"pour {number} is corrected"))
+        self._settle(known[-1], outcome)
+
+    def _settle(self, trial: PourTrial, outcome: Outcome) -> None:
         trial.take(outcome, self.scene, self.costing, penalised=self.plan.settings.on_failed_pour == "penalise")
         if trial.status == "weighed" and trial.cost is not None:
             self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))

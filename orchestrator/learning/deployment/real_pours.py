@@ -117,7 +117,7 @@ class PourTrial:
     vector: Vector | None = None
 
     def take(self, outcome: Outcome, scene: Scene, costing: Costing, *, penalised: bool) -> None:
-        """Record the outcome.
+        """Record the outcome; it replaces an earlier one.
 
         Args:
             outcome: answer to the request.
@@ -128,6 +128,8 @@ class PourTrial:
         Raises:
             ValueError: the outcome is not one of a pour.
         """
+        self.cost = self.vector = self.measurement = None
+        self.reason, self.mishap = "", False
         match outcome:
             case Poured(measurement) if not is_sound(measurement.fractions):
                 self.status, self.reason = "failed", "weighing: the balance gave no numbers"

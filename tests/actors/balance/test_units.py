@@ -38,7 +38,19 @@ def test_step_of_the_display_is_one_of_the_last_digit_sent():
 
 @pytest.mark.parametrize(
     ("text", "mass", "step"),
-    [("203.4 g", 0.2034, 1e-4), (" 203,40g ", 0.2034, 1e-5), ("0.2034 kg", 0.2034, 1e-4), ("−1.5 g", -1.5e-3, 1e-4)],
+    [
+        ("203.4 g", 0.2034, 1e-4),
+        (" 203,40g ", 0.2034, 1e-5),
+        ("0.2034 kg", 0.2034, 1e-4),
+        ("−1.5 g", -1.5e-3, 1e-4),
+        ("1,234.5 g", 1.2345, 1e-4),
+        ("1.234,5 g", 1.2345, 1e-4),
+        ("1 234,5 g", 1.2345, 1e-4),
+        ("1'234 g", 1.234, 1e-3),
+        ("1.2340 g", 1.234e-3, 1e-7),
+        ("312.345 g", 0.312345, 1e-6),
+        ("1,234 kg", 1.234, 1e-3),
+    ],
 )
 def test_typed_weights_are_understood_as_people_type_them(text, mass, step):
     typed = typed_weight(text)
@@ -53,7 +65,11 @@ def test_typed_weights_are_understood_as_people_type_them(text, mass, step):
         ("about 200 g", "not a weight; type a number and a unit"),
         ("", "not a weight"),
         ("200 pcs", "'pcs' is not a unit of mass"),
-        ("1.234.5 g", "not a weight"),
+        ("1.234.5 g", "not a number"),
+        ("1,234 g", "'1,234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'"),
+        ("1.234 g", "'1.234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'"),
+        ("1,250 g", "may be 1.250 g or 1250 g"),
+        ("100000 kg", "'100000 kg' is too much: at most 20 kg is possible"),
     ],
 )
 def test_a_typed_weight_that_could_be_misread_is_asked_for_again(text, said):

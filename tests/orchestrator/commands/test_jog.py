@@ -74,6 +74,7 @@ class Session:
     ("typed", "step"),
     [
         ("j5 +2", JogStep("joint 5", 2.0, "deg")),
+        ("z − 1,234", JogStep("z", -1.234, "mm")),  # 1234 mm are no step
         ("J1 -0,5", JogStep("joint 1", -0.5, "deg")),
         ("z -5", JogStep("z", -5.0, "mm")),
         ("rx 3", JogStep("rx", 3.0, "deg")),

@@ -154,10 +154,14 @@ def test_a_weight_is_typed_as_people_type_it_and_a_wrong_one_is_told(page: Any, 
         page.get_by_role("button", name="Send the weight").click()
         assert not page.evaluate("document.querySelector('.weights').checkValidity()")
         assert lab.served.laboratories[0].bench.answers == []
+        weight.fill("1,234")
+        page.get_by_role("button", name="Send the weight").click()
+        page.get_by_text("'1,234 g' may be 1.234 g or 1234 g").wait_for()
+        assert lab.served.laboratories[0].bench.answers == []
         weight.fill("12,3")
         page.get_by_role("button", name="Send the weight").click()
         lab.do(lab.served.pouring())
-        wait_until(page, lambda: lab.served.laboratories[0].bench.answers[:1] == ["12.3 g"])
+        wait_until(page, lambda: lab.served.laboratories[0].bench.answers[:1] == ["12,3 g"])
 
 
 @pytest.mark.slow
