@@ -298,6 +298,36 @@ def _measured(case: str) -> list[dict[str, Any]]:
     return list(records[case]["measurements"]) if case in records else []
 
 
+def counted_claims() -> str:
+    """Claims that are counts or ratios of measured figures: validation, speed, and D3's intervals."""
+    judged = [one for record in kept_records(FOLDER).values() for one in record["measurements"] if one["judged"]]
+    performance = json.loads((FOLDER / "data" / "performance.json").read_text(encoding="utf-8")).values()
+    ratios = [one["result"] for one in performance if "ratio_per_simulated_second" in one["result"]]
+    faster, per_second = (
+        f"{min(row[key] for row in ratios):.0f} to {max(row[key] for row in ratios):.0f} times"
+        for key in ("ratio", "ratio_per_simulated_second")
+    )
+    results = json.loads((FOLDER / "data" / "results.json").read_text(encoding="utf-8"))
+    *_, pours = results["study-intervals"]["rows"]
+    return _table(
+        ("claim", "shown by"),
+        (
+            (
+                f"{sum(one['passed'] for one in judged)} of {len(judged)} physical criteria are met",
+                "[validation](validation.md)",
+            ),
+            (
+                f"On one core {faster} as fast as SPlisHSPlasH ({per_second} per simulated second)",
+                "[performance](performance.md)",
+            ),
+            (
+                f"D3's 90 % intervals are too wide: {pours[2]} of {pours[1]} pours lie in theirs",
+                "[ten worlds](results.md#ten-worlds)",
+            ),
+        ),
+    )
+
+
 def columns() -> str:
     """Columns of a file of weighed pours."""
     rows = [(f"`{name}`", "g") for name in MASS_COLUMNS] + [("`split`", ", ".join(SPLITS))]
@@ -687,6 +717,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "effects": effects,
     "seeds": seeds,
     "columns": columns,
+    "counted-claims": counted_claims,
     "liquids": liquids,
     "states": states,
     **{name: partial(section, model) for name, model in SECTIONS.items()},
