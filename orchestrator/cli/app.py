@@ -222,13 +222,21 @@ _queue(
     "decant queue submit my.yaml --rig left --priority 5",
     "decant queue submit my.yaml --task plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
 )
-_queue(queue_commands.list_campaigns, "decant queue list", "decant queue list --json", name="list")
-_queue(queue_commands.show, "decant queue show quick   # the first letters of an id suffice")
+_queue(
+    queue_commands.list_campaigns,
+    "decant queue list",
+    "decant queue list quick   # one campaign; the first letters of an id suffice",
+    name="list",
+)
 _queue(queue_commands.logs, "decant queue logs -f", "decant queue logs quickstart-3f2a1c --json")
-_queue(queue_commands.pause, "decant queue pause quickstart-3f2a1c", "decant queue pause   # the queue")
+_queue(
+    queue_commands.pause,
+    "decant queue pause quickstart-3f2a1c",
+    "decant queue pause quickstart-3f2a1c --now   # stops the motion",
+    "decant queue pause   # the queue",
+)
 _queue(queue_commands.resume, "decant queue resume quickstart-3f2a1c", "decant queue resume   # the queue")
 _queue(queue_commands.stop, "decant queue stop quickstart-3f2a1c   # its results so far are kept")
-_queue(queue_commands.abort, "decant queue abort quickstart-3f2a1c")
 _queue(
     queue_commands.answer,
     "decant queue answer",
@@ -250,13 +258,17 @@ _materials = _group(
     "decant materials weigh virtual/beaker '412.3 g' --liquid water   # after filling it",
     "decant materials list                                            # what the pours since then left",
 )
-_materials(materials_commands.list_vessels, "decant materials list", "decant materials list --json", name="list")
+_materials(
+    materials_commands.list_vessels,
+    "decant materials list",
+    "decant materials list virtual/beaker   # the entries of its account",
+    name="list",
+)
 _materials(
     materials_commands.weigh,
     "decant materials weigh virtual/beaker '412.3 g' --liquid water   # the source of a campaign",
     "decant materials weigh beaker-1 '412.3 g' --note 'after lunch'     # a vessel of the daemon",
 )
-_materials(materials_commands.history, "decant materials history virtual/beaker")
 _materials(materials_commands.place, "decant materials place night/receiver right")
 _materials(
     materials_commands.poured, "decant materials poured monday-1 --from beaker-1 --into vial-7 --weighed '30.2 g'"

@@ -204,18 +204,15 @@ OUTPUTS: dict[str, Any] = {
     "runs check": RunCheckOutput,
     "runs export": ExportOutput,
     "study run": StudyOutput | StudyCostOutput,
-    "study report": StudyOutput,
     "robot check": CheckOutput,
     "robot archive": ArchiveOutput,
     "balance check": BalanceCheckOutput,
     **own_extras("decant.outputs").get("recording", {}),
     "queue submit": CampaignOut,
-    "queue list": QueueOutput,
-    "queue show": CampaignDetailOut,
+    "queue list": QueueOutput | CampaignDetailOut,
     "queue logs": EventOutput,
     "queue pour": PourOut,
-    "materials list": VesselContentsOutput,
-    "materials history": VesselHistoryOutput,
+    "materials list": VesselContentsOutput | VesselHistoryOutput,
 }
 """Models of the output, by command."""
 

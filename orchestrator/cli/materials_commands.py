@@ -90,14 +90,27 @@ def _of_campaign(vessel: str) -> str:
     return vessel
 
 
-def list_vessels(url: Url = None, state: State = None, as_json: Json = False) -> None:
+def list_vessels(
+    vessel: Annotated[
+        str | None, typer.Argument(metavar="VESSEL", help="Show the last entries of this vessel's account.")
+    ] = None,
+    limit: Annotated[int, typer.Option(min=1, help="Number of entries.")] = 20,
+    url: Url = None,
+    state: State = None,
+    as_json: Json = False,
+) -> None:
     """List vessels with what is left in each one, its standard deviation, and where it stands.
+
+    With a vessel: its fillings, weighings and pours, newest last.
 
     Vessels of the daemon have an id. The sources of `dispense` campaigns and of `decant dose`, and the vessels that an
     arm carries between places, are LABORATORY/VESSEL.
     """
     from orchestrator.materials.vessel_account import VesselAccount
 
+    if vessel is not None:
+        _show_entries(vessel, limit, url, state, as_json)
+        return
     rows: list[dict[str, Any]]
     with _opened(url, state) as where:
         if not isinstance(where, VesselAccount):
@@ -127,14 +140,7 @@ def _content(one: dict[str, Any]) -> str:
     return f"{one['mass_g']:.1f} ± {one['deviation_g']:.1f} g"
 
 
-def history(
-    vessel: VesselName,
-    limit: Annotated[int, typer.Option(min=1, help="Number of entries.")] = 20,
-    url: Url = None,
-    state: State = None,
-    as_json: Json = False,
-) -> None:
-    """Show the last entries of a vessel's account, newest last: fillings, weighings and pours."""
+def _show_entries(vessel: str, limit: int, url: str | None, state: Path | None, as_json: bool) -> None:
     from orchestrator.materials.vessel_account import VesselAccount
 
     with _opened(url, state) as where:

@@ -34,6 +34,10 @@ CampaignOrQueue = Annotated[
     str | None,
     typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue.", autocompletion=queued_campaigns),
 ]
+CampaignOrAll = Annotated[
+    str | None,
+    typer.Argument(metavar="[CAMPAIGN_ID]", help="Show this campaign.", autocompletion=queued_campaigns),
+]
 Url = Annotated[
     str | None, typer.Option(help="URL of the daemon; default: $DECANT_URL, or the daemon on this machine.")
 ]
@@ -147,8 +151,14 @@ def submit(
         print_message(f"it waits for: {found['waits_for']}")
 
 
-def list_campaigns(url: Url = None, state: State = None, as_json: Json = False) -> None:
-    """List campaigns, rigs, open questions and problems."""
+def list_campaigns(key: CampaignOrAll = None, url: Url = None, state: State = None, as_json: Json = False) -> None:
+    """List campaigns, rigs, open questions and problems; or show one campaign.
+
+    With a campaign: its progress, its pours with predictions and weights, and the audit entries.
+    """
+    if key is not None:
+        _show(key, url, state, as_json)
+        return
     with connected_client(url, state) as client:
         status, campaigns = client.get("/status"), client.get("/campaigns", limit=50)
         questions = client.get("/questions")
@@ -192,8 +202,7 @@ def _standing(one: dict[str, Any]) -> str:
     return " · ".join(parts)
 
 
-def show(key: CampaignId, url: Url = None, state: State = None, as_json: Json = False) -> None:
-    """Show one campaign: its progress, its pours with predictions and weights, and the audit entries."""
+def _show(key: str, url: str | None, state: Path | None, as_json: bool) -> None:
     with connected_client(url, state) as client:
         found = client.get(f"/campaigns/{key}")
     if as_json:
@@ -288,12 +297,23 @@ def _finished(event: dict[str, Any]) -> str:
     return f"{what}: {outcome['type'].lower()}"
 
 
-def pause(key: CampaignOrQueue = None, url: Url = None, state: State = None) -> None:
+def pause(
+    key: CampaignOrQueue = None,
+    now: Annotated[
+        bool, typer.Option("--now", help="Stop the campaign's motion at once; a pour that has started is UNKNOWN.")
+    ] = False,
+    url: Url = None,
+    state: State = None,
+) -> None:
     """Pause a campaign at its next checkpoint: a pour that has started is finished and weighed.
 
-    Without a campaign, the queue is paused: no campaign starts, and running ones continue.
+    Without a campaign, the queue is paused: no campaign starts, and running ones continue. With --now, a tilted vessel
+    is brought upright after the operator has agreed. A software stop is not a safety function: keep the robot's own
+    emergency stop within reach.
     """
-    _change(key, "pause", url, state)
+    if now and key is None:
+        raise RefusalError("--now stops the motion of one campaign: name it. 'decant estop' stops every arm")
+    _change(key, "abort" if now else "pause", url, state)
 
 
 def resume(key: CampaignOrQueue = None, url: Url = None, state: State = None) -> None:
@@ -314,14 +334,6 @@ def _change(key: str | None, what: str, url: str | None, state: Path | None) -> 
         print("queue paused" if found["queue_paused"] else "queue resumed")
     else:
         print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
-
-
-def abort(key: CampaignId, url: Url = None, state: State = None) -> None:
-    """Stop the motion of a campaign at once. A tilted vessel is brought upright after the operator has agreed.
-
-    A software stop is not a safety function: keep the robot's own emergency stop within reach.
-    """
-    _change(key, "abort", url, state)
 
 
 def estop(

@@ -40,7 +40,7 @@ def report(
     if (folder / JOURNAL_NAME).is_file():
         page, figures = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
     elif folder.suffix in (".yaml", ".yml"):
-        raise RefusalError(f"{folder}: is a file; name a run's folder, or for a study: decant study report {folder}")
+        raise RefusalError(f"{folder}: is a file, no run's folder; for a study: decant study run {folder} --report")
     else:
         raise RefusalError(_nothing_there(folder))
     print_note(f"report  {page}")

@@ -1,4 +1,4 @@
-"""The commands `decant study run` and `report`: a resumable comparison of strategies, with figures and a page."""
+"""The command `decant study run`: a resumable comparison of strategies, with figures and a page."""
 
 from __future__ import annotations
 
@@ -39,6 +39,9 @@ def run_study(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
     ] = False,
+    report: Annotated[
+        bool, typer.Option("--report", help="Start nothing; write figures, tables and the page from what is finished.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Compare C1 to C4 and D1 to D3 with repetitions, on virtual benches that differ more or less from the simulator.
@@ -50,11 +53,17 @@ def run_study(
     from orchestrator.study.study_plan import cells_of
 
     plan = read_study(file)
-    cluster = None if ray is None or dry_run else _checked_cluster(ray)
+    cluster = None if ray is None or dry_run or report else _checked_cluster(ray)
     cells = cells_of(plan)
     if dry_run:
         check_settings(plan)
         _print_remaining(plan, cells, as_json)
+        return
+    if report:
+        with opened(plan) as folder:
+            page = _report(plan, folder)
+        if as_json:
+            _print_result(plan, folder, page, len(cells), None)
         return
     with opened(plan) as folder:
         with _workers(plan, folder, jobs, cluster) as workers:
@@ -100,18 +109,6 @@ def _workers(plan: StudyPlan, folder: Path, jobs: int | None, cluster: RaySettin
 
     with Refused(LaboratoryError), ClusterTasks(cluster) as tasks:
         yield ClusterCells(plan, folder, tasks, jobs)
-
-
-def report_study(file: StudyPath, as_json: Json = False) -> None:
-    """Write figures, tables and the page of a study from the results that there are."""
-    from orchestrator.study.study_folder import opened
-    from orchestrator.study.study_plan import cells_of
-
-    plan = read_study(file)
-    with opened(plan) as folder:
-        page = _report(plan, folder)
-    if as_json:
-        _print_result(plan, folder, page, len(cells_of(plan)), None)
 
 
 def _print_result(plan: StudyPlan, folder: Path, page: Path, cells: int, finished: int | None) -> None:
@@ -255,7 +252,7 @@ def register(app: typer.Typer) -> None:
         "study",
         "Compare strategies with repetitions, on virtual benches that differ from the simulator.",
         "decant study run configs/studies/quick.yaml",
-        "decant study report configs/studies/quick.yaml   # again, from the results that there are",
+        "decant study run configs/studies/quick.yaml --report   # again, from the results that there are",
         quiet=True,
     )
     add(
@@ -265,4 +262,3 @@ def register(app: typer.Typer) -> None:
         "decant study run configs/studies/paper.yaml --jobs 2    # continues a stopped study",
         name="run",
     )
-    add(report_study, "decant study report configs/studies/quick.yaml", name="report")

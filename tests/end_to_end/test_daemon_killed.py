@@ -148,13 +148,13 @@ def test_killed_during_a_pour_it_asks_what_came_of_it_writes_the_answer_down_and
     assert "had begun when the run was interrupted" in question["text"]
     assert question["options"] == ["repeat", "lost", "weighed SPILLED RETAINED [LOADED]"]
     assert "bench" in question["details"]
-    assert laboratory.told("queue", "show", key)["state"] == "waiting for operator"
+    assert laboratory.told("queue", "list", key)["state"] == "waiting for operator"
 
     nonsense = laboratory.decant("queue", "answer", str(question["id"]), "spilt", "milk", check=False)
     assert nonsense.returncode == 2
     assert "'spilt milk' is not an answer" in nonsense.stderr
     laboratory.decant("queue", "answer", str(question["id"]), "weighed", "3.2", "0.4")
-    laboratory.until(lambda: laboratory.told("queue", "show", key)["state"] == "finished")
+    laboratory.until(lambda: laboratory.told("queue", "list", key)["state"] == "finished")
     assert laboratory.end() == 0
 
     entries = laboratory.entries()
@@ -199,7 +199,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         card.get_by_role("button", name="It was weighed").click()
         card.wait_for(state="detached")
         page.locator("#ended").get_by_text("finished").wait_for()
-        assert laboratory.told("queue", "show", key)["state"] == "finished"
+        assert laboratory.told("queue", "list", key)["state"] == "finished"
         assert laboratory.end() == 0
 
         entries = laboratory.entries()
@@ -218,7 +218,7 @@ def test_told_to_end_it_finishes_the_pour_and_goes_on_by_itself_when_it_is_start
     assert laboratory.end() == 0
     assert not pour_under_way(laboratory.entries())
     laboratory.start()
-    laboratory.until(lambda: laboratory.told("queue", "show", key)["state"] == "finished")
+    laboratory.until(lambda: laboratory.told("queue", "list", key)["state"] == "finished")
     assert laboratory.told("queue", "list")["questions"] == []
     starts = [e.body["id"] for e in laboratory.entries() if e.kind == Kind.POUR_STARTED]
     assert len(starts) == len(set(starts)) == 5

@@ -47,7 +47,7 @@ def test_a_campaign_goes_on_by_itself_and_the_next_one_runs(tmp_path: Path, name
 
         end = time.monotonic() + PATIENCE
         while (
-            laboratory.told("queue", "show", key)["state"] != "finished"
+            laboratory.told("queue", "list", key)["state"] != "finished"
         ):  # asked about the pour, unless it could be weighed
             for question in laboratory.told("queue", "list")["questions"]:
                 assert question["kind"] == "unknown"
@@ -64,7 +64,7 @@ def test_a_campaign_goes_on_by_itself_and_the_next_one_runs(tmp_path: Path, name
         assert sorted(begun) == sorted([*set(begun), *withdrawn])
 
         second = laboratory.decant("queue", "submit", "small.yaml").stdout.strip()
-        laboratory.until(lambda: laboratory.told("queue", "show", second)["state"] == "finished")
+        laboratory.until(lambda: laboratory.told("queue", "list", second)["state"] == "finished")
         children = psutil.Process(laboratory.process.pid).children()
         assert not [child for child in children if child.status() == psutil.STATUS_ZOMBIE]
         assert laboratory.end() == 0

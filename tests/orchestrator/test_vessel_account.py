@@ -183,7 +183,7 @@ def test_a_person_weighs_a_source_on_the_command_line_and_sees_what_is_left(
         "bench/jar": pytest.approx(30.5),
     }
     assert "169.5 ± 0.1 g" in invoke("materials list").stdout
-    lines = invoke("materials history bench/beaker").stdout.splitlines()
+    lines = invoke("materials list bench/beaker").stdout.splitlines()
     assert [line.split()[2] for line in lines] == ["weighed", "poured"]
     assert "Monday" in lines[0]
     assert VesselAccount.open().known(series())["beaker"].mass == pytest.approx(0.1695)

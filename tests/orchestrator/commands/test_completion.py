@@ -96,13 +96,13 @@ def test_bash_offers_runs_and_the_vessels_they_used(place: Path, monkeypatch: py
 
 @pytest.mark.slow
 def test_bash_offers_campaigns_of_the_daemon_and_nothing_without_one(place: Path) -> None:
-    assert completed(place, "bash", "decant queue show ") == set()
+    assert completed(place, "bash", "decant queue list ") == set()
     real = Real(place / "state")
     try:
         reach = f"--url {real.url} --state {place / 'state'}"
         invoke(f"queue pause {reach}")
         queued = invoke(f"queue submit {place / 'configs/campaigns/quickstart.yaml'} {reach}").stdout.strip()
         environment = {"DECANT_URL": real.url, "DECANT_TOKEN": real.token()}
-        assert completed(place, "bash", "decant queue show q", **environment) == {queued}
+        assert completed(place, "bash", "decant queue list q", **environment) == {queued}
     finally:
         real.close()

@@ -94,7 +94,7 @@ def test_queries_of_a_daemon_print_what_is_documented(tmp_path: Path) -> None:
         submitted = said(f"queue submit {ROOT / 'configs/campaigns/quickstart.yaml'} {reach} --json")
         key = validated("queue submit", submitted)["id"]
         assert validated("queue list", said(f"queue list {reach} --json"))["campaigns"]
-        assert validated("queue show", said(f"queue show {key} {reach} --json"))["id"] == key
+        assert validated("queue list", said(f"queue list {key} {reach} --json"))["id"] == key
         for line in said(f"queue logs {reach} --json").splitlines():
             validated("queue logs", line)
     finally:
