@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
+import mmap
 import os
+import struct
 import subprocess
 import sys
 import tomllib
@@ -15,6 +18,7 @@ import pytest
 
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.shipped import STARTING_SET
+from sim_engine.engine_package import LIBRARIES
 from sim_engine.resources import EXTRAS
 from tests.plugins import test_plugins as example
 
@@ -153,6 +157,49 @@ def test_every_package_of_an_extra_is_declared_in_it() -> None:
         name = package.get(module, module)
         assert any(text.startswith(name) for text in declared["optional-dependencies"][extra]), name
         assert not any(text.startswith(name) for text in declared["dependencies"]), name
+
+
+BARE = {
+    *("libc.so.6", "libdl.so.2", "libm.so.6", "libpthread.so.0", "librt.so.1", "libutil.so.1"),
+    *("libgcc_s.so.1", "libstdc++.so.6", "libz.so.1"),
+}
+"""Shared libraries of a Debian that has Python and apt and nothing else."""
+
+
+def needed_libraries(path: Path) -> set[str]:
+    """The shared libraries that one of 64 bits names. Source: elf(5), DT_NEEDED."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        if data[:6] != b"\x7fELF\x02\x01":
+            return set()
+        begin, (size, count) = struct.unpack_from("<Q", data, 32)[0], struct.unpack_from("<HH", data, 54)
+        headers = [struct.unpack_from("<IIQQQQ", data, begin + size * n) for n in range(count)]
+        dynamic = next((data[offset : offset + length] for kind, _, offset, _, _, length in headers if kind == 2), b"")
+        entries = list(struct.iter_unpack("<qQ", dynamic))
+        names = next((value for tag, value in entries if tag == 5), 0)
+        loaded = [(at, offset, length) for kind, _, offset, at, _, length in headers if kind == 1]
+        strings = next((names - at + offset for at, offset, length in loaded if at <= names < at + length), 0)
+        ends = {strings + value: data.find(b"\0", strings + value) for tag, value in entries if tag == 1}
+        return {data[first:end].decode() for first, end in ends.items()}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="shared libraries of Linux")
+def test_installed_packages_need_no_shared_library_that_a_bare_debian_lacks() -> None:
+    """Else a machine without a desktop fails at the first import. What Taichi lacks there is known and replaced."""
+    paths = [
+        (distribution.name, path)
+        for distribution in importlib.metadata.distributions()
+        for path in map(Path, map(distribution.locate_file, distribution.files or []))
+        if ".so" in path.suffixes and path.is_file()
+    ]
+    assert len(paths) > 100
+    contained = {path.name for _, path in paths}
+    missing: dict[str, set[str]] = {}
+    for package, path in paths:
+        libraries = {name for name in needed_libraries(path) if not name.startswith("ld-linux")}
+        if libraries - BARE - contained:
+            missing.setdefault(package, set()).update(libraries - BARE - contained)
+    assert missing.pop("taichi", set()) <= set(LIBRARIES["taichi"])
+    assert missing == {}
 
 
 @pytest.mark.slow
