@@ -6,6 +6,7 @@ repeats a step after a fixable error.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Awaitable, Callable, Mapping
 
 from actors.balance.balance_device import DeviceBalance
@@ -20,6 +21,7 @@ from actors.balance.balance_interface import (
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.readings import typed_weight
 from actors.balance.weighing_plan import (
+    SURE,
     PourMasses,
     WeighingStep,
     loaded_mass,
@@ -131,8 +133,11 @@ class Weighings:
         return step.when == "once" and step.key in self._weighed
 
     async def _do(self, step: WeighingStep) -> None:
-        """Carry out one step. If hands are needed, ask the operator first; repeat until it succeeds."""
-        problem, typed = "", step.by == "operator"
+        """Carry out one step. If hands are needed, ask the operator first; repeat until it succeeds.
+
+        A typed weight that can hardly be right is asked for again; the same text confirms it.
+        """
+        problem, doubted, typed = "", "", step.by == "operator"
         while True:
             answer = ""
             if step.hands or problem:
@@ -145,6 +150,8 @@ class Weighings:
                 else:
                     await self._read(step)
                 problem = self._misfilled(step)
+                if not problem and typed and answer != doubted:
+                    problem, doubted = self._doubt(step, answer), answer
                 if not problem:
                     return
             except (*MENDABLE, ValueError) as error:
@@ -166,6 +173,23 @@ class Weighings:
             return ""
         allowed = f"{1e3 * self._nominal:g} ± {1e3 * self._spec.load_tolerance:g} g"
         return f"{1e3 * loaded:.2f} g are in the pourer, but {allowed} are asked for; fill anew"
+
+    def _doubt(self, step: WeighingStep, answer: str) -> str:
+        """Return the reason why a weight that was just typed can hardly be right; '' if there is none."""
+        before = self.weighed.get({"tray_after": "tray_before", "pourer_after": "pourer_empty"}.get(step.key, ""))
+        typed = self.weighed[step.key]
+        if before is None:
+            return f"'{answer}' is not above 0 g" if step.key == "pourer_empty" and typed.mass <= 0.0 else ""
+        loaded = loaded_mass(self._spec.position, self.weighed)
+        slack = SURE * math.hypot(before.uncertainty, typed.uncertainty)
+        if -slack <= typed.mass - before.mass <= loaded + slack:
+            return ""
+        what, when = ("tray", "before the pour") if step.key == "tray_after" else ("pourer", "when it was empty")
+        least, most = 1e3 * before.mass, 1e3 * (before.mass + loaded)
+        return (
+            f"'{answer}' is {1e3 * typed.mass:g} g. The {what} was {least:g} g {when}, and {most - least:g} g were "
+            f"loaded: {least:g} to {most:g} g are possible. Read it again; type the same text to keep it"
+        )
 
     def _note(self, key: str, weighed: PourMasses) -> None:
         self._weighed[key] = weighed

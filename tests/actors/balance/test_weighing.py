@@ -21,7 +21,10 @@ POURER, RECEIVER, TRAY = 0.0873, 0.1421, 0.4096
 
 
 class Operator:
-    """Puts things on a virtual balance as asked; anything on `surprises` happens before an answer, once each."""
+    """Puts things on a virtual balance as asked; anything on `surprises` happens before an answer, once each.
+
+    Of a list, the next one happens each time.
+    """
 
     def __init__(self, far, placement: Placement, surprises: dict[str, object] | None = None) -> None:
         self.far, self.placement = far, placement
@@ -43,6 +46,10 @@ class Operator:
             raise LaboratoryError("asked for ever")
         for words in [words for words in self.surprises if words in question.text]:
             answer = self.surprises.pop(words)
+            if isinstance(answer, list):
+                answer, *later = answer
+                if later:
+                    self.surprises[words] = later
             if callable(answer):
                 answer = answer()
             if answer is not None:
@@ -148,6 +155,35 @@ def test_a_weight_typed_without_its_unit_is_asked_for_again(virtual):
         "'409.6' has no unit; type '409.6 g' if that is what is meant"
     ]
     assert measured.spilled == pytest.approx(SPILLED, abs=1e-9)
+
+
+def test_a_weight_with_two_meanings_is_shown_with_both_and_asked_for_again(virtual):
+    wiped, after = ["1,234 g", "1.234 g", "1234 g"], ["1,250 g", "1,25 kg"]
+    (measured,), operator = play(virtual, Placement.MANUAL, {"Wipe the tray": wiped, "Weigh the tray": after})
+    assert [q.problem for q in operator.asked if q.problem] == [
+        "'1,234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'",
+        "'1.234 g' may be 1.234 g or 1234 g; type '1.2340 g' or '1234 g'",
+        "'1,250 g' may be 1.250 g or 1250 g; type '1.2500 g' or '1250 g'",
+    ]
+    assert measured.spilled == pytest.approx(0.016)
+
+
+def test_a_weight_that_can_hardly_be_right_is_shown_back_and_kept_if_it_is_typed_again(virtual):
+    (measured,), operator = play(
+        virtual, Placement.MANUAL, {"Weigh the tray": ["41.0 g", "4110 g"], "Weigh the pourer": "390.0 g"}
+    )
+    problems = [q.problem for q in operator.asked if q.problem]
+    assert problems == [
+        "'41.0 g' is 41 g. The tray was 409.6 g before the pour, and 200.3 g were loaded: 409.6 to 609.9 g are possible. "
+        "Read it again; type the same text to keep it",
+        problems[1],
+        "'390.0 g' is 390 g. The pourer was 87.3 g when it was empty, and 200.3 g were loaded: 87.3 to 287.6 g are "
+        "possible. Read it again; type the same text to keep it",
+    ]
+    assert "'4110 g' is 4110 g" in problems[1]
+    assert measured.spilled == pytest.approx(SPILLED, abs=1e-9)
+    with pytest.raises(WeighingError, match="the tray got lighter"):
+        play(virtual, Placement.MANUAL, {"Weigh the tray": ["41.0 g", "41.0 g"]})
 
 
 @pytest.mark.parametrize("stayed_on", [True, False])
