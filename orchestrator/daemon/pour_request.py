@@ -6,11 +6,12 @@ help texts and arguments have its descriptions. The module imports pydantic alon
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
 from datetime import datetime
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 CallerId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,79}$")]
 Key = Annotated[str, Field(min_length=1, max_length=80)]
@@ -40,10 +41,34 @@ def moment(value: object) -> object:
     return read.timestamp()
 
 
+def _near(value: float) -> float:
+    """Refuse a time that can't be meant: in milliseconds, or counted from now. 0 stands for no time.
+
+    Raises:
+        ValueError: it is more than a year away; the message shows the readings.
+    """
+    now = time.time()
+    if value == 0 or abs(value - now) <= YEAR:
+        return value
+    meant = ""
+    for kind, seconds in (("in milliseconds", 1e-3 * value), ("counted from now", now + value)):
+        if now - YEAR <= seconds <= now + YEAR and value > 0:
+            iso = datetime.fromtimestamp(seconds).astimezone().isoformat(timespec="seconds")
+            meant += f"; {kind} it would be '{iso}': give {seconds:.0f} if that is meant"
+    raise ValueError(
+        f"{value:.15g} is in the year {1970.0 + value / 31_556_952.0:.6g} as seconds since 1970, and a start should be "
+        f"within a year{meant}"
+    )
+
+
+YEAR = 366.0 * 86400.0
+"""Largest distance of a start from now [s]."""
+
 Moment = Annotated[
     float,
     BeforeValidator(moment),
     Field(allow_inf_nan=False, description="Seconds since 1970, or a time with its zone: 2026-11-27T08:00:00+01:00."),
+    AfterValidator(_near),
 ]
 
 

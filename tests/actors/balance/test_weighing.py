@@ -174,8 +174,8 @@ def test_a_weight_that_can_hardly_be_right_is_shown_back_and_kept_if_it_is_typed
     )
     problems = [q.problem for q in operator.asked if q.problem]
     assert problems == [
-        "'41.0 g' is 41 g. The tray was 409.6 g before the pour, and 200.3 g were loaded: 409.6 to 609.9 g are possible. "
-        "Read it again; type the same text to keep it",
+        "'41.0 g' is 41 g. The tray was 409.6 g before the pour, and 200.3 g were loaded: 409.6 to 609.9 g are "
+        "possible. Read it again; type the same text to keep it",
         problems[1],
         "'390.0 g' is 390 g. The pourer was 87.3 g when it was empty, and 200.3 g were loaded: 87.3 to 287.6 g are "
         "possible. Read it again; type the same text to keep it",

@@ -8,7 +8,8 @@ import gc
 import json
 import re
 import socket
-from datetime import UTC, datetime, timedelta
+import time
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -358,13 +359,14 @@ def test_a_campaign_waits_for_its_earliest_start_and_says_so(
 ) -> None:
     async def work() -> None:
         async with serving(tmp_path) as served:
-            late = await served.submit(not_before="2126-11-27T08:00:00+01:00")
+            start = datetime.now(UTC).replace(microsecond=0) + timedelta(days=90)
+            late = await served.submit(not_before=start.astimezone(timezone(timedelta(hours=1))).isoformat())
             early = await served.submit(not_before=(datetime.now(UTC) + timedelta(seconds=0.3)).isoformat())
             await served.until(early, "finished")
             found = await served.get(f"/campaigns/{late}")
             assert found["state"] == "queued"
-            assert found["not_before"] == datetime(2126, 11, 27, 7, tzinfo=UTC).timestamp()
-            assert found["waits_for"].startswith("its earliest start, 2126-11-27 ")
+            assert found["not_before"] == start.timestamp()
+            assert found["waits_for"] == f"its earliest start, {start.astimezone().isoformat(' ')}"
             paths = "/status", "/campaigns", "/questions", f"/campaigns/{late}"
             answers = {path: await served.get(path) for path in paths}
             client = SimpleNamespace(get=lambda path, **query: answers[path])
@@ -387,8 +389,22 @@ def test_a_campaign_waits_for_its_earliest_start_and_says_so(
         ("1764230400", "should be a time with its zone"),
         ("", "should be a time with its zone"),
         (float("inf"), "finite number"),
+        (3600, "3600 is in the year 1970 as seconds since 1970, and a start should be within a year; counted from now"),
+        ("2126-11-27T08:00:00+01:00", "is in the year 2126"),
+        (-5, "is in the year 1970"),
+        (1e300, "is in the year"),
     ],
 )
 def test_an_earliest_start_that_is_no_time_is_refused(value: object, text: str) -> None:
     with pytest.raises(ValidationError, match=re.escape(text)):
         SubmissionIn.model_validate({"not_before": value})
+
+
+def test_an_earliest_start_in_milliseconds_is_refused_with_both_readings() -> None:
+    """As `Date.now()` of JavaScript gives it: such a campaign would wait for ever."""
+    now = int(time.time())
+    shown = datetime.fromtimestamp(now).astimezone().isoformat()
+    text = f"is in the year 5.*; in milliseconds it would be '{re.escape(shown)}': give {now} if that is meant"
+    with pytest.raises(ValidationError, match=text):
+        SubmissionIn.model_validate({"not_before": 1000 * now})
+    assert SubmissionIn.model_validate({"not_before": now + 60}).not_before == now + 60
