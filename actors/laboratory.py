@@ -382,14 +382,14 @@ class RayLaboratory(_OpenLaboratory):
         return self
 
     async def _open_all(self) -> None:
-        here = None if self._cluster is None else self._cluster.here
+        this_node = None if self._cluster is None else self._cluster.here
         self._pool = self._pool or self._open_pool(self._ray_pool())
         if self._optimizer is None:
-            optimizer = RayDevice("optimiser", Proposer, node=here, looked_after=True)
+            optimizer = RayDevice("optimiser", Proposer, node=this_node, looked_after=True)
             self._optimizer = self._open_optimizer(optimizer)
         if not self._pours:
             return
-        node = None if self._cluster is None else self._cluster.bench or here
+        node = None if self._cluster is None else self._cluster.bench or this_node
         if self._spec.bench is not None:
             # The ground truth's simulator, on the arm's machine. It reserves no core: the pool's size is the
             # campaign's choice, and a pour must never wait for it.

@@ -133,8 +133,8 @@ class BenchSettings(Settings):
     @property
     def theta(self) -> SimulationParameters:
         """θ of the ground truth."""
-        found: SimulationParameters = self.liquid.parameters()
-        return found
+        parameters: SimulationParameters = self.liquid.parameters()
+        return parameters
 
 
 class LaboratorySettings(Settings):

@@ -260,16 +260,16 @@ def _device_check(name: str, settings: PumpSettings | SpillSensorSettings | Grip
     cls, arguments = settings.driver()
     driver: Pump | SpillSensor | Gripper = cls(*arguments)
     try:
-        found = driver.connect()
+        model = driver.connect()
         if isinstance(settings, GripperSettings):
             problem = cast("Gripper", driver).state().problem
             if problem:
-                return DeviceCheck(name, "warn", found, "a pour asks for what it needs; see docs/reference/grippers.md")
+                return DeviceCheck(name, "warn", model, "a pour asks for what it needs; see docs/reference/grippers.md")
         if isinstance(settings, SpillSensorSettings):
             wet = [event.place for event in cast("SpillSensor", driver).events() if event.wet]
             if wet:
-                return DeviceCheck(name, "warn", f"{found}; wet: {', '.join(wet)}", "wipe it before the first pour")
-        return DeviceCheck(name, "ok", found)
+                return DeviceCheck(name, "warn", f"{model}; wet: {', '.join(wet)}", "wipe it before the first pour")
+        return DeviceCheck(name, "ok", model)
     except LaboratoryError as error:
         return DeviceCheck(name, "fail", str(error), "check power, cable and address")
     finally:

@@ -136,19 +136,19 @@ def check_places(problems: Problems, places: Sequence[PlaceSettings], tool: Pose
             )
 
 
-def _differ(one: Pose, other: Pose) -> bool:
+def _differ(first_pose: Pose, other: Pose) -> bool:
     """Whether two poses differ by more than 0.1 mm or 0.1 mrad. Near half a turn, a controller shows either of two
     opposite rotation vectors for the same pose."""
-    apart = math.dist(one.as_list[:3], other.as_list[:3])
-    first, second = (_quaternion(pose) for pose in (one, other))
-    turned = min(math.dist(first, second), math.dist(first, tuple(-part for part in second)))
+    apart = math.dist(first_pose.as_list[:3], other.as_list[:3])
+    first, second = (_quaternion(pose) for pose in (first_pose, other))
+    turned = min(math.dist(first, second), math.dist(first, tuple(-component for component in second)))
     return apart > 1e-4 or 2.0 * turned > 1e-4
 
 
 def _quaternion(pose: Pose) -> tuple[float, ...]:
     angle = math.hypot(*(vector := pose.as_list[3:]))
     share = math.sin(0.5 * angle) / angle if angle > 0.0 else 0.0
-    return (math.cos(0.5 * angle), *(share * part for part in vector))
+    return (math.cos(0.5 * angle), *(share * component for component in vector))
 
 
 class PlaceRecord(Protocol):

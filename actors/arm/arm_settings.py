@@ -79,9 +79,9 @@ class ArmDiagnostics:
         checks = [DeviceCheck("arm", "fail" if self.problem else "ok", self.problem or who)]
         if self.checksum and not virtual:
             accepted = record is not None and (record.checksum, record.serial) == (self.checksum, self.serial)
-            found = f"{self.checksum}, accepted by {record.accepted_by if record and accepted else 'nobody'}"
+            acceptance = f"{self.checksum}, accepted by {record.accepted_by if record and accepted else 'nobody'}"
             advice = "" if accepted else f"read the arm's safety settings, then: {accept}"
-            checks.append(DeviceCheck("safety checksum", "ok" if accepted else "fail", found, advice))
+            checks.append(DeviceCheck("safety checksum", "ok" if accepted else "fail", acceptance, advice))
         return checks
 
     def recorded(self) -> dict[str, Any]:

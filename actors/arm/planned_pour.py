@@ -103,7 +103,7 @@ class PourPath:
         if factor == 1.0:
             return self
         approach, pour, retreat = (
-            JointPath(part.times / factor, part.joints) for part in (self.approach, self.pour, self.retreat)
+            JointPath(path.times / factor, path.joints) for path in (self.approach, self.pour, self.retreat)
         )
         r = self.report
         return PourPath(
@@ -194,10 +194,10 @@ def pack(executed: ExecutedPath) -> dict[str, Any]:
         executed: as read back.
     """
     columns = np.column_stack([executed.times / TIME_UNIT, executed.joints / JOINT_UNIT])
-    whole = np.round(columns).astype("<i4")
-    data = np.diff(whole, axis=0, prepend=np.zeros((1, 7), "<i4")).astype("<i4").T.tobytes()
+    integers = np.round(columns).astype("<i4")
+    data = np.diff(integers, axis=0, prepend=np.zeros((1, 7), "<i4")).astype("<i4").T.tobytes()
     return {
-        "samples": len(whole),
+        "samples": len(integers),
         "completed": executed.completed,
         "tracking": dict(executed.tracking),
         "packed": base64.b85encode(zlib.compress(data, 9)).decode("ascii"),
@@ -221,8 +221,8 @@ def unpack(data: dict[str, Any]) -> ExecutedPath:
     try:
         raw = zlib.decompress(base64.b85decode(data["packed"]))
         steps = np.frombuffer(raw, "<i4").reshape(7, int(data["samples"])).T
-        whole = np.cumsum(steps, axis=0)
-        times, joints = whole[:, 0].astype(float) * TIME_UNIT, whole[:, 1:].astype(float) * JOINT_UNIT
+        integers = np.cumsum(steps, axis=0)
+        times, joints = integers[:, 0].astype(float) * TIME_UNIT, integers[:, 1:].astype(float) * JOINT_UNIT
         return ExecutedPath(times, joints, bool(data["completed"]), dict(data["tracking"]))
     except (KeyError, TypeError, ValueError, zlib.error) as error:
         raise ValueError(f"not an executed path: {error!r}") from error

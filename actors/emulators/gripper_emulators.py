@@ -77,9 +77,9 @@ class Fingers:
 
     def put(self, width: float | None) -> None:
         """See `GripperEmulator.put`."""
-        here, self.object = self.width, width
+        opening, self.object = self.width, width
         if width is None:
-            self.move(self._target, self._speed, start=here)
+            self.move(self._target, self._speed, start=opening)
 
     @property
     def _obstacle(self) -> float | None:
@@ -292,7 +292,7 @@ class OnRobotEmulator:
             "get_status": lambda index: 2 if fingers.stopped_by_object else 0,
             "stop": self._stop,
         }
-        own: dict[str, Callable[..., Any]] = {
+        by_name: dict[str, Callable[..., Any]] = {
             "get_width": lambda index: 1e3 * fingers.width,
             "get_safety_failed": lambda index: False,
             "get_s1_triggered": lambda index: self._safety,
@@ -300,7 +300,7 @@ class OnRobotEmulator:
             "grip": self._grip,
         }
         if self._two:
-            own = {
+            by_name = {
                 "get_external_width": lambda index: 1e3 * fingers.width,
                 "get_min_external_width": lambda index: 1e3 * fingers.closed,
                 "get_max_external_width": lambda index: 1e3 * fingers.widest,
@@ -309,8 +309,8 @@ class OnRobotEmulator:
                 "get_force": lambda index: round(self._pressed),
                 "grip_external": self._grip_external,
             }
-        found = {f"{prefix}_{name}": method for name, method in {**held, **own}.items()}
-        return {**found, "cb_is_device_connected": self._is_connected}
+        methods = {f"{prefix}_{name}": method for name, method in {**held, **by_name}.items()}
+        return {**methods, "cb_is_device_connected": self._is_connected}
 
     @property
     def _pressed(self) -> float:
@@ -354,8 +354,8 @@ class _Threads(socketserver.ThreadingMixIn):
     def begin(self) -> None:
         """Serve from now on."""
         self._clients: set[socket.socket] = set()
-        found: Any = self.server_address  # type: ignore[attr-defined]
-        self.address, self.port = str(found[0]), int(found[1])
+        address: Any = self.server_address  # type: ignore[attr-defined]
+        self.address, self.port = str(address[0]), int(address[1])
         threading.Thread(target=self.serve_forever, args=(0.05,), name="gripper", daemon=True).start()  # type: ignore[attr-defined]
 
     def process_request(self, request: Any, client_address: Any) -> None:

@@ -170,14 +170,14 @@ class DigitalGripper:
         signals = [(self._closing, closed)]
         if self._settings.open is not None:
             signals.insert(0, (Signal.of(self._settings.open), not closed))
-        lines = [f"  set_{one.group}_digital_out({one.number}, {one.level == on})" for one, on in signals]
+        lines = [f"  set_{signal.group}_digital_out({signal.number}, {signal.level == on})" for signal, on in signals]
         program = "\n".join(["sec gripper():", *lines, "end", ""])
         try:
             with socket.create_connection((self._settings.address, PORT), timeout=self._timeout) as connection:
                 connection.recv(1)  # the controller has accepted the connection
                 connection.sendall(program.encode())
                 end = time.monotonic() + self._timeout
-                while not all(one.given(self._bits()[1]) == on for one, on in signals):
+                while not all(signal.given(self._bits()[1]) == on for signal, on in signals):
                     if time.monotonic() > end:
                         raise GripperError(
                             f"{self._where}: the outputs are not set; is the controller in remote control, are the "

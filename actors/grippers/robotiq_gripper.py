@@ -247,7 +247,7 @@ class RobotiqGripper:
             self._drop()
             raise GripperError(f"{self._where}: 'SET {pairs}' was answered with {answer[:40]!r} instead of 'ack'")
 
-    def _ask(self, request: bytes, whole: Callable[[bytes], bool]) -> bytes:
+    def _ask(self, request: bytes, complete: Callable[[bytes], bool]) -> bytes:
         with self._one_at_a_time:
             try:
                 if self._socket is None:
@@ -258,12 +258,12 @@ class RobotiqGripper:
                 connection.settimeout(self._timeout)
                 connection.sendall(request)
                 data, end = b"", time.monotonic() + self._timeout
-                while not whole(data):
+                while not complete(data):
                     connection.settimeout(max(end - time.monotonic(), 1e-3))
-                    more = connection.recv(4096)
-                    if not more:
+                    received = connection.recv(4096)
+                    if not received:
                         raise ConnectionError("it closed the connection")
-                    data = (data + more).lstrip(b"\r\n")  # one may follow an 'ack'
+                    data = (data + received).lstrip(b"\r\n")  # one may follow an 'ack'
                 return data
             except TimeoutError:
                 self._drop()
@@ -300,17 +300,17 @@ class RobotiqGripper:
 
     def _wait(self, name: str, value: int) -> None:
         end = time.monotonic() + ACTIVATION
-        while (found := self.get(name)) != value:
+        while (current := self.get(name)) != value:
             if time.monotonic() > end:
                 fault = FAULTS.get(self.get("FLT"), "")
                 raise GripperError(
-                    f"{self._where} is not ready after {ACTIVATION:g} s ({name} {found}){fault and ': '}{fault}"
+                    f"{self._where} is not ready after {ACTIVATION:g} s ({name} {current}){fault and ': '}{fault}"
                 )
             time.sleep(REST)
 
     def state(self) -> GripperState:
         """See `Gripper.state`."""
-        position, found, fault = self.get("POS"), self.get("OBJ"), self.get("FLT")
+        position, detection, fault = self.get("POS"), self.get("OBJ"), self.get("FLT")
         active = self.get("ACT") == 1 and self.get("STA") == READY
         going = active and self.get("GTO") == 1  # otherwise OBJ means nothing
         force, problem = self.get("FOR"), ""
@@ -323,8 +323,8 @@ class RobotiqGripper:
         low, high = self._settings.forces
         return GripperState(
             self._settings.width_at(position),
-            moving=going and found == MOVING,
-            detected=going and found == CLOSING_STOPPED,
+            moving=going and detection == MOVING,
+            detected=going and detection == CLOSING_STOPPED,
             force=low + (high - low) * force / 255.0,
             problem=problem,
         )

@@ -100,11 +100,11 @@ def matern_correlation(first: Array, second: Array, lengths: Array) -> Array:
     for begin in range(0, len(first), BLOCK):  # whose temporaries stay in the processor's cache
         s = cdist(first[begin : begin + BLOCK], second)
         s *= np.sqrt(5.0)
-        part = correlation[begin : begin + BLOCK]
-        np.add(s, 1.0, out=part)
-        part += s**2 / 3.0
+        block = correlation[begin : begin + BLOCK]
+        np.add(s, 1.0, out=block)
+        block += s**2 / 3.0
         np.negative(s, out=s)
-        part *= np.exp(s, out=s)
+        block *= np.exp(s, out=s)
     return correlation
 
 

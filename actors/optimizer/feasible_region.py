@@ -79,18 +79,18 @@ class Region:
         """
         d = self._space.dimension
         sequence = qmc.Sobol(d, scramble=True, rng=rng) if even else None
-        drawn, found = 0, np.empty((0, d))
-        while len(found) < count:
-            if drawn >= _MOST_DRAWN:
+        attempts, accepted = 0, np.empty((0, d))
+        while len(accepted) < count:
+            if attempts >= _MOST_DRAWN:
                 raise ValueError(
-                    f"of {drawn} points of the space {len(found)} meet all constraints; {count} are needed"
+                    f"of {attempts} points of the space {len(accepted)} meet all constraints; {count} are needed"
                 )
-            some = 2 ** max(0, math.ceil(math.log2(max(count, drawn, 1))))
+            some = 2 ** max(0, math.ceil(math.log2(max(count, attempts, 1))))
             fresh = rng.random((some, d)) if sequence is None else np.asarray(sequence.random(some))
-            drawn += some
+            attempts += some
             fresh = self.snap(fresh if law is None else law(fresh))
-            found = np.concatenate([found, fresh[self.allows(fresh)]])
-        return found[:count]
+            accepted = np.concatenate([accepted, fresh[self.allows(fresh)]])
+        return accepted[:count]
 
     def _decoded(self, index: int, units: Array) -> Array:
         axis = self._space.axes[index]

@@ -64,7 +64,7 @@ def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Seque
 
     best, lowest = np.clip(covariance.centre, bounds[:, 0], bounds[:, 1]), math.inf
     for start in starts:
-        found: Any = minimize(
+        minimum: Any = minimize(
             loss,
             np.clip(start, bounds[:, 0], bounds[:, 1]),
             jac=True,
@@ -72,8 +72,8 @@ def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Seque
             method="L-BFGS-B",
             options={"maxiter": ITERATIONS, "ftol": 1e-6, "gtol": 1e-3},
         )
-        if math.isfinite(found.fun) and found.fun < lowest:
-            best, lowest = found.x, float(found.fun)
+        if math.isfinite(minimum.fun) and minimum.fun < lowest:
+            best, lowest = minimum.x, float(minimum.fun)
     K, _ = covariance.observed(best)
     L, trouble = lapack.dpotrf(K, lower=1)
     if trouble:

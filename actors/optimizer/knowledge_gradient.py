@@ -126,15 +126,15 @@ def predicted_minimum(process: ModelAveragedProcess, places: Array, targets: Arr
     spreads = np.hypot(its, noises)
     covariances = process.covariances(places, targets)
     edges = np.concatenate([[-np.inf], 0.5 * (SHOWN[1:] + SHOWN[:-1]), [np.inf]])
-    found = []
+    minima = []
     for i in range(len(places)):
         chances = np.diff(ndtr((edges[:, None] - at[:, i]) / spreads[:, i]), axis=0)  # (shown, components)
         slope = covariances[:, i] / spreads[:, i, None] ** 2
         left = np.sqrt(np.maximum(deviations**2 - slope * covariances[:, i], 1e-10))
         moved = means + slope * (SHOWN[:, None] - at[:, i])[:, :, None]  # (shown, components, targets)
         costs = clipped_mean(moved, np.broadcast_to(left, moved.shape))
-        found.append(float(np.einsum("kc,c,kcm->km", chances, process.mixture, costs).min(axis=1).sum()))
-    return np.array(found)
+        minima.append(float(np.einsum("kc,c,kcm->km", chances, process.mixture, costs).min(axis=1).sum()))
+    return np.array(minima)
 
 
 Score = Callable[[Array], Array]
@@ -188,8 +188,8 @@ def _allowed(
             over = process.exceedance(points, discrepancy.limit.loss) - discrepancy.limit.probability
             value = value + FORBIDDEN * np.maximum(over, 0.0)
         if feasibility is not None:
-            made = np.exp(feasibility.log_probability(points))
-            value = made * value + (1.0 - made)
+            probability = np.exp(feasibility.log_probability(points))
+            value = probability * value + (1.0 - probability)
         return np.asarray(value)
 
     return changed
@@ -199,7 +199,7 @@ def pour_gains(process: ModelAveragedProcess, points: Array, known: Array) -> Ar
     """Gain g (m,) of one more pour at points (m, dimension), given poured ones (k ≥ 1, dimension), in cost units."""
     place = known[int(np.argmin(process.predict(known)[0]))]
     means, deviations, noises = process.components(points)
-    at_best, its_deviation, _ = (part[:, 0] for part in process.components(place[None, :]))
+    at_best, its_deviation, _ = (component[:, 0] for component in process.components(place[None, :]))
     best = shortfall(0.0, -at_best, its_deviation)[:, None]  # E f⁺ of each component
     doubt = process.differences(points, place)
     doubt = doubt**2 / np.hypot(doubt, noises)
@@ -255,8 +255,8 @@ def instructive(
         observe(index)
     chosen = []
     for _ in range(count):
-        own = np.maximum(np.diagonal(G[:, : len(everything)])[: len(places)], 0.0) + noise
-        removed = (G[: len(places), len(everything) :] ** 2 @ importance) / own
+        variances = np.maximum(np.diagonal(G[:, : len(everything)])[: len(places)], 0.0) + noise
+        removed = (G[: len(places), len(everything) :] ** 2 @ importance) / variances
         best = int(np.argmax(removed))
         chosen.append(places[best])
         observe(best)
@@ -314,12 +314,12 @@ def found(
     over = np.zeros(len(candidates)) if limit is None else process.exceedance(candidates, limit.loss)
     gain = None
     if len(known):
-        kept = over <= (1.0 if limit is None else limit.probability)
-        gain = float(pour_gains(process, candidates[kept], known).max()) if kept.any() else None
+        allowed = over <= (1.0 if limit is None else limit.probability)
+        gain = float(pour_gains(process, candidates[allowed], known).max()) if allowed.any() else None
     shifts, deviations, factor = process.displaced()
-    drawn: tuple[BenchOffset, ...] = ()
+    offsets: tuple[BenchOffset, ...] = ()
     if query.count == 0:
-        drawn = tuple(BenchOffset(*pair) for pair in zip(*map(tuples, process.drawn(DRAWN)), strict=True))
+        offsets = tuple(BenchOffset(*pair) for pair in zip(*map(tuples, process.drawn(DRAWN)), strict=True))
     return DiscrepancyFound(
         uninformative=process.uninformative,
         shifts=tuple(map(float, shifts)),
@@ -328,7 +328,7 @@ def found(
         gain=gain,
         exceedances=() if limit is None else tuple(map(float, process.exceedance(points, limit.loss))),
         least_exceedance=None if limit is None else float(over.min()),
-        drawn=drawn,
+        drawn=offsets,
         since_change=None if process.since is None else len(process.points) - process.since,
     )
 

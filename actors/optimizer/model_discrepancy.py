@@ -146,7 +146,7 @@ class Hypotheses:
         dimension = len(discrepancy.offset_priors)
         z, rows = latent[:, : 2 * dimension], np.asarray(ndtr(latent[:, 2 * dimension :]))
         width, gain = latent[:, 2 * dimension : 2 * dimension + 2].T
-        rest, length, far, known, noise, growth = rows[:, 2:].T
+        residual, length, far, known, noise, growth = rows[:, 2:].T
         near = far < NEAR_SHARE
         beyond = (far - NEAR_SHARE) / (1.0 - NEAR_SHARE)
         spread = np.where(near, _evenly(NEAR, far / NEAR_SHARE), _evenly(FARTHER, beyond))
@@ -156,8 +156,8 @@ class Hypotheses:
             index = np.minimum((known / KNOWN_SHARE * len(discrepancy.drawn)).astype(int), len(discrepancy.drawn) - 1)
             around = known < KNOWN_SHARE
             spread = np.where(around, KNOWN_SPREAD, spread)
-            scales[around] = np.array([one.scales for one in discrepancy.drawn])[index[around]]
-            shifts[around] = np.array([one.shifts for one in discrepancy.drawn])[index[around]]
+            scales[around] = np.array([offset.scales for offset in discrepancy.drawn])[index[around]]
+            shifts[around] = np.array([offset.shifts for offset in discrepancy.drawn])[index[around]]
         shift, factor, origin = (
             np.array([getattr(prior, name) for prior in discrepancy.offset_priors])
             for name in ("shift", "factor", "origin")
@@ -169,7 +169,7 @@ class Hypotheses:
             factors * shifts + moved,
             less * WIDTH * width,
             less * GAIN * gain,
-            np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), rest), _evenly(RESTS, rest)),
+            np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), residual), _evenly(RESTS, residual)),
             _evenly(LENGTHS, length),
             _evenly(NOISES, noise),
             _evenly(NOISE_GROWTHS, growth),
@@ -178,15 +178,15 @@ class Hypotheses:
             centre,
         )
 
-    def only(self, kept: NDArray[np.int_]) -> Hypotheses:
+    def only(self, indices: NDArray[np.int_]) -> Hypotheses:
         """Return a subset."""
         names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "growths", "near", "contrary"
-        return replace(self, **{name: getattr(self, name)[kept] for name in names})
+        return replace(self, **{name: getattr(self, name)[indices] for name in names})
 
     def moved(self, points: Array) -> Array:
         """(J, m, dimension): the simulator's points that each hypothesis assigns to points (m, dimension)."""
-        there = self.scales[:, None, :] * points[None, :, :] + self.shifts[:, None, :]
-        return np.asarray(self.centre + np.exp(self.widths)[:, None, None] * (there - self.centre))
+        positions = self.scales[:, None, :] * points[None, :, :] + self.shifts[:, None, :]
+        return np.asarray(self.centre + np.exp(self.widths)[:, None, None] * (positions - self.centre))
 
 
 @dataclass(frozen=True)
@@ -252,16 +252,16 @@ class ModelAveragedProcess:
         informed, uninformative = weights[:, :J], weights[:, J:]
         self._trusting = np.where(self._all.contrary, 0.0, informed.sum(axis=0))
         self.uninformative = float(informed[:, self._all.contrary].sum() + uninformative.sum())
-        drawn = _evenly_drawn(informed.ravel(), KEPT)
-        counting = segments.counting[drawn // J]
-        drawn = drawn % J
-        self._kept = self._all.only(drawn)
+        sample = _evenly_drawn(informed.ravel(), KEPT)
+        counting = segments.counting[sample // J]
+        sample = sample % J
+        self._kept = self._all.only(sample)
         if len(points):
 
             def make(moved: Array) -> Hypotheses:
-                return Hypotheses.of(discrepancy, centre, moved, contrary[drawn])
+                return Hypotheses.of(discrepancy, centre, moved, contrary[sample])
 
-            self._kept = self._resampled(latent[drawn], self._kept, counting, make)
+            self._kept = self._resampled(latent[sample], self._kept, counting, make)
         self.mixture = np.concatenate([np.full(KEPT, informed.sum() / KEPT), uninformative.sum(axis=0)])
         self._lengths = np.concatenate([self._kept.lengths, UNINFORMATIVE_LENGTHS])
         self._least_noises = np.concatenate([self._kept.noises, UNINFORMATIVE_NOISES])
@@ -280,7 +280,7 @@ class ModelAveragedProcess:
         if m == 0:
             return _Prior(*(np.empty((J, 0)) for _ in range(3)))
         mean, deviation = (
-            part.reshape(J, m) for part in self.simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
+            moments.reshape(J, m) for moments in self.simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
         )
         gain = np.exp(hypotheses.gains)[:, None] / self.worst
         means = np.clip(gain * np.where(hypotheses.contrary[:, None], self.worst - mean, mean), 0.0, 1.0)
@@ -300,12 +300,12 @@ class ModelAveragedProcess:
 
     # -- posterior weights -----------------------------------------------------------------------------------------
 
-    def _resampled(self, latent: Array, kept: Hypotheses, counting: NDArray[np.bool_], make: Remake) -> Hypotheses:
+    def _resampled(self, latent: Array, sample: Hypotheses, counting: NDArray[np.bool_], make: Remake) -> Hypotheses:
         """Move drawn hypotheses (k) by Markov chains that keep the posterior: the drawn ones are few, and coarse.
 
         Args:
             latent: (k, D), their latent variables.
-            kept: the hypotheses.
+            sample: the hypotheses.
             counting: (k, n), the observations that count for each.
             make: returns hypotheses of latent variables.
 
@@ -313,7 +313,7 @@ class ModelAveragedProcess:
         Berzuini 2001.
         """
         rng = np.random.default_rng(1)
-        likelihood = self._likelihood(kept, counting)
+        likelihood = self._likelihood(sample, counting)
         for step in STEPS:
             proposed = np.sqrt(1.0 - step**2) * latent + step * rng.standard_normal(latent.shape)
             candidates = make(proposed)
@@ -340,13 +340,13 @@ class ModelAveragedProcess:
         """
         at_data = _joined(self._informed(self._all, self.points), self._uninformative(self.points, self._costs))
         lengths = np.concatenate([self._all.lengths, UNINFORMATIVE_LENGTHS])
-        found = self._weighed(at_data, lengths, prior, 0)
-        while found.since is not None:
-            later = self._weighed(at_data, lengths, prior, found.since)
+        weighted = self._weighed(at_data, lengths, prior, 0)
+        while weighted.since is not None:
+            later = self._weighed(at_data, lengths, prior, weighted.since)
             if later.since is None:
-                return replace(later, since=found.since) if later.surprised else found
-            found = later
-        return found
+                return replace(later, since=weighted.since) if later.surprised else weighted
+            weighted = later
+        return weighted
 
     def _weighed(self, at_data: _Prior, lengths: Array, prior: Array, begin: int) -> _Segments:
         """Weights of the starts of a segment among the observations from `begin`, with at most one change there."""
@@ -435,15 +435,15 @@ class ModelAveragedProcess:
     def covariances(self, first: Array, second: Array) -> Array:
         """Posterior covariances (components, m, k) of f between points (m, dimension) and others (k, dimension)."""
         (at_first, V), (at_second, W) = self._projected(first), self._projected(second)
-        found = _correlation(first, second, self._lengths)
-        found *= at_first.spreads[:, :, None] * at_second.spreads[:, None, :]
-        return np.asarray(found - V.transpose(0, 2, 1) @ W)
+        covariance = _correlation(first, second, self._lengths)
+        covariance *= at_first.spreads[:, :, None] * at_second.spreads[:, None, :]
+        return np.asarray(covariance - V.transpose(0, 2, 1) @ W)
 
     def differences(self, points: Array, place: Array) -> Array:
         """Posterior deviations (components, m) of f(points) − f(place), place (dimension,)."""
-        own = self.covariances(points, place[None, :])[:, :, 0]
+        covariance = self.covariances(points, place[None, :])[:, :, 0]
         deviations, at_place = self.components(points)[1], self.components(place[None, :])[1]
-        return np.sqrt(np.maximum(deviations**2 + at_place**2 - 2.0 * own, 1e-12))
+        return np.sqrt(np.maximum(deviations**2 + at_place**2 - 2.0 * covariance, 1e-12))
 
     # -- moments of the cost ---------------------------------------------------------------------------------------
 

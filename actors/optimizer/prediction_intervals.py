@@ -86,8 +86,8 @@ def observation_intervals(process: GaussianProcess, points: Array, level: float)
         means.append(prior_mean + process.scale * (cross @ alpha))
         deviations.append(process.scale * np.sqrt(variance + (covariance.value(theta, "noise") * np.exp(growth)) ** 2))
     weights = np.exp(np.array(log_weights) - max(log_weights))
-    kept = weights > NEGLIGIBLE
-    mixture = weights[kept] / weights[kept].sum(), np.array(means)[kept], np.array(deviations)[kept]
+    relevant = weights > NEGLIGIBLE
+    mixture = weights[relevant] / weights[relevant].sum(), np.array(means)[relevant], np.array(deviations)[relevant]
     return highest_density_intervals(*mixture, level, largest=math.inf)
 
 

@@ -193,10 +193,10 @@ class RememberedGroup:
 
     def moved(self, points: Array) -> Array:
         """Points (m, at least the dimension) of an even design, moved to the same quantiles of the normals."""
-        found = points.copy()
+        shifted = points.copy()
         for axis, centre, deviation in zip(self.axes, self.centres, self.deviations, strict=True):
-            found[:, axis] = truncated_quantiles(points[:, axis], centre, deviation)
-        return found
+            shifted[:, axis] = truncated_quantiles(points[:, axis], centre, deviation)
+        return shifted
 
 
 def truncated_quantiles(uniform: Array, mean: float, deviation: float, lower: float = 0.0, upper: float = 1.0) -> Array:

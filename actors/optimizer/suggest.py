@@ -76,8 +76,8 @@ def describe(
     at_known, known_deviations = model.surrogate.predict(known)
     expected = at_known
     if not risky and feasibility is not None and len(arrays.costs):
-        made = feasibility.made(known)
-        expected = made * at_known + (1.0 - made) * arrays.costs.max()
+        probability = feasibility.made(known)
+        expected = probability * at_known + (1.0 - probability) * arrays.costs.max()
     best = int(np.argmin(expected))
     process = model.process
     description: dict[str, object] = {
@@ -129,10 +129,10 @@ def posterior_of(
     contexts = array(question.contexts, query.context_dimension)
     if not len(contexts):
         prior, memory = array(question.prior, 2), question.memory or ()
-        drawn = drawn_beforehand(question.count, query.space.dimension, prior, rng, memory)
+        draws = drawn_beforehand(question.count, query.space.dimension, prior, rng, memory)
         lack = (DISCREPANCY_PRIOR[0],) * question.count
         held = None if question.memory is None else tuple(group.weight for group in memory)
-        return Posterior(tuples(region.snap(drawn)), lack, float(question.count), held)
+        return Posterior(tuples(region.snap(draws)), lack, float(question.count), held)
     sampled = sample_posterior(
         model.process,
         contexts,
@@ -441,16 +441,16 @@ def _check_risk(query: RiskQuery) -> None:
         raise ValueError(f"risk: level = {risk.level} is outside [0, 1)")
     if len(query.data) > 1 and not query.predict_at:
         raise ValueError("risk: predict_at must name the requests that the best is one of")
-    for index, one in enumerate(risk.disturbances):
-        sizes = len(one.scales), len(one.shifts), len(one.context)
+    for index, disturbance in enumerate(risk.disturbances):
+        sizes = len(disturbance.scales), len(disturbance.shifts), len(disturbance.context)
         if sizes != (query.space.dimension, query.space.dimension, query.context_dimension):
             raise ValueError(f"risk: disturbance {index} has {sizes} numbers, which fit neither space nor the others")
-        if not all(math.isfinite(value) for value in (*one.scales, *one.shifts, *one.context)):
+        if not all(math.isfinite(value) for value in (*disturbance.scales, *disturbance.shifts, *disturbance.context)):
             raise ValueError(f"risk: disturbance {index} is not finite")
 
 
 def _check_discrepancy(discrepancy: ModelDiscrepancy, dimension: int) -> None:
-    offsets = (part for one in discrepancy.drawn for part in (one.scales, one.shifts))
+    offsets = (values for offset in discrepancy.drawn for values in (offset.scales, offset.shifts))
     sizes = {len(discrepancy.offset_priors), *map(len, offsets)}
     if sizes != {dimension}:
         raise ValueError(f"discrepancy: priors and bench offsets have {sorted(sizes)} axes, the space has {dimension}")

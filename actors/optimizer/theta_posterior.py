@@ -119,19 +119,19 @@ def sample_posterior(
     # As many different starts as walkers / 2 span all directions: an ensemble never leaves the subspace in which it
     # starts.
     best = np.argsort(-at_starts, kind="stable")[: walkers // 2]
-    drawn = rng.choice(STARTS, walkers - len(best), p=weights / weights.sum())
-    x = starts[np.concatenate([best, drawn])]
+    more_starts = rng.choice(STARTS, walkers - len(best), p=weights / weights.sum())
+    x = starts[np.concatenate([best, more_starts])]
     x = x + 1e-3 * rng.standard_normal(x.shape)
     x[:, :dimension] = np.clip(x[:, :dimension], 1e-6, 1.0 - 1e-6)
     chain = _stretched(x, density, rng)
-    kept = chain[BURN_IN:]
-    flat = kept.reshape(-1, dimension + 1)
+    samples = chain[BURN_IN:]
+    flat = samples.reshape(-1, dimension + 1)
     chosen = flat[np.linspace(0, len(flat) - 1, count).round().astype(int)]
     held = []
     for group in memory:
         share = group.weight * group.density(flat)
         held.append(float(np.mean(share / (share + 1.0 - group.weight))))
-    return Sampled(snap(chosen[:, :dimension]), np.exp(chosen[:, dimension]), _effective(kept), tuple(held))
+    return Sampled(snap(chosen[:, :dimension]), np.exp(chosen[:, dimension]), _effective(samples), tuple(held))
 
 
 def drawn_beforehand(
@@ -197,9 +197,9 @@ def _stretched(x: Array, density: Callable[[Array], Array], rng: np.random.Gener
             z = ((STRETCH - 1.0) * rng.random(len(moving)) + 1.0) ** 2 / STRETCH
             others = x[rng.choice(still, len(moving))]
             proposed = others + z[:, None] * (x[moving] - others)
-            there = density(proposed)
-            accepted = np.log(rng.random(len(moving))) < (d - 1) * np.log(z) + there - values[moving]
-            x[moving[accepted]], values[moving[accepted]] = proposed[accepted], there[accepted]
+            proposed_density = density(proposed)
+            accepted = np.log(rng.random(len(moving))) < (d - 1) * np.log(z) + proposed_density - values[moving]
+            x[moving[accepted]], values[moving[accepted]] = proposed[accepted], proposed_density[accepted]
         chain[step] = x
     return chain
 
@@ -278,7 +278,7 @@ def expected_reductions(
     prior = process.prior_covariance(np.concatenate([unit, poured], axis=1))
     lack = matern(poured, poured, np.full(poured.shape[1], DISCREPANCY_LENGTH))[0]
     scatter = weighed.noise**2 + process.noise**2 + 1e-10
-    rows, rest = [], np.zeros(m)
+    rows, unexplained = [], np.zeros(m)
     for theta, deviation in zip(thetas, lacks, strict=True):
         means, V = process.projected(np.concatenate([np.tile(theta, (len(contexts), 1)), contexts], axis=1))
         near = V[:, : n + m]
@@ -286,10 +286,10 @@ def expected_reductions(
         weights = np.linalg.solve(R[:n, :n] + scatter * np.eye(n), R[:n, n:])  # (n, m)
         corrected = weights.T @ (means[:n] + weighed.offsets) - means[n : n + m]
         rows.append(np.concatenate([corrected, -means[n + m :]]))
-        rest += np.maximum(np.diag(R[n:, n:]) - (R[:n, n:] * weights).sum(axis=0), 0.0)
+        unexplained += np.maximum(np.diag(R[n:, n:]) - (R[:n, n:] * weights).sum(axis=0), 0.0)
     f = np.array(rows)
     f = f - f.mean(axis=0)
     C = f.T @ f / len(thetas)
     variances = np.diag(C)
-    reductions = C[:m, m:] ** 2 / (variances[:m] + rest / len(thetas) + scatter)[:, None]
+    reductions = C[:m, m:] ** 2 / (variances[:m] + unexplained / len(thetas) + scatter)[:, None]
     return reductions.mean(axis=1), float(variances[m:].mean())

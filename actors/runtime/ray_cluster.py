@@ -174,8 +174,8 @@ class Versions:
         for each in fields(self):
             ours, theirs = getattr(self, each.name), getattr(other, each.name)
             if ours != theirs:
-                what = "the simulator's code" if each.name == "simulator" else each.name.capitalize()
-                return f"{what}: {theirs} there, {ours} here"
+                subject = "the simulator's code" if each.name == "simulator" else each.name.capitalize()
+                return f"{subject}: {theirs} there, {ours} here"
         return None
 
 
@@ -212,16 +212,16 @@ def check_cluster(spec: RaySettings, *, pours: bool) -> list[Node]:
         LaboratoryError: with the problem and its remedy.
     """
     _check_answers(spec.address)
-    found = _read_cluster(spec.address)
-    if "error" in found:
-        raise LaboratoryError(f"Ray cluster at {spec.address}: {found['error']}")
+    cluster = _read_cluster(spec.address)
+    if "error" in cluster:
+        raise LaboratoryError(f"Ray cluster at {spec.address}: {cluster['error']}")
     nodes = [
         Node(**{**node, "versions": Versions(**node["versions"]) if node["versions"] else None})
-        for node in found["nodes"]
+        for node in cluster["nodes"]
     ]
     _check_nodes(spec, nodes)
     if pours:
-        _check_bench(spec, nodes, found["available"])
+        _check_bench(spec, nodes, cluster["available"])
     return nodes
 
 
@@ -296,8 +296,8 @@ def _collect(address: str) -> dict[str, Any]:
     requested = [_request_versions(node.id) for node in nodes]
     ray.wait(requested, num_returns=len(requested), timeout=WORKER_DEADLINE)
     still = living_nodes()  # Ray needs some time to notice that a node is dead
-    found = [_with_versions(node, ref) for node, ref in zip(nodes, requested, strict=True) if node.id in still]
-    answer = {"nodes": [dataclasses.asdict(node) for node in found], "available": ray.available_resources()}
+    versions = [_with_versions(node, ref) for node, ref in zip(nodes, requested, strict=True) if node.id in still]
+    answer = {"nodes": [dataclasses.asdict(node) for node in versions], "available": ray.available_resources()}
     ray.shutdown()
     return answer
 

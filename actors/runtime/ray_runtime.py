@@ -243,8 +243,8 @@ def forget_ray_logs(folder: Path | None = None) -> int:
     folder = folder or ray_folder()
     removed = 0
     for path in [] if folder is None else folder.glob("session_*/logs/*-*"):
-        found = _WORKER_LOG.fullmatch(path.name)
-        if found is not None and not psutil.pid_exists(int(found[1])):
+        match = _WORKER_LOG.fullmatch(path.name)
+        if match is not None and not psutil.pid_exists(int(match[1])):
             path.unlink(missing_ok=True)
             removed += 1
     return removed
@@ -366,8 +366,8 @@ def _keep(session: _Session, start: RayStart) -> None:
                     command = python_module("actors.runtime.ray_cleanup", "message", str(session.address))
                     exit_message = ChildProcess(command, output=False, errors="shown")
         except Exception as error:
-            what = "Ray does not start" if session.address is None else f"Ray cluster at {session.address}"
-            session.failure = LaboratoryError(f"{what}: {error}")
+            problem = "Ray does not start" if session.address is None else f"Ray cluster at {session.address}"
+            session.failure = LaboratoryError(f"{problem}: {error}")
             session.failure.__cause__ = error
         session.ready.set()
         if session.failure is None:

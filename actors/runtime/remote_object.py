@@ -164,8 +164,8 @@ class RayDevice:
 
     def _start(self) -> None:
         placement = {} if self._node is None else self._node.options
-        made = actor_class(self._class, (("work", 1), ("control", 2)))
-        self._actor = made.options(num_cpus=0, **placement).remote(*self._args)
+        remote_class = actor_class(self._class, (("work", 1), ("control", 2)))
+        self._actor = remote_class.options(num_cpus=0, **placement).remote(*self._args)
         self._lost = self._met = False
 
     async def call(self, method: str, *args: Any, deadline: float, urgent: bool = False) -> Any:

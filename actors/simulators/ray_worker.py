@@ -127,12 +127,12 @@ class RayWorker:
 
         try:
             greeting: Greeting
-            greeting, found = await asyncio.wrap_future(self._actor.greet.remote().future())
+            greeting, versions = await asyncio.wrap_future(self._actor.greet.remote().future())
         except ray.exceptions.RayActorError as error:
             if "error raised in its creation task" in str(error):
                 raise WorkerUnusableError(f"a simulator's process does not start: {_last_line(error)}") from error
             raise _lost(error) from error
-        if self._expected is not None and (difference := self._expected.difference(found)):
+        if self._expected is not None and (difference := self._expected.difference(versions)):
             raise WorkerUnusableError(f"the simulator on {greeting.host} is not like this machine's: {difference}")
         return greeting
 

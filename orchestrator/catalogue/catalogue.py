@@ -163,10 +163,10 @@ class Catalogue:
 
     def run(self, name: str) -> Row:
         """One run, with its notes (time, by, text) and its pours under 'list_of_pours'."""
-        found = self._find(name)
-        notes = self._connection.execute("select time, by, text from note where path = ?", [found["path"]]).fetchall()
+        row = self._find(name)
+        notes = self._connection.execute("select time, by, text from note where path = ?", [row["path"]]).fetchall()
         written = [dict(zip(("time", "by", "text"), note, strict=True)) for note in notes]
-        return {**found, "notes": written, "list_of_pours": self.pours({"run": found["path"]})}
+        return {**row, "notes": written, "list_of_pours": self.pours({"run": row["path"]})}
 
     def note(self, name: str, text: str, by: str | None = None) -> Row:
         """Add a note to a run; returns 'run' and 'notes'.
@@ -174,9 +174,9 @@ class Catalogue:
         Args:
             by: author of the note; the user of this process unless given.
         """
-        found = self._find(name)
-        notes = add_note(Path(found["path"]), text, by)
-        return {"run": found["run"], "notes": [note.model_dump() for note in notes]}
+        row = self._find(name)
+        notes = add_note(Path(row["path"]), text, by)
+        return {"run": row["run"], "notes": [note.model_dump() for note in notes]}
 
     def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
         """Write runs and pours into files.
@@ -197,9 +197,9 @@ class Catalogue:
         from orchestrator.catalogue.known_posteriors import imported  # slow import
 
         query = "select content from posterior join run using (path) order by begun, path"
-        found = [KnownPosterior.model_validate_json(row[0]) for row in self._connection.execute(query)]
-        own = {one.posterior for one in found}
-        return [*found, *(one for one in imported(self.state) if one.posterior not in own)]
+        measured_here = [KnownPosterior.model_validate_json(row[0]) for row in self._connection.execute(query)]
+        names = {known.posterior for known in measured_here}
+        return [*measured_here, *(known for known in imported(self.state) if known.posterior not in names)]
 
     def posterior(self, name: str) -> KnownPosterior:
         """The posterior of a run, or an imported one.
@@ -279,8 +279,8 @@ _BELONGS = "path text references run on delete cascade"
 
 def _layout() -> Iterator[str]:
     """The statements that create the tables."""
-    own = {name: [c for c in columns if c.name != _NOTES] for name, columns in TABLES.items()}
-    declared = {name: ", ".join(f"{c.name} {_TYPES[c.type]}" for c in columns) for name, columns in own.items()}
+    layout = {name: [c for c in columns if c.name != _NOTES] for name, columns in TABLES.items()}
+    declared = {name: ", ".join(f"{c.name} {_TYPES[c.type]}" for c in columns) for name, columns in layout.items()}
     yield "drop view if exists runs"
     for table in ("tag", "note", "posterior", "pour", "run"):  # earlier versions have tags
         yield f"drop table if exists {table}"
@@ -290,7 +290,7 @@ def _layout() -> Iterator[str]:
     yield f"create table note ({_BELONGS}, time real, by text, text text) strict"
     for table in ("pour", "posterior", "note"):
         yield f"create index {table}_by_path on {table} (path)"
-    columns = [f"state_now(state, path) as {c.name}" if c.name == "state" else c.name for c in own["run"]]
+    columns = [f"state_now(state, path) as {c.name}" if c.name == "state" else c.name for c in layout["run"]]
     columns.append(f"(select json_group_array(text) from note where note.path = run.path) as {_NOTES}")
     yield f"create view runs as select {', '.join(columns)} from run"
 
@@ -337,8 +337,8 @@ def _stamp(run: Path) -> str:
     marks = []
     for name in (JOURNAL_NAME, f"{JOURNAL_NAME}-wal", ANNOTATIONS_NAME):
         try:
-            found = (run / name).stat()
-            marks.append(f"{found.st_mtime_ns}:{found.st_size}")
+            status = (run / name).stat()
+            marks.append(f"{status.st_mtime_ns}:{status.st_size}")
         except OSError:
             if name == JOURNAL_NAME and not has_begun(run / JOURNAL_NAME):
                 return ""
@@ -376,4 +376,4 @@ def _held(journal: Path) -> bool:
         lines = Path("/proc/locks").read_text(encoding="ascii").splitlines()
     except OSError:
         return True  # unknown: the state in the journal is used
-    return any(len(part := line.split()) > 5 and part[-3].rpartition(":")[2] == str(lock) for line in lines)
+    return any(len(fields := line.split()) > 5 and fields[-3].rpartition(":")[2] == str(lock) for line in lines)

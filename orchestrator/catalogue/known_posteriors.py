@@ -52,23 +52,23 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
     plan, name = record.header.fingerprint, directory.name
     results = [from_json(event.encoded) for event in record.closed.values()]
     encoded: dict[str, Any] = next((result for result in results if result.get("kind") == "calibration"), {})
-    found, calibration = encoded.get("found") or {}, plan.get("calibration")
+    calibrated, calibration = encoded.get("found") or {}, plan.get("calibration")
     if calibration is None:
         raise NoPosteriorError(f"{name}: has no calibration, and therefore no posterior")
-    if not found:
+    if not calibrated:
         raise NoPosteriorError(f"{name}: its calibration is not finished; resume it first")
-    rows = (found.get("posterior") or {}).get("thetas")
+    rows = (calibrated.get("posterior") or {}).get("thetas")
     if not rows:
         raise NoPosteriorError(f"{name}: its calibration has no posterior of the parameters; C4 has one")
     memory = encoded.get("memory") or {}
-    alone = {key: (one["mean"], one["deviation"]) for key, one in (memory.get("alone") or {}).items()}
-    told = alone or {key: (one.mean, one.deviation) for key, one in estimates(rows).items()}
-    priors = {one["name"]: one for one in calibration.get("parameter_prior", ())}
+    alone = {key: (entry["mean"], entry["deviation"]) for key, entry in (memory.get("alone") or {}).items()}
+    told = alone or {key: (entry.mean, entry.deviation) for key, entry in estimates(rows).items()}
+    priors = {entry["name"]: entry for entry in calibration.get("parameter_prior", ())}
     parameters = {}
     for axis in (Axis(**row) for row in calibration["parameters"]["axes"]):
-        own = _without_range(*told[axis.name], axis, priors.get(axis.name))
-        if own is not None and group_of(axis.name) is not None:
-            parameters[axis.name] = {"mean": own[0], "deviation": own[1]}
+        estimate = _without_range(*told[axis.name], axis, priors.get(axis.name))
+        if estimate is not None and group_of(axis.name) is not None:
+            parameters[axis.name] = {"mean": estimate[0], "deviation": estimate[1]}
     if not parameters:
         raise NoPosteriorError(f"{name}: its pours leave all parameters open")
     scene, liquid = calibration["scene"], Liquid.model_validate(calibration["scene"]["liquid"])
@@ -89,7 +89,7 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
             },
             "pourer": scene["pourer"]["name"],
             "shape": shape_digest(scene),
-            "receivers": list(dict.fromkeys(one["receiver"]["name"] for one in scenes)),
+            "receivers": list(dict.fromkeys(entry["receiver"]["name"] for entry in scenes)),
             "pours": int(encoded.get("training_pours", 0)),
             "fixed": {key: float(value) for key, value in calibration["fixed_parameters"].items()},
             "parameters": parameters,
@@ -148,9 +148,9 @@ def import_posterior(known: KnownPosterior, state: Path | None = None) -> None:
     folder.mkdir(exist_ok=True)
     name = "".join(c if c.isalnum() or c in "-_." else "_" for c in known.posterior)
     path = folder / f"{name}.json"
-    part = path.with_suffix(".part")
-    part.write_text(known.model_dump_json(), encoding="utf-8")
-    part.replace(path)
+    partial = path.with_suffix(".part")
+    partial.write_text(known.model_dump_json(), encoding="utf-8")
+    partial.replace(path)
 
 
 def posterior_text(known: KnownPosterior) -> str:

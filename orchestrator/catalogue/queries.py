@@ -71,7 +71,7 @@ def condition_sql(table: str, conditions: Mapping[str, Any]) -> tuple[str, list[
     """
     if unknown := conditions.keys() - {*CONDITIONS, "words", "run", "limit"}:
         raise TypeError(f"no condition is called {', '.join(sorted(unknown))}")
-    own, of_run = ["1"], [f"instr(lower({_ALL_TEXT}), lower(?)) > 0" for _ in conditions.get("words") or ()]
+    of_pour, of_run = ["1"], [f"instr(lower({_ALL_TEXT}), lower(?)) > 0" for _ in conditions.get("words") or ()]
     values: list[Any] = []
     run_values: list[Any] = list(conditions.get("words") or ())
     for name, text in conditions.items():
@@ -82,26 +82,26 @@ def condition_sql(table: str, conditions: Mapping[str, Any]) -> tuple[str, list[
                 continue
             case "since" | "until":
                 column, sign = "begun" if table == "run" else "time", ">=" if name == "since" else "<"
-                own.append(f"{column} {sign} ?")
+                of_pour.append(f"{column} {sign} ?")
                 values.append(moment(text, end=name == "until"))
             case "mode":
                 if text.lower() not in MODES:
                     raise InvalidArgumentError(f"mode '{text}' is not one of {', '.join(MODES)}")
-                own.append("mode = ?")
+                of_pour.append("mode = ?")
                 values.append(MODES[text.lower()])
             case "run":
-                own.append("(lower(run) glob lower(?) or path = ?)")
+                of_pour.append("(lower(run) glob lower(?) or path = ?)")
                 values += [str(text), str(Path(text).absolute())]
             case "state":
                 of_run.append(_LIKE.format(name))
                 run_values.append(text)
             case _:
-                own.append((_ANY_LIKE if table == "run" and name in _LISTS else _LIKE).format(name))
+                of_pour.append((_ANY_LIKE if table == "run" and name in _LISTS else _LIKE).format(name))
                 values.append(text)
     if of_run:
         condition = " and ".join(of_run)
-        own.append(condition if table == "run" else f"path in (select path from runs where {condition})")
-    return " and ".join(own), values + run_values
+        of_pour.append(condition if table == "run" else f"path in (select path from runs where {condition})")
+    return " and ".join(of_pour), values + run_values
 
 
 def moment(text: str, *, end: bool = False, now: datetime | None = None) -> float:

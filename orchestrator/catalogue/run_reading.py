@@ -203,7 +203,7 @@ def _rows(directory: Path) -> tuple[Row, list[Row], str]:
         "laboratory": laboratory.get("name"),
         "seed": plan.get("seed"),
         **{key: _different(s[key]["name"] for s in scenes.values()) for key in ("liquid", "pourer", "receiver")},
-        "strategy": _different(filter(None, (_strategy(plan, part) for part in ("calibration", "deployment")))),
+        "strategy": _different(filter(None, (_strategy(plan, stage) for stage in ("calibration", "deployment")))),
         "simulations": record.simulations,
         "pours": outcomes.count("weighed"),
         "failed_pours": outcomes.count("failed"),
@@ -257,8 +257,8 @@ def _pour(pour: RunPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> 
     }
 
 
-def _strategy(plan: Mapping[str, Any], part: str) -> str:
-    return str(((plan.get(part) or {}).get("settings") or {}).get("strategy", ""))
+def _strategy(plan: Mapping[str, Any], stage: str) -> str:
+    return str(((plan.get(stage) or {}).get("settings") or {}).get("strategy", ""))
 
 
 def _different(names: Iterable[str]) -> list[str]:

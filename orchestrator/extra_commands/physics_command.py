@@ -151,7 +151,7 @@ def _chosen(names: list[str]) -> list[Case]:
         wanted = {case(name).name for name in names}
     except KeyError as error:
         raise RefusalError(str(error.args[0])) from None
-    return [one for one in CASES if not names or one.name in wanted]
+    return [entry for entry in CASES if not names or entry.name in wanted]
 
 
 def shown(value: float | None, unit: str) -> str:
@@ -296,15 +296,15 @@ def figure_of(record: Mapping[str, Any]) -> Figure | None:
     """The figure from the curves in a record, to draw it again without measuring."""
     from sim_engine.validation.case_result import Figure, Series
 
-    kept = record.get("figure")
-    if kept is None:
+    stored = record.get("figure")
+    if stored is None:
         return None
     series = [
         Series(s["name"], tuple(s["x"]), tuple(s["y"]), s["kind"], s["panel"], tuple(s["spread"]))
-        for s in kept["series"]
+        for s in stored["series"]
     ]
-    titles, x_labels, y_labels = (tuple(kept[name]) for name in ("titles", "x_labels", "y_labels"))
-    log_x = kept["log_x"] if isinstance(kept["log_x"], bool) else tuple(kept["log_x"])
+    titles, x_labels, y_labels = (tuple(stored[name]) for name in ("titles", "x_labels", "y_labels"))
+    log_x = stored["log_x"] if isinstance(stored["log_x"], bool) else tuple(stored["log_x"])
     return Figure(titles, x_labels, y_labels, tuple(series), log_x)
 
 
@@ -314,11 +314,11 @@ def _curves(figure: Figure) -> dict[str, Any]:
     def short(value: Any) -> Any:
         if isinstance(value, float):
             return float(f"{value:.5g}")
-        return [short(one) for one in value] if isinstance(value, list | tuple) else value
+        return [short(number) for number in value] if isinstance(value, list | tuple) else value
 
-    kept = dataclasses.asdict(figure)
-    kept["series"] = [{name: short(value) for name, value in one.items()} for one in kept["series"]]
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in kept.items()}
+    stored = dataclasses.asdict(figure)
+    stored["series"] = [{name: short(value) for name, value in series.items()} for series in stored["series"]]
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in stored.items()}
 
 
 def case_record(case: Case, result: CaseResult, image: Path | None, fingerprint: str) -> dict[str, Any]:

@@ -266,33 +266,35 @@ def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
         raise RefusalError(f"{out}: exists already; choose another name, or remove it first")
     try:
         with waiting_for(lambda: "measuring the vessel"):
-            found = work([])
+            fitted = work([])
     except QuantityError as error:
         raise RefusalError(str(error)) from None
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}") from None
-    for note in found.notes:
+    for note in fitted.notes:
         print_note(f"note: {note}")
-    for doubt in found.doubts:
+    for doubt in fitted.doubts:
         print_warning(doubt)
-    print_note(f"{out} holds {1e6 * found.capacity:.0f} ± {1e6 * found.deviation:.1f} mL; its picture: {found.picture}")
+    print_note(
+        f"{out} holds {1e6 * fitted.capacity:.0f} ± {1e6 * fitted.deviation:.1f} mL; its picture: {fitted.picture}"
+    )
     if vessel.as_json:
         from orchestrator.cli.command_results import VesselOutput
 
         print_json(
             VesselOutput(
                 file=out,
-                picture=found.picture,
-                capacity_mL=1e6 * found.capacity,
-                capacity_deviation_mL=1e6 * found.deviation,
-                radius_deviation_mm=None if found.radius_deviation is None else 1e3 * found.radius_deviation,
-                notes=found.notes,
-                doubts=found.doubts,
+                picture=fitted.picture,
+                capacity_mL=1e6 * fitted.capacity,
+                capacity_deviation_mL=1e6 * fitted.deviation,
+                radius_deviation_mm=None if fitted.radius_deviation is None else 1e3 * fitted.radius_deviation,
+                notes=fitted.notes,
+                doubts=fitted.doubts,
             )
         )
 
 
-def _quantity(text: str | None, what: str, unit: str, example: str) -> float | None:
+def _quantity(text: str | None, subject: str, unit: str, example: str) -> float | None:
     if text is None:
         return None
     from sim_engine.settings.quantity import QuantityError, typed_quantity
@@ -300,7 +302,7 @@ def _quantity(text: str | None, what: str, unit: str, example: str) -> float | N
     try:
         return typed_quantity(text, unit, example)
     except QuantityError as error:
-        raise RefusalError(f"{what} {text!r}: {error}") from None
+        raise RefusalError(f"{subject} {text!r}: {error}") from None
 
 
 # -- turned vessels ----------------------------------------------------------------------------------------------------
@@ -330,8 +332,8 @@ def _turned(
     from sim_engine.vessel_acquisition.outline_fit import find_outline
     from sim_engine.vessel_acquisition.wall_thickening import RESERVE, fits_grid, least_wall
 
-    given, floor, height = sizes.lengths()
-    wall = given or wall
+    depth, floor, height = sizes.lengths()
+    wall = depth or wall
     if wall is None:
         raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'")
     floor = wall if floor is None else floor
@@ -373,10 +375,10 @@ def _measured(sizes: Sizes, vessel: Vessel, height: float) -> list[Evidence]:
     from orchestrator.extra_commands.vessel_tables import read_diameters, read_fill_table, read_tilt_table
     from sim_engine.vessel_acquisition.measurements import FillTable, Radii, TiltTable
 
-    found: list[Evidence] = []
+    evidence: list[Evidence] = []
     if sizes.diameters is not None:
         heights, widths = read_diameters(sizes.diameters, height)
-        found.append(Radii("callipers", heights, widths / 2.0, np.full(len(heights), CALLIPERS)))
+        evidence.append(Radii("callipers", heights, widths / 2.0, np.full(len(heights), CALLIPERS)))
     volume_error = vessel.volume(BALANCE)
     if sizes.fill is not None:
         levels, masses = read_fill_table(
@@ -388,12 +390,12 @@ def _measured(sizes: Sizes, vessel: Vessel, height: float) -> list[Evidence]:
         )
         volumes = np.array([vessel.volume(mass) for mass in masses / 1e3])
         radius = float(np.sqrt(volumes.max() / (np.pi * levels.max() / 1e3)))
-        found.append(FillTable(levels / 1e3, volumes, RULER, volume_error, radius))
+        evidence.append(FillTable(levels / 1e3, volumes, RULER, volume_error, radius))
     if sizes.tilt is not None:
         tilts, masses = read_tilt_table(sizes.tilt, angle=float(np.degrees(ANGLE)), balance=1e3 * BALANCE)
         volumes = np.array([vessel.volume(mass) for mass in masses / 1e3])
-        found.append(TiltTable(np.radians(tilts), volumes, ANGLE, volume_error))
-    return found
+        evidence.append(TiltTable(np.radians(tilts), volumes, ANGLE, volume_error))
+    return evidence
 
 
 def _doubts(outline: FittedOutline, vessel: Vessel) -> list[str]:

@@ -58,7 +58,7 @@ def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
         RefusalError: a pair is invalid, or lies outside the vessel (exit code 2).
     """
     heights, widths = [], []
-    for pair in filter(None, (part.strip() for part in text.split(","))):
+    for pair in filter(None, (entry.strip() for entry in text.split(","))):
         at, colon, wide = pair.partition(":")
         try:
             if not colon:
@@ -154,13 +154,13 @@ def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, floa
     columns = columns_of(table, wanted, {}, problems)
     if problems:
         raise ConfigError(problems)
-    names = [one.standard for one in columns if one is not None]
-    missing = [one.standard for one in wanted if one.standard not in names]
+    names = [name.standard for name in columns if name is not None]
+    missing = [name.standard for name in wanted if name.standard not in names]
     if missing:
         raise RefusalError(f"{path}:1: the column '{missing[0]}' is missing; write '{column},mass_g'")
     if table.note:
         print_note(f"note: {table.note}")
-    found: list[tuple[int, float, float]] = []
+    rows: list[tuple[int, float, float]] = []
     for row in table.rows:
         at = f"{path}:{row.line}"
         try:
@@ -169,18 +169,18 @@ def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, floa
             numbers = []
         if len(numbers) != len(names):
             raise RefusalError(f"{at}: should be two numbers, {column} and mass_g")
-        values = {one.standard: n * one.factor for one, n in zip(columns, numbers, strict=True) if one is not None}
+        values = {name.standard: n * name.factor for name, n in zip(columns, numbers, strict=True) if name is not None}
         value, mass = values[column], values["mass_g"]
         if not 0.0 < value <= upper * (1.0 + 1e-9):
             raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}")
         if not 0.0 <= mass < 1e5:
             raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0")
-        found.append((row.line, value, mass))
-        if len(found) > MOST_ROWS:
+        rows.append((row.line, value, mass))
+        if len(rows) > MOST_ROWS:
             raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows")
-    if len(found) < FEWEST_ROWS:
-        raise RefusalError(f"{path}: has {len(found)} row(s); at least {FEWEST_ROWS} say something about a shape")
-    return found
+    if len(rows) < FEWEST_ROWS:
+        raise RefusalError(f"{path}: has {len(rows)} row(s); at least {FEWEST_ROWS} say something about a shape")
+    return rows
 
 
 def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str]) -> Floats:

@@ -53,10 +53,10 @@ def _outermost_rings(corners: FloatArray) -> NDArray[np.bool_]:
         while len(chain) > 1 and _bent_in(chain[-2], chain[-1], (r, z)):
             chain.pop()
         chain.append((r, z))
-    kept = np.zeros(len(corners), dtype=bool)
+    outermost = np.zeros(len(corners), dtype=bool)
     for r, z in chain:
-        kept |= (height == z) & (radius == r)
-    return kept
+        outermost |= (height == z) & (radius == r)
+    return outermost
 
 
 def _bent_in(below: tuple[float, float], middle: tuple[float, float], above: tuple[float, float]) -> bool:
@@ -124,8 +124,8 @@ def nearest_links(sampled: SampledPath, receiver: Vessel | None) -> tuple[Neares
     world = cell_transforms(sampled.spec).world.inverse
     table, cup = [], []
     along = np.linspace(0.0, 1.0, 13)[:, None]
-    for name, first, second, drawn in LINKS:
-        radius = drawn + sampled.link_error
+    for name, first, second, radius_drawn in LINKS:
+        radius = radius_drawn + sampled.link_error
         a, b = points[:, first, None], points[:, second, None]
         line = a + (b - a) * along
         above = line[..., 2].min(axis=1) - radius - sampled.spec.cell.table
@@ -155,16 +155,16 @@ def nearest_to_itself(sampled: SampledPath, points: FloatArray) -> tuple[str, Ne
     links = [(name, ends[:, first + 1, None], ends[:, second + 1, None], thick) for name, first, second, thick in LINKS]
     column = ("base", ends[:, 0, None], ends[:, 1, None], LINKS[0][3])
     along, coarse = (np.linspace(0.0, 1.0, count)[:, None] for count in (13, 4))
-    found = []
+    nearest = []
     for name, a, b, thick in (column, *links[:2]):
-        line, drawn = a + (b - a) * along, thick + 2.0 * sampled.link_error
+        line, thickness = a + (b - a) * along, thick + 2.0 * sampled.link_error
         inside = np.einsum("nji,nkj->nki", pose.rotation, line - pose.position[:, None])
-        pairs = [("the carried vessel", from_cylinder(inside, radius, height).min(axis=1) - drawn)]
+        pairs = [("the carried vessel", from_cylinder(inside, radius, height).min(axis=1) - thickness)]
         for end, c, d, slim in links[3:] if name != "forearm" else ():
             apart = np.linalg.norm(line[:, :, None] - (c + (d - c) * coarse)[:, None], axis=-1)
-            pairs.append((f"the {end}", apart.min(axis=(1, 2)) - drawn - slim))
-        found += [(thing, Nearest(float(gap.min()), int(np.argmin(gap)), name)) for thing, gap in pairs]
-    return min(found, key=lambda each: each[1].distance)
+            pairs.append((f"the {end}", apart.min(axis=(1, 2)) - thickness - slim))
+        nearest += [(thing, Nearest(float(gap.min()), int(np.argmin(gap)), name)) for thing, gap in pairs]
+    return min(nearest, key=lambda each: each[1].distance)
 
 
 def from_cylinder(points: FloatArray, radius: float, height: float) -> FloatArray:

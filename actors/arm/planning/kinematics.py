@@ -66,20 +66,20 @@ def forward(q: FloatArray, m: RobotModel) -> tuple[FloatArray, FloatArray]:
     return rotation, position
 
 
-def _chain(q: FloatArray, own: Calibration) -> tuple[list[FloatArray], list[FloatArray], FloatArray, FloatArray]:
+def _chain(q: FloatArray, dh: Calibration) -> tuple[list[FloatArray], list[FloatArray], FloatArray, FloatArray]:
     """Directions of the joints' axes and a point on each, rotation and position of the flange of a calibrated robot."""
     rotation = np.broadcast_to(np.eye(3), (*q.shape[:-1], 3, 3))
     position = np.zeros((*q.shape[:-1], 3))
     axes, points = [], []
     for k in range(6):
-        s, c = np.sin(q[..., k] + own.theta[k]), np.cos(q[..., k] + own.theta[k])
-        sa, ca = np.sin(own.alpha[k]), np.cos(own.alpha[k])
+        s, c = np.sin(q[..., k] + dh.theta[k]), np.cos(q[..., k] + dh.theta[k])
+        sa, ca = np.sin(dh.alpha[k]), np.cos(dh.alpha[k])
         zero = np.zeros_like(s)
         columns = [(c, s, zero), (-s * ca, c * ca, zero + sa), (s * sa, -c * sa, zero + ca)]
         turned = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
         axes.append(rotation[..., 2])
         points.append(position)
-        step = np.stack([own.a[k] * c, own.a[k] * s, zero + own.d[k]], axis=-1)
+        step = np.stack([dh.a[k] * c, dh.a[k] * s, zero + dh.d[k]], axis=-1)
         position = position + (rotation @ step[..., None])[..., 0]
         rotation = rotation @ turned
     return axes, points, rotation, position
@@ -104,8 +104,8 @@ def refined(q: FloatArray, rotation: FloatArray, position: FloatArray, m: RobotM
         return q
     q, known = q.copy(), np.isfinite(q).all(axis=-1)
     for step in range(NEWTON_STEPS + 1):
-        axes, points, there, place = _chain(q[known], m.calibration)
-        apart = rotation[known] @ np.swapaxes(there, -1, -2)
+        axes, points, flange, place = _chain(q[known], m.calibration)
+        apart = rotation[known] @ np.swapaxes(flange, -1, -2)
         turn = 0.5 * np.stack([apart[:, 2, 1] - apart[:, 1, 2], apart[:, 0, 2] - apart[:, 2, 0],
                                apart[:, 1, 0] - apart[:, 0, 1]], axis=-1)  # fmt: skip
         error = np.concatenate([position[known] - place, turn], axis=-1)
@@ -267,8 +267,8 @@ def to_quaternions(rotation: FloatArray) -> FloatArray:
         products[:, 0, i + 1] = products[:, i + 1, 0] = r[:, k, j] - r[:, j, k]
         products[:, j + 1, k + 1] = products[:, k + 1, j + 1] = r[:, j, k] + r[:, k, j]
     largest = np.argmax(np.diagonal(products, axis1=1, axis2=2), axis=1)
-    found = products[np.arange(len(r)), largest]
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True), dtype=float)
+    quaternions = products[np.arange(len(r)), largest]
+    return np.asarray(quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True), dtype=float)
 
 
 def between(a: FloatArray, b: FloatArray, shares: FloatArray) -> FloatArray:

@@ -123,10 +123,10 @@ def _home(spec: UrArmSettings) -> list[str]:
     for name, point in (("the tool", tool[0]), ("the pourer", pourer.position[0])):
         problems += [f"home: {name} is {text}" for text in outside(point, spec)]
     margins = singularities(q, model)[0]
-    for part, margin in zip(PARTS, margins, strict=True):
+    for path, margin in zip(PARTS, margins, strict=True):
         if margin < spec.limits.singularity:
             problems.append(
-                f"home: the {part} is {margin:.2f} from singular, limits.singularity asks for "
+                f"home: the {path} is {margin:.2f} from singular, limits.singularity asks for "
                 f"{spec.limits.singularity:.2f}; bend it more"
             )
     return problems
@@ -340,14 +340,14 @@ def _ranges(s: SampledPath) -> Iterator[str]:
 
 
 def _joint_speeds(s: SampledPath) -> Iterator[str]:
-    for k, (name, own) in enumerate(zip(JOINT_NAMES, s.model.joint_speed, strict=True)):
-        most = min(own, s.spec.limits.joint_speed)
+    for k, (name, fastest) in enumerate(zip(JOINT_NAMES, s.model.joint_speed, strict=True)):
+        most = min(fastest, s.spec.limits.joint_speed)
         worst = _first_worst(s.joint_speeds[:, k])
         speed = float(s.joint_speeds[worst, k])
         if speed > most * (1.0 + SLACK):
             yield (
                 f"{name} would turn at {math.degrees(speed):.0f} deg/s, {s.when(worst)}; "
-                f"{math.degrees(most):.0f} deg/s are allowed: {_slower(s, 'joint_speed' if most < own else None)}"
+                f"{math.degrees(most):.0f} deg/s are allowed: {_slower(s, 'joint_speed' if most < fastest else None)}"
             )
 
 
@@ -368,18 +368,18 @@ def _singular(s: SampledPath, cure: str = MOVE) -> Iterator[str]:
             f"{s.when(worst[0])}: the wrist {1e3 * shoulder * reach:.0f} mm from above the base's axis, "
             f"{1e3 * least * reach:.0f} mm are asked for; {cure} away from the base"
         )
-    asked = math.degrees(math.asin(least))
+    wanted = math.degrees(math.asin(least))
     if elbow < least:
         folded = math.cos(float(s.joints[worst[1], 2])) < 0.0
         state, help_ = ("folded", "away from the base") if folded else ("straight", "nearer or lower")
         yield (
-            f"{s.when(worst[1])}: elbow {math.degrees(math.asin(elbow)):.1f} deg from {state}, {asked:.1f} deg are "
+            f"{s.when(worst[1])}: elbow {math.degrees(math.asin(elbow)):.1f} deg from {state}, {wanted:.1f} deg are "
             f"asked for; {cure} {help_}"
         )
     if wrist < least:
         yield (
             f"{s.when(worst[2])}: wrist 2 {math.degrees(math.asin(wrist)):.1f} deg from where joints 4 and 6 turn "
-            f"about one axis, {asked:.1f} deg are asked for; turn 'direction', or {cure} sideways"
+            f"about one axis, {wanted:.1f} deg are asked for; turn 'direction', or {cure} sideways"
         )
 
 

@@ -97,9 +97,9 @@ def vessel_at(place: PlaceSettings, spec: UrArmSettings) -> Transforms:
 
 def standing_at(place: PlaceSettings, vessels: Mapping[Role, Vessel], spec: UrArmSettings) -> Standing:
     """The largest of the vessels that may stand at a place."""
-    found = [vessels[role] for role in place.holds if role in vessels]
+    standing = [vessels[role] for role in place.holds if role in vessels]
     x, y, z = map(float, vessel_at(place, spec).position)
-    radius, height = (max((getattr(v, name) for v in found), default=0.0) for name in ("outer_radius", "rim_height"))
+    radius, height = (max((getattr(v, name) for v in standing), default=0.0) for name in ("outer_radius", "rim_height"))
     return Standing(place.name, (x, y, z), radius, height, place.clearance)
 
 
@@ -135,24 +135,26 @@ def plan_way(
     over = max((each.foot[2] - floor + each.height + each.clearance for each in others), default=0.0) + 0.01
     points = np.concatenate([hull(vessel) for vessel in carried]) if carried else np.zeros((1, 3))
     best: tuple[JointPath, list[str]] | None = None
-    found: list[str] = []
+    way_problems: list[str] = []
     for knots in routes(start, above, over):
         try:
             path = travel([*knots, end], np.array(spec.home.angles), spec, fastest, hardest)
         except OutOfReachError as error:
-            found = [_unreached(error, spec)]
+            way_problems = [_unreached(error, spec)]
             continue
         except RacingJointError:
-            found = ["on a straight way from home two joints would turn about one axis and race; teach another pose"]
+            way_problems = [
+                "on a straight way from home two joints would turn about one axis and race; teach another pose"
+            ]
             continue
         sampled = SampledPath.of("way", path, spec)
-        found = [*check_way_limits(sampled, points), *standing_problems(sampled, points, others, own=place.name)]
-        if best is None or len(found) < len(best[1]):
-            best = (path, found)
-        if not found:
+        way_problems = [*check_way_limits(sampled, points), *standing_problems(sampled, points, others, own=place.name)]
+        if best is None or len(way_problems) < len(best[1]):
+            best = (path, way_problems)
+        if not way_problems:
             break
     if best is None or best[1]:
-        problems = found if best is None else best[1]
+        problems = way_problems if best is None else best[1]
         raise InvalidActionError(f"place '{place.name}': " + "; ".join(problems))
     return PlaceWay(place.name, best[0], spec.robot.parameters.checksum)
 
@@ -209,8 +211,8 @@ def in_the_way(
     parts = (("approach", path.approach, ()), ("pour", path.pour, path.phases))
     return [
         problem
-        for name, part, phases in parts
-        for problem in standing_problems(SampledPath.of(name, part, spec, phases), points, others)
+        for name, points_of_part, phases in parts
+        for problem in standing_problems(SampledPath.of(name, points_of_part, spec, phases), points, others)
     ]
 
 
@@ -281,13 +283,13 @@ def place_problems(
         vessels: of a campaign; without them, only what does not depend on them is checked.
     """
     standing = [standing_at(place, vessels, spec) for place in places]
-    for (_, one), (i, other) in combinations(enumerate(standing), 2):
-        apart = math.dist(one.foot[:2], other.foot[:2]) - one.radius - other.radius
-        if apart < max(one.clearance, other.clearance):
+    for (_, first), (i, other) in combinations(enumerate(standing), 2):
+        apart = math.dist(first.foot[:2], other.foot[:2]) - first.radius - other.radius
+        if apart < max(first.clearance, other.clearance):
             yield (
                 i,
-                f"places '{one.place}' and '{other.place}' overlap: what stands there is {1e3 * apart:.0f} mm apart, "
-                f"{1e3 * max(one.clearance, other.clearance):.0f} mm have to stay free",
+                f"places '{first.place}' and '{other.place}' overlap: what stands there is {1e3 * apart:.0f} mm apart, "
+                f"{1e3 * max(first.clearance, other.clearance):.0f} mm have to stay free",
             )
     for i, (place, foot) in enumerate(zip(places, standing, strict=True)):
         axis = vessel_at(place, spec).rotation[:, 2]

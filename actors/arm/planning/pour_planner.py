@@ -86,25 +86,25 @@ def plan_path(motion: PourMotion, spec: UrArmSettings, pourer: Vessel, receiver:
     problems = check_limits(spec)
     if problems:
         raise InvalidActionError(refusal(problems))
-    made = followable(motion)
-    phases: Phases = tuple((p.name, p.start, p.end) for p in made.phases)
-    first_pose = tuple(made.sample(np.zeros(1))[0].tolist())
+    executed = followable(motion)
+    phases: Phases = tuple((p.name, p.start, p.end) for p in executed.phases)
+    first_pose = tuple(executed.sample(np.zeros(1))[0].tolist())
     approach, approached, wrong = _approach(first_pose, spec, pourer, receiver)
     problems = list(wrong)
     barred = bool(problems)
     pour = None
     try:
-        pour = _pour(made, np.array(spec.home.angles) if approach is None else approach.joints[-1], spec)
+        pour = _pour(executed, np.array(spec.home.angles) if approach is None else approach.joints[-1], spec)
         during = SampledPath.of("pour", pour, spec, phases)
     except OutOfReachError as error:
-        during = SampledPath.beyond("pour", pour_times(made), error.poses, spec, phases)
+        during = SampledPath.beyond("pour", pour_times(executed), error.poses, spec, phases)
         problems = [check_reach(during)]  # if the approach failed too, this is its cause
     problems += check_stretch(during, pourer, receiver)
     # hold, return and retreat pass through poses that tilt and approach have passed through
-    nearest, texts = check_clearance(during, made.phases[0].end, pourer, receiver)
+    nearest, texts = check_clearance(during, executed.phases[0].end, pourer, receiver)
     if approached >= spec.limits.clearance or nearest.index > 0:  # its first pose is the last one of the approach
         problems += texts
-    if pour is not None and not problems and not _follows(pour, made, spec):
+    if pour is not None and not problems and not _follows(pour, executed, spec):
         problems.append(
             "joints that are linear between waypoints leave the pour's poses by more than 0.1 deg or 0.3 mm"
         )
@@ -112,7 +112,7 @@ def plan_path(motion: PourMotion, spec: UrArmSettings, pourer: Vessel, receiver:
         problems.append(f"the pour needs {len(pour.times)} waypoints, a controller takes {MOST_WAYPOINTS}")
     if problems or pour is None or approach is None:
         raise (UnreachablePlaceError if barred else InvalidActionError)(refusal(problems))
-    retreat = _retreat(made, approach, pour, spec)
+    retreat = _retreat(executed, approach, pour, spec)
     back = SampledPath.of("retreat", retreat, spec)
     problems = check_stretch(back, pourer, receiver)
     if problems:
@@ -121,13 +121,13 @@ def plan_path(motion: PourMotion, spec: UrArmSettings, pourer: Vessel, receiver:
         approach=approach,
         pour=pour,
         retreat=retreat,
-        tilts=made.tilt(pour.times),
+        tilts=executed.tilt(pour.times),
         phases=phases,
         report=report(
             [SampledPath.of("approach", approach, spec), during, back],
             min(nearest.distance, approached),
             pourer,
-            _deviation(motion, made),
+            _deviation(motion, executed),
         ),
         calibration=spec.robot.parameters.checksum,
     )
@@ -156,16 +156,16 @@ def _approach(
             sampled = SampledPath.beyond(
                 "approach", np.linspace(0.0, STEP * len(error.poses), len(error.poses)), error.poses, spec
             )
-            found, distance = [check_reach(sampled)], np.inf
+            problems, distance = [check_reach(sampled)], np.inf
         except RacingJointError as error:
-            found, distance = [check_way(error, spec)], np.inf
+            problems, distance = [check_way(error, spec)], np.inf
         else:
-            nearest, found = check_clearance(sampled, path.duration, pourer, receiver)
-            found += check_stretch(sampled, pourer, receiver)
+            nearest, problems = check_clearance(sampled, path.duration, pourer, receiver)
+            problems += check_stretch(sampled, pourer, receiver)
             distance = nearest.distance
-        if best is None or len(found) < len(best[2]):
-            best = (path, distance, found)
-        if not found:
+        if best is None or len(problems) < len(best[2]):
+            best = (path, distance, problems)
+        if not problems:
             break
     assert best is not None
     return best[0], best[1], tuple(best[2])
@@ -208,8 +208,8 @@ def _retreat(motion: PourMotion, approach: JointPath, pour: JointPath, spec: UrA
     )
 
 
-def _deviation(asked: PourMotion, made: PourMotion) -> float:
-    if asked is made:
+def _deviation(requested: PourMotion, executed: PourMotion) -> float:
+    if requested is executed:
         return 0.0
-    times = np.linspace(0.0, made.duration, 2000)
-    return float(np.abs(asked.tilt(times) - made.tilt(times)).max())
+    times = np.linspace(0.0, executed.duration, 2000)
+    return float(np.abs(requested.tilt(times) - executed.tilt(times)).max())

@@ -68,12 +68,12 @@ def followable(motion: PourMotion, steepest: float = STEEPEST) -> PourMotion:
     phases: list[Phase] = []
     late = 0.0
     for phase in motion.phases:
-        own = [s for s in motion.segments if phase.start - 1e-9 <= s.start < phase.end - 1e-9]
+        own_segments = [s for s in motion.segments if phase.start - 1e-9 <= s.start < phase.end - 1e-9]
         start, end = phase.start + late, phase.end + late
-        if own:
-            speed = max(max(abs(s.velocity), abs(s.velocity + s.acceleration * s.duration)) for s in own)
-            acceleration = min(_hardest(tuple(own)), steepest)
-            turned = turn(start, own[0].tilt, own[-1].end_tilt, speed, acceleration)
+        if own_segments:
+            speed = max(max(abs(s.velocity), abs(s.velocity + s.acceleration * s.duration)) for s in own_segments)
+            acceleration = min(_hardest(tuple(own_segments)), steepest)
+            turned = turn(start, own_segments[0].tilt, own_segments[-1].end_tilt, speed, acceleration)
             segments += turned
             end = turned[-1].start + turned[-1].duration
             late = end - phase.end
@@ -114,10 +114,10 @@ def pour_times(motion: PourMotion, finer: int = 1) -> FloatArray:
     times = np.sort(np.concatenate(pieces))
     # ends that were computed in two ways differ in the last bits; the phases' own ends are kept
     distinct = np.concatenate([[True], np.diff(times) > 1e-6])
-    kept: FloatArray = times[distinct]
+    times_kept: FloatArray = times[distinct]
     for end in ends:
-        kept[np.argmin(np.abs(kept - end))] = end
-    return kept
+        times_kept[np.argmin(np.abs(times_kept - end))] = end
+    return times_kept
 
 
 def trapezoid(length: float, speed: float, acceleration: float, step: float) -> tuple[FloatArray, FloatArray]:
@@ -200,8 +200,8 @@ class SampledPath:
         calibrated robot by no more than the flange does."""
         if self.model.calibration is None:
             return 0.0
-        nominal, own = (forward(self.joints, model)[1] for model in (self.model.nominal, self.model))
-        return SAME_PLACE + float(np.linalg.norm(nominal - own, axis=-1).max())
+        nominal, calibrated = (forward(self.joints, model)[1] for model in (self.model.nominal, self.model))
+        return SAME_PLACE + float(np.linalg.norm(nominal - calibrated, axis=-1).max())
 
     @cached_property
     def flange(self) -> Transforms:

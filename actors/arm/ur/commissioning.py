@@ -47,14 +47,14 @@ HOME_TOLERANCE = math.radians(1.0)
 
 def tool_check(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
     """Compare the controller's TCP with the file's."""
-    there = Pose.of(*state.tool)
-    away, turned = distance(spec.tool, there), turn(spec.tool, there)
+    pose = Pose.of(*state.tool)
+    away, turned = distance(spec.tool, pose), turn(spec.tool, pose)
     if away <= TOOL_TOLERANCE and turned <= TURN_TOLERANCE:
-        return DeviceCheck("tool", "ok", f"TCP {_point(there)}")
+        return DeviceCheck("tool", "ok", f"TCP {_point(pose)}")
     return DeviceCheck(
         "tool",
         "fail",
-        f"TCP on the controller {_point(there)}, in the file {_point(spec.tool)}: {1e3 * away:.1f} mm and "
+        f"TCP on the controller {_point(pose)}, in the file {_point(spec.tool)}: {1e3 * away:.1f} mm and "
         f"{math.degrees(turned):.1f} deg apart",
         "set the TCP in the installation on the teach pendant, or correct 'tool' in the file: they have to agree",
     )
@@ -151,22 +151,22 @@ class UrDiagnostics(ArmDiagnostics):
     @classmethod
     def of_record(cls, spec: UrArmSettings, recorded: Mapping[str, Any]) -> UrDiagnostics:
         """From `recorded`."""
-        found = findings_of(recorded)
-        return cls._of(spec.with_values(address=found.address), found)
+        findings = findings_of(recorded)
+        return cls._of(spec.with_values(address=findings.address), findings)
 
     def recorded(self) -> dict[str, Any]:
         """See `ArmDiagnostics.recorded`."""
         return {} if self.found is None else recorded_findings(self.found)
 
     @classmethod
-    def _of(cls, spec: UrArmSettings, found: Findings) -> UrDiagnostics:
+    def _of(cls, spec: UrArmSettings, findings: Findings) -> UrDiagnostics:
         return cls(
-            checksum="" if found.state is None else found.state.checksum,
-            serial=found.serial,
-            model=found.model,
-            software=".".join(str(part) for part in found.software[:3]),
+            checksum="" if findings.state is None else findings.state.checksum,
+            serial=findings.serial,
+            model=findings.model,
+            software=".".join(str(number) for number in findings.software[:3]),
             spec=spec,
-            found=found,
+            found=findings,
         )
 
     def checks(self, record: SafetyRecord | None, *, accept: str, virtual: bool) -> list[DeviceCheck]:
@@ -185,33 +185,37 @@ class UrDiagnostics(ArmDiagnostics):
 
 
 def judge(
-    spec: UrArmSettings, found: Findings, record: SafetyRecord | None, *, accept: str, virtual: bool = False
+    spec: UrArmSettings, findings: Findings, record: SafetyRecord | None, *, accept: str, virtual: bool = False
 ) -> list[DeviceCheck]:
     """One line for each fact that was read.
 
     Args:
         spec: settings of the laboratory's file.
-        found: values of the controller.
+        findings: values of the controller.
         record: the accepted safety settings; None if there are none.
         accept: the command that accepts them.
         virtual: whether the arm is virtual and needs no acceptance.
     """
-    checks = _connection(spec, found)
-    if found.software:
-        checks.append(_software(found))
-    if found.dashboard is not None:
-        checks += _dashboard(spec, found, found.dashboard)
-    name = (found.dashboard or {}).get("get robot model", "")
-    if found.state is not None and found.software and name:
-        rests = found.exchange is not None and found.exchange.rests
-        checks += robot_checks(spec, name, found.software, found.state, rests=rests)
-    if found.state is not None:
+    checks = _connection(spec, findings)
+    if findings.software:
+        checks.append(_software(findings))
+    if findings.dashboard is not None:
+        checks += _dashboard(spec, findings, findings.dashboard)
+    name = (findings.dashboard or {}).get("get robot model", "")
+    if findings.state is not None and findings.software and name:
+        rests = findings.exchange is not None and findings.exchange.rests
+        checks += robot_checks(spec, name, findings.software, findings.state, rests=rests)
+    if findings.state is not None:
         checks += [
-            _checksum(found, record, accept, virtual=virtual),
-            tool_check(spec, found.state),
-            home_check(spec, found.state),
+            _checksum(findings, record, accept, virtual=virtual),
+            tool_check(spec, findings.state),
+            home_check(spec, findings.state),
         ]
-    if found.state is not None and spec.calibration_file is not None and found.state.calibration != spec.calibration:
+    if (
+        findings.state is not None
+        and spec.calibration_file is not None
+        and findings.state.calibration != spec.calibration
+    ):
         checks.append(
             DeviceCheck(
                 "stored calibration",
@@ -220,10 +224,10 @@ def judge(
                 "record it again: decant robot check --record; pours are planned with the robot's own in any case",
             )
         )
-    if found.state is not None and found.exchange is not None:
-        checks.append(mount_check(spec, found.state, found.exchange))
-    if found.exchange is not None:
-        exchange = found.exchange
+    if findings.state is not None and findings.exchange is not None:
+        checks.append(mount_check(spec, findings.state, findings.exchange))
+    if findings.exchange is not None:
+        exchange = findings.exchange
         payload = payload_check(spec, exchange.payload, exchange.payload_centre)
         checks += [payload, _unless_blocked(_motion(exchange), checks), _network(exchange)]
     return checks
@@ -234,41 +238,41 @@ def readiness(spec: UrArmSettings) -> DeviceCheck:
 
     The text is that of `why_not_ready`, as in a run. The reading changes nothing and does not upload a program.
     """
-    found = read_status(spec.address)
-    unreached = [check for check in _connection(spec, found) if check.state == "fail"]
-    if unreached or found.exchange is None:
+    status = read_status(spec.address)
+    unreached = [check for check in _connection(spec, status) if check.state == "fail"]
+    if unreached or status.exchange is None:
         return replace(unreached[0], name="motion") if unreached else DeviceCheck("motion", "warn", "not reported")
-    motion = _motion(found.exchange)
-    states = {check.name: check for check in _dashboard(spec, found, found.dashboard or {})}
+    motion = _motion(status.exchange)
+    states = {check.name: check for check in _dashboard(spec, status, status.dashboard or {})}
     if motion.state == "fail":
         remedies = (states[name].advice for name in ("safety", "arm", "program"))
         return replace(motion, advice=next(filter(None, remedies), "set the slider on the teach pendant"))
     remote = states["remote control"]
     if remote.state == "fail":
         return replace(remote, name="motion", found=f"remote control is {remote.found}")
-    if not same_robot(found.model, spec.model):
-        text = f"the controller says {found.model or 'nothing'}, the file {spec.model}"
+    if not same_robot(status.model, spec.model):
+        text = f"the controller says {status.model or 'nothing'}, the file {spec.model}"
         return DeviceCheck("motion", "fail", text, "correct 'model' or 'address' in the file")
     return motion
 
 
-def _connection(spec: UrArmSettings, found: Findings) -> list[DeviceCheck]:
+def _connection(spec: UrArmSettings, findings: Findings) -> list[DeviceCheck]:
     """Whether the controller could be reached and read."""
-    if not found.address:
+    if not findings.address:
         return [
             DeviceCheck(
                 "address",
                 "fail",
-                f"'{spec.address}' is the name of no machine: {found.problems[0]}",
+                f"'{spec.address}' is the name of no machine: {findings.problems[0]}",
                 "write the controller's IP address into the file (teach pendant: Settings, System, Network)",
             )
         ]
-    checks = [DeviceCheck("address", "ok", found.address), *_ports(found)]
-    return checks + [DeviceCheck("answers", "fail", text, ANSWERS) for text in found.problems]
+    checks = [DeviceCheck("address", "ok", findings.address), *_ports(findings)]
+    return checks + [DeviceCheck("answers", "fail", text, ANSWERS) for text in findings.problems]
 
 
-def _ports(found: Findings) -> list[DeviceCheck]:
-    reasons = set(found.ports.values())
+def _ports(findings: Findings) -> list[DeviceCheck]:
+    reasons = set(findings.ports.values())
     if None not in reasons:
         everything = "all ports that Decant uses are closed" if reasons == {"refused"} else "no port answers"
         advice = (
@@ -278,10 +282,12 @@ def _ports(found: Findings) -> list[DeviceCheck]:
             else "is it switched on, its cable plugged in, this computer in the same network, no firewall between?"
         )
         return [
-            DeviceCheck("network", "fail", f"{everything} at {found.address} ({', '.join(map(str, reasons))})", advice)
+            DeviceCheck(
+                "network", "fail", f"{everything} at {findings.address} ({', '.join(map(str, reasons))})", advice
+            )
         ]
     checks = []
-    for port, reason in found.ports.items():
+    for port, reason in findings.ports.items():
         name = PORTS[port]
         advice = (
             f"on PolyScope 5.10 or later enable the service '{name}' under Settings, Security, Services; else look for "
@@ -296,9 +302,9 @@ def _ports(found: Findings) -> list[DeviceCheck]:
     return checks
 
 
-def _software(found: Findings) -> DeviceCheck:
-    version = ".".join(str(part) for part in found.software[:3])
-    major, minor = found.software[:2]
+def _software(findings: Findings) -> DeviceCheck:
+    version = ".".join(str(number) for number in findings.software[:3])
+    major, minor = findings.software[:2]
     if major == POLYSCOPE_X and minor >= FIRST_X:
         return DeviceCheck(
             "software",
@@ -325,10 +331,10 @@ def _software(found: Findings) -> DeviceCheck:
     )
 
 
-def _dashboard(spec: UrArmSettings, found: Findings, responses: dict[str, str]) -> list[DeviceCheck]:
+def _dashboard(spec: UrArmSettings, findings: Findings, responses: dict[str, str]) -> list[DeviceCheck]:
     checks = []
     remote = responses.get("is in remote control", "").lower()
-    if found.software and found.software[0] < 5:
+    if findings.software and findings.software[0] < 5:
         checks.append(DeviceCheck("remote control", "ok", "a CB3 controller always takes programs"))
     elif remote == "true":
         checks.append(DeviceCheck("remote control", "ok", "on"))
@@ -374,9 +380,9 @@ def _safety_mode(word: str) -> DeviceCheck:
     return DeviceCheck("safety", state, word.lower().replace("_", " ") or "not reported", mode.advice)
 
 
-def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virtual: bool) -> DeviceCheck:
-    assert found.state is not None
-    checksum = found.state.checksum
+def _checksum(findings: Findings, record: SafetyRecord | None, accept: str, *, virtual: bool) -> DeviceCheck:
+    assert findings.state is not None
+    checksum = findings.state.checksum
     if not checksum:
         return DeviceCheck(
             "safety checksum",
@@ -393,11 +399,11 @@ def _checksum(found: Findings, record: SafetyRecord | None, accept: str, *, virt
             f"{checksum}, not accepted yet",
             f"compare it with the teach pendant, read the safety settings there, then: {accept}",
         )
-    if record.serial != found.serial:
+    if record.serial != findings.serial:
         return DeviceCheck(
             "safety checksum",
             "fail",
-            f"{record.checksum} was accepted for robot {record.serial}, this is {found.serial or 'unknown'}",
+            f"{record.checksum} was accepted for robot {record.serial}, this is {findings.serial or 'unknown'}",
             f"is this the right controller? If so, read its safety settings, then: {accept}",
         )
     if record.checksum.upper() != checksum:

@@ -148,9 +148,9 @@ def _exchange(connection: rtde.Requests, rate: float, seconds: float) -> Exchang
     trips = []
     version: tuple[int, ...] = ()
     for _ in range(ROUND_TRIPS if seconds else 1):
-        asked = time.monotonic()
+        requested_at = time.monotonic()
         version = struct.unpack(">4I", connection.ask(rtde.GET_URCONTROL_VERSION)[:16])
-        trips.append(time.monotonic() - asked)
+        trips.append(time.monotonic() - requested_at)
     names = ("timestamp", "payload", "payload_cog", "actual_tool_accelerometer", "actual_qd", *STATUS)
     outputs = rtde.Outputs(connection, names, rate)
     arrivals: list[float] = []
@@ -209,7 +209,7 @@ class Findings:
         if self.exchange is not None:
             return self.exchange.version
         match = re.search(r"(\d+)\.(\d+)\.(\d+)", (self.dashboard or {}).get("PolyscopeVersion", ""))
-        return tuple(int(part) for part in match.groups()) if match else ()
+        return tuple(int(number) for number in match.groups()) if match else ()
 
     @property
     def serial(self) -> str:
@@ -290,15 +290,15 @@ def look_at(host: str) -> Findings:
     return Findings(address, ports, dashboard, parts, exchange, tuple(problems))
 
 
-def recorded_findings(found: Findings) -> dict[str, Any]:
+def recorded_findings(findings: Findings) -> dict[str, Any]:
     """JSON-ready values, from which `findings_of` makes the same findings."""
     return {
-        "address": found.address,
-        "ports": {str(port): problem for port, problem in found.ports.items()},
-        "dashboard": found.dashboard,
-        "primary": None if found.parts is None else {str(kind): body.hex() for kind, body in found.parts.items()},
-        "exchange": None if found.exchange is None else asdict(found.exchange),
-        "problems": list(found.problems),
+        "address": findings.address,
+        "ports": {str(port): problem for port, problem in findings.ports.items()},
+        "dashboard": findings.dashboard,
+        "primary": None if findings.parts is None else {str(kind): body.hex() for kind, body in findings.parts.items()},
+        "exchange": None if findings.exchange is None else asdict(findings.exchange),
+        "problems": list(findings.problems),
     }
 
 

@@ -279,7 +279,7 @@ class MotionMonitor:
         """End the program in any state, and wait until the arm stands still."""
         self._client.order_stop(self._motion.number)
         end = time.monotonic() + STANDING_TIME
-        asked = False
+        requested = False
         while time.monotonic() < end:
             reading = self._look()
             if reading.stands and reading.runtime == STOPPED_PROGRAM:
@@ -287,8 +287,8 @@ class MotionMonitor:
                 return self._outcome(kind, text)
             if reading.stands:
                 self._standing = self._standing or time.monotonic()
-            if not asked and (kind != "operator" or time.monotonic() > end - 0.6 * STANDING_TIME):
-                asked = True
+            if not requested and (kind != "operator" or time.monotonic() > end - 0.6 * STANDING_TIME):
+                requested = True
                 self._end_program()
             time.sleep(LOOK_INTERVAL)
         return self._outcome(kind, text + "; it could not be seen to stand and its program to end")

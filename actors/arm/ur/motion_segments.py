@@ -81,11 +81,11 @@ def upright_way(path: PourPath, joints: FloatArray, spec: UrArmSettings) -> tupl
     Raises:
         ArmRefusedError: the arm does not stand on the path.
     """
-    here, apart = rejoin(path.pour, joints)
+    start, apart = rejoin(path.pour, joints)
     if apart > OFF_PATH:
         raise ArmRefusedError(_astray("the pour's path", apart, "bring the pourer upright at the pendant, by hand"))
-    tilt = float(np.interp(here, path.pour.times, path.tilts))
-    back, on = _between(path.pour.times, here, 0.0), _between(path.pour.times, here, path.pour.duration)
+    tilt = float(np.interp(start, path.pour.times, path.tilts))
+    back, on = _between(path.pour.times, start, 0.0), _between(path.pour.times, start, path.pour.duration)
     back_tilts, on_tilts = (np.interp(times, path.pour.times, path.tilts) for times in (back, on))
     goes_back = back_tilts.max() <= max(on_tilts.max(), tilt + 1e-3)
     times, tilts = (back, back_tilts) if goes_back else (on, on_tilts)
@@ -125,25 +125,25 @@ def way_home(path: PourPath | PlaceWay, joints: FloatArray, spec: UrArmSettings)
     return _paced(points, np.zeros(len(points)), costs)[0]
 
 
-def _between(times: FloatArray, here: float, there: float) -> FloatArray:
+def _between(times: FloatArray, start: float, end: float) -> FloatArray:
     """A path's times from one to another, in the order in which they are passed."""
-    low, high = min(here, there), max(here, there)
+    low, high = min(start, end), max(start, end)
     inner = times[(times > low) & (times < high)]
     chosen = np.concatenate([[low], inner, [high]])
-    return chosen if there >= here else chosen[::-1]
+    return chosen if end >= start else chosen[::-1]
 
 
 def _paced(points: FloatArray, tilts: FloatArray, costs: FloatArray) -> tuple[JointPath, FloatArray]:
     """Pass points one after another, each part within at most its time [s], with a smooth start and end."""
     along = np.concatenate([[0.0], np.cumsum(costs)])
-    whole = float(along[-1])
-    ramp = min(RAMP, max(whole, 1e-3))
-    duration = max(whole + ramp, 0.1)
+    length = float(along[-1])
+    ramp = min(RAMP, max(length, 1e-3))
+    duration = max(length + ramp, 0.1)
     times = np.linspace(0.0, duration, max(3, int(duration / _GRID)))
     done = np.where(times < ramp, times**2 / (2.0 * ramp), times - 0.5 * ramp)
     left = np.where(duration - times < ramp, (duration - times) ** 2 / (2.0 * ramp), duration - times - 0.5 * ramp)
-    place = np.where(times < 0.5 * duration, done, duration - ramp - left) * whole / max(duration - ramp, 1e-9)
-    place = np.clip(place, 0.0, whole)
+    place = np.where(times < 0.5 * duration, done, duration - ramp - left) * length / max(duration - ramp, 1e-9)
+    place = np.clip(place, 0.0, length)
     joints = np.stack([np.interp(place, along, points[:, k]) for k in range(6)], axis=-1)
     joints[0], joints[-1] = points[0], points[-1]
     return JointPath(times, joints), np.interp(place, along, tilts)

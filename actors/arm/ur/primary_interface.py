@@ -55,16 +55,16 @@ def split(data: bytes) -> tuple[list[tuple[int, bytes]], bytes]:
     Raises:
         PrimaryError: a package has an invalid size.
     """
-    found, place = [], 0
+    packages, place = [], 0
     while len(data) - place >= _HEAD.size:
         size, kind = _HEAD.unpack_from(data, place)
         if not _HEAD.size <= size <= _LONGEST:
             raise PrimaryError(f"a package of {size} bytes")
         if len(data) - place < size:
             break
-        found.append((kind, data[place + _HEAD.size : place + size]))
+        packages.append((kind, data[place + _HEAD.size : place + size]))
         place += size
-    return found, data[place:]
+    return packages, data[place:]
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def read_parts(address: str, timeout: float = 3.0) -> dict[int, bytes]:
     Raises:
         PrimaryError: no state arrived, or it cannot be read.
     """
-    begin, rest, parts = time.monotonic(), b"", dict[int, bytes]()
+    begin, pending, parts = time.monotonic(), b"", dict[int, bytes]()
     needed, welcome = {JOINTS, CARTESIAN}, {SAFETY, CONFIGURATION, KINEMATICS}
     try:
         with socket.create_connection((address, PORT), timeout=timeout) as connection:
@@ -151,7 +151,7 @@ def read_parts(address: str, timeout: float = 3.0) -> dict[int, bytes]:
                 data = connection.recv(65536)
                 if not data:
                     break
-                packages, rest = split(rest + data)
+                packages, pending = split(pending + data)
                 for kind, body in packages:
                     if kind == STATE:
                         parts |= dict(split(body)[0])
@@ -258,15 +258,17 @@ class Primary:
     def _message(self, body: bytes) -> None:
         if len(body) < 10:
             return
-        kind, rest = body[9], body[10:]
-        if kind == _EXCEPTION and len(rest) >= 8:
+        kind, content = body[9], body[10:]
+        if kind == _EXCEPTION and len(content) >= 8:
             self.broken = True
-            line = int.from_bytes(rest[:4], "big", signed=True)
-            self.complaints.append(f"line {line}: {rest[8:].decode('utf-8', 'replace')}")
-        elif kind == _KEY and len(rest) >= 9:
-            self.complaints.append(rest[9 + rest[8] :].decode("utf-8", "replace"))
-        elif kind == _ERROR and len(rest) >= 20:
-            code, argument = struct.unpack_from(">2i", rest)
-            text = rest[20:].decode("utf-8", "replace").strip("\0 ") or CAUSES.get(code, "see the log on the pendant")
+            line = int.from_bytes(content[:4], "big", signed=True)
+            self.complaints.append(f"line {line}: {content[8:].decode('utf-8', 'replace')}")
+        elif kind == _KEY and len(content) >= 9:
+            self.complaints.append(content[9 + content[8] :].decode("utf-8", "replace"))
+        elif kind == _ERROR and len(content) >= 20:
+            code, argument = struct.unpack_from(">2i", content)
+            text = content[20:].decode("utf-8", "replace").strip("\0 ") or CAUSES.get(
+                code, "see the log on the pendant"
+            )
             self.causes.append(f"C{code}A{argument} ({text})")
             self.complaints.append(self.causes[-1])

@@ -84,8 +84,8 @@ def payload_check(spec: UrArmSettings, payload: float | None, centre: Sequence[f
 
 
 def _lengths(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
-    own = spec.robot
-    apart = max((abs(a - b) for a, b in zip(state.lengths, (*own.a, *own.d), strict=False)), default=0.0)
+    robot = spec.robot
+    apart = max((abs(a - b) for a, b in zip(state.lengths, (*robot.a, *robot.d), strict=False)), default=0.0)
     if apart > SAME_LENGTH:
         return DeviceCheck(
             "lengths",
@@ -94,13 +94,13 @@ def _lengths(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
             "this series of the model is not supported; send 'decant robot check' with its label to the maintainers",
         )
     calibration = state.calibration
-    found = "nominal, as a simulator's are" if calibration is None else f"calibrated, checksum {calibration.checksum}"
-    return DeviceCheck("lengths", "ok", found)
+    origin = "nominal, as a simulator's are" if calibration is None else f"calibrated, checksum {calibration.checksum}"
+    return DeviceCheck("lengths", "ok", origin)
 
 
 def _limits(spec: UrArmSettings, state: RobotState) -> list[DeviceCheck]:
     checks = []
-    allowed = [min(spec.limits.joint_speed, own) for own in spec.robot.joint_speed]
+    allowed = [min(spec.limits.joint_speed, fastest) for fastest in spec.robot.joint_speed]
     slow = [k for k, speed in enumerate(state.joint_speeds) if allowed[k] > speed + 1e-6]
     if slow:
         k = min(slow, key=state.joint_speeds.__getitem__)
@@ -140,17 +140,17 @@ def _kinematics(spec: UrArmSettings, state: RobotState) -> DeviceCheck:
     """Compare the own forward kinematics with the controller's pose of the tool."""
     robot = spec.with_values(calibration=state.calibration).robot
     rotation, position = forward(np.array(state.joints), robot)
-    tool, there = transform_of(Pose.of(*state.tool)), transform_of(Pose.of(*state.pose))
-    away = float(np.linalg.norm(position + rotation @ tool.position - there.position))
-    chord = float(np.linalg.norm(rotation @ tool.rotation - there.rotation)) / math.sqrt(8.0)
+    tool, flange = transform_of(Pose.of(*state.tool)), transform_of(Pose.of(*state.pose))
+    away = float(np.linalg.norm(position + rotation @ tool.position - flange.position))
+    chord = float(np.linalg.norm(rotation @ tool.rotation - flange.rotation)) / math.sqrt(8.0)
     turned = 2.0 * math.asin(min(1.0, chord))
-    found = f"{1e3 * away:.2f} mm and {math.degrees(turned):.3f} deg from where its lengths and joints put it"
+    deviation = f"{1e3 * away:.2f} mm and {math.degrees(turned):.3f} deg from where its lengths and joints put it"
     if away <= SAME_PLACE and turned <= SAME_ANGLE:
-        return DeviceCheck("kinematics", "ok", f"the tool is {found}")
+        return DeviceCheck("kinematics", "ok", f"the tool is {deviation}")
     return DeviceCheck(
         "kinematics",
         "fail",
-        f"has its tool {found}; at most {1e3 * SAME_PLACE:g} mm and {math.degrees(SAME_ANGLE):g} deg are allowed",
+        f"has its tool {deviation}; at most {1e3 * SAME_PLACE:g} mm and {math.degrees(SAME_ANGLE):g} deg are allowed",
         "pours would go astray. Is 'model' right? If so, switch the controller off and on, so that it sends its "
         "calibration anew; if that does not help, the robot needs the manufacturer's service",
     )

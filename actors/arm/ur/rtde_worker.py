@@ -175,7 +175,7 @@ class Worker:
 def _version(text: str) -> tuple[int, ...]:
     numbers = "".join(c if c.isdigit() or c == "." else " " for c in text).split()
     dotted = next((n for n in numbers if "." in n), "0.0")
-    return tuple(int(part) for part in dotted.split(".") if part)
+    return tuple(int(number) for number in dotted.split(".") if number)
 
 
 def main() -> None:

@@ -277,7 +277,7 @@ class UrArm:
         - the dashboard, over a separate connection;
         - the end of the heartbeat.
         """
-        asked = time.monotonic()
+        requested_at = time.monotonic()
         self._stopped = True
         self.lock()
         self._session.stop(self._stops.ask())
@@ -291,7 +291,7 @@ class UrArm:
             if self._stops.wait_for_end(timeout):
                 if self._stops.unseen:
                     break
-                times = self._stops.times(asked)
+                times = self._stops.times(requested_at)
                 self.last_stop = times or self.last_stop
                 return 0.0 if times is None else times.standing
             if means is not None:
@@ -337,12 +337,12 @@ class UrArm:
         return released
 
     def _check_calibration(self, path: PourPath | PlaceWay) -> None:
-        own = self._spec.robot.parameters.checksum
-        if path.calibration not in (None, own):
+        checksum = self._spec.robot.parameters.checksum
+        if path.calibration not in (None, checksum):
             raise ArmRefusedError(
                 f"the pour was planned for a robot with {_kinematics(path.calibration)}, this one has "
-                f"{_kinematics(own)}: millimetres and a degree apart. Plan it again with the connected robot's facts "
-                "(`ArmSettings.fitted_to`)"
+                f"{_kinematics(checksum)}: millimetres and a degree apart. Plan it again with the connected robot's "
+                "facts (`ArmSettings.fitted_to`)"
             )
 
     def _go(self, segment: MotionSegment, *, pours: bool = False, tilts: _Tilts | None = None) -> ExecutedPath:

@@ -208,8 +208,8 @@ class WorkerProcess:
         return f"the arm's worker died during {method} (status {self._child.status}); connect again"
 
     def _errors(self) -> str:
-        kept = self._child.errors_kept
-        return f" (it said: {kept})" if kept else ""
+        messages = self._child.errors_kept
+        return f" (it said: {messages})" if messages else ""
 
 
 OPEN_TIME, ANSWER_TIME = 30.0, 15.0

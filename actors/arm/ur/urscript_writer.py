@@ -69,20 +69,20 @@ def thinned(path: JointPath, tolerance: float = THINNING) -> JointPath:
         tolerance: largest change of any joint at any time [rad].
     """
     times, joints = path.times, path.joints
-    kept, anchor = [0], 0
+    indices, anchor = [0], 0
     low, high = np.full(6, -np.inf), np.full(6, np.inf)
     for i in range(1, len(times)):
         step = times[i] - times[anchor]
         slope = (joints[i] - joints[anchor]) / step
         if i > anchor + 1 and bool(np.any((slope < low) | (slope > high))):
             anchor = i - 1
-            kept.append(anchor)
+            indices.append(anchor)
             step = times[i] - times[anchor]
             slope = (joints[i] - joints[anchor]) / step
             low, high = np.full(6, -np.inf), np.full(6, np.inf)
         low, high = np.maximum(low, slope - tolerance / step), np.minimum(high, slope + tolerance / step)
-    kept.append(len(times) - 1)
-    return JointPath(times[kept], joints[kept])
+    indices.append(len(times) - 1)
+    return JointPath(times[indices], joints[indices])
 
 
 def checked(path: JointPath) -> JointPath:

@@ -102,8 +102,8 @@ class FarProcess:
     def _end(self) -> str:
         """Describe how the process ended, for an error message."""
         self._process.wait(1.0)
-        said = f": {self._process.last_error}" if self._process.last_error else ""
-        return f" (status {self._process.status}{said})"
+        reason = f": {self._process.last_error}" if self._process.last_error else ""
+        return f" (status {self._process.status}{reason})"
 
 
 class VirtualSerialBalance(FarProcess):

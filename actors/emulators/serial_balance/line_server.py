@@ -200,9 +200,9 @@ class TcpEnd(LineEnd):
 
     def unplug(self) -> None:
         """See `LineEnd.unplug`."""
-        for one in (self._client, self._listener):
-            if one is not None:
-                one.close()
+        for end in (self._client, self._listener):
+            if end is not None:
+                end.close()
         self._client = self._listener = None
         self._queue.clear()
 
@@ -251,10 +251,10 @@ class Replay:
         """See `EmulatedBalance.hear`."""
         self._begin(now)
         self._received += data
-        while (found := self._find()) is not None:
-            self._received = self._received[len(self._events[found].data) :]
-            self._at = found + 1
-            self._play(found, now)
+        while (command := self._find()) is not None:
+            self._received = self._received[len(self._events[command].data) :]
+            self._at = command + 1
+            self._play(command, now)
         longest = max((len(e.data) for e in self._events if e.direction == "out"), default=0)
         if len(self._received) >= longest:
             self._received = b""
@@ -340,9 +340,9 @@ class Server:
         """Execute the commands from standard input; return False at its end."""
         data = os.read(0, 65536)
         self._orders += data
-        *whole, rest = self._orders.split(b"\n")
-        self._orders = bytearray(rest)
-        for text in whole:
+        *lines, incomplete = self._orders.split(b"\n")
+        self._orders = bytearray(incomplete)
+        for text in lines:
             try:
                 answer = self._order(json.loads(text), now)
             except (KeyError, TypeError, ValueError, OSError) as error:

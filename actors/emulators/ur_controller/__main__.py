@@ -50,7 +50,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     chosen.joints = HOME
     if given_joints is not None:
         try:
-            a, b, c, d, e, f = (radians(float(part)) for part in given_joints.split(","))
+            a, b, c, d, e, f = (radians(float(degrees_text)) for degrees_text in given_joints.split(","))
             chosen.joints = (a, b, c, d, e, f)
         except ValueError:
             parser.error(f"--joints {given_joints}: six numbers [deg], separated by commas")

@@ -169,8 +169,8 @@ class ControllerFaults:
         planes: list[dict[str, Any]] | None = None,
     ) -> dict[str, Any]:
         """Narrow the safety configuration; limits that are not given become the model's own."""
-        own = SafetyConfiguration.of(self._controller.model)
-        ranges, speeds = own.joint_ranges, own.joint_speeds
+        safety = SafetyConfiguration.of(self._controller.model)
+        ranges, speeds = safety.joint_ranges, safety.joint_speeds
         if joint_ranges is not None:
             ranges = tuple((_finite(low), _finite(high)) for low, high in joint_ranges)
         if joint_speeds is not None:
@@ -183,7 +183,7 @@ class ControllerFaults:
             x, y, z = (_finite(v) for v in plane["normal"])
             size = math.sqrt(x * x + y * y + z * z)
             walls.append(SafetyPlane((x / size, y / size, z / size), _finite(plane["offset"])))
-        speed = own.tool_speed if tool_speed is None else _finite(tool_speed)
+        speed = safety.tool_speed if tool_speed is None else _finite(tool_speed)
         configuration = SafetyConfiguration(ranges, speeds, speed, tuple(walls))
         self._controller.configure_safety(configuration)
         return {"checksum": configuration.checksum}
@@ -324,8 +324,8 @@ class ControllerFaults:
         """Return the executed joint positions since a controller time, without noise."""
         start = _finite(since)
         newest = itertools.takewhile(lambda one: one[0] >= start, reversed(self._controller.robot.history))
-        kept = list(newest)[::-1]
-        return {"times": [t for t, _ in kept], "joints": [list(q) for _, q in kept]}
+        entries = list(newest)[::-1]
+        return {"times": [t for t, _ in entries], "joints": [list(q) for _, q in entries]}
 
     def clear(self) -> None:
         """End stalls and refusals, and cancel pending faults."""

@@ -92,10 +92,10 @@ class Uploads:
             sender.refuse()
 
     async def _translate_in_process(self, text: str) -> Translated:
-        asked = question(text, self._controller.known_commands)
+        request = question(text, self._controller.known_commands)
         try:
             answer = await run_async(
-                python_module("actors.emulators.ur_controller.urscript.translator"), asked, timeout=PATIENCE
+                python_module("actors.emulators.ur_controller.urscript.translator"), request, timeout=PATIENCE
             )
         except TimeoutError:
             answer = b""

@@ -151,10 +151,10 @@ class Robot:
         target, true = self.mover.q, self._true
         if moves or true != target:
             share = 1.0 - exp(-dt / self.lag)
-            there = [a + share * (b - a) for a, b in zip(true, target, strict=True)]
-            if all(abs(a - b) < 1e-9 for a, b in zip(there, target, strict=True)):
-                there = list(target)
-            fresh: Joints = (there[0], there[1], there[2], there[3], there[4], there[5])
+            reached = [a + share * (b - a) for a, b in zip(true, target, strict=True)]
+            if all(abs(a - b) < 1e-9 for a, b in zip(reached, target, strict=True)):
+                reached = list(target)
+            fresh: Joints = (reached[0], reached[1], reached[2], reached[3], reached[4], reached[5])
             rates = [(b - a) / dt for a, b in zip(true, fresh, strict=True)]
             self.qd = (rates[0], rates[1], rates[2], rates[3], rates[4], rates[5])
             self._true = fresh
@@ -411,13 +411,13 @@ def calibrated(model: ControlledModel) -> ControlledModel:
     nominal = model.nominal.parameters
 
     def shifted(values: Joints, differences: Joints, scale: float = 1.0) -> Joints:
-        one, two, three, four, five, six = (v + scale * x for v, x in zip(values, differences, strict=True))
-        return one, two, three, four, five, six
+        base, two, three, four, five, six = (v + scale * x for v, x in zip(values, differences, strict=True))
+        return base, two, three, four, five, six
 
-    own = Calibration(
+    calibration = Calibration(
         theta, shifted(nominal.a, a, size), shifted(nominal.d, d, size), shifted(nominal.alpha, alpha), "virtual"
     )
-    return replace(model, calibration=own)
+    return replace(model, calibration=calibration)
 
 
 HOME: Joints = tuple(radians(v) for v in (0.0, -90.0, 90.0, -90.0, -90.0, 0.0))  # type: ignore[assignment]

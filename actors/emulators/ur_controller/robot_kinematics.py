@@ -291,10 +291,10 @@ class Kinematics:
         for _ in range(_SHIFTS):
             if q is None:
                 return None
-            there = self.flange(q)
-            if distance(there[1], flange[1]) < 1e-9 and angle_between(there[0], flange[0]) < 1e-9:
+            pose = self.flange(q)
+            if distance(pose[1], flange[1]) < 1e-9 and angle_between(pose[0], flange[0]) < 1e-9:
                 return q
-            target = compose(compose(flange, invert(there)), target)
+            target = compose(compose(flange, invert(pose)), target)
             q = self._nominal_nearest(target, q)
         return None
 
@@ -305,13 +305,13 @@ class Kinematics:
         for solution in self.inverse(flange, near[5]):
             total = 0.0
             turned = []
-            for angle, there, limit in zip(solution, near, limits, strict=True):
-                k = angle + 2.0 * pi * round((there - angle) / (2.0 * pi))
+            for angle, previous, limit in zip(solution, near, limits, strict=True):
+                k = angle + 2.0 * pi * round((previous - angle) / (2.0 * pi))
                 if k > limit:
                     k -= 2.0 * pi
                 elif k < -limit:
                     k += 2.0 * pi
-                total += (k - there) ** 2
+                total += (k - previous) ** 2
                 turned.append(k)
             if total < least:
                 least = total
@@ -319,11 +319,11 @@ class Kinematics:
         return best
 
 
-def _frames(q: Sequence[float], own: Calibration) -> list[Transform]:
+def _frames(q: Sequence[float], dh: Calibration) -> list[Transform]:
     """Denavit–Hartenberg frames of the six links, base frame."""
     frame: Transform = (IDENTITY, (0.0, 0.0, 0.0))
     frames = []
-    for joint, theta, a, d, twist in zip(q, own.theta, own.a, own.d, own.alpha, strict=True):
+    for joint, theta, a, d, twist in zip(q, dh.theta, dh.a, dh.d, dh.alpha, strict=True):
         angle = joint + theta
         turned = multiply(rotation_matrix((0.0, 0.0, angle)), rotation_matrix((twist, 0.0, 0.0)))
         frame = compose(frame, (turned, (a * cos(angle), a * sin(angle), d)))

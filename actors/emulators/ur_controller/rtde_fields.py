@@ -93,12 +93,12 @@ class InputRecipe:
         if len(payload) != self._struct.size:
             return None
         values = self._struct.unpack(payload)
-        found: dict[str, Any] = {}
+        fields: dict[str, Any] = {}
         place = 0
         for name, count in zip(self.fields, self._counts, strict=True):
-            found[name] = values[place] if count == 1 else values[place : place + count]
+            fields[name] = values[place] if count == 1 else values[place : place + count]
             place += count
-        return found
+        return fields
 
 
 _ZERO6 = (0.0,) * 6

@@ -11,7 +11,7 @@ from actors.emulators.ur_controller.urscript.program import Command
 
 def commands_of(controller: ControllerAccess) -> dict[str, Command]:
     """Return all commands, bound to one controller, by their URScript names."""
-    found = dict(COMMANDS)
+    commands = dict(COMMANDS)
     for subject in (MoveCommands, Queries, SettingCommands, Signalling):
-        found |= subject(controller).commands()
-    return found
+        commands |= subject(controller).commands()
+    return commands

@@ -72,8 +72,8 @@ def norm(a: Any) -> float:
 
 def normalize(v: Any) -> list[float]:
     """Return a list divided by its length."""
-    given, size = numbers(v, length(v)), norm(v)
-    return [x / size for x in given]
+    vector, size = numbers(v, length(v)), norm(v)
+    return [x / size for x in vector]
 
 
 def rpy2rotvec(rpy: Any) -> list[float]:

@@ -127,12 +127,12 @@ class MoveCommands:
         target, speed, acceleration = transform_of(six(pose)), rate(v, "speed"), rate(a, "acceleration")
 
         def aim() -> None:
-            here = self._robot.arm.frame(self._mover.q)
-            away = [b - c for b, c in zip(target[1], here[1], strict=True)]
-            turn = rotation_between(here[0], target[0])
+            frame = self._robot.arm.frame(self._mover.q)
+            away = [b - c for b, c in zip(target[1], frame[1], strict=True)]
+            turn = rotation_between(frame[0], target[0])
             left = max(norm3(away), norm3(turn))
             pace = min(speed, (2.0 * 0.8 * acceleration * left) ** 0.5, left / (2.0 * self._controller.dt))
-            turned = compose((here[0], (0.0, 0.0, 0.0)), ((1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0), turn))[1]
+            turned = compose((frame[0], (0.0, 0.0, 0.0)), ((1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0), turn))[1]
             share = pace / left if left > 1e-9 else 0.0
             velocity = [share * x for x in (*away, *turned)]
             self._mover.tool_speed(self._robot.arm, velocity, acceleration, acceleration)

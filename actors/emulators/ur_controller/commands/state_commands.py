@@ -166,8 +166,8 @@ class SettingCommands:
 
     def commands(self) -> dict[str, Command]:
         """Return the commands by name."""
-        found = dict.fromkeys(WITHOUT_EFFECT, Command(lambda *_, **__: None))
-        found |= {
+        by_name = dict.fromkeys(WITHOUT_EFFECT, Command(lambda *_, **__: None))
+        by_name |= {
             "set_tcp": Command(self.set_tcp),
             "set_payload": Command(self.set_payload),
             "set_target_payload": Command(self.set_payload),
@@ -179,7 +179,7 @@ class SettingCommands:
             "protective_stop": Command(lambda: self._controller.protective_stop("asked for by the program")),
             "rtde_set_watchdog": Command(self.set_watchdog),
         }
-        return found
+        return by_name
 
     def set_tcp(self, pose: Any, tcp_name: Any = "") -> None:
         """Set the tool centre point in the flange's frame."""
@@ -244,28 +244,28 @@ class Signalling:
 
     def commands(self) -> dict[str, Command]:
         """Return the commands by name."""
-        r, found = self._registers, {}
+        r, by_name = self._registers, {}
         for name, store in (("integer", (r.input_int, r.output_int)), ("float", (r.input_double, r.output_double))):
             inputs, outputs = store
-            found[f"read_input_{name}_register"] = _reader(inputs)
-            found[f"read_output_{name}_register"] = _reader(outputs)
-            found[f"write_output_{name}_register"] = _writer(outputs, integer=name == "integer")
-        found["read_input_boolean_register"] = lambda at: bool(r.input_bits >> whole(at, 0, 127, "register") & 1)
-        found["read_output_boolean_register"] = lambda at: bool(r.output_bits >> whole(at, 0, 127, "register") & 1)
-        found["write_output_boolean_register"] = self._write_bit
+            by_name[f"read_input_{name}_register"] = _reader(inputs)
+            by_name[f"read_output_{name}_register"] = _reader(outputs)
+            by_name[f"write_output_{name}_register"] = _writer(outputs, integer=name == "integer")
+        by_name["read_input_boolean_register"] = lambda at: bool(r.input_bits >> whole(at, 0, 127, "register") & 1)
+        by_name["read_output_boolean_register"] = lambda at: bool(r.output_bits >> whole(at, 0, 127, "register") & 1)
+        by_name["write_output_boolean_register"] = self._write_bit
         for group, (first, highest) in _GROUPS.items():
-            found[f"set_{group}_out"] = self._digital_setter(first, highest)
-            found[f"get_{group}_out"] = self._digital_getter(first, highest, inputs=False)
-            found[f"get_{group}_in"] = self._digital_getter(first, highest, inputs=True)
+            by_name[f"set_{group}_out"] = self._digital_setter(first, highest)
+            by_name[f"get_{group}_out"] = self._digital_getter(first, highest, inputs=False)
+            by_name[f"get_{group}_in"] = self._digital_getter(first, highest, inputs=True)
         for name in ("set_analog_out", "set_standard_analog_out"):
-            found[name] = self.set_analog
+            by_name[name] = self.set_analog
         for name in ("set_analog_outputdomain", "set_standard_analog_output_domain"):
-            found[name] = self.set_domain
+            by_name[name] = self.set_domain
         for name in ("get_analog_out", "get_standard_analog_out"):
-            found[name] = lambda n: self._signals.analog_reading(whole(n, 0, 1, "output"))
+            by_name[name] = lambda n: self._signals.analog_reading(whole(n, 0, 1, "output"))
         for name in ("get_analog_in", "get_standard_analog_in"):
-            found[name] = lambda n: self._signals.analog_in[whole(n, 0, 1, "input")]
-        return {name: Command(function) for name, function in found.items()}
+            by_name[name] = lambda n: self._signals.analog_in[whole(n, 0, 1, "input")]
+        return {name: Command(function) for name, function in by_name.items()}
 
     def _write_bit(self, at: Any, value: Any) -> None:
         bit = 1 << whole(at, 0, 127, "register")
@@ -301,9 +301,9 @@ def _reader(store: list[Any]) -> Callable[..., Any]:
 
 def _writer(store: list[Any], *, integer: bool) -> Callable[..., Any]:
     def write(at: Any, value: Any) -> None:
-        given = number(value)
+        written = number(value)
         if integer:
-            given = (int(given) + 0x80000000) % 0x100000000 - 0x80000000
-        store[whole(at, 0, REGISTERS - 1, "register")] = given
+            written = (int(written) + 0x80000000) % 0x100000000 - 0x80000000
+        store[whole(at, 0, REGISTERS - 1, "register")] = written
 
     return write

@@ -247,9 +247,9 @@ class ToolSpeed:
         rotation, (x, y, z) = self._frame
         turned = multiply(rotation_matrix((v[3] * dt, v[4] * dt, v[5] * dt)), rotation)
         self._frame = (turned, (x + v[0] * dt, y + v[1] * dt, z + v[2] * dt))
-        there = self._arm.joints(self._frame, q)
+        joints = self._arm.joints(self._frame, q)
         if self._stops and self._ceiling is None:
             self._ceiling = 1.2 * max(abs(v) for v in qd)
-        if self._ceiling is not None and max(abs(b - a) for a, b in zip(q, there, strict=True)) > self._ceiling * dt:
+        if self._ceiling is not None and max(abs(b - a) for a, b in zip(q, joints, strict=True)) > self._ceiling * dt:
             raise UnreachableError("near a singularity a straight stop would make a joint faster")
-        return there
+        return joints

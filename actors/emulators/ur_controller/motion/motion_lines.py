@@ -177,10 +177,10 @@ class Corner:
         """
         w1, w2 = (1.0 - k) ** 2 * self._into, k**2 * self._out
         if isinstance(self._before, JointLine) and isinstance(self._after, JointLine):
-            one, two = self._before, self._after
+            earlier, two = self._before, self._after
             q = [
-                c - w1 * d1 / one.length + w2 * d2 / two.length
-                for c, d1, d2 in zip(two.start, one.delta, two.delta, strict=True)
+                c - w1 * d1 / earlier.length + w2 * d2 / two.length
+                for c, d1, d2 in zip(two.start, earlier.delta, two.delta, strict=True)
             ]
             return q[0], q[1], q[2], q[3], q[4], q[5]
         assert isinstance(self._before, ToolLine)

@@ -76,13 +76,13 @@ class DashboardServer:
             line: as sent.
             privileged: whether it came over a connection that may send commands.
         """
-        asked = " ".join(line.split())
+        command = " ".join(line.split())
         for name, do, remote_only in self._commands:
-            if asked.lower() == name.lower() or asked.lower().startswith(name.lower() + " "):
+            if command.lower() == name.lower() or command.lower().startswith(name.lower() + " "):
                 if remote_only and not privileged:
                     return REFUSAL
-                return do(asked[len(name) + 1 :])
-        return f"could not understand: '{asked[:200]}'"
+                return do(command[len(name) + 1 :])
+        return f"could not understand: '{command[:200]}'"
 
     def _stop(self, _: str) -> str:
         self._controller.stop()

@@ -43,16 +43,16 @@ def split(data: bytes) -> list[tuple[int, bytes]]:
     Raises:
         ValueError: the sizes are inconsistent.
     """
-    found, place = [], 0
+    messages, place = [], 0
     while place < len(data):
         if len(data) - place < _SIZE.size:
             raise ValueError(f"{len(data) - place} bytes left over")
         size, kind = _SIZE.unpack_from(data, place)
         if size < _SIZE.size or place + size > len(data):
             raise ValueError(f"a package of {size} bytes where {len(data) - place} are left")
-        found.append((kind, data[place + _SIZE.size : place + size]))
+        messages.append((kind, data[place + _SIZE.size : place + size]))
         place += size
-    return found
+    return messages
 
 
 # More than 20 fields: the fields of UR's message.
@@ -98,7 +98,7 @@ class PrimaryState:
     checksum: int
 
 
-def robot_state(s: PrimaryState, *more: bytes) -> bytes:
+def robot_state(s: PrimaryState, *packages: bytes) -> bytes:
     """Encode a robot state, with further sub-packages after the usual ones."""
     joints = b"".join(
         struct.pack(">3d4fB", q, target, qd, current, 48.0 if s.powered else 0.0, 32.0, 32.0, s.joint_mode)
@@ -123,7 +123,7 @@ def robot_state(s: PrimaryState, *more: bytes) -> bytes:
         package(CARTESIAN_INFO, struct.pack(">12d", *s.pose, *s.tcp)),
         package(ADDITIONAL_INFO, bytes(4)),
         package(SAFETY_DATA, struct.pack(">I", s.checksum), bytes(34)),
-        *more,
+        *packages,
     )
 
 
@@ -140,11 +140,11 @@ def safety_checksum(state: bytes) -> str | None:
     return f"{int.from_bytes(data[:4], 'big'):08X}" if len(data) >= 4 else None
 
 
-def kinematics_info(own: Calibration) -> bytes:
+def kinematics_info(dh: Calibration) -> bytes:
     """Encode the Denavit–Hartenberg parameters; a robot without calibration sends checksums of all ones."""
-    rows = (struct.pack(">4d", *row) for row in zip(own.theta, own.a, own.d, own.alpha, strict=True))
-    checksums = (zlib.crc32(row) if own.checksum else 0xFFFFFFFF for row in rows)
-    numbers = (*own.theta, *own.a, *own.d, *own.alpha)
+    rows = (struct.pack(">4d", *row) for row in zip(dh.theta, dh.a, dh.d, dh.alpha, strict=True))
+    checksums = (zlib.crc32(row) if dh.checksum else 0xFFFFFFFF for row in rows)
+    numbers = (*dh.theta, *dh.a, *dh.d, *dh.alpha)
     return package(KINEMATICS_INFO, struct.pack(">6I24dI", *checksums, *numbers, 0))
 
 

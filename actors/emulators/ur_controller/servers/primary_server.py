@@ -46,7 +46,7 @@ class PrimaryServer:
             for client in clients:
                 client.send(state)
 
-    def state(self, *more: bytes) -> bytes:
+    def state(self, *packages: bytes) -> bytes:
         """Return the robot's current state."""
         c, robot = self.controller, self.controller.robot
         power, mode = c.power, c.safety.mode
@@ -76,7 +76,7 @@ class PrimaryServer:
                 analog_voltage=c.signals.analog_voltage,
                 checksum=int(c.safety.checksum, 16),
             ),
-            *more,
+            *packages,
         )
 
     def first(self) -> bytes:

@@ -86,8 +86,8 @@ def _read(c: Controller, path: str) -> tuple[int, dict[str, Any]]:
         "/system/v1/information": {"robotType": c.model.name, "serialNumber": c.model.serial},
         "/versions/v1": {"marketingVersion": "{}.{}.{}".format(*c.model.version)},
     }
-    found = answers.get(path)
-    return (404, {"message": "not found"}) if found is None else (200, found | {"message": "ok"})
+    answer = answers.get(path)
+    return (404, {"message": "not found"}) if answer is None else (200, answer | {"message": "ok"})
 
 
 class RobotApiConnection(Connection):

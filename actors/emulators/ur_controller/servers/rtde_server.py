@@ -140,12 +140,12 @@ class RtdeConnection(Connection):
             frequency = SLOWEST if frequency < SLOWEST else highest
         names = rtde.names(payload[:LONGEST_NAMES])
         kinds = [self._server.fields[n].kind if n in self._server.fields else "NOT_FOUND" for n in names]
-        whole = bool(names) and "NOT_FOUND" not in kinds
+        complete = bool(names) and "NOT_FOUND" not in kinds
         number = 1 if self._protocol == 2 else 0
-        if whole:
+        if complete:
             self._outputs = OutputRecipe(number, [self._server.fields[n] for n in names])
             self._interval = 1.0 / frequency
-        head = bytes([number if whole else 0]) if self._protocol == 2 else b""
+        head = bytes([number if complete else 0]) if self._protocol == 2 else b""
         self._send(rtde.SETUP_OUTPUTS, head + ",".join(kinds).encode())
 
     def _setup_inputs(self, payload: bytes) -> None:
@@ -158,12 +158,12 @@ class RtdeConnection(Connection):
                 kinds.append("IN_USE")
             else:
                 kinds.append(INPUT_KINDS[name])
-        whole = bool(names) and not {"NOT_FOUND", "IN_USE"} & set(kinds) and self._recipes < 255
-        if whole:
+        complete = bool(names) and not {"NOT_FOUND", "IN_USE"} & set(kinds) and self._recipes < 255
+        if complete:
             self._recipes += 1
             self._inputs[self._recipes] = InputRecipe(names, kinds)
             owners.update(dict.fromkeys(names, self))
-        self._send(rtde.SETUP_INPUTS, bytes([self._recipes if whole else 0]) + ",".join(kinds).encode())
+        self._send(rtde.SETUP_INPUTS, bytes([self._recipes if complete else 0]) + ",".join(kinds).encode())
 
     def _data(self, payload: bytes) -> None:
         recipe = self._inputs.get(payload[0]) if payload else None
