@@ -230,6 +230,7 @@ class VesselHandling:
         self._mass: dict[Role, float] = {}
         self._ways: dict[tuple[str, bool], PlaceWay] = {}
         self._way: PlannedPour | PlaceWay | None = None
+        self._motion: tuple[Role, str] | None = None
         self._away = False
         self._back: PlannedPour | None = None
         self._poured: _Poured | None = None
@@ -583,6 +584,11 @@ class VesselHandling:
             self._agreed = () if self._asked else then
         except LaboratoryError as error:
             self.forget()
+            if self._motion is not None:
+                role, note = self._motion
+                self._motion = None
+                with contextlib.suppress(LaboratoryError):  # the reason stands in `error`
+                    self._record.put(role, None, f"interrupted: {note}")
             if self._away or isinstance(error, STUCK):
                 await consent.bring_home(error, begun=False, path=self._way)
                 self._away = False
@@ -599,7 +605,7 @@ class VesselHandling:
         place, vessel = self._at[role], self._vessel(role)
         on_balance = place == self._layout.balance.name
         width = grip_limits(vessel, self._held.spec, self._spec).width
-        self._record.put(role, None, f"the arm began to take it from '{place}'")
+        self._note_motion(role, f"the arm began to take it from '{place}'")
         await self._held.open_at(vessel)
         await self._drive(place, full=False, homewards=False)
         shown = (await self._balance.read()).mass if on_balance else math.nan
@@ -663,13 +669,18 @@ class VesselHandling:
         others = {name: stands for name, stands in self._record.stands().items() if name != role}
         if taken := [name for name, stands in others.items() if stands in (None, place)]:
             raise LaboratoryError(f"'{place}' may not be free: where does '{taken[0]}' stand?")
-        self._record.put(role, None, f"the arm began to carry it to '{place}'")
+        self._note_motion(role, f"the arm began to carry it to '{place}'")
         await self._drive(place, full=self._mass.get(role, 0.0) > FILMED, homewards=False)
         await self._held.open_at(self._vessel(role))
         await self._truth.placed(role, place, on_balance=place == self._layout.balance.name)
         self._at[role] = place
         self._record.put(role, place)
+        self._motion = None
         await self._drive(place, full=False, homewards=True)
+
+    def _note_motion(self, role: Role, note: str) -> None:
+        self._record.put(role, None, note)
+        self._motion = role, note
 
     async def _drive(self, place: str, *, full: bool, homewards: bool) -> None:
         way = replace(self._ways[place, full], homewards=homewards)

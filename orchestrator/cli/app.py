@@ -6,8 +6,12 @@ that `--help` starts fast.
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import errno
 import functools
+import io
+import os
 import sys
 from typing import Annotated
 
@@ -289,6 +293,11 @@ for _register in own_extras("decant.commands").values():
 
 def main() -> None:
     """Run the command line."""
+    if (
+        sys.getfilesystemencoding() == "ascii"
+    ):  # arguments and files are UTF-8, also in a locale that has no such letters
+        command = [sys.executable, *sys.orig_argv[1:]]
+        os.execve(sys.executable, command, {**os.environ, "PYTHONUTF8": "1"})
     # Typer builds the parameters of all commands before it reads the first word
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     commands = [one for one in app.registered_commands if one.name == word]
@@ -296,4 +305,20 @@ def main() -> None:
     named = copy.copy(app)
     if commands or groups:
         named.registered_commands, named.registered_groups = commands, groups
-    named()
+    for stream in (sys.stdout, sys.stderr):  # a name must not end a command that has done its work
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        try:
+            named()
+        finally:
+            sys.stdout.flush()
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE):
+            raise
+        if error.errno != errno.EPIPE:
+            where = error.filename or "the output can't be written completely"
+            print(f"decant: {where}: {error.strerror}", file=sys.stderr)
+        with contextlib.suppress(OSError):  # Python flushes it once more at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)

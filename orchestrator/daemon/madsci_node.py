@@ -358,7 +358,7 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
 
     @app.get("/state")
     async def state() -> Any:
-        return ordering.materials.everything()
+        return ordering.materials.everything(daemon.shared.running_laboratories)
 
     @app.get("/log")
     async def log() -> Any:

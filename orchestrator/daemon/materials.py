@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
@@ -275,8 +275,12 @@ class Materials:
             raise MaterialError(f"there is no {table} '{key[:80]}'; there are {', '.join(known) or 'none'}")
         return found[0]
 
-    def everything(self) -> dict[str, list[dict[str, Any]]]:
-        """Return all materials, with the contents of the vessels; ready for JSON, masses in g and volumes in ml."""
+    def everything(self, running: Collection[str] = ()) -> dict[str, list[dict[str, Any]]]:
+        """Return all materials, with the contents of the vessels; ready for JSON, masses in g and volumes in ml.
+
+        Args:
+            running: names of the laboratories in which a campaign runs.
+        """
         contents = {one.vessel: one for one in self.account.all()}
         vessels = []
         for row in self._store.rows("select * from vessel order by id"):
@@ -289,10 +293,11 @@ class Materials:
                 }
             )  # fmt: skip
         places = self.account.places()
-        sources = [
-            {"id": name, "position": places[name].text if name in places else "", "content": held.json_content()}
-            for name, held in contents.items()
-        ]
+        sources = []
+        for name, held in contents.items():
+            place, in_use = places.get(name), name.partition("/")[0] in running
+            position = "" if place is None else place.moving_text if in_use else place.text
+            sources.append({"id": name, "position": position, "in_use": in_use, "content": held.json_content()})
         liquids = [
             {"id": row["id"], "code": row["code"] or "", "properties": json.loads(row["properties"])}
             for row in self._store.rows("select * from liquid order by id")

@@ -100,6 +100,11 @@ class SharedServices:
         running = self.running(item)
         return None if running is None else running.progress()
 
+    @property
+    def running_laboratories(self) -> list[str]:
+        """Names of the laboratories in which campaigns run."""
+        return [worker.running.laboratory for worker in self.workers.values() if worker.running is not None]
+
     def wake(self) -> None:
         """Wake all rig workers after a change."""
         for worker in self.workers.values():
@@ -156,10 +161,14 @@ class Running:
         common: what it shares with others.
         item: which campaign.
         rig: that it has leased.
+
+    Attributes:
+        laboratory: name of its laboratory; '' before its run begins.
     """
 
     def __init__(self, common: SharedServices, item: QueueItem, rig: Rig) -> None:
         self._shared, self.item, self._rig = common, item, rig
+        self.laboratory = ""
         self._progress: ProgressState | None = None
         self._handle: RunHandle | None = None
         self._asked_to_end = False
@@ -180,6 +189,7 @@ class Running:
         found = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig, vessels)
         request, warned = await asyncio.to_thread(_prepared, found)
         assert request.folder is not None
+        self.laboratory = request.campaign.laboratory.name
         for text in warned:
             self._log_warning(text)
         await self._shared.warm.open()

@@ -130,9 +130,9 @@ async def resume_pour(queue: Queue, orders: Orders, person: Operator, key: str) 
 
 
 @router.get("/materials", operation_id="materials", response_model=MaterialsOut)
-async def materials(orders: Orders, person: Viewer) -> Any:
+async def materials(daemon: Daemon, orders: Orders, person: Viewer) -> Any:
     """List liquids, vessels with their contents, and positions."""
-    return orders.materials.everything()
+    return orders.materials.everything(daemon.running_laboratories)
 
 
 @router.get("/materials/account", operation_id="account", response_model=list[AccountOut])
@@ -204,4 +204,4 @@ async def place_vessel(daemon: Daemon, orders: Orders, person: Operator, key: st
 
 def _changed(daemon: SharedServices, orders: Ordering, by: str, what: str, detail: str) -> Any:
     daemon.note(by, what, detail=detail)
-    return orders.materials.everything()
+    return orders.materials.everything(daemon.running_laboratories)

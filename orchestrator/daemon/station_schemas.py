@@ -226,6 +226,9 @@ class SourceOut(ResponseModel):
     position: str
     """Place of the laboratory where it stands; UNKNOWN after an interrupted motion; '' without places."""
 
+    in_use: bool
+    """Whether a campaign runs in its laboratory: it may move, and its content be weighed later."""
+
     content: ContentOut
 
 

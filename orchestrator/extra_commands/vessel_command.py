@@ -258,6 +258,8 @@ def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
     """Make a vessel, and print what was made. Nothing is written over."""
     from sim_engine.settings.quantity import QuantityError
 
+    if not (vessel.name or out.stem).isprintable():  # such as bytes that are not UTF-8
+        raise RefusalError(f"--name {vessel.name or out.stem!r}: should be text in UTF-8, as in --name 'glass 3'")
     if out.suffix not in (".yaml", ".yml"):
         raise RefusalError(f"{out}: a vessel file is YAML; write {out.with_suffix('.yaml')}")
     if not out.parent.is_dir():

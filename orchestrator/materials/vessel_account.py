@@ -124,6 +124,7 @@ class VesselPlace:
         place: name of the place; None: UNKNOWN, since a motion with it has begun and not ended.
         by: who made the entry; '' for a run.
         note: for people, such as the motion that was under way.
+        origin: the last place that was known; '' if none was.
     """
 
     vessel: str
@@ -131,6 +132,20 @@ class VesselPlace:
     place: str | None
     by: str = ""
     note: str = ""
+    origin: str = ""
+
+    @property
+    def moving(self) -> bool:
+        """Whether a motion with it has begun, and was not noted as interrupted."""
+        return self.place is None and self.note.startswith(("the arm began to take it ", "the arm began to carry it "))
+
+    @property
+    def moving_text(self) -> str:
+        """The same as `text`, while a campaign moves it: "in the gripper, from 'left' to 'pan'"."""
+        if not self.moving:
+            return self.text
+        origin, (_, to, target) = f"from '{self.origin}'" if self.origin else "", self.note.partition(" to '")
+        return ", ".join(filter(None, ("in the gripper", origin + to + target)))
 
     @property
     def text(self) -> str:
@@ -361,7 +376,11 @@ class VesselAccount:
         with self._connection() as connection:
             if not connection.execute("select 1 from sqlite_master where name = 'stand'").fetchone():
                 return {}
-            rows = connection.execute(f"select vessel, t, place, by, note from stand where {LATEST}").fetchall()
+            origin = "select place from stand as former where former.vessel = stand.vessel and place is not null"
+            rows = connection.execute(
+                f"select vessel, t, place, by, note, coalesce(({origin} order by id desc limit 1), '') from stand "
+                f"where {LATEST}"
+            ).fetchall()
         return {str(row[0]): VesselPlace(*row) for row in rows}
 
     def put(self, vessel: str, place: str | None, *, by: str = "", note: str = "") -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 import pytest
 
 from actors.interfaces import LaboratoryError, ProgressCallback
+from orchestrator.daemon.daemon_store import Store
+from orchestrator.daemon.materials import Materials
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, LaboratoryPlaces, Transfer, VesselAccount
 from sim_engine.errors import InvalidArgumentError
@@ -104,6 +107,28 @@ def test_where_a_vessel_stands_outlasts_the_program_and_a_place_holds_one(
     assert (refused.exit_code, "a place holds one vessel" in refused.stderr) == (2, True)
     assert invoke("materials place night/pourer left").exit_code == 0
     assert cell.stands() == {"receiver": "right", "pourer": "left"}
+
+
+def test_a_vessel_is_in_the_gripper_while_a_campaign_moves_it_and_unknown_only_afterwards(tmp_path: Path) -> None:
+    account = VesselAccount(tmp_path / FILE_NAME)
+    cell = LaboratoryPlaces(account, "night")
+    cell.content("pourer", 0.1, 0.0, "water")
+    cell.put("pourer", "left")
+    with contextlib.closing(Store(tmp_path / "store.sqlite")) as store:
+        materials = Materials(store)
+
+        def shown(*running: str) -> tuple[str, bool]:
+            (source,) = materials.everything(running)["sources"]
+            return source["position"], source["in_use"]
+
+        assert shown("night") == ("left", True)
+        cell.put("pourer", None, "the arm began to take it from 'left'")
+        assert shown("night") == ("in the gripper, from 'left'", True)
+        cell.put("pourer", None, "the arm began to carry it to 'pan'")
+        assert shown("night") == ("in the gripper, from 'left' to 'pan'", True)
+        assert shown() == shown("day") == ("UNKNOWN (the arm began to carry it to 'pan')", False)
+        cell.put("pourer", None, "interrupted: the arm began to carry it to 'pan'")
+        assert shown("night") == ("UNKNOWN (interrupted: the arm began to carry it to 'pan')", True)
 
 
 class DosingBench(HeldBench):

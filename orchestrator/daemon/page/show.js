@@ -195,8 +195,9 @@ export function poursTable(pours) {
 export function vesselsTable(vessels) {
   return el("table", {},
     el("thead", {}, el("tr", {}, ["Vessel", "Stands", "Holds"].map((head) => el("th", { scope: "col" }, head)))),
-    el("tbody", {}, vessels.map(({ id, position, content }) => el("tr", {}, cell("Vessel", id), cell("Stands", position),
-      cell("Holds", content.mass_g === null ? "unknown" : `${content.mass_g.toFixed(1)} g ${content.liquid}`)))));
+    el("tbody", {}, vessels.map(({ id, position, in_use: inUse, content }) => el("tr", {}, cell("Vessel", id), cell("Stands", position),
+      content.mass_g === null && inUse ? cell("Holds", "", "not weighed yet") :
+        cell("Holds", content.mass_g === null ? "unknown" : `${content.mass_g.toFixed(1)} g ${content.liquid}`)))));
 }
 
 const NIGHT = { consent: "Consent", pour: "Pour", accounted: "Masses", fault: "FAULT", answer: "Answer", end: "End" };
