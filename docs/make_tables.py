@@ -48,7 +48,6 @@ from orchestrator.extra_commands.physics_command import kept_records
 from orchestrator.learning.campaign_plan import OutputSettings
 from orchestrator.learning.deployment.disturbances import RiskSettings
 from orchestrator.learning.deployment.model_monitoring import (
-    DiscrepancyPolicySettings,
     RiskLimitSettings,
     StopSettings,
 )
@@ -79,7 +78,6 @@ SECTIONS: dict[str, type[Settings]] = {
     "deployment": campaign.DeploymentSection,
     "risk": RiskSettings,
     "window": WindowSettings,
-    "discrepancy_policy": DiscrepancyPolicySettings,
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSettings,
@@ -168,7 +166,6 @@ OF_SECTIONS = {
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "RiskSettings": "[risk](#risk)",
     "WindowSettings": "[window](#window)",
-    "DiscrepancyPolicySettings": "[discrepancy policy](#discrepancy-policy)",
     "RiskLimitSettings": "[risk limit](#risk-limit)",
     "StopSettings": "[stop](#stop)",
     "DataSettings": "[data](#data)",

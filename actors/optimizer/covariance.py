@@ -1,7 +1,7 @@
 """Prior covariance of observations, with the gradients that a fit needs.
 
     f ~ GP(0, σ² M_ℓ + k)                   the cost; k: a known covariance, if there is one
-    y_i = f + ε_i,  ε_i ~ N(0, n_i²)        n_i may depend on the action
+    y_i = f + ε_i,  ε_i ~ N(0, n²)
 
 M is the Matérn 5/2 correlation. With a prior for shears, M_ℓ is a function of T x instead of x; T has ones on its
 diagonal, and its other elements are fitted.
@@ -26,30 +26,27 @@ Pullback = Callable[[Array], Array]
 class HyperPrior:
     """Priors over the hyperparameters, in units of the cube (lengths) and of the cost's scale (the others).
 
-    Each pair is (median, standard deviation of the logarithm), except for shears and the noise's growth (mean, standard
-    deviation). With few observations the maximum of the likelihood alone is unreliable: on a plateau the lengthscales
-    grow without bound, and the model becomes overconfident.
+    Each pair is (median, standard deviation of the logarithm), except for shears (mean, standard deviation). With few
+    observations the maximum of the likelihood alone is unreliable: on a plateau the lengthscales grow without bound
+    and the model becomes overconfident.
 
     Attributes:
         length: of each axis' lengthscale.
         shear: of the elements of T beside its diagonal (mean, standard deviation); None: T = 1.
         signal: of the signal's standard deviation.
         noise: of the observations' standard deviation.
-        noise_growth: of the coefficients of the noise's logarithm.
     """
 
     length: tuple[float, float] = (0.35, 0.7)
     shear: tuple[float, float] | None = None
     signal: tuple[float, float] = (1.0, 0.5)
     noise: tuple[float, float] = (0.1, 1.0)
-    noise_growth: tuple[float, float] = (0.0, 1.5)
 
 
 LENGTH_BOUNDS = (0.03, 5.0)
 SHEAR_BOUNDS = (-3.0, 3.0)
 SIGNAL_BOUNDS = (0.05, 6.0)
 NOISE_BOUNDS = (1e-3, 3.0)
-GROWTH_BOUNDS = (0.0, 4.0)
 
 
 class PriorCovariance(Protocol):
@@ -115,8 +112,7 @@ def _distances(first: Array, second: Array, lengths: Array) -> tuple[Array, Arra
 
 
 class Covariance:
-    """The covariance of the module docstring. Hyperparameters θ are logarithms, except for shears and the
-    noise's growth.
+    """The covariance of the module docstring. Hyperparameters θ are logarithms, except for shears.
 
     Attributes:
         points: (n, dimension) of all observations.
@@ -131,7 +127,6 @@ class Covariance:
         points: Array,
         prior: HyperPrior,
         *,
-        growth: Array | None = None,
         known: PriorCovariance | None = None,
         unit: float = 1.0,
     ) -> None:
@@ -140,12 +135,11 @@ class Covariance:
         Args:
             points: (n, dimension).
             prior: over the hyperparameters.
-            growth: (n, q): log n_i grows with these features; None: constant noise.
             known: further covariance of the cost.
             unit: of the costs here, for `known`.
         """
         self.points = points
-        self._growth, self._known, self._unit = growth, known, unit
+        self._known, self._unit = known, unit
         self._constant = None if known is None else known.covariance(points, points) / unit**2
         dimension = points.shape[1]
         rows: list[tuple[str, tuple[float, float], tuple[float, float], bool]] = [
@@ -155,8 +149,6 @@ class Covariance:
         ]
         if prior.shear is not None:
             rows += [("shear", prior.shear, SHEAR_BOUNDS, False)] * (dimension * (dimension - 1))
-        if growth is not None:
-            rows += [("noise_growth", prior.noise_growth, GROWTH_BOUNDS, False)] * growth.shape[1]
         self.names = tuple(row[0] for row in rows)
         self._shears = [i for i, name in enumerate(self.names) if name == "shear"]
         self._beside_diagonal = ~np.eye(dimension, dtype=np.bool_)
@@ -189,15 +181,6 @@ class Covariance:
         T[self._beside_diagonal] = theta[self._shears]
         return np.asarray(points @ T.T)
 
-    def growth(self, theta: Array) -> Array:
-        """(q,) coefficients of the noise's logarithm."""
-        return theta[[i for i, name in enumerate(self.names) if name == "noise_growth"]]
-
-    def noises(self, theta: Array) -> Array:
-        """(n,) standard deviations of the observations."""
-        noise = np.full(len(self.points), self.value(theta, "noise"))
-        return noise if self._growth is None else noise * np.exp(self._growth @ self.growth(theta))
-
     def observed(self, theta: Array) -> tuple[Array, Pullback]:
         """Covariance of the observations (n, n), and its pullback: symmetric W (n, n) → Σ W_ij ∂K_ij/∂θ (p,)."""
         lengths = self.lengths(theta)
@@ -208,7 +191,7 @@ class Covariance:
         K = base.copy()
         if self._constant is not None:
             K += self._constant
-        noise = self.noises(theta) ** 2
+        noise = self.value(theta, "noise") ** 2
         K[np.diag_indices_from(K)] += noise + 1e-8
 
         def pullback(W: Array) -> Array:
@@ -219,8 +202,6 @@ class Covariance:
             if self._shears:
                 by_shear = _by_shear(points, self.points, W * slope) / lengths[:, None] ** 2
                 gradient += list(-variance * by_shear[self._beside_diagonal])
-            if self._growth is not None:
-                gradient += list(self._growth.T @ diagonal)
             return np.array(gradient)
 
         return K, pullback

@@ -130,9 +130,6 @@ RESIDUAL_PRIOR = HyperPrior(signal=(0.4, 0.7), noise=(0.07, 1.0))
 SMALLEST_SCALE = 1e-60
 """Smallest unit of costs; fourth powers of a smaller one (products of covariances) leave the range of floats."""
 
-VARYING_FROM = 20
-"""Number of observations below which the noise is taken as constant: fewer cannot determine its variation."""
-
 
 class GaussianProcess:
     """GP regression with Matérn 5/2 ARD kernel, fitted noise and a given prior mean; hyperparameters by MAP.
@@ -141,8 +138,7 @@ class GaussianProcess:
         points: (n, dimension) of the observations.
         lengths: (dimension,) fitted lengthscales.
         signal: fitted standard deviation of the signal, in the cost's unit.
-        noise: fitted standard deviation of the observations, in the cost's unit; if it varies, its value at zero
-            growth features.
+        noise: fitted standard deviation of the observations, in the cost's unit.
         evidence: difference of the log-likelihood to that of pure noise around the prior mean.
         residuals: (n,) costs less their prior mean, in units of `scale`.
         covariance_terms: prior covariance, as a function of the hyperparameters.
@@ -158,8 +154,6 @@ class GaussianProcess:
         *,
         mean: Mean,
         scale: float,
-        growth: NoiseGrowth | None = None,
-        start: Array | None = None,
         estimated_mean: bool = False,
     ) -> None:
         """Fit.
@@ -169,21 +163,15 @@ class GaussianProcess:
             covariance: of the observations, in units of scale².
             mean: prior mean of the cost at points (m, dimension) → (m,).
             scale: unit of the priors, in the cost's unit.
-            growth: features of the covariance's varying noise.
-            start: initial hyperparameters; None: the centre of their priors, and a second start with longer
-                lengthscales and more noise.
             estimated_mean: see the attribute.
         """
-        self.points, self.mean, self.scale, self.growth = covariance.points, mean, scale, growth
-        starts = [] if start is None else [start]
-        if start is None:
-            noisy = covariance.centre.copy()
-            noisy[[i for i, name in enumerate(covariance.names) if name in ("length", "noise")]] += 0.5
-            noisy[covariance.names.index("noise")] += 1.0
-            starts = [covariance.centre, noisy]
+        self.points, self.mean, self.scale = covariance.points, mean, scale
+        noisy = covariance.centre.copy()  # longer lengthscales and more noise
+        noisy[[i for i, name in enumerate(covariance.names) if name in ("length", "noise")]] += 0.5
+        noisy[covariance.names.index("noise")] += 1.0
         residuals = (costs - mean(self.points)) / scale
         self.residuals, self.estimated_mean = residuals, estimated_mean
-        fitted = maximum_a_posteriori(covariance, residuals, starts)
+        fitted = maximum_a_posteriori(covariance, residuals, [covariance.centre, noisy])
         self.covariance_terms, self._fitted = covariance, fitted
         theta = fitted.theta
         self.lengths: Array = covariance.lengths(theta)
@@ -229,9 +217,7 @@ class GaussianProcess:
 
     def noise_at(self, points: Array) -> Array:
         """Standard deviations of single real observations at points (m, dimension): (m,), in the cost's unit."""
-        if self.growth is None or len(points) == 0:
-            return np.full(len(points), self.noise)
-        return self.noise * np.exp(self.growth.features(points) @ self.covariance_terms.growth(self.theta))
+        return np.full(len(points), self.noise)
 
     def covariance(self, first: Array, second: Array) -> Array:
         """Posterior covariance of the noise-free cost between points (m, d) and (k, d): (m, k), in its unit squared."""
@@ -243,94 +229,31 @@ class GaussianProcess:
         return np.asarray(self.scale**2 * (self.covariance_terms.between(theta, first, second) - V.T @ W))
 
 
-@dataclass(frozen=True)
-class NoiseGrowth:
-    """Features of the noise's logarithm: the expected cost, linearly, and its nearness to the middle of its range.
-
-    A pour that certainly spills nothing scatters least, and one that certainly spills all scatters less than one at the
-    threshold. The coefficients cannot be negative: so far, larger noise in the valley always stood for a wall too steep
-    for the kernel.
-
-    Attributes:
-        process: of the cost, fitted with constant noise.
-        low, high: range of its means at the observations.
-    """
-
-    process: GaussianProcess
-    low: float
-    high: float
-
-    def features(self, points: Array) -> Array:
-        """(m, 2) at points (m, dimension), each about −½ … ½."""
-        mean = self.process.predict(points)[0]
-        z = np.clip((mean - self.low) / max(self.high - self.low, 1e-300), 0.0, 1.0) - 0.5
-        return np.stack([z, 0.5 - 4.0 * z * z], axis=1)
-
-
-def with_varying_noise(process: GaussianProcess, costs: Array, prior: HyperPrior, **terms: Any) -> GaussianProcess:
-    """Return the same model with an action-dependent noise if the observations support it; otherwise `process`.
-
-    The noise grows with the mean of `process`, as a plug-in: the first step of Kersting et al. with a parametric noise.
-    Criterion: the log-likelihood must increase by more than the penalty of Schwarz' criterion for the coefficients.
-
-    Args:
-        process: fitted with constant noise.
-        costs: (n,), those of `process`.
-        prior: over the hyperparameters.
-        terms: of `Covariance`, those of `process`.
-
-    Source: Kersting et al., Most likely heteroscedastic Gaussian process regression, ICML 2007; Schwarz, Estimating the
-    dimension of a model, 1978.
-    """
-    count = len(costs)
-    if count < VARYING_FROM:
-        return process
-    means = process.predict(process.points)[0]
-    growth = NoiseGrowth(process, float(means.min()), float(means.max()))
-    features = growth.features(process.points)
-    covariance = Covariance(process.points, prior, growth=features, **terms)
-    start = np.concatenate([process.theta, np.zeros(features.shape[1])])
-    varied = GaussianProcess(
-        costs,
-        covariance,
-        mean=process.mean,
-        scale=process.scale,
-        growth=growth,
-        start=start,
-        estimated_mean=process.estimated_mean,
-    )
-    charge = 0.5 * features.shape[1] * math.log(count)
-    return varied if varied.log_likelihood > process.log_likelihood + charge else process
-
-
 def constant_mean_process(
     points: Array,
     costs: Array,
     *,
-    varying: bool = False,
     prior: HyperPrior = CONSTANT_PRIOR,
 ) -> GaussianProcess:
     """GP whose prior mean is the mean of the data: (n, dimension), (n,)."""
     centre = float(costs.mean())
     mean, scale = _constant(centre), _scale(costs - centre, costs)
-    return _fitted(points, costs, mean, scale, varying, prior, estimated_mean=True)
+    return GaussianProcess(costs, Covariance(points, prior), mean=mean, scale=scale, estimated_mean=True)
 
 
-def zero_mean_process(points: Array, costs: Array, *, varying: bool = False) -> GaussianProcess:
+def zero_mean_process(points: Array, costs: Array) -> GaussianProcess:
     """GP with prior mean zero, as in the paper: unexplored regions are expected to spill nothing.
 
     Limitations: for a cost in [0, 1] that is minimised by a lower confidence bound, it explores corners indefinitely
     and is worse than random search. For replication.
     """
-    return _fitted(points, costs, _constant(0.0), _scale(costs, costs), varying)
+    return GaussianProcess(costs, Covariance(points, CONSTANT_PRIOR), mean=_constant(0.0), scale=_scale(costs, costs))
 
 
 def simulated_mean_process(
     simulated: GaussianProcess,
     points: Array,
     costs: Array,
-    *,
-    varying: bool = False,
 ) -> GaussianProcess:
     """GP of the real cost around a surrogate of the simulated one: f_r = f_s + δ, f_s ~ `simulated`'s posterior.
 
@@ -340,30 +263,8 @@ def simulated_mean_process(
     Source: Lopez-Guevara et al., CoRL 2017, section 3.4 (D3); Kennedy & O'Hagan 2000 with ρ = 1.
     """
     scale = max(simulated.scale, 1e-9)
-    terms: dict[str, Any] = {"known": simulated, "unit": scale}
-    process = _fitted(points, costs, lambda x: simulated.predict(x)[0], scale, varying, RESIDUAL_PRIOR, **terms)
-    return process
-
-
-def _fitted(
-    points: Array,
-    costs: Array,
-    mean: Mean,
-    scale: float,
-    varying: bool,
-    prior: HyperPrior = CONSTANT_PRIOR,
-    *,
-    estimated_mean: bool = False,
-    **terms: Any,
-) -> GaussianProcess:
-    process = GaussianProcess(
-        costs,
-        Covariance(points, prior, **terms),
-        mean=mean,
-        scale=scale,
-        estimated_mean=estimated_mean,
-    )
-    return with_varying_noise(process, costs, prior, **terms) if varying else process
+    covariance = Covariance(points, RESIDUAL_PRIOR, known=simulated, unit=scale)
+    return GaussianProcess(costs, covariance, mean=lambda x: simulated.predict(x)[0], scale=scale)
 
 
 def _of_noise_alone(residuals: Array) -> float:

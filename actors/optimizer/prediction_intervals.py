@@ -69,7 +69,6 @@ def observation_intervals(process: GaussianProcess, points: Array, level: float)
     if process.estimated_mean:
         covariance = covariance.with_uncertain_mean(MEAN_DEVIATION)
     prior_mean = process.mean(points)
-    features = None if process.growth is None else process.growth.features(points)
     log_weights, means, deviations = [], [], []
     for theta, log_ratio in zip(*_proposed(covariance, process.residuals, process.theta), strict=True):
         K, _ = covariance.observed(theta)
@@ -80,11 +79,10 @@ def observation_intervals(process: GaussianProcess, points: Array, level: float)
         cross = covariance.cross(theta, points)
         V = solve_triangular(L, cross.T, lower=True, check_finite=False)
         variance = np.maximum(covariance.variance(theta, points) - np.einsum("ij,ij->j", V, V), 1e-12)
-        growth = 0.0 if features is None else features @ covariance.growth(theta)
         likelihood = -0.5 * float(process.residuals @ alpha) - float(np.log(np.diagonal(L)).sum())
         log_weights.append(likelihood + log_ratio)
         means.append(prior_mean + process.scale * (cross @ alpha))
-        deviations.append(process.scale * np.sqrt(variance + (covariance.value(theta, "noise") * np.exp(growth)) ** 2))
+        deviations.append(process.scale * np.sqrt(variance + covariance.value(theta, "noise") ** 2))
     weights = np.exp(np.array(log_weights) - max(log_weights))
     relevant = weights > NEGLIGIBLE
     mixture = weights[relevant] / weights[relevant].sum(), np.array(means)[relevant], np.array(deviations)[relevant]

@@ -126,8 +126,6 @@ AcquisitionName = Literal["lcb", "posterior_minimum"]
 """'lcb' minimises m(x) − κ s(x). 'posterior_minimum' minimises m(x); further points of the same answer use the
 penalised 'lcb'."""
 
-NoiseName = Literal["constant", "varying"]
-
 
 @dataclass(frozen=True)
 class Data:
@@ -354,7 +352,6 @@ class SurrogateQuery:
         failed: places of real requests that failed during execution, for example because the vessels touched. They are
             among `data` too, with the cost of the failure. Proposals avoid places with a likely failure, and the best
             point is one that is likely to succeed.
-        noise: of real observations: 'constant', or 'varying' with the expected cost if the observations support it.
     """
 
     space: Space
@@ -369,7 +366,6 @@ class SurrogateQuery:
     infeasible: tuple[Point, ...] = ()
     refused: tuple[Point, ...] = ()
     failed: tuple[Point, ...] = ()
-    noise: NoiseName = "constant"
 
     @property
     def context_dimension(self) -> int:

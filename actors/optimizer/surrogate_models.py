@@ -188,7 +188,7 @@ class Model:
 
 def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
     """Fit the surrogate of a query; None with too few observations."""
-    points, costs, varying = arrays.points, arrays.costs, query.noise == "varying"
+    points, costs = arrays.points, arrays.costs
     describes = isinstance(query, MinimumQuery) and not query.replicates
     averages = isinstance(query, PourQuery) and query.discrepancy is not None
     prior = OBLIQUE_PRIOR if describes or averages else CONSTANT_PRIOR
@@ -199,14 +199,14 @@ def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
             return Model(averaged, simulated, simulated.lengths, averaged)
         if not len(points):
             return Model(simulated, simulated, simulated.lengths)
-        process = simulated_mean_process(simulated, points, costs, varying=varying)
+        process = simulated_mean_process(simulated, points, costs)
         return Model(process, process, simulated.lengths)
     if len(points) < 2:
         return None
     if isinstance(query, RegressionQuery | MinimumQuery) and query.mean == "zero":
-        process = zero_mean_process(points, costs, varying=varying)
+        process = zero_mean_process(points, costs)
     else:
-        process = constant_mean_process(points, costs, varying=varying, prior=prior)
+        process = constant_mean_process(points, costs, prior=prior)
     lengths = process.lengths[: query.space.dimension]
     if isinstance(query, RiskQuery):
         return Model(RiskProcess.of(process, query.risk), process, lengths)

@@ -94,8 +94,6 @@ if TYPE_CHECKING:
     from orchestrator.learning.deployment.deployment_ledger import SearchSettings as SearchSettings
     from orchestrator.learning.deployment.objectives import Objective as Objective
     from orchestrator.learning.deployment.objectives import Objectives as Objectives
-    from orchestrator.learning.requests import Answered as Answered
-    from orchestrator.learning.requests import Ask as Ask
     from orchestrator.learning.requests import Decision as Decision
     from orchestrator.learning.requests import Failed as Failed
     from orchestrator.learning.requests import Outcome as Outcome

@@ -28,7 +28,7 @@ Answer = Annotated[
     str | None,
     typer.Option(
         help="With --resume: the outcome of the interrupted pour: 'lost', 'weighed 3.2 0.4' (g spilled, g retained), "
-        "or on the virtual bench 'repeat'. If D3 asks how to continue: 'go on' or 'stop'."
+        "or on the virtual bench 'repeat'."
     ),
 ]
 Laboratory = Annotated[

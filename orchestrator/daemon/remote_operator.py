@@ -182,20 +182,16 @@ class RunQuestions:
 
     async def __call__(self, text: str, options: Sequence[str]) -> str:
         """Ask a question with its options."""
-        unknown = "lost" in options
         question, _, problem = text.partition("\n")
-        details: dict[str, float | str] = {}
-        if unknown:
-            details[LOAD] = 1e3 * self._load
-            details |= await asyncio.to_thread(self._look)
-            before = [q for q in self._store.questions(only_open=False, campaign=self._campaign) if q.text == question]
-            if before and before[0].answer and not problem:
-                details["answered before"] = f"'{before[0].answer}' by {before[0].by}; check whether it was used"
+        details: dict[str, float | str] = {LOAD: 1e3 * self._load, **await asyncio.to_thread(self._look)}
+        before = [q for q in self._store.questions(only_open=False, campaign=self._campaign) if q.text == question]
+        if before and before[0].answer and not problem:
+            details["answered before"] = f"'{before[0].answer}' by {before[0].by}; check whether it was used"
         return await self._asking.ask(
             campaign=self._campaign,
             rig=self._rig,
-            kind="unknown" if unknown else "strategy",
-            about="unknown pour" if unknown else "decision",
+            kind="unknown",
+            about="unknown pour",
             text=question,
             problem=problem,
             wants="option",

@@ -125,12 +125,6 @@ class DeploymentSettings(StrategySettings):
     pours: PourCount | None = None
     """Real pours per receiver."""
 
-    noise: Literal["constant", "varying"] = "constant"
-    """Scatter of a pour: the same for all actions, or varying with the action if at least 20 observations show it."""
-
-    on_failed_pour: Literal["penalise", "ignore"] = "penalise"
-    """How a failed pour enters the data."""
-
     def check(self, premises: Premises, complaints: Problems) -> None:
         """Add a problem for each combination of values that is invalid."""
         if not self.learns_on_pours:

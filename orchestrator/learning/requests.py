@@ -1,7 +1,6 @@
 """Requests of strategies and their outcomes: immutable values without handles and without a clock.
 
-A strategy returns `Simulate`, `Pour`, `Suggest` or `Ask` and receives `Simulated`, `Poured`, `Suggested`, `Answered` or
-`Failed`.
+A strategy returns `Simulate`, `Pour` or `Suggest` and receives `Simulated`, `Poured`, `Suggested` or `Failed`.
 """
 
 from __future__ import annotations
@@ -117,20 +116,7 @@ class Suggest:
     purpose: str = "suggest"
 
 
-@dataclass(frozen=True)
-class Ask:
-    """Ask the operator for a decision. The run pauses; the answer is given on resume, recorded and replayed.
-
-    Attributes:
-        question: includes the facts that the answer depends on.
-        options: allowed answers.
-    """
-
-    question: str
-    options: tuple[str, ...]
-
-
-Request = Simulate | Pour | Suggest | Ask
+Request = Simulate | Pour | Suggest
 
 
 @dataclass(frozen=True)
@@ -155,13 +141,6 @@ class Suggested:
 
 
 @dataclass(frozen=True)
-class Answered:
-    """Outcome of an `Ask`: one of its options."""
-
-    answer: str
-
-
-@dataclass(frozen=True)
 class Failed:
     """A failed request.
 
@@ -177,7 +156,7 @@ class Failed:
     reason: str
 
 
-Outcome = Simulated | Poured | Suggested | Answered | Failed
+Outcome = Simulated | Poured | Suggested | Failed
 
 
 @dataclass(frozen=True)

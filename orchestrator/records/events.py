@@ -292,13 +292,12 @@ class OperatorAsked(JournalEvent):
 
 @dataclass(frozen=True, kw_only=True)
 class OperatorAnswered(JournalEvent):
-    """The operator's answer; `outcome` is that of a strategy's question."""
+    """The operator's answer."""
 
     KIND = Kind.OPERATOR_ANSWERED
 
     id: int
     answer: str
-    outcome: Outcome | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True, kw_only=True)

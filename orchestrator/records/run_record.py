@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from actors.interfaces import PourProgress
-from orchestrator.learning.requests import Ask, Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggested
+from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggested
 from orchestrator.learning.stage_result import displayed_action, weighed_masses
 from orchestrator.learning.strategy import Progress
 from orchestrator.records.codec import Results
@@ -379,8 +379,6 @@ class RunState:
             case Requested(request=Pour()):
                 self._pour(event)
                 stage.pours_asked += 1
-            case Requested(request=Ask(question)):
-                self._ask(event, question)
             case RequestStarted(request=Simulate()):
                 self.running.add(event.id)
                 stage.occupancy.simulation_started(event.time)
@@ -400,7 +398,9 @@ class RunState:
             case PourCorrected():
                 self._pours[event.id].correct(event)
             case OperatorAsked():
-                self._ask(event, event.question)
+                if event.id not in self._questions:
+                    self._questions[event.id] = RecordedQuestion(event.time, event.stage, event.question)
+                    self.questions.append(self._questions[event.id])
             case OperatorAnswered():
                 for known in (self._questions.get(event.id), self._pours.get(event.id)):
                     if known is not None:
@@ -432,12 +432,6 @@ class RunState:
             self._pours[event.id] = RunPour(event.stage, event.id, event.request)
             self.pours.append(self._pours[event.id])
         return self._pours[event.id]
-
-    def _ask(self, event: Requested | OperatorAsked, text: str) -> None:
-        # A strategy's question is written when it is requested and again when it is answered.
-        if event.id not in self._questions:
-            self._questions[event.id] = RecordedQuestion(event.time, event.stage, text)
-            self.questions.append(self._questions[event.id])
 
     def _finished(self, stage: RecordedStage, event: RequestFinished) -> None:
         match event.outcome:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 from actors.balance.readings import KILOGRAMS
 from orchestrator.learning.campaign_plan import CampaignPlan
-from orchestrator.learning.requests import Answered, Ask, Failed, Outcome, Pour, Poured, Request, Slots
+from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import Strategy
@@ -82,10 +82,6 @@ class StageHistory:
         """Pours that had begun and have no outcome."""
         return [key for key in self.pour_attempts if key not in self.outcomes and key not in self.withdrawn]
 
-    def open_questions(self) -> dict[int, Ask]:
-        """Questions to the operator without an answer."""
-        return {key: ask for key, ask in self.requests.items() if isinstance(ask, Ask) and key not in self.outcomes}
-
 
 def read_history(journal: JournalReader, stage: str) -> StageHistory:
     """Read all entries of a stage.
@@ -113,8 +109,6 @@ def read_history(journal: JournalReader, stage: str) -> StageHistory:
             case RequestFinished():
                 history.outcomes[event.id] = event.outcome
                 history.finished.append(event)
-            case OperatorAnswered(outcome=outcome) if outcome is not None:
-                history.outcomes[event.id] = outcome
             case DecisionMade():
                 history.decisions += 1
             case StageClosed():
@@ -242,48 +236,6 @@ async def settle_unknown_pours(
         if outcome is not None:
             events.append(RequestFinished(stage=stage, id=key, request=pour, outcome=outcome, replayed=True))
         journal.append(*events)
-
-
-async def settle_open_questions(
-    journal: Journal,
-    history: StageHistory,
-    stage: str,
-    *,
-    ask: AskOperator | None,
-    on_waiting: Callable[[str], None],
-) -> None:
-    """Ask each question with which a strategy paused the run, and write the answers to the journal.
-
-    Raises:
-        OperatorNeededError: no operator is present, or no valid answer was given.
-    """
-    for key, request in history.open_questions().items():
-        if ask is None:
-            raise needs_answer(request)
-        on_waiting(request.question)
-        text = request.question
-        for _ in range(_TRIES):
-            reply = ask(text, request.options)
-            answer = await reply if inspect.isawaitable(reply) else reply
-            meant = next((o for o in request.options if o.lower() == " ".join(answer.lower().split())), None)
-            if meant is not None:
-                break
-            text = f"{request.question}\n'{answer}' is not an answer; answer with one of: {'; '.join(request.options)}"
-        else:
-            raise needs_answer(request)
-        journal.append(
-            OperatorAsked(stage=stage, id=key, question=request.question, options=request.options),
-            OperatorAnswered(stage=stage, id=key, answer=meant, outcome=Answered(meant)),
-        )
-
-
-def needs_answer(request: Ask) -> OperatorNeededError:
-    """The error that pauses the run; its text explains how to answer."""
-    options = "; ".join(request.options)
-    return OperatorNeededError(
-        f"{request.question} The run is paused. Resume with one of these answers: {options}, for example "
-        f"--answer '{request.options[0]}'"
-    )
 
 
 def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome | None:

@@ -42,7 +42,6 @@ from orchestrator.runs.resume import (
     OperatorNeededError,
     StageHistory,
     read_history,
-    settle_open_questions,
     settle_unknown_pours,
 )
 from orchestrator.runs.run_folder import FIGURES, film_file, write_film, write_provenance
@@ -165,7 +164,7 @@ class _RunEngine:
         self._enter(State.PREPARING, "resumed" if resume else "begun")
         for stage in self._stages:
             history = histories[stage.name]
-            if history.unknown_pours() or history.open_questions():
+            if history.unknown_pours():
                 histories[stage.name] = await self._settle(stage, history)
         async with self._laboratory as laboratory:
             if isinstance(laboratory, Telling):
@@ -278,13 +277,6 @@ class _RunEngine:
             stage.name,
             plan=self._plan,
             scenes=self._scenes,
-            ask=self._ask_operator,
-            on_waiting=lambda question: self._enter(State.WAITING_FOR_OPERATOR, question),
-        )
-        await settle_open_questions(
-            self._journal,
-            history,
-            stage.name,
             ask=self._ask_operator,
             on_waiting=lambda question: self._enter(State.WAITING_FOR_OPERATOR, question),
         )

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from actors.interfaces import PourProgress
-from orchestrator.learning.requests import Ask, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import Strategy
@@ -40,10 +40,10 @@ from orchestrator.records.events import (
 from orchestrator.records.journal import Journal
 from orchestrator.records.journal_file import JournalError
 from orchestrator.runs.request_executor import RequestExecutor
-from orchestrator.runs.resume import StageHistory, needs_answer, replay, weighed_by_hand
+from orchestrator.runs.resume import StageHistory, replay, weighed_by_hand
 from sim_engine.outcome import RecordedFrames
 
-_DELIVERY_ORDER: dict[type[Request], int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
+_DELIVERY_ORDER: dict[type[Request], int] = {Suggest: 0, Simulate: 1, Pour: 2}
 """Order of delivery of pending requests: fast kinds first, so that a free slot does not wait for `ask`."""
 
 
@@ -270,9 +270,6 @@ class StageScheduler:
                     self._journal.log("warning", text, stage=self._stage, kept=True)
 
                 outcome = await self._executor.suggest(request, started=started, retrying=retrying)
-            case Ask():
-                # A question is answered on resume: a display that is redrawn takes no input, and the arm does not wait.
-                raise needs_answer(request)
         self._finish(pending, outcome, time.monotonic() - begin, frames)
 
     def _finish(self, pending: PendingRequest, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:

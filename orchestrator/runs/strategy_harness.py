@@ -24,7 +24,6 @@ import numpy as np
 
 from actors.optimizer.suggest import propose
 from orchestrator.learning.requests import (
-    Ask,
     Failed,
     Outcome,
     Pour,
@@ -153,7 +152,7 @@ class StrategyHarness:
 
     def _next(self, waiting: list[Request]) -> Request:
         """Questions first; a pour takes longer than the simulations next to it."""
-        rank: dict[type, int] = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2}
+        rank: dict[type, int] = {Suggest: 0, Simulate: 1, Pour: 2}
         if self.beside is not None and any(isinstance(r, Pour) for r in waiting):
             self._since_pour += 1
             if self._since_pour > self.beside:
@@ -165,10 +164,6 @@ class StrategyHarness:
     def _outcome(self, request: Request) -> Outcome:
         if isinstance(request, Suggest):
             return Suggested(replace(propose(request.query), seconds=0.0))
-        if isinstance(request, Ask):
-            raise AssertionError(
-                f"the harness has no operator for {request!r}; answer it with StrategyHarness(answer=…)"
-            )
         parameters = request.parameters if isinstance(request, Simulate) else THETA
         spill = self.simulated if isinstance(request, Simulate) else self.real
         error = request.pose_error if isinstance(request, Simulate) else None
@@ -295,7 +290,7 @@ def failures(share: float, seed: int) -> Callable[[Request], Outcome | None]:
     rng, lost = np.random.default_rng(seed), math.nan
 
     def fail(request: Request) -> Outcome | None:
-        if isinstance(request, (Suggest, Ask)) or rng.random() >= share:
+        if isinstance(request, Suggest) or rng.random() >= share:
             return None
         if isinstance(request, Pour):
             return (

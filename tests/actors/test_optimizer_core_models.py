@@ -1,4 +1,4 @@
-"""What the surrogates make of simulations that are right, off, scaled or wrong, and of noise that varies."""
+"""What the surrogates make of simulations that are right, off, scaled or wrong."""
 
 import json
 import math
@@ -54,13 +54,10 @@ def error(answer):
     return float(np.sqrt(np.mean((np.array(answer.predictions) - cup(ASK)) ** 2)))
 
 
-@pytest.mark.parametrize("kind", [{}, {"growth": 1}, {"shear": (0.0, 0.5)}])
+@pytest.mark.parametrize("kind", [{}, {"shear": (0.0, 0.5)}])
 def test_the_likelihoods_gradient_is_that_of_the_likelihood(kind):
     points, costs = points_of(20, 3, 3), np.random.default_rng(4).standard_normal(20)
-    terms = {}
-    if "growth" in kind:
-        terms["growth"] = points_of(20, 5) - 0.5
-    covariance = Covariance(points, HyperPrior(shear=kind.get("shear")), **terms)
+    covariance = Covariance(points, HyperPrior(shear=kind.get("shear")))
     theta = covariance.centre + 0.3 * np.random.default_rng(6).standard_normal(len(covariance.centre))
     numeric = approx_fprime(theta, lambda t: fitting.negative_log_likelihood(covariance, costs, t)[0], 1e-6)
     exact = fitting.negative_log_likelihood(covariance, costs, theta)[1]
@@ -105,47 +102,6 @@ def test_the_best_point_is_one_that_was_poured():
     assert propose(query).best_point in query.data.points
 
 
-# -- noise ---------------------------------------------------------------------------------------------------------
-
-
-def scattered(count, deviation, seed):
-    """Pours that scatter by deviation(cost)."""
-    points = points_of(count, seed)
-    costs = cup(points)
-    return data_of(points, costs + deviation(costs) * np.random.default_rng(seed + 100).standard_normal(count))
-
-
-def test_where_the_pours_show_it_noise_grows_with_what_is_spilled():
-    data = scattered(90, lambda cost: 0.01 + 0.2 * cost, 2)
-    varying = propose(MinimumQuery(PLANE, data, noise="varying", acquisition="posterior_minimum"))
-    constant = propose(MinimumQuery(PLANE, data, acquisition="posterior_minimum"))
-    assert varying.noises[0] < 0.04  # 0.01 in truth, in the valley
-    assert constant.noises[0] > 0.08
-    assert varying.hyperparameters["noise"] < constant.hyperparameters["noise"] * 1.5
-
-
-@pytest.mark.parametrize("deviation", [0.08, 0.005])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_noise_that_is_the_same_everywhere_stays_so(deviation, seed):
-    data = scattered(50, lambda cost: deviation, seed)
-    varying = propose(MinimumQuery(PLANE, data, noise="varying"))
-    constant = propose(MinimumQuery(PLANE, data))
-    assert (varying.points, varying.noises) == (constant.points, constant.noises)
-
-
-def test_a_few_pours_cannot_tell_and_noise_stays_constant():
-    data = scattered(12, lambda cost: 0.01 + 0.3 * cost, 2)
-    assert propose(MinimumQuery(PLANE, data, noise="varying")).points == propose(MinimumQuery(PLANE, data)).points
-
-
-def test_around_simulations_the_pours_noise_may_vary_too():
-    data = scattered(60, lambda cost: 0.01 + 0.3 * cost, 5)
-    simulated = data_of(points_of(30, 9), cup(points_of(30, 9)))
-    query = PourQuery(PLANE, data, simulated=simulated)
-    varying, constant = propose(replace(query, noise="varying")), propose(query)
-    assert varying.best_noise < 0.6 * constant.best_noise
-
-
 # -- travelling ----------------------------------------------------------------------------------------------------
 
 
@@ -156,6 +112,5 @@ def test_a_question_with_everything_in_it_survives_the_journal():
         simulated=data_of(points_of(2, 1), (0.1, 0.2)),
         infeasible=((0.5, 0.6),),
         constraints=(Linear((("x", 1.0), ("y", -2.0)), 0.5),),
-        noise="varying",
     )
     assert from_json(json.loads(canonical(to_json(query, PourQuery))), PourQuery) == query

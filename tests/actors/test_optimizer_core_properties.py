@@ -55,7 +55,6 @@ def questions(draw):
         "infeasible": tuple(draw(st.lists(point, max_size=3))),
         "failed": tuple(draw(st.lists(point, max_size=3))),
         "constraints": constraints,
-        "noise": draw(st.sampled_from(["constant", "varying"])),
     }
     kind = draw(st.sampled_from([MinimumQuery, PourQuery]))
     parts["acquisition"] = draw(st.sampled_from(["lcb", "posterior_minimum"]))
@@ -185,5 +184,5 @@ def test_many_duplicates_and_a_hundred_points_are_no_trouble(dimension):
     points = np.repeat(rng.random((10, dimension)), 10, axis=0)
     data = Data(tuple(map(tuple, points.tolist())), tuple(rng.random(100).tolist()))
     for mean in MEANS:
-        answer = propose(query_with(mean, space, data, data, noise="varying"))
+        answer = propose(query_with(mean, space, data, data))
         assert all(map(math.isfinite, (*answer.means, *answer.deviations)))

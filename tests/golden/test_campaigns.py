@@ -19,7 +19,7 @@ import pytest
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, load_vessel
 from orchestrator.campaigns.fingerprint import deciding, fingerprint
 from orchestrator.learning.campaign_plan import CampaignPlan
-from orchestrator.learning.requests import Ask, Failed, Pour, Request, Simulate, Slots, Suggest
+from orchestrator.learning.requests import Failed, Pour, Request, Simulate, Slots, Suggest
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import Strategy
 from orchestrator.records.codec import encode_request, to_json
@@ -76,7 +76,7 @@ def _stage(strategy: Strategy, slots: int) -> Iterator[dict[str, Any]]:
             assert strategy.finished, "asks for nothing, waits for nothing, is not finished"
             return
         # Questions are answered first. A pour takes as long as three simulations.
-        order = {Suggest: 0, Ask: 0, Simulate: 1, Pour: 2 if asked % 4 else 1}
+        order = {Suggest: 0, Simulate: 1, Pour: 2 if asked % 4 else 1}
         number, request = min(waiting, key=lambda one: (order[type(one[1])], one[0]))
         waiting.remove((number, request))
         outcome = outcome_of(request)

@@ -136,7 +136,6 @@ QUERIES: dict[str, SuggestionQuery] = {
     "lcb, constant mean": replace(PLAIN, count=3, pending=points(2, 7), map_resolution=6),
     "lcb, zero mean, plain": replace(PLAIN, mean="zero", plain=True, kappa=1.5),
     "lcb, simulated mean": INFORMED,
-    "lcb, varying noise": replace(PLAIN, data=data(20, 8), noise="varying"),
     "posterior minimum": replace(PLAIN, acquisition="posterior_minimum", count=2),
     "refusals and failures": replace(PLAIN, infeasible=points(3, 9), refused=points(2, 10), failed=POURED.points[:1]),
     "a constraint": replace(PLAIN, constraints=(Linear((("x_offset", 1.0), ("angular_velocity", 0.05)), 0.17),)),

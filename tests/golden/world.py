@@ -23,8 +23,6 @@ from actors.optimizer.questions import (
     SurrogateMap,
 )
 from orchestrator.learning.requests import (
-    Answered,
-    Ask,
     Failed,
     Outcome,
     Pour,
@@ -68,8 +66,6 @@ def outcome_of(request: Request) -> Outcome:
     match request:
         case Suggest(query):
             return Suggested(answer(query))
-        case Ask():
-            return Answered(request.options[0])
         case Simulate():
             chance = noise("lost", request.seed)
             if chance < LOST:

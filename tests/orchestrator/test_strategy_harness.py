@@ -9,7 +9,7 @@ from typing import Any, Literal
 import pytest
 
 from orchestrator.learning.deployment.d2 import RealOnly
-from orchestrator.learning.requests import Ask, Outcome, Pour, Request, Simulate, Slots
+from orchestrator.learning.requests import Outcome, Pour, Request, Simulate, Slots
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import Progress
 from orchestrator.runs.strategy_harness import (
@@ -185,13 +185,3 @@ def test_a_replay_that_asks_for_something_else_names_both_requests() -> None:
             type("Other", (Simulates,), {"request": lambda self, n: Simulate(SCENE.name, CENTRE, THETA, 100 + n)})(),
             run,
         )
-
-
-def test_a_question_to_the_operator_needs_an_answer() -> None:
-    class Asks(Simulates):
-        def ask(self, slots: Slots) -> list[Request]:
-            self.left, self.open = 0, 1
-            return [Ask("Go on?", ("yes", "no"))]
-
-    with pytest.raises(AssertionError, match=r"no operator for Ask\(.*StrategyHarness\(answer=…\)"):
-        StrategyHarness(narrow_cup).run(Asks())

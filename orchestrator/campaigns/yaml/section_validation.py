@@ -242,6 +242,8 @@ def _bound(number: float) -> str:
 
 
 REMOVED = {
+    "on_failed_pour": "a pour that fails while it is made counts as the worst loss; remove it",
+    "discrepancy_policy": "a simulator that seems wrong is weighted accordingly and reported; remove it",
     "pareto": "the weighted sum of the objectives is minimised; give each a 'weight', and remove it",
     "costs": "simulations run while the arm pours, 'simulations_per_pour' of them; remove it",
 }

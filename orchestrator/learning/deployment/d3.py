@@ -21,7 +21,6 @@ from orchestrator.learning.deployment.deployment_base import MAP_RESOLUTION, Dep
 from orchestrator.learning.deployment.deployment_ledger import SearchSettings
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import (
-    DiscrepancyPolicySettings,
     RiskLimitSettings,
     Rules,
     StopSettings,
@@ -50,9 +49,6 @@ class D3Settings(SearchSettings):
     model: Literal["adaptive", "residual"] = "adaptive"
     """How simulations enter the surrogate of pours; 'adaptive' averages over ways in which the simulator may be wrong,
     'residual' is the paper's, which always believes it."""
-
-    discrepancy_policy: DiscrepancyPolicySettings | None = None
-    """With 'model: adaptive': what follows when the simulator seems not to describe this bench."""
 
     risk_limit: RiskLimitSettings | None = None
     """With 'model: adaptive': what no pour may lose, once one has kept it."""
@@ -93,7 +89,7 @@ class D3Settings(SearchSettings):
     def check(self, premises: Premises, complaints: Problems) -> None:
         """Check that each key belongs to the selected model."""
         super().check(premises, complaints)
-        for key in () if self.adaptive else ("discrepancy_policy", "risk_limit", "stop", "good_enough"):
+        for key in () if self.adaptive else ("risk_limit", "stop", "good_enough"):
             if getattr(self, key) is not None:
                 complaints.add(f"needs 'model: adaptive', not '{self.model}'", key, key=True)
 
@@ -109,7 +105,6 @@ class D3Settings(SearchSettings):
             return None
         limit = None if self.risk_limit is None else Limit(worst * self.risk_limit.loss, self.risk_limit.probability)
         return Rules(
-            discrepancy_policy=self.discrepancy_policy or DiscrepancyPolicySettings(),
             limit=limit,
             fallback="go on" if self.risk_limit is None else self.risk_limit.fallback,
             min_gain=None if self.stop is None else worst * self.stop.min_gain,
@@ -154,7 +149,7 @@ class Hybrid(Deployment[D3Settings]):
         super().__init__(plan, scene, parameters, seed)
         simulated = partial(self._ledger.simulated, everything=True)
         rules = self._settings.rules(self._ledger.costing.worst)
-        self._choice = PourChoice(self._requests, simulated, rules, self._ask_operator)
+        self._choice = PourChoice(self._requests, simulated, rules)
         self._before = self._settings.prior_simulations
         self._found_at: int | None = None
 

@@ -18,8 +18,6 @@ from orchestrator.learning.deployment.deployment_result import Deployed, Recomme
 from orchestrator.learning.deployment.model_monitoring import Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck, expecting, scaled_interval, trust
 from orchestrator.learning.requests import (
-    Answered,
-    Ask,
     Decision,
     Outcome,
     Pour,
@@ -141,8 +139,6 @@ class Deployment(ABC, Generic[S]):
         self._width_known = False
         self._queued_pour: Pour | None = None
         self._pouring: Pour | None = None
-        self._unasked: tuple[Ask, Callable[[str], None]] | None = None
-        self._asked: tuple[Ask, Callable[[str], None]] | None = None
         self._finished = False
         self.decisions: list[Decision] = self._ledger.decisions
         if plan.memory is not None:
@@ -156,13 +152,7 @@ class Deployment(ABC, Generic[S]):
         return self._finished and self._pouring is None and self._trials.idle
 
     def ask(self, slots: Slots) -> list[Request]:
-        """Return the queued requests, and the next query as soon as the data it depends on is complete; nothing while
-        the operator has to decide."""
-        if self._unasked is not None:
-            self._asked, self._unasked = self._unasked, None
-            return [self._asked[0]]
-        if self._asked is not None:
-            return []
+        """Return the queued requests, and the next query as soon as the data it depends on is complete."""
         if not self._width_known and slots.simulations > 0:
             self._trials.width, self._width_known = slots.simulations, True
         simulations = self._trials.issue(slots.simulations)
@@ -181,16 +171,11 @@ class Deployment(ABC, Generic[S]):
         return [self._pouring]
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """Record the outcome of a query, a simulation or a pour, or the operator's answer."""
+        """Record the outcome of a query, a simulation or a pour."""
         if isinstance(request, Suggest):
             self._questions.answer(request, outcome)
         elif isinstance(request, Simulate):
             self._ledger.settle(request, outcome)
-        elif isinstance(request, Ask):
-            if self._asked is None or request != self._asked[0] or not isinstance(outcome, Answered):
-                raise ValueError(f"this was not asked, or not answered: {request.question}")
-            then, self._asked = self._asked[1], None
-            then(outcome.answer)
         elif request == self._pouring:
             self._pouring = None
             self._ledger.take(outcome)
@@ -245,10 +230,6 @@ class Deployment(ABC, Generic[S]):
             elif band is not None:  # averaged over hyperparameters; the largest loss is unknown there
                 known = replace(known, band=(min(band[0], worst), min(band[1], worst)))
         self._pour(suggestion.points[0], known)
-
-    def _ask_operator(self, question: Ask, then: Callable[[str], None]) -> None:
-        """Queue a question to the operator, with the function that takes the answer."""
-        self._unasked = (question, then)
 
     def _conclude(self, suggestion: Suggestion) -> None:
         self._report.final = suggestion

@@ -52,7 +52,7 @@ class DeploymentLedger:
     """Trials and pours of a deployment in one scene.
 
     A refusal does not count against a budget; at most `MAX_REFUSED` are free. A pour that failed after something had
-    moved counts, and enters the data with the worst cost (`on_failed_pour: penalise`) or not at all (`ignore`).
+    moved counts, and enters the data with the worst cost.
 
     Attributes:
         plan, scene: what is poured, and where.
@@ -113,7 +113,7 @@ class DeploymentLedger:
         self._settle(known[-1], outcome)
 
     def _settle(self, trial: PourTrial, outcome: Outcome) -> None:
-        trial.take(outcome, self.scene, self.costing, penalised=self.plan.settings.on_failed_pour == "penalise")
+        trial.take(outcome, self.scene, self.costing, penalised=True)
         if trial.status == "weighed" and trial.cost is not None:
             self.decisions.append(Decision(f"pour {trial.number}: loss {trial.cost:.4g}", {"loss": trial.cost}))
 
@@ -231,7 +231,7 @@ class DeploymentRequests:
         settings = self._plan.settings
         if isinstance(settings, SearchSettings):
             parts["kappa"] = settings.kappa
-        return kind(self._plan.actions, data, noise=settings.noise, **self._limits(everything), **parts)
+        return kind(self._plan.actions, data, **self._limits(everything), **parts)
 
     def space_filling(self, **parts: Any) -> SpaceFillingQuery:
         """A query for points that fill the space of actions."""

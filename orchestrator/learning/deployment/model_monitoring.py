@@ -2,7 +2,6 @@
 
 - `SimulatorMonitor` records the optimiser's conclusions after every pour and decides whether the next pour is made.
 - `offset_priors` and `displacement` describe how a bench may deviate from its simulator.
-- `subsampled` selects the observations that a query carries.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Annotated, Final, Literal
 
 from actors.optimizer.questions import BenchOffset, DiscrepancyFound, Limit, OffsetPrior, Suggestion
 from orchestrator.learning.deployment.real_pours import PourTrial
-from orchestrator.learning.requests import Ask, Decision
+from orchestrator.learning.requests import Decision
 from orchestrator.learning.stage_result import ResultPart
 from sim_engine.action import ACTION_DIMENSIONS, DEG
 from sim_engine.liquids import SimulationParameters
@@ -22,11 +21,12 @@ from sim_engine.search_space import Axis, Space
 from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 
-Fallback = Literal["ask", "go on", "stop"]
+Fallback = Literal["go on", "stop"]
 
 GO_ON: Final = "go on"
-STOP: Final = "stop"
-OPTIONS = (GO_ON, STOP)
+
+ALARM = 0.9
+"""Probability of an uninformative simulator from which an alarm is raised."""
 
 DOUBT = 0.3
 """Probability of an uninformative simulator from which it is in doubt."""
@@ -40,17 +40,6 @@ WORDS = (
 """Description of the simulator below each probability of being uninformative; above all, it is wrong here."""
 
 
-class DiscrepancyPolicySettings(Settings):
-    """D3 with `model: adaptive`: what follows when the simulator seems not to describe this bench."""
-
-    limit: Annotated[float, Quantity("1", "90 %", 0.1, 1.0)] = 0.9
-    """Probability that it does not describe this bench, from which the policy follows."""
-
-    policy: Fallback = GO_ON
-    """go on: its predictions are weighted accordingly; stop: the deployment ends; ask: the campaign pauses with a
-    question."""
-
-
 class RiskLimitSettings(Settings):
     """D3 with `model: adaptive`: what no pour may lose, once one has kept it."""
 
@@ -62,7 +51,7 @@ class RiskLimitSettings(Settings):
 
     fallback: Fallback = GO_ON
     """Where no action keeps it, which is logged before the pour. go on: the least risky one is poured; stop: the
-    deployment ends; ask: the campaign pauses with a question."""
+    deployment ends."""
 
 
 class StopSettings(Settings):
@@ -107,17 +96,8 @@ class Believed(ResultPart):
     factor: float
     """Ratio of real to simulated loss."""
 
-    limit: float
-    """Probability of an uninformative simulator from which the policy applies."""
-
-    policy: str
-    """The policy."""
-
-    followed: str | None
-    """The applied policy; None below the limit."""
-
     alarm: bool
-    """Whether the probability is at or above the limit."""
+    """Whether the simulator seems not to describe this bench: a probability of 90 % or more."""
 
     changed_since: int | None = None
     """Number of the first pour since which the bench has behaved differently; None if it has not."""
@@ -144,25 +124,9 @@ class BenchFound(ResultPart):
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Consequence of an answer before its pour is made.
-
-    Attributes:
-        ask: question to the operator; None: no question.
-        end: reason why no pour follows; empty if one does.
-        limit: whether it concerns the limit of a pour's loss.
-    """
-
-    ask: Ask | None = None
-    end: str = ""
-    limit: bool = False
-
-
-@dataclass(frozen=True)
 class Rules:
     """Rules from the settings; losses in their own unit."""
 
-    discrepancy_policy: DiscrepancyPolicySettings
     limit: Limit | None
     fallback: Fallback
     min_gain: float | None
@@ -176,9 +140,8 @@ class SimulatorMonitor:
         self._rules, self._actions, self._worst = rules, actions, worst
         self._after: list[Belief] = []
         self._latest: DiscrepancyFound | None = None
-        self._followed: str | None = None
         self._changed: int | None = None
-        self._accepted = False
+        self._alarmed = self._accepted = False
         self.decisions: list[Decision] = []
 
     # -- what is logged --------------------------------------------------------------------------------------------
@@ -228,8 +191,8 @@ class SimulatorMonitor:
 
     # -- decisions ----------------------------------------------------------------------------------------------
 
-    def judge(self, suggestion: Suggestion, pours: Sequence[PourTrial], left: int) -> Verdict:
-        """Decide whether the proposed pour is made.
+    def judge(self, suggestion: Suggestion, pours: Sequence[PourTrial], left: int) -> str:
+        """Decide whether the proposed pour is made: the reason why no pour follows, or an empty text.
 
         Args:
             suggestion: the answer that proposes it.
@@ -238,7 +201,7 @@ class SimulatorMonitor:
         """
         found, rules = suggestion.discrepancy, self._rules
         if found is None:
-            return Verdict()
+            return ""
         weighed = [pour.cost for pour in pours if pour.status == "weighed" and pour.cost is not None]
         if weighed and suggestion.best_mean is not None:
             best = max(suggestion.best_mean, 0.0)
@@ -247,48 +210,32 @@ class SimulatorMonitor:
             if rules.min_gain is not None and found.gain is not None and found.gain < rules.min_gain:
                 why = f"no further pour is worthwhile: the next one is expected to save {self._share(found.gain)}"
                 return self._saved(left, f"{why}, the best action to lose {self._share(best)}")
-        if found.uninformative >= rules.discrepancy_policy.limit and self._followed is None and weighed:
-            return self._by(rules.discrepancy_policy.policy, self.text, "the simulator is weighted accordingly")
+        if found.uninformative >= ALARM and not self._alarmed and weighed:
+            self._alarmed = True
+            self.decisions.append(Decision(f"{self.text}; the simulator is weighted accordingly", urgent=True))
+            return ""
         limit = rules.limit
         if limit is None or not any(cost <= limit.loss for cost in weighed) or not found.exceedances:
-            return Verdict()
+            return ""
         risk = found.exceedances[0]
         if risk <= limit.probability * (1.0 + 1e-9):
-            return Verdict()
+            return ""
         why = (
             f"no action is known to keep the limit: the least risky one loses more than {self._share(limit.loss)} "
             f"with {_percent(risk)}, allowed are {_percent(limit.probability)}"
         )
         if self._accepted:
             self.decisions.append(Decision(f"{why}; it is poured", {"risk": risk}, urgent=True))
-            return Verdict()
-        return self._by(rules.fallback, why, "the least risky action is poured", limit=True)
+            return ""
+        self._accepted = rules.fallback == GO_ON
+        then = "the least risky action is poured" if self._accepted else "this deployment ends with what is known"
+        self.decisions.append(Decision(f"{why}; {then}", urgent=True))
+        return "" if self._accepted else why
 
-    def answer(self, answer: str, *, limit: bool) -> str:
-        """Record the operator's answer; return the reason to end, or an empty text."""
-        if limit:
-            self._accepted = answer == GO_ON
-        else:
-            self._followed = answer
-        self.decisions.append(Decision(f"the operator decided: {answer}", urgent=True))
-        return "the operator decided to stop" if answer == STOP else ""
-
-    def _by(self, policy: Fallback, why: str, then: str, *, limit: bool = False) -> Verdict:
-        if policy == "ask":
-            meaning = f"{GO_ON}: {then}; {STOP}: this deployment ends with what is known"
-            return Verdict(Ask(f"{why[0].upper()}{why[1:]}. How to go on? {meaning}.", OPTIONS), limit=limit)
-        if limit:
-            self._accepted = policy == GO_ON
-        else:
-            self._followed = policy
-        what = then if policy == GO_ON else "this deployment ends with what is known"
-        self.decisions.append(Decision(f"{why}; {what}", urgent=True))
-        return Verdict() if policy == GO_ON else Verdict(end=why)
-
-    def _saved(self, left: int, why: str) -> Verdict:
+    def _saved(self, left: int, why: str) -> str:
         end = f"{why}; {left} pour{'s' * (left != 1)} saved"
         self.decisions.append(Decision(f"stopped: {end}", {"saved": float(left)}, urgent=True))
-        return Verdict(end=end)
+        return end
 
     def _share(self, loss: float) -> str:
         return _percent(loss / self._worst)
@@ -303,10 +250,7 @@ class SimulatorMonitor:
             after=tuple(self._after),
             displaced=displaced,
             factor=1.0 if self._latest is None else self._latest.factor,
-            limit=self._rules.discrepancy_policy.limit,
-            policy=self._rules.discrepancy_policy.policy,
-            followed=self._followed,
-            alarm=share >= self._rules.discrepancy_policy.limit,
+            alarm=share >= ALARM,
             changed_since=self._changed,
             text=self.text,
         )

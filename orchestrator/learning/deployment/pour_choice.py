@@ -13,7 +13,6 @@ from orchestrator.learning.deployment.deployment_base import DeploymentReport
 from orchestrator.learning.deployment.deployment_ledger import DeploymentRequests
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import Rules, SimulatorMonitor, offset_priors
-from orchestrator.learning.requests import Ask
 
 
 class PourChoice:
@@ -22,7 +21,6 @@ class PourChoice:
     Args:
         simulated: observations of the simulated cost for a query.
         rules: consequences of answers about the simulator; None with the paper's model, which always believes it.
-        ask_operator: queues a question to the operator, with the function that takes the answer.
 
     Attributes:
         ended: reason why no further pour is made; None if they go on.
@@ -33,10 +31,9 @@ class PourChoice:
         requests: DeploymentRequests,
         simulated: Callable[[], Data],
         rules: Rules | None,
-        ask_operator: Callable[[Ask, Callable[[str], None]], None],
     ) -> None:
         self._requests, self._ledger, self._plan = requests, requests.ledger, requests.ledger.plan
-        self._simulated, self._rules, self._ask_operator = simulated, rules, ask_operator
+        self._simulated, self._rules = simulated, rules
         worst = self._ledger.costing.worst
         self._monitor = None if rules is None else SimulatorMonitor(rules, self._plan.actions, worst)
         self.ended: str | None = None
@@ -91,21 +88,10 @@ class PourChoice:
             pour(suggestion)
             return
         self.record(suggestion)
-        verdict = monitor.judge(suggestion, self._ledger.pours, self._plan.pours - self._ledger.counted)
+        end = monitor.judge(suggestion, self._ledger.pours, self._plan.pours - self._ledger.counted)
         self._take_decisions(monitor)
-        if verdict.ask is not None:
-
-            def answered(answer: str) -> None:
-                end = monitor.answer(answer, limit=verdict.limit)
-                self._take_decisions(monitor)
-                if end:
-                    self.ended = end
-                else:
-                    self.judge(suggestion, pour)
-
-            self._ask_operator(verdict.ask, answered)
-        elif verdict.end:
-            self.ended = verdict.end  # conclude with the data so far
+        if end:
+            self.ended = end  # conclude with the data so far
         else:
             pour(suggestion)
 

@@ -280,8 +280,6 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           simulations_per_pour: 3
           kappa: 3
           initial_samples: 4
-          on_failed_pour: ignore
-          noise: varying
         on_unknown: repeat
         parallel_simulations: 5
         outputs: {{directory: here, recording: false, figures: false, frame_rate: 4 1/s, recorded_simulations: 2,
@@ -339,8 +337,6 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
         simulations_per_pour=3,
         kappa=3.0,
         initial_samples=4,
-        on_failed_pour="ignore",
-        noise="varying",
     )
     (tmp_path / "again.json").write_text(json.dumps(plan.resolved))
     again = load_campaign(tmp_path / "again.json")

@@ -151,19 +151,18 @@ def test_failed_simulations_and_pours_never_poison_a_fit():
         assert all(math.isfinite(c) and c <= 1.0 for c in costs)
 
 
-@pytest.mark.parametrize(("policy", "entered"), [("penalise", 1.0), ("ignore", None)])
-def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
+def test_a_failed_pour_counts_and_enters_the_data_as_the_worst():
     def second_fails(request):
         lost = isinstance(request, Pour) and request.number == 2
         return Failed("pour_failed", "the operator knocked the cup over") if lost else None
 
-    strategy = make("D2", pours=4, on_failed_pour=policy)
+    strategy = make("D2", pours=4)
     played = StrategyHarness(narrow_cup, answer=second_fails).run(strategy)
     assert [r.number for r in played.pours] == [1, 2, 3, 4]
     final = [r for r in played.asked if isinstance(r, Suggest)][-1].query
-    assert len(final.data) == (4 if entered else 3)
+    assert len(final.data) == 4
     row = strategy.result().pours[1]
-    assert (row.status, row.loss) == ("failed", entered)
+    assert (row.status, row.loss) == ("failed", 1.0)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +171,6 @@ def test_a_failed_pour_counts_and_enters_the_data_as_told(policy, entered):
         ("D2", {}, True),
         ("D3", {"model": "adaptive"}, True),
         ("D3", {"model": "residual"}, False),
-        ("D2", {"on_failed_pour": "ignore"}, False),
     ],
 )
 def test_a_pour_that_went_wrong_is_a_warning_of_more_near_it_but_not_in_the_paper(name, changes, warns):

@@ -120,7 +120,6 @@ def make(name: str, dimension: int) -> Any:
             iterations=6,
             prior_simulations=7,
             simulations_per_pour=1,
-            noise="varying",
             model="residual",
         )
         return KINDS[name](deployment, SCENE, THETA, 5)
