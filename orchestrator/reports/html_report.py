@@ -33,10 +33,10 @@ LARGEST_VECTOR = 1_500_000
 
 _THETA_FIGURES = ("discrepancy", "posterior", "test discrepancy")
 
-_FIRST_FIGURES = ("recommended pour", "spillage", "loss map")
+_FIRST_FIGURES = ("recommended pour", "loss against pours", "loss map")
 """Figures at the top of the page, in this order."""
 
-_NARROW = ("test discrepancy", "spillage", "loss map", "uncertainty", "posterior")
+_NARROW = ("test discrepancy", "loss", "uncertainty", "posterior")
 """Figures that can be placed next to each other."""
 
 _FIGURES: dict[str, tuple[str, str]] = {
@@ -58,7 +58,7 @@ _FIGURES: dict[str, tuple[str, str]] = {
         "regressions, on pours used for calibration and on others.",
         "Gain of calibration: θ* and its rivals, on the pours of the calibration and on others.",
     ),
-    "spillage": (
+    "loss against pours": (
         "Loss of every pour in the order made, with its prediction and the best so far.",
         "Loss of every pour (dots), its prediction (bars: nine in ten lie inside), and the best so far (line).",
     ),

@@ -1,7 +1,7 @@
 """The figures of a run: the choice of figures for its results, and those of losses and discrepancies.
 
 - `draw_figures` writes all figures into a folder; `figures_of` returns them for notebooks.
-- `draw_spillage` and `draw_discrepancy` draw losses against pours, and θ* next to its rivals.
+- `draw_losses` and `draw_discrepancy` draw losses against pours, and θ* next to its rivals.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def draw_figures(
 ) -> dict[str, Path]:
     """Draw all figures that the results allow.
 
-    These are the discrepancy map and its trials, the test discrepancy, spillage against pours, loss maps, safe windows,
+    These are the discrepancy map and its trials, the test discrepancy, loss against pours, loss maps, safe windows,
     and the comparison of the first pours with simulations. With more than two searched axes, a map shows the two most
     important ones, and the trials against every axis are a separate figure.
 
@@ -115,7 +115,7 @@ def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = Non
     unit = deployment_unit(plan.deployment)
     if series := pour_series(plan, results, unit):
         title = f"Loss of every pour: {plan.name}"
-        found["spillage against pours"] = partial(draw_spillage, series, cost=unit.label, title=title)
+        found["loss against pours"] = partial(draw_losses, series, cost=unit.label, title=title)
     for scene, result in deployments_of(results).items():
         picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
         if picture is not None:
@@ -212,7 +212,7 @@ def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture
 
 
 def pour_series(plan: CampaignPlan, results: Results, unit: LossUnit) -> list[PourSeries]:
-    """Pours by receiver, for `draw_spillage`; refused ones (nothing was poured) are left out."""
+    """Pours by receiver, for `draw_losses`; refused ones (nothing was poured) are left out."""
     series = []
     for scene, result in deployments_of(results).items():
         pours = [pour for pour in result.pours if pour.status in ("weighed", "failed")]
@@ -283,7 +283,7 @@ class PourSeries:
         return running
 
 
-def draw_spillage(series: Sequence[PourSeries], *, cost: str, title: str) -> Figure:
+def draw_losses(series: Sequence[PourSeries], *, cost: str, title: str) -> Figure:
     """Loss against pours, one panel for each receiver: measured, best so far, and prediction interval.
 
     Args:
@@ -295,7 +295,7 @@ def draw_spillage(series: Sequence[PourSeries], *, cost: str, title: str) -> Fig
         ValueError: no receiver, or a receiver without pours.
     """
     if not series or not all(len(s.losses) for s in series):
-        raise ValueError("spillage against pours: no pours to draw")
+        raise ValueError("loss against pours: no pours to draw")
     columns = min(len(series), 3)
     rows = -(-len(series) // columns)
     figure, axes = style.new_figure(

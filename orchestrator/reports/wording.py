@@ -151,7 +151,7 @@ def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> lis
     if row.risk is not None:
         said.append(_sentence(risk_line(row.risk, unit)))
     if row.ended:
-        said.append(f"The search ended: {row.ended.rstrip('.')}.")
+        said.append(f"The search stopped: {row.ended.rstrip('.')}.")
     if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
         said.append(_sentence(trust))
     return said

@@ -25,7 +25,7 @@ from orchestrator.reports.run_figures import (
     discrepancy_groups,
     draw_discrepancy,
     draw_figures,
-    draw_spillage,
+    draw_losses,
     pour_series,
 )
 from orchestrator.reports.stage_views import evaluation_of
@@ -45,7 +45,7 @@ def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], t
         "discrepancy map",
         "test discrepancy",
         "posterior",
-        "spillage against pours",
+        "loss against pours",
         "loss map narrow",
         "uncertainty of the loss narrow",
     }
@@ -56,18 +56,18 @@ def test_run_gets_every_figure_that_its_results_allow(results: dict[str, Any], t
 def test_unfinished_run_gets_the_figures_it_can(results: dict[str, Any], tmp_path: Path) -> None:
     assert draw_figures(tmp_path, example_run.campaign(), {}) == {}
     only_pours = draw_figures(tmp_path, example_run.campaign(), {"narrow cup": results["narrow cup"]})
-    assert set(only_pours) == {"spillage against pours", "loss map narrow", "uncertainty of the loss narrow"}
+    assert set(only_pours) == {"loss against pours", "loss map narrow", "uncertainty of the loss narrow"}
 
 
 @pytest.mark.slow
 def test_a_figure_that_fails_does_not_take_the_others_with_it(
     results: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / "spillage-against-pours.png").mkdir()
+    (tmp_path / "loss-against-pours.png").mkdir()
     drawn = draw_figures(tmp_path, example_run.campaign(), results)
-    assert "spillage against pours" not in drawn
+    assert "loss against pours" not in drawn
     assert len(drawn) == 5
-    assert "figure 'spillage against pours' was not drawn" in caplog.text
+    assert "figure 'loss against pours' was not drawn" in caplog.text
 
 
 def test_discrepancy_map_shows_every_useful_trial_and_theta_in_percent(results: dict[str, Any]) -> None:
@@ -213,7 +213,7 @@ def test_nothing_to_draw_is_said_not_drawn(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="neither a surrogate nor a single observation"):
         draw_surrogate(SurrogatePicture("θ", "|Δ| [%]", example_run.THETA, [], []))
     with pytest.raises(ValueError, match="no pours"):
-        draw_spillage([], cost="loss [%]", title="")
+        draw_losses([], cost="loss [%]", title="")
     with pytest.raises(ValueError, match="no set of pours"):
         draw_discrepancy([], title="")
     assert not list(tmp_path.iterdir())
@@ -236,13 +236,13 @@ def test_clueless_first_prediction_does_not_squeeze_the_measured_pours(
 
     monkeypatch.setattr(figures_module, "_pour_panel", watching)
     series = PourSeries("cup", [10.0, 5.0, 2.0], [(50.0, 0.0, 850.0), (6.0, 4.0, 8.0), (2.0, 0.0, 4.0)])
-    assert is_picture(style.save(draw_spillage([series], cost="loss [%]", title=""), tmp_path / "spillage.png"))
+    assert is_picture(style.save(draw_losses([series], cost="loss [%]", title=""), tmp_path / "spillage.png"))
     assert tops == [20.0]
 
 
 def test_receivers_and_predictors_that_are_missing_leave_room_not_errors(tmp_path: Path) -> None:
     failed = PourSeries("cup", [None, None], [None, None])
-    assert is_picture(style.save(draw_spillage([failed], cost="loss [%]", title="all failed"), tmp_path / "failed.png"))
+    assert is_picture(style.save(draw_losses([failed], cost="loss [%]", title="all failed"), tmp_path / "failed.png"))
     alone = DiscrepancyGroup("another receiver", 1, 0.05)
     assert is_picture(style.save(draw_discrepancy([alone], title="θ* alone"), tmp_path / "alone.png"))
 

@@ -150,7 +150,7 @@ def test_ranges_of_theta_have_the_unit_of_their_value(made: Made) -> None:
 
 def test_pictures_come_first_and_parameters_that_were_not_searched_in_one_line(made: Made) -> None:
     first = made.page[: made.page.index("<h2>Summary</h2>")]
-    assert re.findall(r'alt="(\w+ \w+)', first) == ["recommended pour", "spillage against", "loss map"]
+    assert re.findall(r'alt="(\w+ \w+)', first) == ["recommended pour", "loss against", "loss map"]
     shown = texts(made.page)
     table = shown[shown.index("θ* with its region") : shown.index("Not searched: ")]
     assert "not searched" not in table

@@ -43,7 +43,7 @@ BUSY = PoolUse(
 def test_summary_tells_theta_discrepancies_losses_actions_and_files(results: dict[str, Any], tmp_path: Path) -> None:
     plan = example_run.campaign()
     results = {**results, "evaluation": changed(results["evaluation"], mean_predictor={"test": 0.1234})}
-    figures = {"spillage against pours": tmp_path / "spillage.png"}
+    figures = {"loss against pours": tmp_path / "spillage.png"}
     summary = summarise(
         plan,
         results,
