@@ -267,17 +267,19 @@ def parse_quantity(value: Any, unit: str, example: str) -> float:
     text = match[2] if match else ""
     if not math.isfinite(number):
         raise QuantityError(f"{value} is not finite; should be {kind}, for example '{example}'")
+    typed, written = split_typed(str(value))
+    if match and len(typed) > len(match[1]) and (readings := number_readings(typed)):
+        corrected = " or ".join(repr(f"{reading} {written or preferred}".strip()) for reading in readings)
+        doubt = (
+            "has two meanings" if len(readings) > 1 else f"has {'a decimal comma' if ',' in typed else 'separators'}"
+        )
+        raise QuantityError(f"{value!r} {doubt}; write {corrected}")
     if unit == "1" and not text:
         return number
     if not text:
         raise QuantityError(f"{value} has no unit; write '{value} {preferred}' if that is what is meant")
     if text == unit:
         return number
-    typed, written = split_typed(str(value))
-    if readings := number_readings(typed) if "," in typed else ():
-        corrected = " or ".join(f"'{reading} {written}'" for reading in readings)
-        doubt = "has a decimal comma" if len(readings) == 1 else "has two meanings"
-        raise QuantityError(f"{value!r} {doubt}; write {corrected}")
     return _converted(number, text, repr(value), unit, example)
 
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+import re
+from decimal import Decimal
 from pathlib import Path
 
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from orchestrator.campaigns.action_assignments import assigned_action, set_action
 from orchestrator.campaigns.file_loading import load_campaign, load_parameters
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
-from sim_engine.settings.quantity import QuantityError, format_quantity, parse_quantity
+from sim_engine.settings.quantity import QuantityError, format_quantity, parse_quantity, typed_number, typed_quantity
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -54,6 +58,77 @@ def test_an_ounce_is_a_mass_and_a_fluid_ounce_a_volume() -> None:
         parse_quantity("8 fl oz", "kg", "200 g")
     with pytest.raises(QuantityError, match="unknown unit 'OZ'; did you mean 'oz'"):
         parse_quantity("8 OZ", "kg", "200 g")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("12,5 g", "'12,5 g' has a decimal comma; write '12.5 g'"),
+        ("12,5", "'12,5' has a decimal comma; write '12.5 g'"),
+        ("1,234 g", "'1,234 g' has two meanings; write '1.234 g' or '1234 g'"),
+        ("1.234,5 g", "'1.234,5 g' has a decimal comma; write '1234.5 g'"),
+        ("1 234 g", "'1 234 g' has separators; write '1234 g'"),
+    ],
+)
+def test_a_file_has_decimal_points_and_no_separators(text: str, said: str) -> None:
+    with pytest.raises(QuantityError) as refusal:
+        parse_quantity(text, "kg", "200 g")
+    assert str(refusal.value) == said
+    assert parse_quantity("1.234 kg", "kg", "200 g") == 1.234
+    assert parse_quantity("1_000 g", "kg", "200 g") == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("65,5 g", 0.0655),  # LiamMorrow/LiftLog#518 took 65
+        ("93,5 g", 0.0935),  # oliexdev/openScale#589 took 935
+        ("1,23 kg", 1.23),  # ing-bank/lion#1731 took 123
+        ("1.000.000 mg", 1.0),  # ambassify/parse-js#42 took 1000
+        ("1,000,000 mg", 1.0),
+        ("- 5 g", -0.005),
+        ("1.971,13 g", 1.97113),
+    ],
+)
+def test_a_typed_quantity_means(text: str, value: float) -> None:
+    assert typed_quantity(text, "kg", "200 g") == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1.234 g", "'1.234 g' may be 1.234 g or 1234 g"),  # dm4t2/vue-currency-input#102 took the first in Germany
+        ("145.1.4.2,4.124 g", "is not a number"),  # foodcoopshop/foodcoopshop#540 left out all points
+        ("1,23,456 g", "is not a number"),
+        ("21 kg", "is too much"),
+        ("about 5 g", "is not a quantity"),
+        ("5 mm", "is a length"),
+    ],
+)
+def test_a_typed_quantity_that_could_be_misread_is_refused(text: str, said: str) -> None:
+    with pytest.raises(QuantityError, match=said):
+        typed_quantity(text, "kg", "200 g")
+
+
+@given(
+    number=st.decimals(0, 10**7, places=None, allow_nan=False, allow_infinity=False),
+    places=st.integers(0, 5),
+    groups=st.sampled_from(["", ",", ".", " ", "'", "\u202f"]),
+    comma=st.booleans(),
+)
+def test_a_number_is_read_as_it_was_meant_or_refused_in_every_country(
+    number: Decimal, places: int, groups: str, comma: bool
+) -> None:
+    sign = "," if comma else "."
+    assume(groups != sign)
+    whole, _, decimals = f"{number:,.{places}f}".partition(".")
+    text = whole.replace(",", groups) + (sign + decimals if decimals else "")
+    meant = Decimal(f"{number:.{places}f}")
+    try:
+        readings = [typed_number(text)]
+    except QuantityError as error:
+        readings = [Decimal(reading) for reading in re.findall(r"'([0-9.]+)'", str(error).partition("; type ")[2])]
+    assert meant in readings
 
 
 def test_formatted_quantity_reads_back_to_the_same_float() -> None:
