@@ -27,6 +27,7 @@ from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.section_validation import validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report, wrong_kind
+from orchestrator.recordings.recording_checks import impossible
 from orchestrator.recordings.time_series import TimeSeries, gaps, read_series, write_series
 from sim_engine.action import ACTION_DIMENSIONS, Dimension
 from sim_engine.liquids import Liquid, LiquidSettings
@@ -327,6 +328,8 @@ def _checked(path: Path, section: RecordingFile, scene: Scene, series: TimeSerie
         zero,
     )
     errors, unusual = _masses(recording, series, poured.lines)
+    grip = section.placement.grip
+    errors = errors or impossible(scene, series, tilt, poured, zero, grip=grip, step=section.balance.step)
     if errors:
         raise ConfigError(errors)
     return replace(recording, warnings=(*warnings, *unusual))
@@ -345,13 +348,6 @@ def _masses(
         )
         return [series.problem(int(lines[above[0]]), text, "mass")], []
     warnings: list[Problem] = []
-    largest = float(np.abs(recording.tilts).max())
-    if largest < math.radians(3.2) and net.max() > 5.0 * step:
-        text = (
-            f"the tilt stays below {math.degrees(largest):.2g}°, and the mass rises; if it is in radians, name its "
-            "column tilt_rad"
-        )
-        warnings.append(series.problem(1, text, "tilt"))
     peak = np.maximum.accumulate(net)
     fallen = np.flatnonzero(peak - net > max(6.0 * step, 0.5e-3, 0.01 * float(peak[-1])))
     if len(fallen):

@@ -40,11 +40,11 @@ from orchestrator.recordings.recording_replay import (
     SEEN,
     Onset,
     ReplayValues,
-    arrivals,
     flow_of,
     onset_of,
     time_of_fall,
 )
+from orchestrator.recordings.time_series import arrivals
 from sim_engine.errors import InvalidArgumentError
 
 Floats = NDArray[np.float64]
@@ -269,7 +269,7 @@ def fit_recordings(
     for i, name in enumerate(names):
         unknown = problem.unknowns[name]
         middle = float(unknown.at(found[i]))
-        further = {"grip": LIP, "lag": FILM / middle}.get(name, 0.0)
+        further = LIP if name == "grip" else FILM / middle if name == "lag" else 0.0
         deviation = math.hypot(unknown.deviation * float(np.sqrt(covariance[i, i])), further)
         low, high = (float(unknown.at(found[i] + sign * QUANTILE * deviation / unknown.deviation)) for sign in (-1, 1))
         values.append(FittedValue(name, middle, low, high, deviation < 0.5 * UNKNOWNS[name].deviation))

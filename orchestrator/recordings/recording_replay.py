@@ -24,6 +24,7 @@ from actors.dosing.cup_flow import CupFlow
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing.pour_response import displayed, fall_time
 from orchestrator.recordings.recording_file import PourRecording
+from orchestrator.recordings.time_series import Arrivals, arrivals
 from sim_engine.action import DEG, Action
 from sim_engine.errors import InvalidSceneError
 from sim_engine.liquids import Liquid, SimulationParameters
@@ -274,43 +275,6 @@ class Onset:
 
     time: float
     tilt: float
-
-
-@dataclass(frozen=True)
-class Arrivals:
-    """How the readings arrived.
-
-    Attributes:
-        interval: median [s].
-        longest: largest gap [s].
-        step: of the display [kg].
-        repeated: number of readings that repeat the one before although the mass rises by more than 1.5 steps.
-        rising: number of readings while it does.
-    """
-
-    interval: float
-    longest: float
-    step: float
-    repeated: int
-    rising: int
-
-
-def arrivals(times: Floats, masses: Floats, step: float) -> Arrivals:
-    """Describe how readings arrived.
-
-    Args:
-        times, masses: of the readings (R,) [s], [kg].
-        step: of the display [kg].
-
-    The rise of the mass is the slope between the readings one second before and after.
-    """
-    gaps = np.diff(times)
-    slope = (np.interp(times + 1.0, times, masses) - np.interp(times - 1.0, times, masses)) / (
-        np.minimum(times + 1.0, times[-1]) - np.maximum(times - 1.0, times[0])
-    )
-    rising = slope[1:] * gaps > 1.5 * step
-    same = np.abs(np.diff(masses)) < 0.5 * step
-    return Arrivals(float(np.median(gaps)), float(gaps.max()), step, int(np.sum(rising & same)), int(np.sum(rising)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,8 @@ from actors.dosing.pour_response import displayed
 from orchestrator.recordings.first_day import MISS
 from orchestrator.recordings.recording_file import PourRecording
 from orchestrator.recordings.recording_fit import SHAPE, UNKNOWNS, FittedReadings, Unknown, held_share, lag_before
-from orchestrator.recordings.recording_replay import QUANTILE, arrivals, flow_of
+from orchestrator.recordings.recording_replay import QUANTILE, flow_of
+from orchestrator.recordings.time_series import arrivals
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 

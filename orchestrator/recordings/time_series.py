@@ -230,3 +230,40 @@ def gaps(column: Column, longest: float) -> list[int]:
     """Positions before which a column has no value for more than `longest` [s]."""
     found: list[int] = (np.flatnonzero(np.diff(column.times) > longest) + 1).tolist()
     return found
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """How the readings arrived.
+
+    Attributes:
+        interval: median [s].
+        longest: largest gap [s].
+        step: of the display [kg].
+        repeated: number of readings that repeat the one before although the mass rises by more than 1.5 steps.
+        rising: number of readings while it does.
+    """
+
+    interval: float
+    longest: float
+    step: float
+    repeated: int
+    rising: int
+
+
+def arrivals(times: Floats, masses: Floats, step: float) -> Arrivals:
+    """Describe how readings arrived.
+
+    Args:
+        times, masses: of the readings (R,) [s], [kg].
+        step: of the display [kg].
+
+    The rise of the mass is the slope between the readings one second before and after.
+    """
+    gaps = np.diff(times)
+    slope = (np.interp(times + 1.0, times, masses) - np.interp(times - 1.0, times, masses)) / (
+        np.minimum(times + 1.0, times[-1]) - np.maximum(times - 1.0, times[0])
+    )
+    rising = slope[1:] * gaps > 1.5 * step
+    same = np.abs(np.diff(masses)) < 0.5 * step
+    return Arrivals(float(np.median(gaps)), float(gaps.max()), step, int(np.sum(rising & same)), int(np.sum(rising)))
