@@ -28,12 +28,11 @@ def test_a_program_asks_for_pours_and_reads_them_as_a_table_with_units(tmp_path:
         assert pour.received_g > 0.0
         assert "received_g" in pour._repr_html_()
         station.weigh("beaker", "100 g")
-        for number in (2, 3):
-            station.pour(f"plan:{number}", source="beaker", receiver="vial-2", amount=f"{number} g")
+        station.pour("plan:2", source="beaker", receiver="vial-2", amount="2 g")
         table = station.pours()
-        assert list(table["id"]) == ["plan:3", "plan:2", "plan:1"]
+        assert list(table["id"]) == ["plan:2", "plan:1"]
         assert table.attrs["units"]["received_g"] == "g"
-        assert station.cancel("plan:3").id == "plan:3"
+        assert station.cancel("plan:2").id == "plan:2"
         assert set(station.vessels()["id"]) == {"beaker", "vial-1", "vial-2"}
         with pytest.raises(decant.DecantError, match="there is no vessel 'nothing'"):
             station.pour("plan:4", source="nothing", receiver="vial-2", amount="5 g")

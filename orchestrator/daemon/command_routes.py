@@ -21,6 +21,7 @@ from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Ope
 from orchestrator.daemon.campaign_queue import RequestRefusedError
 from orchestrator.daemon.daemon_store import ENDED, QuestionOut, QueueItem
 from orchestrator.daemon.emergency_stop import UNSTORED, recorded_reason
+from orchestrator.daemon.pour_request import SubmissionIn
 from orchestrator.daemon.query_routes import campaign_out, found_item, status
 from orchestrator.daemon.remote_operator import AnswerError
 from orchestrator.daemon.rig_worker import SharedServices
@@ -32,7 +33,6 @@ from orchestrator.daemon.schemas import (
     MoveIn,
     StatusOut,
     StoppedOut,
-    SubmissionIn,
     WhatMovesOut,
 )
 from orchestrator.daemon.submissions import SubmissionError, run_request

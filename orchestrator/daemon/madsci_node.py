@@ -35,8 +35,7 @@ from orchestrator.daemon.daemon_settings import MadsciSettings, networks
 from orchestrator.daemon.daemon_store import ENDED, QueueItem
 from orchestrator.daemon.emergency_stop import StopForms
 from orchestrator.daemon.ordering import Ordering
-from orchestrator.daemon.pour_request import PourIn, described, problems_text
-from orchestrator.daemon.schemas import SubmissionIn
+from orchestrator.daemon.pour_request import PourIn, SubmissionIn, described, problems_text
 from orchestrator.daemon.supervisor import Supervisor
 from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION

@@ -20,9 +20,8 @@ from orchestrator.daemon.campaign_queue import CampaignQueue, RequestRefusedErro
 from orchestrator.daemon.daemon_store import QueueItem
 from orchestrator.daemon.materials import SURE, Materials
 from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, settled_pour
-from orchestrator.daemon.pour_request import PourIn
+from orchestrator.daemon.pour_request import PourIn, SubmissionIn
 from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.schemas import SubmissionIn
 from orchestrator.daemon.submissions import Submission, planned_order, prepare
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.run_tasks import POUR

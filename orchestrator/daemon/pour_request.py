@@ -1,4 +1,4 @@
-"""The parameters of one ordered pour: the request of the HTTP API, from which the other interfaces take theirs.
+"""The requests that queue work, one ordered pour (`PourIn`) or one campaign (`SubmissionIn`), of every interface.
 
 `decant queue pour`, `decant.Station.pour`, the SiLA 2 server and the MADSci node make this model of their parameters;
 help texts and arguments have its descriptions. The module imports pydantic alone, so that the command line starts fast.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Mapping
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -138,6 +138,32 @@ class PourIn(RequestModel):
 
     predict: bool = True
     """Predict the pour before it is queued. An action is predicted by simulations, which takes seconds."""
+
+
+class SubmissionIn(RequestModel):
+    """A campaign: `text` with its `files`, or the `path` of a file on the daemon's machine."""
+
+    text: str = Field(default="", max_length=500_000)
+    """The campaign as YAML. Its paths refer to `files`."""
+
+    files: dict[str, str] = Field(default_factory=dict)
+    """Files that the campaign refers to: relative path → content in base64."""
+
+    path: str = Field(default="", max_length=1000)
+    """Instead of `text` and `files`: a file in one of the folders that the daemon's settings list as roots."""
+
+    task: Literal["run", "calibrate", "plan"] = "run"
+    rig: str = Field(default="", max_length=60)
+    """Rig to run on; '' selects the matching one."""
+
+    priority: int = Field(default=0, ge=-1000, le=1000)
+    """Higher priorities run first."""
+
+    id: CallerId | Literal[""] = ""
+    """Chosen by the caller. The same campaign with the same id is queued once, however often it is sent."""
+
+    not_before: Moment | None = None
+    """Earliest start."""
 
 
 def problems_text(errors: Iterable[Mapping[str, Any]], begin: int = 0) -> str:

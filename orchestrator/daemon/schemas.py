@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.daemon.pour_request import CallerId, Moment, RequestModel
+from orchestrator.daemon.pour_request import Moment, RequestModel
 from orchestrator.reports.run_summary import PourSummary
 
 
@@ -17,32 +17,6 @@ class ResponseModel(BaseModel):
     """Base of the models of responses."""
 
     model_config = ConfigDict(use_attribute_docstrings=True)
-
-
-class SubmissionIn(RequestModel):
-    """A campaign: `text` with its `files`, or the `path` of a file on the daemon's machine."""
-
-    text: str = Field(default="", max_length=500_000)
-    """The campaign as YAML. Its paths refer to `files`."""
-
-    files: dict[str, str] = Field(default_factory=dict)
-    """Files that the campaign refers to: relative path → content in base64."""
-
-    path: str = Field(default="", max_length=1000)
-    """Instead of `text` and `files`: a file in one of the folders that the daemon's settings list as roots."""
-
-    task: Literal["run", "calibrate", "plan"] = "run"
-    rig: str = Field(default="", max_length=60)
-    """Rig to run on; '' selects the matching one."""
-
-    priority: int = Field(default=0, ge=-1000, le=1000)
-    """Higher priorities run first."""
-
-    id: CallerId | Literal[""] = ""
-    """Chosen by the caller. The same campaign with the same id is queued once, however often it is sent."""
-
-    not_before: Moment | None = None
-    """Earliest start."""
 
 
 class AnswerIn(RequestModel):

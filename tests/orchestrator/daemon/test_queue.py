@@ -24,8 +24,8 @@ from orchestrator.cli.app import app
 from orchestrator.cli.queue_commands import submit
 from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.daemon_store import QueueItem
+from orchestrator.daemon.pour_request import SubmissionIn
 from orchestrator.daemon.run_readout import Pours
-from orchestrator.daemon.schemas import SubmissionIn
 from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.runs.run_service import RunHandle, RunRequest
