@@ -58,6 +58,7 @@ def test_an_unknown_engine_is_refused_before_anything_starts(monkeypatch: pytest
 
 def test_an_engine_that_is_not_installed_is_refused_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine_package, "_is_installed", lambda name: name == "taichi")
+    monkeypatch.setitem(LIBRARIES, "taichi", {})
     monkeypatch.delenv("DECANT_ENGINE", raising=False)
     assert engine_name() == "taichi"
     monkeypatch.setenv("DECANT_ENGINE", "quadrants")
