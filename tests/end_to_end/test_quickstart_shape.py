@@ -53,12 +53,9 @@ def test_quickstart_calibrates_and_then_pours_into_a_cup_that_calibration_never_
 
 
 @pytest.mark.parametrize("name", ["quickstart", "paper"])
-def test_a_resumed_run_of_a_shipped_campaign_is_exact_and_asks_nobody(name: str) -> None:
+def test_a_resumed_run_of_a_shipped_campaign_asks_nobody(name: str) -> None:
     campaign = plan(name)
     assert campaign.on_unknown == "repeat"
-    assert campaign.deployment is not None
-    assert campaign.deployment.settings.order == "logical", "else the clock decides what is asked for"
-    assert {stage.order for stage in stages_of(campaign)} == {"logical"}
 
 
 @pytest.mark.parametrize("name", ["quickstart", "paper"])
