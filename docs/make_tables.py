@@ -606,6 +606,10 @@ def command_line() -> str:
     return "\n".join(parts)
 
 
+ATTRIBUTE = r"^ {4}(\w+): (.*(?:\n {8}.*)*)"
+"""A line of the attributes in a dataclass's docstring."""
+
+
 def json_output() -> str:
     """The output of every command with --json, from its schema."""
     from orchestrator.cli.json_output import output_schema
@@ -620,11 +624,13 @@ def json_output() -> str:
             continue
         for reference in output.get("anyOf", [output]):
             model = kinds[reference["$ref"].rpartition("/")[2]]
+            text, _, fields = model["description"].partition("Attributes:\n")  # of a dataclass
+            described = dict(re.findall(ATTRIBUTE, fields, re.MULTILINE))
             rows = [
-                (f"`{key}`", _json_type(part), _prose(part.get("description")))
+                (f"`{key}`", _json_type(part), _prose(part.get("description", described.get(key))))
                 for key, part in model["properties"].items()
             ]
-            parts.append(f"{_prose(model['description'])}\n\n{_table(('key', 'value', 'meaning'), rows)}")
+            parts.append(f"{_prose(text.strip())}\n\n{_table(('key', 'value', 'meaning'), rows)}")
     return "\n".join(parts)
 
 
@@ -686,7 +692,7 @@ def events() -> str:
             base = [field.name for field in dataclasses.fields(module.Event)]
             fields_of = [field.name for field in dataclasses.fields(kind)]
             own = base if kind is module.Event else [field for field in fields_of if field not in base]
-            described = dict(re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", fields, re.MULTILINE))
+            described = dict(re.findall(ATTRIBUTE, fields, re.MULTILINE))
             rows = [(f"`{field}`", _one_line(described.get(field, ""))) for field in own]
             parts.append(f"## {name}\n\n{_one_line(text)}\n")
             if rows:

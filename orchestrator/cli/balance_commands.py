@@ -87,9 +87,9 @@ def check(
             driver.close()
     failed = [one for one in checks if one.state == "fail"]
     if as_json:
-        from orchestrator.cli.command_results import BalanceCheckOutput
+        from orchestrator.cli.command_results import CheckOutput
 
-        print_json(BalanceCheckOutput(balance=balance, ready=not failed, checks=checks))
+        print_json(CheckOutput(laboratory=balance, mode="", ready=not failed, checks=checks))
     if failed:
         raise RefusalError(f"{len(failed)} of {len(checks)} checks fail", FAILED)
     print_message("ready" if all(one.state == "ok" for one in checks) else "ready, with warnings")

@@ -13,8 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from actors.arm.arm_interface import PathReport
 from actors.interfaces import DeviceCheck
+from orchestrator.reports.prediction_scores import Score, ScoredRow
 from sim_engine.liquids import SimulationParameters
-from sim_engine.prediction_band import SampleStatistics
+from sim_engine.prediction_band import PredictionInterval, SampleStatistics
 
 
 class CommandOutput(BaseModel):
@@ -64,24 +65,12 @@ class CalibrateOutput(BaseModel):
     report: Path | None
 
 
-class IntervalOutput(CommandOutput):
-    """Prediction interval of r = spilled / poured for a single pour."""
-
-    low: float
-    high: float
-    level: float
-    """Probability, such as 0.9."""
-
-    deviations: dict[str, float | None]
-    """Standard deviations by source: simulations, discrepancy, resolution."""
-
-
 class PredictionOutput(BaseModel):
     """Prediction over seeds: `SampleStatistics` by quantity, such as received, spilled, retained and spillage."""
 
     model_config = ConfigDict(extra="allow", use_attribute_docstrings=True, defer_build=True)
 
-    band: IntervalOutput | None
+    band: PredictionInterval | None
     seeds: list[int]
     __pydantic_extra__: dict[str, SampleStatistics]
 
@@ -133,45 +122,12 @@ class SimulateOutput(CommandOutput):
     """Effects of this pour that are not simulated: `kind`, `share`, `text`."""
 
 
-class ScoredPourOutput(CommandOutput):
-    """A weighed pour of the table with its prediction."""
-
-    line: int
-    """Line in the table."""
-
-    split: str
-    action: dict[str, float | None]
-    measured: float | None
-    """r = spilled / poured as weighed; null if it is undefined."""
-
-    predicted: SampleStatistics | None
-    band: IntervalOutput | None
-    inside: bool | None
-    """Whether the measured value is inside the interval."""
-
-
-class ScoresOutput(CommandOutput):
-    """Agreement of predictions and weighed pours."""
-
-    pours: int
-    mean_error: float | None
-    """Mean absolute difference of r."""
-
-    spearman: float | None
-    """Rank correlation."""
-
-    held: int
-    """Number of pours inside their interval."""
-
-    share_held: float | None
-
-
 class SimulateTableOutput(CommandOutput):
     """Predictions for a table of weighed pours (`--from`)."""
 
     scene: str
     from_: Path = Field(serialization_alias="from")
-    scores: dict[str, ScoresOutput]
+    scores: dict[str, Score]
     """By split, and for all."""
 
     level: float
@@ -184,7 +140,7 @@ class SimulateTableOutput(CommandOutput):
     bands: dict[str, float | None]
     """Standard deviations of the shifts in the intervals."""
 
-    pours: list[ScoredPourOutput]
+    pours: list[ScoredRow]
 
 
 class DryRunOutput(CommandOutput):
@@ -226,34 +182,16 @@ class ReportOutput(CommandOutput):
 
 
 class CheckOutput(CommandOutput):
-    """Checks of a laboratory."""
+    """Checks of a laboratory, of a balance, or of the recordings of a commissioning day."""
 
     laboratory: str
+    """Name of the laboratory; the balance as it was named; the archive."""
+
     mode: str
-    ready: bool
-    """Whether no check fails."""
-
-    checks: list[DeviceCheck]
-
-
-class BalanceCheckOutput(CommandOutput):
-    """Checks of a balance."""
-
-    balance: str
-    """The balance as it was named on the command line."""
+    """'virtual' or 'hardware'; '' for a balance and an archive."""
 
     ready: bool
     """Whether no check fails."""
-
-    checks: list[DeviceCheck]
-
-
-class ArchiveOutput(CommandOutput):
-    """Replay of the recordings of a commissioning day."""
-
-    archive: str
-    ready: bool
-    """Whether all recordings are read as on the day."""
 
     checks: list[DeviceCheck]
 
@@ -311,19 +249,6 @@ class StudyCostOutput(CommandOutput):
     simulations: int
     pours: int
     cpu_hours: float
-
-
-class RunCheckOutput(CommandOutput):
-    """Check of a run's records."""
-
-    run: Path
-    complete: bool
-    """Whether the check found no problem."""
-
-    problems: list[str]
-    entries: int
-
-    pours: list[str]
 
 
 class ExportOutput(CommandOutput):

@@ -15,8 +15,6 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from orchestrator.campaigns.campaign_prior import KnownPosterior
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
 from orchestrator.cli.command_results import (
-    ArchiveOutput,
-    BalanceCheckOutput,
     CalibrateOutput,
     CheckOutput,
     CommandOutput,
@@ -26,7 +24,6 @@ from orchestrator.cli.command_results import (
     ExportOutput,
     PluginsOutput,
     ReportOutput,
-    RunCheckOutput,
     SimulateOutput,
     SimulateTableOutput,
     StudyCostOutput,
@@ -39,6 +36,7 @@ from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, StatusOu
 from orchestrator.daemon.station_schemas import AccountOut, ContentOut, PourOut
 from orchestrator.learning.dispense import Dose
 from orchestrator.learning.single_action import WeighedPour
+from orchestrator.records.journal_check import JournalCheck
 from orchestrator.reports.run_summary import PLANNED, ReceiverSummary, RunSummary
 from sim_engine.liquids import SimulationParameters
 from sim_engine.settings.model import DescribedSchema, meanings
@@ -201,12 +199,12 @@ OUTPUTS: dict[str, Any] = {
     "runs pours": PoursOutput,
     "runs show": PreviousRunDetail,
     "runs known": KnownOutput,
-    "runs check": RunCheckOutput,
+    "runs check": JournalCheck,
     "runs export": ExportOutput,
     "study run": StudyOutput | StudyCostOutput,
     "robot check": CheckOutput,
-    "robot archive": ArchiveOutput,
-    "balance check": BalanceCheckOutput,
+    "robot archive": CheckOutput,
+    "balance check": CheckOutput,
     **own_extras("decant.outputs").get("recording", {}),
     "queue submit": CampaignOut,
     "queue list": QueueOutput | CampaignDetailOut,

@@ -119,7 +119,7 @@ def archive(
     stable weights of the balance, the weighed pours of runs. Exit code 1 if this version of Decant reads one of them
     differently. Nothing is connected.
     """
-    from orchestrator.cli.command_results import ArchiveOutput
+    from orchestrator.cli.command_results import CheckOutput
     from orchestrator.cli.commissioning_archive import CommissioningArchive
 
     with Refused(OSError):
@@ -131,7 +131,7 @@ def archive(
     checks = list(kept.replay())
     failed = [one for one in checks if one.state == "fail"]
     if as_json:
-        print_json(ArchiveOutput(archive=str(archive), ready=not failed, checks=checks))
+        print_json(CheckOutput(laboratory=str(archive), mode="", ready=not failed, checks=checks))
     else:
         print_table(checks)
     if failed:

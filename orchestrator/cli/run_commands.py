@@ -12,6 +12,7 @@ import getpass
 import inspect
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -297,10 +298,7 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
     with _refusing():
         found = check_journal(folder / JOURNAL_NAME)
     if as_json:
-        from orchestrator.cli.command_results import RunCheckOutput
-
-        problems, entries, pours = list(found.problems), found.entries, list(found.pours)
-        print_json(RunCheckOutput(run=folder, complete=not problems, problems=problems, entries=entries, pours=pours))
+        print_json(asdict(found))
     else:
         print(f"{folder}: {found.verdict}")
         for pour in found.pours:

@@ -30,14 +30,13 @@ from orchestrator.cli.console import (
 
 if TYPE_CHECKING:
     from orchestrator.campaigns.pour_table import RecordTable
-    from orchestrator.cli.command_results import IntervalOutput, ScoredPourOutput
     from orchestrator.learning.campaign_plan import CampaignPlan, RecordedPour, RecordSet
     from orchestrator.reports.prediction_scores import ScoredRow
     from sim_engine.action import Action
     from sim_engine.liquids import SimulationParameters
     from sim_engine.model_validity import ModelValidity
     from sim_engine.outcome import PourOutcome, SimulatedPour
-    from sim_engine.prediction_band import CalibrationResidual, PredictionInterval, SampleStatistics
+    from sim_engine.prediction_band import CalibrationResidual, SampleStatistics
     from sim_engine.scene import PourTask, Scene
     from sim_engine.search_space import Space
     from sim_engine.simulator import PourSimulator
@@ -158,7 +157,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
                 scene=scene.name,
                 delivered_g=None if delivered is None else 1e3 * delivered,
                 delivered_ml=None if delivered is None else scene.liquid.millilitres(delivered),
-                prediction=PredictionOutput.model_validate({"band": _interval(where), "seeds": seeds, **over_seeds}),
+                prediction=PredictionOutput.model_validate({"band": where, "seeds": seeds, **over_seeds}),
                 regimes=None if regime is None else regime.as_json(),
                 not_covered=[] if regime is None else [one.as_json() for one in regime.not_covered],
             )
@@ -315,7 +314,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
         title = f"{scene.pourer.name} into {scene.receiver.name}, {len(rows)} weighed pours"
         print_note(f"picture: {figure_style.save(draw_scored(rows, title=title, note=said), options.png)}")
     if options.as_json:
-        from orchestrator.cli.command_results import ScoresOutput, SimulateTableOutput
+        from orchestrator.cli.command_results import SimulateTableOutput
         from sim_engine.prediction_band import resolution_shift
 
         left, shift = known.residual, resolution_shift(known.theta.particles)
@@ -325,14 +324,14 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
             SimulateTableOutput(
                 scene=scene.name,
                 from_=source,
-                scores={split: ScoresOutput(**one.as_json()) for split, one in found.items()},
+                scores=found,
                 level=LEVEL,
                 theta=known.theta,
                 thetas=len(known.thetas),
                 simulations=sum(map(len, outcomes)),
                 cpu_s=sum(outcome.cpu_s for some in outcomes for outcome in some),
                 bands={"discrepancy_shift": left_shift, "resolution_shift": 0.0 if own else shift},
-                pours=[_scored(row, dimensions) for row in rows],
+                pours=rows,
             )
         )
     else:
@@ -467,29 +466,6 @@ def _row(
         SampleStatistics.of(values),
         band_of(outcomes, residual),
         len(outcomes) - len(values),
-    )
-
-
-def _interval(band: PredictionInterval | None) -> IntervalOutput | None:
-    from orchestrator.cli.command_results import IntervalOutput
-
-    if band is None:
-        return None
-    deviations = {name: getattr(band, name) for name in ("simulations", "discrepancy", "resolution")}
-    return IntervalOutput(low=band.low, high=band.high, level=band.level, deviations=deviations)
-
-
-def _scored(row: ScoredRow, dimensions: Sequence[str]) -> ScoredPourOutput:
-    from orchestrator.cli.command_results import ScoredPourOutput
-
-    return ScoredPourOutput(
-        line=row.line,
-        split=row.split,
-        action={name: getattr(row.action, name) for name in dimensions},
-        measured=row.measured,
-        predicted=row.predicted,
-        band=_interval(row.band),
-        inside=row.held,
     )
 
 

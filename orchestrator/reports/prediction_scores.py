@@ -8,7 +8,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from orchestrator.campaigns.pour_table import column_name
 from orchestrator.reports import figure_style as style
@@ -70,21 +70,6 @@ class Score:
     error: float | None
     correlation: float | None
     held: int
-
-    @property
-    def share_held(self) -> float | None:
-        """The share of the pours inside their interval."""
-        return self.held / self.pours if self.pours else None
-
-    def as_json(self) -> dict[str, Any]:
-        """JSON-ready mapping."""
-        return {
-            "pours": self.pours,
-            "mean_error": self.error,
-            "spearman": self.correlation,
-            "held": self.held,
-            "share_held": self.share_held,
-        }
 
     def text(self) -> str:
         """'mean |Δ| 1.6 %, Spearman 0.97, 15 of 16 pours inside their 90 % interval'."""

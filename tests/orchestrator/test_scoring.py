@@ -32,9 +32,8 @@ ROWS = [
 
 def test_the_score_is_of_pours_that_have_a_spillage_and_a_prediction() -> None:
     found = score(ROWS)
-    assert (found.pours, found.held) == (3, 2)
     assert found.error == pytest.approx((0.02 + 0.39 + 0.005) / 3)
-    assert found.share_held == pytest.approx(2 / 3)
+    assert (found.held, found.pours) == (2, 3)
     assert set(scores(ROWS)) == {"test", "train", "all"}
     assert scores(ROWS)["train"].held == 1
     assert score([]).error is None

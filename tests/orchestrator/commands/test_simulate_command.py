@@ -97,8 +97,10 @@ def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
     assert [pour["line"] for pour in found["pours"]] == [2, 3, 4]
     assert {split: one["pours"] for split, one in found["scores"].items()} == {"train": 2, "test": 1, "all": 3}
     errors = [abs(pour["measured"] - pour["predicted"]["mean"]) for pour in found["pours"]]
-    assert found["scores"]["all"]["mean_error"] == pytest.approx(sum(errors) / 3)
-    assert found["scores"]["all"]["held"] == sum(pour["inside"] for pour in found["pours"])
+    assert found["scores"]["all"]["error"] == pytest.approx(sum(errors) / 3)
+    assert found["scores"]["all"]["held"] == sum(
+        pour["band"]["low"] <= pour["measured"] <= pour["band"]["high"] for pour in found["pours"]
+    )
     assert (found["simulations"], found["thetas"]) == (6, 2)
     assert found["bands"]["discrepancy_shift"] == 0.2
     for pour in found["pours"]:

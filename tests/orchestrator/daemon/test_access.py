@@ -26,7 +26,7 @@ from tests.support.toy_daemon import Served, held, run, serving
 
 LOOKING = (
     *("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report"),
-    *("/runs", "/pours", "/runs/pours", "/runs/compare?run=a&run=b", "/runs/export", "/runs/x", "/runs/x/report"),
+    *("/runs", "/pours", "/runs/pours", "/runs/export", "/runs/x", "/runs/x/report"),
 )
 DOING = (
     "/campaigns",
@@ -39,7 +39,6 @@ DOING = (
     "/questions/1/answer",
     "/queue/pause",
     "/queue/resume",
-    "/runs/x/tags",
     "/runs/x/notes",
     "/emergency-stop/clear",
     "/shutdown",
