@@ -18,19 +18,17 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from actors.arm.arm_device import STUCK
-from actors.arm.arm_interface import ArmFacts, ArmState, Executed, PlannedPour
+from actors.arm.arm_interface import ArmState, PlannedPour
 from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing_plan import GRIP, Placement
-from actors.bench.consent import Consent, Setup, grams, start_question
-from actors.bench.pour_feasibility import vessel
-from actors.bench.pour_procedure import PourReport
+from actors.bench.consent import Setup, grams, start_question
+from actors.bench.pour_procedure import BenchProcedure, PourReport, largest_tilt
 from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
@@ -39,18 +37,18 @@ from actors.interfaces import (
     DoseTarget,
     InvalidActionError,
     LaboratoryError,
-    Notice,
-    NotPouredError,
     OperatorQuestion,
-    PourFailedError,
     ProgressCallback,
     UnknownPourError,
 )
 from sim_engine.outcome import PourMeasurement
-from sim_engine.scene import SampledMotion, Scene
+from sim_engine.scene import Scene
 
 TICK = 0.05
 """Time between two decisions [s]."""
+
+LOOK_INTERVAL = 0.01
+"""Pause between two readings of the balance [s of the clock]."""
 
 BEFORE_PLACING, AFTER_PLACING = 0.5, 2.0
 """Readings are recorded for so long before and after the receiver is put on the balance [s]."""
@@ -65,58 +63,7 @@ SIGNALS = 400
 """Largest number of samples of a dose's signals in its record."""
 
 
-class BalanceReadings:
-    """Reads the balance as fast as it answers, and keeps each reading once.
-
-    Args:
-        setup: parts of the bench.
-        report: receives the display.
-    """
-
-    def __init__(self, setup: Setup, report: PourReport) -> None:
-        assert setup.balance is not None
-        self._balance, self._report = setup.balance, report
-        self._scale = setup.spec.time_scale
-        self._kept: list[DoseReading] = []
-        self._taken = 0
-        self.step = 0.0
-
-    @contextlib.asynccontextmanager
-    async def running(self) -> AsyncIterator[None]:
-        """Read while the body runs."""
-        task = asyncio.create_task(self._read())
-        try:
-            yield
-        finally:
-            task.cancel()
-            await asyncio.gather(task, return_exceptions=True)
-
-    def fresh(self) -> list[DoseReading]:
-        """Readings since the last call."""
-        found, self._taken = self._kept[self._taken :], len(self._kept)
-        return found
-
-    @property
-    def all(self) -> tuple[DoseReading, ...]:
-        """All readings so far; their times are `time.monotonic` in bench time."""
-        return tuple(self._kept)
-
-    async def _read(self) -> None:
-        last = -math.inf
-        while True:
-            with contextlib.suppress(LaboratoryError):
-                weight = await self._balance.read()
-                if weight.status in ("stable", "unstable") and math.isfinite(weight.mass) and weight.time > last:
-                    last, now = weight.time, time.monotonic()
-                    # the driver's clock is this one, unless it runs on another machine
-                    moment = weight.time if 0.0 <= now - weight.time < 1.0 else now
-                    self.step = weight.step or self.step
-                    self._kept.append(DoseReading(self._scale * moment, weight.mass, weight.stable))
-                    self._report.show(weight.mass, weight.stable)
-            await asyncio.sleep(0.01)
-
-
-class DoseProcedure:
+class DoseProcedure(BenchProcedure):
     """One dose, from the first question to the weighed amount.
 
     Args:
@@ -132,6 +79,8 @@ class DoseProcedure:
         InvalidActionError: the dose can't be made here.
     """
 
+    name = "dose"
+
     def __init__(
         self,
         setup: Setup,
@@ -145,74 +94,31 @@ class DoseProcedure:
     ) -> None:
         check_bench(setup)
         check_dose(scene, dose)
-        self._setup, self._scene, self._dose, self._path = setup, scene, dose, path
-        self._seed, self._settings = seed, settings
-        self._consent = Consent(setup, path)
+        self._dose, self._settings = dose, settings
         parts = {
             "operator": setup.operator_time,
             "approach": setup.spec.warning_time + path.approach_time,
             "dose": 10.0,
             "record": path.retreat_time,
         }
-        self._report = PourReport(progress, parts, 10.0)
-        self._readings = BalanceReadings(setup, self._report)
+        super().__init__(setup, scene, path, seed, PourReport(progress, parts, 10.0), LOOK_INTERVAL)
         self._series: DoseSeries | None = None
-        self._begun = False
-        self._facts: ArmFacts | None = None
-        self._executed: Executed | None = None
-        self._tilts: list[tuple[float, float]] = []
         self._placed: tuple[DoseReading, ...] = ()
         self._zero = self._at = self._duration = 0.0
-
-    async def run(self) -> PourMeasurement:
-        """Run the whole dose.
-
-        Raises:
-            NotPouredError: nothing was poured.
-            UnknownPourError: the amount in the receiver is unknown.
-        """
-        setup = self._setup
-        setup.questions.take_log()
-        try:
-            result = await self._steps()
-        except asyncio.CancelledError as error:
-            await self._consent.leave_safe()
-            if self._begun:
-                setup.tell(Notice("warning", f"the dose was given up after it had begun; {await self._remaining()}"))
-                raise
-            raise NotPouredError("the dose was given up before it began; nothing was poured") from error
-        except (InvalidActionError, PourFailedError):
-            await self._consent.leave_safe()
-            raise
-        except LaboratoryError as error:
-            self._begun = self._begun or self._setup.lost
-            text = f"{error}. Nothing was poured"
-            if self._begun:
-                text = f"{error}. It was not the dose that was asked for: {await self._remaining()}"
-            await self._consent.leave_safe()
-            raise (UnknownPourError if self._begun else NotPouredError)(text) from error
-        finally:
-            await setup.ground_truth.end()
-        return result
 
     # ---- steps in order
 
     async def _steps(self) -> PourMeasurement:
         setup = self._setup
         assert setup.balance is not None
-        self._report.enter("operator")
-        self._facts = await setup.arm.ready()
-        await self._consent.make_safe()
-        if setup.held is not None:
-            await setup.held.ready(vessel(self._scene.pourer))
-        await setup.balance.device.revive()
-        await setup.balance.resume()
+        await self._ready()
         await setup.balance.connect()
         await self._refill()
         await setup.ground_truth.prepare_dose(self._scene, self._dose, self._seed)
         async with self._readings.running():
             await self._prepare()
             await self._consent.given(start_question(setup.spec, self._path))
+            self._moves = True
             async with setup.ground_truth.followed():
                 result = await self._out_and_home()
         self._report.enter("record", 1.0)
@@ -371,6 +277,9 @@ class DoseProcedure:
             return f"the balance shows {grams(weight.mass - self._zero)} in the receiver"
         return "the amount in the receiver is UNKNOWN"
 
+    async def _unknown(self, error: LaboratoryError) -> str:
+        return f"It was not the dose that was asked for: {await self._remaining()}"
+
     def _measurement(self, result: DoseResult, truth: dict[str, Any]) -> PourMeasurement:
         assert self._series is not None
         assert result.amount is not None
@@ -393,8 +302,7 @@ class DoseProcedure:
         }
         notes: dict[str, Any] = {"mode": self._setup.mode, "dose": about, "operator": self._setup.questions.take_log()}
         if self._executed is not None and len(self._executed.times) > 1:
-            motion = SampledMotion(self._executed.times, self._executed.poses)
-            notes["largest_tilt_deg"] = math.degrees(float(motion.tilt(self._executed.times).max()))
+            notes["largest_tilt_deg"] = largest_tilt(self._executed)
             notes["executed"] = self._executed.record()
         # neither the source nor the spilled liquid was weighed
         retained = max(source.mass - result.amount, 0.0)
@@ -406,9 +314,6 @@ class DoseProcedure:
         last = self._readings.all[-1:]
         reading = last[0].mass - self._zero if last else None
         self._report.dose(tilt, state.joints, controller.progress(reading))
-
-    def _seen(self, state: ArmState) -> None:
-        self._report.stand(state.joints, state.pourer)
 
 
 def check_bench(setup: Setup) -> None:

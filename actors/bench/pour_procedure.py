@@ -4,8 +4,8 @@ Two rules always hold. While a question invites hands into the cell, no program 
 back first. The arm moves only after the operator has confirmed the motion and has been informed of the time until it
 starts.
 
-`PourProcedure` runs the steps; `PourReport` reports the progress of the pour to a callback. Questions are in
-`actors.bench.consent`, weighings in `actors.balance.weighing`.
+`PourProcedure` runs the steps in the frame of `BenchProcedure`, which doses have, too. `PourReport` reports the
+progress to a callback. Questions are in `actors.bench.consent`, weighings in `actors.balance.weighing`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import AsyncIterator, Mapping
 from typing import Any
 
 from actors.arm.arm_device import STUCK
@@ -34,6 +34,7 @@ from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.consent import Consent, Setup, grams, start_question
 from actors.bench.ground_truth import PourAsk
 from actors.bench.pour_feasibility import vessel
+from actors.dosing.dose_estimator import DoseReading
 from actors.interfaces import (
     DoseProgress,
     InvalidActionError,
@@ -147,6 +148,141 @@ class PourReport:
                 self._progress(state)
 
 
+class BalanceReadings:
+    """Reads the balance, if there is one, and keeps each reading once.
+
+    Args:
+        setup: parts of the bench.
+        report: receives the display.
+        interval: pause between two readings [s of the clock].
+    """
+
+    def __init__(self, setup: Setup, report: PourReport, interval: float) -> None:
+        self._balance, self._report, self._interval = setup.balance, report, interval
+        self._scale = setup.spec.time_scale
+        self._kept: list[DoseReading] = []
+        self._taken = 0
+        self.step = 0.0
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Read while the body runs."""
+        task = asyncio.create_task(self._read()) if self._balance is not None else None
+        try:
+            yield
+        finally:
+            if task is not None:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+
+    def fresh(self) -> list[DoseReading]:
+        """Readings since the last call."""
+        found, self._taken = self._kept[self._taken :], len(self._kept)
+        return found
+
+    @property
+    def all(self) -> tuple[DoseReading, ...]:
+        """All readings so far; their times are `time.monotonic` in bench time."""
+        return tuple(self._kept)
+
+    async def _read(self) -> None:
+        assert self._balance is not None
+        last = -math.inf
+        while True:
+            with contextlib.suppress(LaboratoryError):
+                weight = await self._balance.read()
+                if weight.status in ("stable", "unstable") and math.isfinite(weight.mass) and weight.time > last:
+                    last, now = weight.time, time.monotonic()
+                    # the driver's clock is this one, unless it runs on another machine
+                    moment = weight.time if 0.0 <= now - weight.time < 1.0 else now
+                    self.step = weight.step or self.step
+                    self._kept.append(DoseReading(self._scale * moment, weight.mass, weight.stable))
+                    self._report.show(weight.mass, weight.stable)
+            await asyncio.sleep(self._interval)
+
+
+class BenchProcedure:
+    """The frame of a pour and of a dose: the first steps, and what is reported after an error.
+
+    Args:
+        setup: parts of the bench.
+        scene: pourer, receiver and liquid.
+        path: checked path of the arm.
+        seed: of a virtual bench's randomness.
+        report: receives the progress.
+        interval: pause between two readings of the balance [s of the clock].
+    """
+
+    name = "pour"
+
+    def __init__(
+        self, setup: Setup, scene: Scene, path: PlannedPour, seed: int, report: PourReport, interval: float
+    ) -> None:
+        self._setup, self._scene, self._path, self._seed, self._report = setup, scene, path, seed, report
+        self._consent = Consent(setup, path)
+        self._readings = BalanceReadings(setup, report, interval)
+        self._begun = self._moves = False
+        self._executed: Executed | None = None
+        self._facts: ArmFacts | None = None
+        self._tilts: list[tuple[float, float]] = []
+
+    async def run(self) -> PourMeasurement:
+        """Run it, from the first question to the last weight.
+
+        Raises:
+            NotPouredError: nothing was poured.
+            UnknownPourError: some liquid may have been poured.
+        """
+        setup = self._setup
+        setup.questions.take_log()
+        try:
+            return await self._steps()
+        except asyncio.CancelledError as error:
+            await self._consent.leave_safe()
+            if self._begun:
+                text = f"the {self.name} was given up after it had begun; {await self._remaining()}"
+                setup.tell(Notice("warning", text))
+                raise
+            raise NotPouredError(f"the {self.name} was given up before it began; nothing was poured") from error
+        except (InvalidActionError, PourFailedError):
+            await self._consent.leave_safe()
+            raise
+        except LaboratoryError as error:
+            self._begun = self._begun or (self._moves and setup.lost)
+            text = f"{error}. {await self._unknown(error) if self._begun else 'Nothing was poured'}"
+            await self._consent.leave_safe()
+            raise (UnknownPourError if self._begun else NotPouredError)(text) from error
+        finally:
+            await setup.ground_truth.end()
+
+    async def _steps(self) -> PourMeasurement:
+        """All steps in order."""
+        raise NotImplementedError
+
+    async def _remaining(self) -> str:
+        """What is known of the liquid, as text."""
+        raise NotImplementedError
+
+    async def _unknown(self, error: LaboratoryError) -> str:
+        """What is known of the liquid after an error, as text."""
+        raise NotImplementedError
+
+    async def _ready(self) -> None:
+        """Connect arm, gripper and balance; no program runs."""
+        setup = self._setup
+        self._report.enter("operator")
+        self._facts = await setup.arm.ready()
+        await self._consent.make_safe()
+        if setup.held is not None:
+            await setup.held.ready(vessel(self._scene.pourer))
+        if setup.balance is not None:
+            await setup.balance.device.revive()
+            await setup.balance.resume()
+
+    def _seen(self, state: ArmState) -> None:
+        self._report.stand(state.joints, state.pourer)
+
+
 WEIGHING_TIME = 3.0
 """Typical bench time until a weight is stable, for the progress bar [s]."""
 
@@ -162,7 +298,7 @@ BEFORE_TILT = 1.0
 _BROKEN_OFF = (ArmStoppedError, ArmLostError, DeviceLostError)
 
 
-class PourProcedure:
+class PourProcedure(BenchProcedure):
     """One pour, from the first question to the last weight.
 
     Args:
@@ -185,70 +321,30 @@ class PourProcedure:
         known: Mapping[str, PourMasses] | None,
         progress: ProgressCallback | None,
     ) -> None:
-        self._setup, self._scene, self._action, self._path, self._seed = setup, scene, action, path, seed
-        self._consent = Consent(setup, path)
+        report = PourReport(progress, _expected(setup, path), path.pour_time)
+        super().__init__(setup, scene, path, seed, report, LOOK_INTERVAL)
+        self._action = action
         self._weighings = Weighings(
             setup.balance_spec, setup.balance, self._consent.ask, known, self._note_weight, nominal=scene.liquid.mass
         )
-        self._report = PourReport(progress, _expected(setup, path), path.pour_time)
-        self._begun = self._moves = False
         self._broken: Exception | None = None
-        self._executed: Executed | None = None
-        self._facts: ArmFacts | None = None
-        self._tilts: list[tuple[float, float]] = []
-        self._readings: list[tuple[float, float]] = []
 
     @property
     def lasting(self) -> dict[str, PourMasses]:
         """Weighings that remain valid for later pours with this pourer."""
         return self._weighings.lasting
 
-    async def run(self) -> PourMeasurement:
-        """Run the whole pour.
-
-        Raises:
-            NotPouredError: nothing was poured.
-            UnknownPourError: some liquid may have been poured.
-        """
-        self._setup.questions.take_log()
-        watching = asyncio.create_task(self._watch())
-        try:
+    async def _steps(self) -> PourMeasurement:
+        async with self._readings.running():
             await self._before()
             await self._move()
             return await self._after()
-        except asyncio.CancelledError as error:
-            await self._consent.leave_safe()
-            if self._begun:
-                weighed = f"The pour was given up after it had begun. Weighed until then: {self._weighed()}"
-                self._setup.tell(Notice("warning", weighed))
-                raise
-            raise NotPouredError("the pour was given up before it began; nothing was poured") from error
-        except (InvalidActionError, PourFailedError):
-            await self._consent.leave_safe()
-            raise
-        except LaboratoryError as error:
-            self._begun = self._begun or (self._moves and self._setup.lost)
-            if self._begun and not isinstance(error, BalanceError):
-                await self._weigh_remaining()
-            await self._consent.leave_safe()
-            raise self._pour_error(error) from error
-        finally:
-            watching.cancel()
-            await asyncio.gather(watching, return_exceptions=True)
-            await self._setup.ground_truth.end()
 
     # ---- steps in order
 
     async def _before(self) -> None:
         setup = self._setup
-        self._report.enter("operator")
-        self._facts = await setup.arm.ready()
-        await self._consent.make_safe()
-        if setup.held is not None:
-            await setup.held.ready(vessel(self._scene.pourer))
-        if setup.balance is not None:
-            await setup.balance.device.revive()
-            await setup.balance.resume()
+        await self._ready()
         show = self._report.pour if self._report.watched else None
         await setup.ground_truth.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
         given: dict[str, PourMasses] = {}
@@ -344,18 +440,20 @@ class PourProcedure:
             self._setup.held.stood(weighed.mass)
         self._setup.tell(Notice("note", f"weighed, {key}: {grams(weighed.mass)} ± {1e3 * weighed.uncertainty:.2f} g"))
 
-    def _pour_error(self, error: Exception) -> LaboratoryError:
-        """Return the error for the caller, with the known facts about the liquid."""
-        if not self._begun:
-            return NotPouredError(f"{error}. Nothing was poured")
-        text = f"{error}. What was poured is unknown"
+    async def _remaining(self) -> str:
+        return f"weighed until then: {self._weighed()}"
+
+    async def _unknown(self, error: LaboratoryError) -> str:
+        if not isinstance(error, BalanceError):
+            await self._weigh_remaining()
+        text = "What was poured is unknown"
         with contextlib.suppress(LaboratoryError):
             m = self._weighings.measurement()
             text = (
-                f"{error}. It was not the pour that was asked for; weighed were {grams(m.loaded)} loaded, "
+                f"It was not the pour that was asked for; weighed were {grams(m.loaded)} loaded, "
                 f"{grams(m.spilled)} spilled, {grams(m.retained)} retained"
             )
-        return UnknownPourError(f"{text}. All weighings: {self._weighed()}")
+        return f"{text}. All weighings: {self._weighed()}"
 
     def _weighed(self) -> str:
         return ", ".join(f"{key} {grams(w.mass)}" for key, w in self._weighings.weighed.items()) or "nothing"
@@ -368,7 +466,7 @@ class PourProcedure:
             **measured.notes,
             "arm": _arm_identity(self._facts),
             "executed_s": float(executed.times[-1]),
-            "largest_tilt_deg": _largest_tilt(executed),
+            "largest_tilt_deg": largest_tilt(executed),
             "executed": executed.record(),
             **({} if self._setup.handling is None else {"cycle": self._setup.handling.cycle}),
             **self._signals(),
@@ -381,10 +479,10 @@ class PourProcedure:
         There are none without a balance below the receiver, and on a virtual bench: its balance is loaded afterwards.
         """
         below = self._setup.balance_spec.position in (Placement.RECEIVER, Placement.EVERYTHING)
-        if self._setup.mode != "hardware" or not below or min(len(self._tilts), len(self._readings)) < 2:
+        if self._setup.mode != "hardware" or not below or min(len(self._tilts), len(self._readings.all)) < 2:
             return {}
         begin = self._tilts[0][0]
-        during = [(t - begin, mass) for t, mass in self._readings if t >= begin - BEFORE_TILT]
+        during = [(one.time - begin, one.mass) for one in self._readings.all if one.time >= begin - BEFORE_TILT]
         signals = {
             "times": [round(t - begin, 3) for t, _ in self._tilts],
             "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in self._tilts],
@@ -401,23 +499,6 @@ class PourProcedure:
         self._report.move(state.phase, state.fraction, state.tilt, moving=state.moving)
         self._seen(state)
 
-    def _seen(self, state: ArmState) -> None:
-        self._report.stand(state.joints, state.pourer)
-
-    async def _watch(self) -> None:
-        """Report the balance's display to the progress callback; it cannot delay the pour."""
-        balance = self._setup.balance
-        if balance is None:
-            return
-        while True:
-            with contextlib.suppress(LaboratoryError):
-                weight = await balance.read()
-                if math.isfinite(weight.mass):
-                    if weight.status in ("stable", "unstable"):
-                        self._readings.append((time.monotonic(), weight.mass))
-                    self._report.show(weight.mass, weight.stable)
-            await asyncio.sleep(LOOK_INTERVAL)
-
 
 def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
     """Expected time of each checkpoint [s of bench time]."""
@@ -431,7 +512,7 @@ def _expected(setup: Setup, path: PlannedPour) -> dict[str, float]:
     }
 
 
-def _largest_tilt(executed: Executed) -> float:
+def largest_tilt(executed: Executed) -> float:
     """Largest tilt as read back [deg]."""
     if len(executed.times) < 2:
         return 0.0
