@@ -3,53 +3,51 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, ClassVar
 
-from sim_engine.settings.model import Count, Settings
+from sim_engine.settings.model import Settings
 from sim_engine.settings.quantity import Quantity
 
 TiltSpeed = Annotated[float, Quantity("rad/s", "3 deg/s", 0.0, 3.2, positive=True)]
-TiltAcceleration = Annotated[float, Quantity("rad/s^2", "600 deg/s^2", 0.0, 20.0, positive=True)]
-Amount = Annotated[float, Quantity("kg", "1 g", 0.0, 1.0, positive=True)]
 MassFlow = Annotated[float, Quantity("kg/s", "0.03 kg/s", 0.0, 1.0, positive=True)]
 Duration = Annotated[float, Quantity("s", "0.6 s", 0.0, 600.0, positive=True)]
 
 
 class DosingSettings(Settings):
-    """How doses are poured."""
+    """How doses are poured. Values that no laboratory needs otherwise are constants of the class."""
 
     approach_speed: TiltSpeed = math.radians(50.0)
     """Speed of the tilt up to the earliest plausible onset."""
 
-    search_speed: TiltSpeed = math.radians(3.5)
-    """Largest speed until the stream is seen."""
-
-    return_speed: TiltSpeed = math.radians(60.0)
-    """Speed of the return; a fast one cuts the film at the lip."""
-
-    acceleration: TiltAcceleration = math.radians(600.0)
-    """Acceleration of the return."""
-
     latency: Duration = 0.07
     """Delay from a decision to the arm's motion, servo lag included."""
 
-    smallest_flow: MassFlow = 0.004
-    """Lower bound of the flow at the end of a dose; it is larger where a slower stream would dribble."""
-
-    largest_fine_flow: MassFlow = 0.008
-    """Upper bound of the flow at the end of a dose."""
-
     largest_flow: MassFlow = 0.03
     """Upper bound of the flow at any time."""
-
-    smallest_top_up: Amount = 1.5e-3
-    """Smallest shortage that is poured again; smaller ones cannot be met dependably."""
-
-    most_top_ups: Count = 3
-    """Largest number of top-ups."""
 
     reading_timeout: Duration = 0.7
     """Time without a reading after which the cup is turned back; longer for a balance that sends less often."""
 
     time_limit: Duration = 60.0
     """Longest duration of a dose."""
+
+    search_speed: ClassVar[float] = math.radians(3.5)
+    """Largest speed until the stream is seen."""
+
+    return_speed: ClassVar[float] = math.radians(60.0)
+    """Speed of the return; a fast one cuts the film at the lip."""
+
+    acceleration: ClassVar[float] = math.radians(600.0)
+    """Acceleration of the return."""
+
+    smallest_flow: ClassVar[float] = 0.004
+    """Lower bound of the flow at the end of a dose; it is larger where a slower stream would dribble."""
+
+    largest_fine_flow: ClassVar[float] = 0.008
+    """Upper bound of the flow at the end of a dose."""
+
+    smallest_top_up: ClassVar[float] = 1.5e-3
+    """Smallest shortage that is poured again; smaller ones cannot be met dependably."""
+
+    most_top_ups: ClassVar[int] = 3
+    """Largest number of top-ups."""

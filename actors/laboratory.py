@@ -368,7 +368,7 @@ class RayLaboratory(_OpenLaboratory):
     async def __aenter__(self) -> RayLaboratory:
         spec = self._spec
         address = None if spec.ray is None else spec.ray.address
-        await open_ray(RayStart(address, spec.simulator_count, spec.object_store))
+        await open_ray(RayStart(address, spec.simulator_count))
         try:
             if self._spec.ray is not None:
                 self._cluster = JoinedCluster(self._spec.ray, self._report, self._lose_bench, self._lose_all)

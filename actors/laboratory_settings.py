@@ -154,9 +154,6 @@ class LaboratorySettings(Settings):
     in_process: Annotated[Switch, NOT_IN_FINGERPRINT] = False
     """Run everything in one process (slow, for debugging)."""
 
-    object_store: Annotated[float, Quantity("MB", "160 MB", 80.0, 100_000.0), NOT_IN_FINGERPRINT] = 160.0
-    """Shared memory for simulators' results, without a cluster."""
-
     ray: Annotated[RaySettings | None, NOT_IN_FINGERPRINT] = None
     """The Ray cluster to run on; unless given, a private Ray on this machine."""
 

@@ -151,13 +151,14 @@ class RayStart:
     Attributes:
         address: host:port of a cluster to join; None for a private Ray on this machine.
         cpus: number of simulators that a private Ray runs at once.
-        object_store: shared memory of a private Ray [MB].
     """
 
     address: str | None = None
     cpus: int = 1
-    object_store: float = 160.0
 
+
+OBJECT_STORE = 160 * 1024 * 1024
+"""Shared memory of a private Ray for simulators' results [bytes]."""
 
 _session: _Session | None = None
 _guard = threading.RLock()
@@ -470,7 +471,7 @@ def _start_private(private: _PrivateRay, start: RayStart) -> None:
                 num_cpus=start.cpus,
                 num_gpus=0,
                 resources={_PROGRAM: 1},
-                object_store_memory=round(max(start.object_store, 80.0)) * 1024 * 1024,
+                object_store_memory=OBJECT_STORE,
                 include_dashboard=False,
                 logging_level=logging.ERROR,
                 log_to_driver=False,

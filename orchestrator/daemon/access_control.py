@@ -114,7 +114,7 @@ class RequestGuard:
 
     @property
     def _too_large(self) -> str:
-        return f"more than {self._limit / 1e6:g} MB are not read (listen: body in the daemon's settings)"
+        return f"more than {self._limit / 1e6:g} MB are not read"
 
 
 async def _refuse(receive: Receive, send: Send, status: int, detail: str, *, drain: bool = True) -> None:

@@ -26,7 +26,7 @@ from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 from orchestrator.daemon import PORT
 from orchestrator.daemon.notifications import NotifySettings, problem_of
 from orchestrator.records.run_registry import state_directory
-from sim_engine.settings.model import Count, FilePath, Name, PositiveCount, Settings, Switch, Text
+from sim_engine.settings.model import Count, FilePath, Name, Settings, Switch, Text
 from sim_engine.settings.quantity import Quantity
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -37,7 +37,6 @@ NO_RIG = "none"
 """The rig of campaigns that pour nothing: they need simulators only."""
 
 Port = Annotated[int, Field(strict=True, ge=0, le=65535)]
-DAY = 86400.0
 
 
 class TlsSettings(Settings):
@@ -66,9 +65,6 @@ class ListenSettings(Settings):
 
     plain: Switch = False
     """Serve another address without TLS, because a proxy in front of the daemon encrypts."""
-
-    body: Annotated[float, Quantity("MB", "4 MB", 0.01, 1000.0)] = 4.0
-    """Largest request: a campaign with all files that it refers to."""
 
 
 class LiveSettings(Settings):
@@ -104,9 +100,6 @@ class RecordingsSettings(Settings):
 
     keep: Count | None = None
     """Number of newest runs whose recordings are kept; all by default."""
-
-    age: Annotated[float, Quantity("s", "30 days", 0.0, 3650.0 * DAY, positive=True)] | None = None
-    """Largest age of a recording; unlimited by default."""
 
 
 class ClusterSettings(Settings):
@@ -155,9 +148,6 @@ class DaemonFile(Settings):
     keep_free: Annotated[float, Quantity("MB", "500 MB", 40.0, 1e7)] = 500.0
     """Free disk space below which no campaign starts."""
 
-    events: PositiveCount = 50_000
-    """Number of stored events, for clients that reconnect."""
-
 
 @dataclass(frozen=True)
 class Rig:
@@ -190,16 +180,15 @@ class DaemonSettings:
     port: int = PORT
     certificate: Path | None = None
     key: Path | None = None
-    body_limit: int = 4_000_000
+    body_limit: int = 4_000_000  # a campaign with all files that it refers to
     rigs: tuple[Rig, ...] = (Rig(ANY_RIG),)
     roots: tuple[Path, ...] = ()
     simulators: int = 0
     ray: RaySettings | None = None
     in_process: bool = False
     keep_recordings: int | None = None
-    recording_age: float | None = None
     keep_free: int = 500_000_000
-    events: int = 50_000
+    events: int = 50_000  # stored for clients that reconnect
     live: tuple[str, int | None] | None = None
     notify: NotifySettings | None = None
     madsci: MadsciSettings | None = None
@@ -346,16 +335,13 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
         port=file.listen.port,
         certificate=files[0],
         key=files[1],
-        body_limit=round(file.listen.body * 1e6),
         rigs=tuple(rigs) or (Rig(ANY_RIG),),
         roots=tuple(roots),
         simulators=file.simulators,
         ray=None if file.ray is None or report.problems else RaySettings(address=file.ray.address),
         in_process=file.in_process,
         keep_recordings=file.recordings.keep,
-        recording_age=file.recordings.age,
         keep_free=round(file.keep_free * 1e6),
-        events=file.events,
         live=None if file.live is None else (file.live.host, file.live.port),
         notify=file.notify,
         madsci=file.madsci,

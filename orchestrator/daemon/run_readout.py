@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -138,29 +137,25 @@ def found_at(spec: LaboratorySettings) -> dict[str, str]:
     return found
 
 
-def prune_recordings(settings: DaemonSettings, busy: Collection[str] = (), now: float | None = None) -> list[Path]:
-    """Delete recordings that exceed the configured number or age.
+def prune_recordings(settings: DaemonSettings, busy: Collection[str] = ()) -> list[Path]:
+    """Delete the recordings of all runs but the newest ones.
 
     Args:
-        settings: limits and folder.
+        settings: number of runs that keep theirs, and folder.
         busy: names of runs in progress.
-        now: time in seconds since 1970.
 
     Returns:
         The deleted files.
     """
-    if settings.keep_recordings is None and settings.recording_age is None:
+    if settings.keep_recordings is None:
         return []
-    now = time.time() if now is None else now
     runs: dict[Path, float] = {}
     for path in settings.runs.glob("*/*.rrd"):
         runs[path.parent] = max(runs.get(path.parent, 0.0), path.stat().st_mtime)
     newest = sorted(runs, key=lambda run: runs[run], reverse=True)
     removed = []
-    for index, run in enumerate(newest):
-        many = settings.keep_recordings is not None and index >= settings.keep_recordings
-        old = settings.recording_age is not None and now - runs[run] > settings.recording_age
-        if (many or old) and run.name not in busy:
+    for run in newest[settings.keep_recordings :]:
+        if run.name not in busy:
             for path in run.glob("*.rrd"):
                 path.unlink()
                 removed.append(path)

@@ -319,8 +319,9 @@ def test_a_shortage_above_the_smallest_dependable_amount_is_poured_again() -> No
     assert result.amount == pytest.approx(record.received, abs=0.3e-3)
 
 
-def test_a_shortage_below_the_smallest_dependable_amount_is_left() -> None:
-    record, result = interrupted_dose(DosingSettings(smallest_top_up=0.04))
+def test_a_shortage_below_the_smallest_dependable_amount_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DosingSettings, "smallest_top_up", 0.04)
+    record, result = interrupted_dose(DosingSettings())
     assert (result.end, result.top_ups) == (DoseEnd.REACHED, 0)
     assert 0.02 < record.received < 0.045
     assert result.amount == pytest.approx(record.received, abs=0.3e-3)

@@ -242,6 +242,8 @@ def _bound(number: float) -> str:
 
 
 REMOVED = {
+    "object_store": "a private Ray reserves 160 MB; remove it",
+    "smallest_top_up": "this limit of doses is fixed; remove it",
     "on_failed_pour": "a pour that fails while it is made counts as the worst loss; remove it",
     "discrepancy_policy": "a simulator that seems wrong is weighted accordingly and reported; remove it",
     "pareto": "the weighted sum of the objectives is minimised; give each a 'weight', and remove it",

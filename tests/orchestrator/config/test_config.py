@@ -238,7 +238,6 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           name: odd
           simulators: 3
           in_process: true
-          object_store: 300 MB
           ray: {{address: "head.local:6379", bench_resource: left_bench}}
           bench:
             liquid: {{particles: 3100, cohesion: 31 mN/m, xsph_rate: 7 Hz, friction: 0.31}}
@@ -294,7 +293,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert (plan.name, plan.seed, plan.parallel_simulations, plan.on_unknown) == ("everything", 41, 5, "repeat")
     assert tuple(plan.outputs.model_dump().values()) == (str(tmp_path / "here"), False, False, True, 4.0, 2)
     lab = plan.laboratory
-    assert (lab.name, lab.simulators, lab.in_process, lab.object_store) == ("odd", 3, True, 300)
+    assert (lab.name, lab.simulators, lab.in_process) == ("odd", 3, True)
     assert lab.ray == RaySettings(address="head.local:6379", bench_resource="left_bench")
     assert (bench.theta.particles, bench.liquid.xsph_rate, bench.liquid.friction) == (3100, 7.0, 0.31)
     assert dataclasses.astuple(bench.pose_error.error) == pytest.approx((0.0011, -0.002, 0.7 * DEG, 1.03, 0.0007))

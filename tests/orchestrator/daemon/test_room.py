@@ -71,10 +71,10 @@ def recorded(settings: DaemonSettings, name: str, age: float) -> Path:
 
 
 def test_recordings_are_kept_as_long_as_they_are_to_be_and_journals_always(tmp_path: Path) -> None:
-    settings = DaemonSettings(tmp_path, keep_recordings=2, recording_age=100.0)
+    settings = DaemonSettings(tmp_path, keep_recordings=2)
     new, newer, many, old = (recorded(settings, n, a) for n, a in (("a", 10), ("b", 5), ("c", 50), ("d", 200)))
-    assert prune_recordings(settings, busy={"d"}, now=1e9) == [many]
-    assert prune_recordings(settings, now=1e9) == [old]
+    assert prune_recordings(settings, busy={"d"}) == [many]
+    assert prune_recordings(settings) == [old]
     assert new.exists()
     assert newer.exists()
     assert len(list(settings.runs.glob("*/journal.sqlite"))) == 4
@@ -83,7 +83,7 @@ def test_recordings_are_kept_as_long_as_they_are_to_be_and_journals_always(tmp_p
 def test_all_recordings_are_kept_unless_somebody_says_otherwise(tmp_path: Path) -> None:
     settings = DaemonSettings(tmp_path)
     recorded(settings, "a", 1e8)
-    assert prune_recordings(settings, now=1e9) == []
+    assert prune_recordings(settings) == []
 
 
 def test_a_snapshot_that_nobody_was_told_of_is_forgotten(tmp_path: Path) -> None:

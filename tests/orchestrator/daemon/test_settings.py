@@ -34,13 +34,13 @@ def test_without_a_file_only_this_machine_is_served(tmp_path: Path, monkeypatch:
 def test_a_file_says_what_is_different(tmp_path: Path) -> None:
     found = load(
         tmp_path,
-        "state: there\nrigs: {left: left.yaml}\nroots: [.]\nlisten: {port: 9, body: 2 MB}\n"
-        "recordings: {keep: 3, age: 2 days}\nkeep_free: 1 GB\n",
+        "state: there\nrigs: {left: left.yaml}\nroots: [.]\nlisten: {port: 9}\n"
+        "recordings: {keep: 3}\nkeep_free: 1 GB\n",
     )
     assert found.state == tmp_path / "there"
     assert [(rig.name, rig.mode) for rig in found.rigs] == [("left", "virtual")]
-    assert (found.port, found.body_limit, found.keep_free) == (9, 2_000_000, 1_000_000_000)
-    assert (found.keep_recordings, found.recording_age) == (3, 172_800.0)
+    assert (found.port, found.keep_free) == (9, 1_000_000_000)
+    assert found.keep_recordings == 3
 
 
 def test_a_cluster_where_nothing_answers_is_refused_before_anything_starts(
@@ -69,7 +69,7 @@ def test_a_cluster_where_nothing_answers_is_refused_before_anything_starts(
         ("ray: {address: 10.0.0.1}\n", "decant.yaml:1:16: ray.address: '10.0.0.1' should be host:port"),
         ("in_process: true\nray: {address: 10.0.0.1:6379}\n", "decant.yaml:2:1: ray: a daemon without Ray"),
         ("roots: [nowhere]\n", "is not a folder"),
-        ("recordings: {age: 30}\n", "decant.yaml:1:19: recordings.age"),
+        ("recordings: {age: 30 days}\n", "decant.yaml:1:14: recordings.age: unknown key"),
     ],
 )
 def test_what_is_wrong_is_said_with_its_place(tmp_path: Path, text: str, said: str) -> None:
