@@ -107,10 +107,6 @@ class LineSettingsError(NoConnectionError):
     """The port cannot be set to this speed or format."""
 
 
-class UnknownDialectError(NoConnectionError):
-    """A device may be connected, but it uses none of the known dialects."""
-
-
 class NotStableError(BalanceError):
     """The weight did not settle in time."""
 
@@ -129,10 +125,6 @@ class UnitError(BalanceError):
 
 class ReferenceLostError(BalanceError):
     """The connection was lost since the last tare: the balance may have been switched off and have a new zero."""
-
-
-class BalanceFaultError(BalanceError):
-    """The balance reports an internal fault."""
 
 
 _OUTSIDE = {
@@ -179,12 +171,12 @@ def unsettled(
             return OutOfRangeError, _OUTSIDE[seen.status]
         case ReadingStatus.ERROR:
             detail = f" ({seen.detail})" if seen.detail else ""
-            return BalanceFaultError, f"it reports a fault{detail}; look it up in its manual"
+            return BalanceError, f"it reports a fault{detail}; look it up in its manual"
         case ReadingStatus.BUSY if seen.detail.startswith(REFUSED):
             return CommandError, f"{seen.detail}. Does it speak this dialect? Set 'dialect: auto' to find out"
         case ReadingStatus.UNREADABLE:
             text = f"it answers, but no weight came within {within:g} s. Its last line was {seen.detail}"
-            return UnknownDialectError, text
+            return NoConnectionError, text
         case ReadingStatus.SILENT:
             return (
                 NoConnectionError,

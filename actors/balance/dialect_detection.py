@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from actors.balance.balance_interface import LineSettingsError, UnknownDialectError
+from actors.balance.balance_interface import LineSettingsError, NoConnectionError
 from actors.balance.dialects.dialect import Dialect, LineSettings
 from actors.balance.line_explanation import explain_line, is_text, most_telling, shown_bytes
 from actors.balance.readings import LineError, Reading
@@ -112,7 +112,7 @@ def detect(
         The detected balance, and the open wire.
 
     Raises:
-        UnknownDialectError: no dialect was recognised; the text lists the attempts and the received bytes.
+        NoConnectionError: no dialect was recognised; the text lists the attempts and the received bytes.
         NoConnectionError: the port cannot be opened.
     """
     timeout = max(answer_time, ANSWERING)
@@ -133,7 +133,7 @@ def detect(
             found = _attempt(patient[earlier.line], allowed, open_wire, interrupted, timeout)
             if found is not None:
                 return found
-    raise UnknownDialectError(_failure(port, [patient.get(attempt.line, attempt) for attempt in quick], allowed))
+    raise NoConnectionError(_failure(port, [patient.get(attempt.line, attempt) for attempt in quick], allowed))
 
 
 def _attempt(

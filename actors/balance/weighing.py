@@ -121,7 +121,7 @@ class Weighings:
             nominal: requested load [kg].
 
         Raises:
-            WeighingError: the weighings are incomplete or inconsistent.
+            BalanceError: the weighings are incomplete or inconsistent.
         """
         return measurement(self._spec.position, self.weighed, nominal=nominal, tolerance=self._spec.load_tolerance)
 

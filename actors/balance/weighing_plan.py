@@ -222,10 +222,6 @@ SURE = 4.0
 """Number of standard deviations beyond which a negative mass is an error instead of noise."""
 
 
-class WeighingError(BalanceError):
-    """The weighings of a pour are incomplete or inconsistent."""
-
-
 @dataclass(frozen=True)
 class PourMasses:
     """One weighing.
@@ -262,7 +258,7 @@ def measurement(
         tolerance: largest deviation of the load from it [kg].
 
     Raises:
-        WeighingError: a weighing is missing or not a number, a mass is negative beyond noise, a mass exceeds the load,
+        BalanceError: a weighing is missing or not a number, a mass is negative beyond noise, a mass exceeds the load,
             or the load differs from the requested one. Missing weighings are never replaced by assumptions.
     """
     _check_complete(placement, weighed)
@@ -318,13 +314,13 @@ def _check_complete(placement: Placement, weighed: Mapping[str, PourMasses]) -> 
     missing = [key for key in asked if key not in weighed]
     if missing:
         what = "; ".join(f"{key} ('{asked[key]}')" for key in missing)
-        raise WeighingError(
+        raise BalanceError(
             f"not weighed: {what}. Without it the pour can't be counted; nothing is assumed in its place"
         )
     for key in asked:
         one = weighed[key]
         if not (math.isfinite(one.mass) and math.isfinite(one.uncertainty) and one.uncertainty >= 0.0):
-            raise WeighingError(f"{key} is not a weight: {one.mass} kg ± {one.uncertainty} kg")
+            raise BalanceError(f"{key} is not a weight: {one.mass} kg ± {one.uncertainty} kg")
 
 
 def _check_sense(mass: dict[str, float], sigma: dict[str, float], nominal: float | None, tolerance: float) -> None:
@@ -332,12 +328,12 @@ def _check_sense(mass: dict[str, float], sigma: dict[str, float], nominal: float
     slack = {name: SURE * sigma[name] + 1e-9 for name in mass}
     shown = {name: f"{_grams(mass[name]):g} ± {_grams(sigma[name]):g} g" for name in mass}
     if mass["loaded"] <= slack["loaded"]:
-        raise WeighingError(
+        raise BalanceError(
             f"loaded {shown['loaded']}: the filled pourer weighed no more than the empty one. Was it filled? "
             "Were the two mixed up?"
         )
     if nominal is not None and abs(mass["loaded"] - nominal) > tolerance:
-        raise WeighingError(
+        raise BalanceError(
             f"loaded {shown['loaded']}, but {_grams(nominal):g} ± {_grams(tolerance):g} g was asked for. Fill anew, or "
             "weigh anew if it was filled right"
         )
@@ -348,9 +344,9 @@ def _check_sense(mass: dict[str, float], sigma: dict[str, float], nominal: float
     }
     for name, hint in hints.items():
         if mass[name] < -slack[name]:
-            raise WeighingError(f"{name} {shown[name]} is less than nothing: {hint} All: {_all(shown)}")
+            raise BalanceError(f"{name} {shown[name]} is less than nothing: {hint} All: {_all(shown)}")
         if mass[name] > mass["loaded"] + slack[name] + slack["loaded"]:
-            raise WeighingError(
+            raise BalanceError(
                 f"{name} {shown[name]} is more than was loaded, {shown['loaded']}: did something else fall on the "
                 f"balance, or was a weighing mixed up? All: {_all(shown)}"
             )

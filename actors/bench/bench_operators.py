@@ -23,10 +23,6 @@ from actors.balance.weighing_plan import Placement
 from actors.interfaces import LaboratoryError, Notice, Operator, OperatorQuestion, OperatorSettings
 
 
-class NoAnswerError(LaboratoryError):
-    """The deadline of a question has passed."""
-
-
 @dataclass(frozen=True)
 class AnsweredQuestion:
     """A question and its answer.
@@ -68,7 +64,7 @@ class OperatorQuestions:
         """Ask a question and wait for the answer.
 
         Raises:
-            NoAnswerError: no answer came before the deadline.
+            LaboratoryError: no answer came before the deadline.
             LaboratoryError: the operator gave up.
         """
         if question.problem:
@@ -109,7 +105,7 @@ class OperatorQuestions:
                 return answering.result()
             waited = time.monotonic() - begun
             if waited >= self._deadline:
-                raise NoAnswerError(f"no answer within {self._deadline:g} s: '{question.text}'")
+                raise LaboratoryError(f"no answer within {self._deadline:g} s: '{question.text}'")
             unseen: Literal["note", "warning"] = "note" if self._on_screen else "warning"
             self._notify(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))
 

@@ -115,10 +115,6 @@ def way_home_question(spec: ArmSettings) -> OperatorQuestion:
     )
 
 
-class ConsentRefusedError(LaboratoryError):
-    """The operator refused."""
-
-
 @dataclass(frozen=True)
 class Setup:
     """The parts of a bench that all its pours share; see `actors.bench.bench_factory.PouringBench`."""
@@ -183,7 +179,7 @@ class Consent:
         """Make sure that nothing moves and nothing can move. The operator is invited into the cell only after that.
 
         Raises:
-            ConsentRefusedError: this cannot be verified, and the operator ends the attempts.
+            LaboratoryError: this cannot be verified, and the operator ends the attempts.
         """
         problem = ""
         while True:
@@ -200,7 +196,7 @@ class Consent:
                     continue
                 problem = str(error)
             if not await self._agreed(unsafe_question(problem)):
-                raise ConsentRefusedError(f"it can't be seen that the arm keeps still: {problem}")
+                raise LaboratoryError(f"it can't be seen that the arm keeps still: {problem}")
 
     async def _agreed(self, question: OperatorQuestion) -> bool:
         return (await self.ask(question)).strip().lower() in ("yes", "y")
@@ -209,10 +205,10 @@ class Consent:
         """Ask for consent to a motion, announce the motion, and release the arm.
 
         Raises:
-            ConsentRefusedError: the operator refused.
+            LaboratoryError: the operator refused.
         """
         if not await self._agreed(question):
-            raise ConsentRefusedError("the operator did not let the arm move")
+            raise LaboratoryError("the operator did not let the arm move")
         spec = self._setup.spec
         text = f"The arm moves in {spec.warning_time:g} s. Keep out of its way."
         # The driver waits for the same time between the release and the first movement.
@@ -265,7 +261,7 @@ class Consent:
         """Make the robot ready again after the operator has fixed the cause; nothing moves yet.
 
         Raises:
-            ConsentRefusedError: the operator leaves the arm as it is.
+            LaboratoryError: the operator leaves the arm as it is.
         """
         if isinstance(error, BenchLostError):
             raise error  # cannot be recovered from here
@@ -281,7 +277,7 @@ class Consent:
                 continue
             self._setup.tell(Notice("info", f"the arm is ready again: {done or 'nothing had to be done'}"))
             return
-        raise ConsentRefusedError(f"{error}; the operator leaves the arm as it stands")
+        raise LaboratoryError(f"{error}; the operator leaves the arm as it stands")
 
     async def leave_safe(self) -> None:
         """Stop arm and balance after any failure, also while this task is being cancelled."""

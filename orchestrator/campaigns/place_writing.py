@@ -15,10 +15,6 @@ from actors.places import PlaceSettings
 from sim_engine.errors import DecantError
 
 
-class PlaceWritingError(DecantError):
-    """The file can't be changed; the text states why."""
-
-
 def write_place(path: Path, place: PlaceSettings) -> None:
     """Write a place into the section `places` of a laboratory file: a new entry, or new values of the one of its name.
 
@@ -27,7 +23,7 @@ def write_place(path: Path, place: PlaceSettings) -> None:
         place: pose, tool and use are written.
 
     Raises:
-        PlaceWritingError: the file is no mapping, or `places` is no list.
+        DecantError: the file is no mapping, or `places` is no list.
         OSError: it can't be read or written.
     """
     yaml = YAML()
@@ -37,12 +33,12 @@ def write_place(path: Path, place: PlaceSettings) -> None:
     try:
         document = yaml.load(path.read_text(encoding="utf-8"))
     except YAMLError as error:
-        raise PlaceWritingError(f"{path}: {error}") from None
+        raise DecantError(f"{path}: {error}") from None
     if not isinstance(document, CommentedMap):
-        raise PlaceWritingError(f"{path}: should be a mapping of keys")
+        raise DecantError(f"{path}: should be a mapping of keys")
     places = document.setdefault("places", CommentedSeq())
     if not isinstance(places, CommentedSeq):
-        raise PlaceWritingError(f"{path}: 'places' should be a list")
+        raise DecantError(f"{path}: 'places' should be a list")
     entry = next((one for one in places if isinstance(one, CommentedMap) and one.get("name") == place.name), None)
     if entry is None:
         entry = CommentedMap(name=place.name)

@@ -36,10 +36,6 @@ RESTING = ("weighed", "failed", "unknown", "cancelled", "paused", "dry run")
 Placed = TypeVar("Placed")
 
 
-class DifferentOrderError(RequestRefusedError):
-    """The id belongs to another order."""
-
-
 class Ordering:
     """Orders of one daemon.
 
@@ -71,7 +67,7 @@ class Ordering:
             return await self._dry_run(request, by)
         body = request.model_dump()
         if await self._once(f"pour {request.id}", lambda: self._place(request, body, by)) != body:
-            raise DifferentOrderError(
+            raise RequestRefusedError(
                 f"id {request.id} belongs to another order; give every pour an id of its own. Nothing was queued"
             )
         return await self.pour_out(request.id)
@@ -91,7 +87,7 @@ class Ordering:
         name = f"campaign {request.id or key}"
         item = await self._once(name, lambda: self._place_campaign(request, key, digest, by))
         if item.body_hash != digest:
-            raise DifferentOrderError(
+            raise RequestRefusedError(
                 f"id {request.id} belongs to another campaign, {item.id}; give every campaign an id of its own. "
                 "Nothing was queued"
             )

@@ -154,10 +154,6 @@ DETAIL = 30.0
 """Frames per simulated second [1/s]."""
 
 
-class NoSuchPourError(InvalidArgumentError):
-    """The journal has no such pour; the message lists the pours it has."""
-
-
 def find_pour(run: Path, number: int, stage: str | None = None) -> RunPour:
     """Find a weighed pour of a run. Doses are not found: their motions were not those of an action.
 
@@ -167,7 +163,7 @@ def find_pour(run: Path, number: int, stage: str | None = None) -> RunPour:
         stage: stage that requested it; None: the last stage with such a pour.
 
     Raises:
-        NoSuchPourError: the run has no such pour.
+        InvalidArgumentError: the run has no such pour.
         JournalError: the journal can't be read.
     """
     weighed = [pour for pour in read_record(run).weighed if pour.request.dose is None]
@@ -179,7 +175,7 @@ def find_pour(run: Path, number: int, stage: str | None = None) -> RunPour:
         known = "; ".join(f"{name}: {', '.join(numbers)}" for name, numbers in stages.items())
         of = "" if stage is None else f" of stage {stage}"
         found = f"weighed were {known}" if known else "none was"
-        raise NoSuchPourError(f"{run}: there is no weighed pour {number}{of}; {found}")
+        raise InvalidArgumentError(f"{run}: there is no weighed pour {number}{of}; {found}")
     return fitting[-1]
 
 

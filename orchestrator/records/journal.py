@@ -247,7 +247,7 @@ class Journal(JournalReader):
         """Begin a new journal.
 
         Raises:
-            JournalLockedError: another process is writing it.
+            JournalError: another process is writing it.
             JournalError: a run or traces of one exist already, or the file can't be written.
         """
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -274,7 +274,7 @@ class Journal(JournalReader):
         """Continue a journal. If its process died before it wrote anything, the journal is begun again.
 
         Raises:
-            JournalLockedError: another process is writing it.
+            JournalError: another process is writing it.
             JournalDamagedError: it has lost or changed entries.
             JournalError: there is none, it has another format, or it belongs to another campaign.
         """

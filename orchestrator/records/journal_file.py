@@ -66,10 +66,6 @@ class JournalFormatError(JournalError):
     exit_code = 2
 
 
-class JournalLockedError(JournalError):
-    """Another process is writing this journal."""
-
-
 @dataclass(frozen=True)
 class Header:
     """The campaign that a journal belongs to.
@@ -219,7 +215,7 @@ def take_lock(path: Path) -> IO[str]:
     """Lock the run for this process.
 
     Raises:
-        JournalLockedError: another process holds the lock.
+        JournalError: another process holds the lock.
         JournalError: the file system can't lock files.
     """
     file = path.with_suffix(".lock").open("a+", encoding="utf-8")
@@ -233,9 +229,7 @@ def take_lock(path: Path) -> IO[str]:
         owner = file.read().strip()
         file.close()
         who = f"process {owner}" if owner else "another process"
-        raise JournalLockedError(
-            f"{path.parent}: {who} is running this campaign; wait for it, or stop it before you resume"
-        )
+        raise JournalError(f"{path.parent}: {who} is running this campaign; wait for it, or stop it before you resume")
     file.truncate(0)
     file.write(str(os.getpid()))
     file.flush()

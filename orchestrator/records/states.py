@@ -51,12 +51,8 @@ RESTING = frozenset({State.QUEUED, State.PAUSED, State.UNKNOWN, State.FAILED, St
 """States in which a run may be left. Any other state in a journal without a writer means that its process died."""
 
 
-class TransitionError(RuntimeError):
-    """A change of state that the table does not allow: a defect in the program."""
-
-
 def check_transition(before: State, after: State) -> None:
-    """Raises TransitionError unless the table allows the change."""
+    """Raises RuntimeError unless the table allows the change."""
     if after not in TRANSITIONS[before]:
         allowed = ", ".join(sorted(TRANSITIONS[before])) or "nothing"
-        raise TransitionError(f"a campaign can't go from {before} to {after}; from {before} it may go to {allowed}")
+        raise RuntimeError(f"a campaign can't go from {before} to {after}; from {before} it may go to {allowed}")

@@ -43,10 +43,6 @@ from sim_engine.scene import Scene
 from sim_engine.settings.quantity import number_readings, typed_number
 
 
-class ReplayError(RunError):
-    """The strategy's requests differ from those in the journal."""
-
-
 @dataclass
 class StageHistory:
     """The journal's content for one stage.
@@ -123,7 +119,7 @@ def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, R
         The requests whose outcome the strategy has not received, by id, in the order in which they were made.
 
     Raises:
-        ReplayError: the strategy's requests differ from those in the journal.
+        RunError: the strategy's requests differ from those in the journal.
     """
     undelivered: dict[int, Request] = {}
     for step in history.steps:
@@ -139,7 +135,7 @@ def replay(strategy: Strategy, history: StageHistory, stage: str) -> dict[int, R
             _check_same(history.requests[key], request, key, stage)
             undelivered[key] = request
         if len(requests) != len(step.ids):
-            raise ReplayError(
+            raise RunError(
                 f"stage {stage}: the journal has {len(step.ids)} request(s) from {step.ids[:1] or 'none'} on, "
                 f"the replayed strategy asks for {len(requests)}. {_ADVICE}"
             )
@@ -168,7 +164,7 @@ def _check_same(written: Request, now: Request, key: int, stage: str) -> None:
     # Decoded and encoded again: a later field with a default that changes nothing does not make a request different.
     before, after = encode_request(written), encode_request(now)
     if canonical(before) != canonical(after):
-        raise ReplayError(
+        raise RunError(
             f"stage {stage}: request {key} differs from the journal's at {first_difference(before, after)}. {_ADVICE}"
         )
 

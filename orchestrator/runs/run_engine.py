@@ -75,8 +75,8 @@ async def run_campaign(
         deadlines: replaces the default deadlines.
 
     Raises:
-        RunError: the run can't begin or continue. Another process runs it (JournalLockedError), its journal doesn't fit
-            (JournalError, ReplayError), the operator is needed (OperatorNeededError), the disk has too little space for
+        RunError: the run can't begin or continue. Another process runs it (JournalError), its journal doesn't fit
+            (RunError), the operator is needed (OperatorNeededError), the disk has too little space for
             a pour's records (NoSpaceError), or the laboratory or a strategy fails.
         LaboratoryError: the laboratory can't be opened.
     """

@@ -45,10 +45,6 @@ SIMULATOR, SIMULATOR_FILE = "simulator", "simulator.json"
 """Key of the solver's version in `versions.json`, and the file of the state directory that keeps it."""
 
 
-class RunNotFoundError(JournalError):
-    """There is no run to resume."""
-
-
 def create_run(plan: CampaignPlan) -> Path:
     """Make the directory of a new run, NAME-DATE-N (NAME-hardware-DATE-N), where N counts the runs of the day.
 
@@ -194,7 +190,7 @@ def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
     resuming it can report the changed settings.
 
     Raises:
-        RunNotFoundError: no such run, or no unfinished run.
+        JournalError: no such run, or no unfinished run.
         JournalDamagedError: its journal has lost or changed entries, so that resuming it could repeat pours.
     """
     parent = plan.outputs.folder
@@ -202,7 +198,7 @@ def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
         directory = parent / run_id
         if not has_begun(directory / JOURNAL_NAME):
             known = sorted(p.parent.name for p in parent.glob(f"*/{JOURNAL_NAME}"))
-            raise RunNotFoundError(f"{directory}: no such run; known: {', '.join(known) or 'none'}")
+            raise JournalError(f"{directory}: no such run; known: {', '.join(known) or 'none'}")
     else:
         directory = _newest_unfinished(plan, parent)
     check_journal(directory / JOURNAL_NAME).require()
@@ -224,7 +220,7 @@ def _newest_unfinished(plan: CampaignPlan, parent: Path) -> Path:
             begun = readable_lines(directory / LEDGER_NAME)[:1]
             found += [(True, line.t, directory) for line in begun if line.body.get("name") == plan.name]
     if not found:
-        raise RunNotFoundError(f"{parent}: no unfinished run of campaign '{plan.name}'; begin one without --resume")
+        raise JournalError(f"{parent}: no unfinished run of campaign '{plan.name}'; begin one without --resume")
     return max(found)[2]
 
 

@@ -98,10 +98,6 @@ _REPORT_INTERVAL = 0.3
 """Minimum time between two progress events of a strategy, unless the event is urgent [s]."""
 
 
-class StrategyError(RunError):
-    """A strategy violates the ask–tell protocol: a defect in the program, not in the laboratory."""
-
-
 class StageScheduler:
     """Runs one strategy to its end, or to a safe point."""
 
@@ -149,7 +145,7 @@ class StageScheduler:
         """Bring the strategy to the state at the end of the journal. Executes nothing.
 
         Raises:
-            ReplayError: the strategy's requests differ from those in the journal.
+            RunError: the strategy's requests differ from those in the journal.
         """
         undelivered = replay(self._strategy, history, self._stage)
         simulations = [key for key, request in history.requests.items() if isinstance(request, Simulate)]
@@ -176,7 +172,7 @@ class StageScheduler:
             The strategy's result, as in the journal.
 
         Raises:
-            StrategyError: it requests more than its slots allow, or nothing while no request is pending.
+            RunError: it requests more than its slots allow, or nothing while no request is pending.
             RequestExecutorError: the laboratory can't continue.
             asyncio.CancelledError: the run is paused; requests that had begun were finished or abandoned, and recorded.
         """
@@ -189,7 +185,7 @@ class StageScheduler:
                 if not self._pending:
                     if self._strategy.finished:
                         break
-                    raise StrategyError(
+                    raise RunError(
                         f"strategy stalled in stage {self._stage}: it is not finished, waits for nothing and asks for "
                         f"nothing with {self._capacity} free simulation slot(s) and the arm free"
                     )
@@ -227,7 +223,7 @@ class StageScheduler:
         simulations = sum(isinstance(r, Simulate) for r in requests)
         pours = sum(isinstance(r, Pour) for r in requests)
         if simulations > slots.simulations or pours > slots.pours:
-            raise StrategyError(
+            raise RunError(
                 f"stage {self._stage}: the strategy asks for {simulations} simulation(s) and {pours} pour(s), but "
                 f"{slots.simulations} and {slots.pours} slot(s) are free"
             )
@@ -301,7 +297,7 @@ class StageScheduler:
             task = pending.task
             if task is not None and task.done():
                 if task.cancelled():
-                    raise StrategyError(f"request {pending.id} of stage {self._stage} was cancelled from outside")
+                    raise RunError(f"request {pending.id} of stage {self._stage} was cancelled from outside")
                 if (error := task.exception()) is not None:
                     raise error
 

@@ -18,13 +18,13 @@ import pytest
 
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.learning.requests import Pour
+from orchestrator.learning.run_errors import RunError
 from orchestrator.records.events import Event, RequestFinished, StageClosed
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
-from orchestrator.records.journal_file import JournalError, JournalLockedError
+from orchestrator.records.journal_file import JournalError
 from orchestrator.records.run_clock import run_time
 from orchestrator.records.run_record import read_record
 from orchestrator.reports.progress_state import ProgressState
-from orchestrator.runs.resume import ReplayError
 from orchestrator.runs.stages import StageDefinition
 from tests.support import toy_campaign
 from tests.support.hypothesis_examples import THOROUGH
@@ -151,7 +151,7 @@ def test_two_processes_can_not_run_one_campaign(tmp_path: Path) -> None:
         _, complaints = second.communicate(timeout=PATIENCE)
         assert second.returncode != 0
         assert f"process {first.pid} is running this campaign" in complaints
-        with pytest.raises(JournalLockedError, match=str(first.pid)):
+        with pytest.raises(JournalError, match=str(first.pid)):
             run(directory, resume=True, stages=toy_stages())
         assert entries_written(directory) >= before
     finally:
@@ -214,7 +214,7 @@ def test_a_strategy_that_has_changed_is_found_out_at_its_first_other_request(tmp
         StageDefinition("first", lambda results, seed: Changed(seed, simulations=3, pours=2, beside=2), pours=True),
         SMALL[1],
     )
-    with pytest.raises(ReplayError, match=r"stage first: request 2 differs from the journal's at seed: \d+ became \d+"):
+    with pytest.raises(RunError, match=r"stage first: request 2 differs from the journal's at seed: \d+ became \d+"):
         run(directory, resume=True, stages=changed)
     assert run(directory, resume=True).state == "finished"  # nothing was lost by trying
 

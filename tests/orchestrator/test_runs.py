@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.runs.run_folder import RunNotFoundError, create_run, find_run
+from orchestrator.records.journal_file import JournalError
+from orchestrator.runs.run_folder import create_run, find_run
 from sim_engine.engine_package import ENGINES, engine_version
 from tests.support.killed_runs import SMALL, die_at, run
 from tests.support.toy_campaign import run_toy, toy_plan
@@ -18,7 +19,7 @@ from tests.support.toy_campaign import run_toy, toy_plan
 
 def test_run_directories_count_up_and_the_newest_unfinished_one_is_resumed(tmp_path: Path) -> None:
     plan = toy_plan(tmp_path / "runs", on_unknown="repeat")
-    with pytest.raises(RunNotFoundError, match="no unfinished run of campaign 'toy'"):
+    with pytest.raises(JournalError, match="no unfinished run of campaign 'toy'"):
         find_run(plan)
     finished, older, newer = (create_run(plan) for _ in range(3))
     assert [p.name.rsplit("-", 1)[1] for p in (finished, older, newer)] == ["1", "2", "3"]
@@ -32,7 +33,7 @@ def test_run_directories_count_up_and_the_newest_unfinished_one_is_resumed(tmp_p
         os.waitpid(fork, 0)
     assert find_run(plan) == newer
     assert find_run(plan, run_id=older.name) == older
-    with pytest.raises(RunNotFoundError, match=r"no such run; known: toy-\d+-1, "):
+    with pytest.raises(JournalError, match=r"no such run; known: toy-\d+-1, "):
         find_run(plan, run_id="nonsense")
     other = replace(plan, seed=8)
     assert find_run(other) == newer  # so that resuming it can say what differs

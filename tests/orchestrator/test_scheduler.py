@@ -15,9 +15,9 @@ from actors import optimizer_actor as optimizer
 from actors.interfaces import InvalidActionError, LaboratoryError, SimulationError
 from actors.runtime.remote_object import DeviceLostError
 from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Slots
+from orchestrator.learning.run_errors import RunError
 from orchestrator.records.events import Event, LogLine, PourProgressed, RequestFinished
 from orchestrator.runs.request_executor import Deadlines, PourUnknownError, RequestExecutorError
-from orchestrator.runs.stage_scheduler import StrategyError
 from tests.support.scripted_strategy import Script, one_stage, pour, run, simulate, states
 from tests.support.toy_campaign import (
     ToyBench,
@@ -243,7 +243,7 @@ class Greedy(Script):
 
 
 def test_a_strategy_that_stalls_is_found_out(tmp_path: Path) -> None:
-    with pytest.raises(StrategyError, match="strategy stalled in stage only"):
+    with pytest.raises(RunError, match="strategy stalled in stage only"):
         run(tmp_path / "run", stages=one_stage(Lazy(simulate(1))))
     assert states(tmp_path / "run")[-1] == "failed"
 
@@ -253,7 +253,7 @@ def test_a_strategy_that_asks_for_more_than_there_is_gets_nothing_started(
     tmp_path: Path, requests: list[Request]
 ) -> None:
     laboratory = ToyLaboratory()
-    with pytest.raises(StrategyError, match="slot"):
+    with pytest.raises(RunError, match="slot"):
         run(tmp_path / "run", laboratory, stages=one_stage(Greedy(*requests)))
     assert laboratory.simulators.tasks == []
     assert laboratory.bench is not None

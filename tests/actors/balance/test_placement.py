@@ -6,15 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from actors.balance.weighing_plan import (
-    Placement,
-    PourMasses,
-    WeighingError,
-    measurement,
-    needed,
-    weighing_uncertainty,
-    weighings,
-)
+from actors.balance.balance_interface import BalanceError
+from actors.balance.weighing_plan import Placement, PourMasses, measurement, needed, weighing_uncertainty, weighings
 
 GRAM = 1e-3
 EMPTY_POURER, EMPTY_RECEIVER, TRAY = 0.0873, 0.1421, 0.4096
@@ -103,7 +96,7 @@ def test_a_missing_weighing_is_named_with_what_to_do_and_never_assumed(placement
     readings = weighed(placement, 0.2, 0.004, 0.01)
     key = list(readings)[left_out]
     del readings[key]
-    with pytest.raises(WeighingError, match=f"not weighed: {key}") as caught:
+    with pytest.raises(BalanceError, match=f"not weighed: {key}") as caught:
         measurement(placement, readings)
     assert "nothing is assumed" in str(caught.value)
 
@@ -112,13 +105,13 @@ def test_a_missing_weighing_is_named_with_what_to_do_and_never_assumed(placement
 def test_a_weight_that_is_no_number_is_refused(placement):
     readings = weighed(placement, 0.2, 0.004, 0.01)
     readings[next(iter(readings))] = PourMasses(float("nan"))
-    with pytest.raises(WeighingError, match="is not a weight"):
+    with pytest.raises(BalanceError, match="is not a weight"):
         measurement(placement, readings)
 
 
 @pytest.mark.parametrize("placement", Placement)
 def test_a_spill_of_less_than_nothing_beyond_noise_is_a_mistake(placement):
-    with pytest.raises(WeighingError, match=r"spilled -\d\S* ± .* is less than nothing"):
+    with pytest.raises(BalanceError, match=r"spilled -\d\S* ± .* is less than nothing"):
         measurement(placement, weighed(placement, 0.2, -0.002, 0.01, sigma=1e-4))
 
 
@@ -131,13 +124,13 @@ def test_within_noise_less_than_nothing_is_nothing_and_the_notes_keep_what_was_r
 
 @pytest.mark.parametrize("placement", Placement)
 def test_more_out_than_in_is_a_mistake(placement):
-    with pytest.raises(WeighingError, match=r"spilled 250 ± \S+ g is more than was loaded, 200 ± "):
+    with pytest.raises(BalanceError, match=r"spilled 250 ± \S+ g is more than was loaded, 200 ± "):
         measurement(placement, weighed(placement, 0.2, 0.25, 0.01, sigma=1e-4))
 
 
 @pytest.mark.parametrize("placement", Placement)
 def test_an_empty_pourer_taken_for_a_full_one_is_a_mistake(placement):
-    with pytest.raises(WeighingError, match=r"no more than the empty one\. Was it filled"):
+    with pytest.raises(BalanceError, match=r"no more than the empty one\. Was it filled"):
         measurement(placement, weighed(placement, 0.0, 0.0, 0.0, sigma=1e-4))
 
 
@@ -145,7 +138,7 @@ def test_an_empty_pourer_taken_for_a_full_one_is_a_mistake(placement):
 def test_another_load_than_asked_for_is_refused_where_that_is_set(placement):
     readings = weighed(placement, 0.19, 0.004, 0.01)
     assert measurement(placement, readings, nominal=0.2).loaded == pytest.approx(0.19)
-    with pytest.raises(WeighingError, match=r"loaded 190 ± 0 g, but 200 ± 5 g was asked for\. Fill anew"):
+    with pytest.raises(BalanceError, match=r"loaded 190 ± 0 g, but 200 ± 5 g was asked for\. Fill anew"):
         measurement(placement, readings, nominal=0.2, tolerance=5 * GRAM)
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from actors.balance.balance_interface import (
-    BalanceFaultError,
+    BalanceError,
     CommandError,
     NoConnectionError,
     NotStableError,
@@ -114,7 +114,7 @@ def test_a_fault_of_the_balance_is_passed_on(driver, each_dialect):
         with pytest.raises(NoConnectionError, match="no answer within"):
             balance.weigh()
         return
-    with pytest.raises(BalanceFaultError, match="reports a fault"):
+    with pytest.raises(BalanceError, match="reports a fault"):
         balance.weigh()
 
 

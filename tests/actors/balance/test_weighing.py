@@ -7,10 +7,10 @@ import asyncio
 import pytest
 
 from actors.balance.balance_device import DeviceBalance
-from actors.balance.balance_interface import ReferenceLostError
+from actors.balance.balance_interface import BalanceError, ReferenceLostError
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.weighing import Weighings
-from actors.balance.weighing_plan import Placement, WeighingError
+from actors.balance.weighing_plan import Placement
 from actors.interfaces import LaboratoryError, OperatorQuestion
 from actors.runtime.remote_object import LocalDevice
 
@@ -205,5 +205,5 @@ def test_a_plug_pulled_during_the_pour_costs_a_question_and_no_weight(virtual, s
 
 
 def test_a_load_far_from_the_one_asked_for_is_refused(virtual):
-    with pytest.raises(WeighingError, match=r"loaded 100\.3 .* but 200 ± 5 g was asked for"):
+    with pytest.raises(BalanceError, match=r"loaded 100\.3 .* but 200 ± 5 g was asked for"):
         play(virtual, Placement.MANUAL, {"Fill the pourer": "187.6 g", "Weigh the pourer with": "90 g"})

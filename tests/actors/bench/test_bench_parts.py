@@ -10,18 +10,9 @@ import pytest
 
 from actors.arm.planned_pour import ExecutedPath, pack, unpack
 from actors.balance.weighing_plan import Placement, weighings
-from actors.bench.bench_operators import (
-    POURER,
-    RECEIVER,
-    TRAY,
-    BenchContents,
-    Hands,
-    NoAnswerError,
-    OperatorQuestions,
-    PlayedOperator,
-)
+from actors.bench.bench_operators import POURER, RECEIVER, TRAY, BenchContents, Hands, OperatorQuestions, PlayedOperator
 from actors.bench.virtual_bench import LONGEST_REST, executed_pour
-from actors.interfaces import Notice, OperatorQuestion, OperatorSettings
+from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, OperatorSettings
 
 STEP = 0.008
 
@@ -110,7 +101,7 @@ def ask(after: float, **spec: float) -> tuple[object, OperatorQuestions, list[No
     async def play() -> object:
         try:
             return await questions.ask(OperatorQuestion("Wipe the tray.", "done", about="tray_wiped"))
-        except NoAnswerError as error:
+        except LaboratoryError as error:
             return error
 
     return asyncio.run(play()), questions, notices
@@ -129,7 +120,7 @@ def test_questions_and_answers_are_written_down_with_their_times():
 
 def test_a_question_that_nobody_answers_is_repeated_and_then_given_up():
     answer, questions, notices = ask(60.0, reminder=0.2, deadline=0.5)
-    assert isinstance(answer, NoAnswerError)
+    assert isinstance(answer, LaboratoryError)
     assert "Wipe the tray." in str(answer)
     assert sum("still waiting" in notice.text for notice in notices) == 2
     assert "no answer" in notices[-1].text

@@ -20,10 +20,10 @@ from orchestrator.cli.view_command import _recording_of, view
 from orchestrator.learning.requests import Pour, Poured
 from orchestrator.live_view.blueprints import put_beside
 from orchestrator.live_view.run_recording import CampaignRecording
-from orchestrator.live_view.simulation_view import NoSuchPourError, find_pour, task_of
+from orchestrator.live_view.simulation_view import find_pour, task_of
 from orchestrator.records.events import Requested, RequestFinished
 from orchestrator.records.journal import JOURNAL_NAME, Header, Journal
-from sim_engine.errors import DecantError
+from sim_engine.errors import DecantError, InvalidArgumentError
 from sim_engine.outcome import PourMeasurement
 from tests.support import example_run
 from tests.support.rerun_recordings import Contents, seen, viewer
@@ -118,7 +118,7 @@ def test_pour_of_an_arm_of_numbers_is_simulated_by_its_action(tmp_path: Path) ->
 @pytest.mark.slow
 def test_what_is_not_there_is_refused_with_what_is(recording: Path, tmp_path: Path) -> None:
     _journal(tmp_path)
-    with pytest.raises(NoSuchPourError, match="no weighed pour 7; weighed were pours: 1; deployment:narrow cup: 1"):
+    with pytest.raises(InvalidArgumentError, match="no weighed pour 7; weighed were pours: 1; deployment:narrow"):
         find_pour(tmp_path, 7)
     with pytest.raises(DecantError, match="has no recording"):
         _recording_of(tmp_path)
