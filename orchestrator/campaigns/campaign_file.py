@@ -305,9 +305,6 @@ class DispenseSettings(Settings):
     doses: Annotated[list[DoseSettings], Example("[{amount: 50 g, position: A1}]")]
     """The amounts, with their receivers."""
 
-    order: Literal["listed", "largest_first"] = "listed"
-    """Order of pouring."""
-
     tolerance: DoseAmount = 1e-3
     """Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %."""
 

@@ -298,8 +298,6 @@ def resolve_dispense(
         if scene is None:
             return None
         scenes.append(scene)
-    if section.order == "largest_first":
-        doses.sort(key=lambda one: -one.amount)
     as_left = section.start == "as_left"
     return DispensePlan(tuple(scenes), tuple(doses), section.refill_below, as_left, laboratory.name)
 
