@@ -308,7 +308,7 @@ def test_the_verb_writes_where_it_is_told_and_figures_for_latex(made: Made, tmp_
 
 @pytest.mark.parametrize(
     ("argument", "said"),
-    [("nothing", "runs/nothing: neither a run nor a study is here"), ("{run} -o page.txt", "should end in .html")],
+    [("nothing", "runs/nothing: no run is here"), ("{run} -o page.txt", "should end in .html")],
 )
 def test_the_verb_refuses_what_it_can_not_report_on(made: Made, argument: str, said: str) -> None:
     done = decant(f"report {argument.format(run=made.result.directory)}")
