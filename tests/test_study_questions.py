@@ -8,7 +8,7 @@ from types import ModuleType
 import pytest
 
 from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED
-from orchestrator.study.study_statistics import LEVEL, RANDOM, Final, Found, Gathered, Key
+from orchestrator.study.study_statistics import LEVEL, RANDOM, Final, Gathered, Key, StrategyScores
 
 LEVELS, CUPS = ["bench1", "bench2"], ["cone"]
 
@@ -26,7 +26,7 @@ def found(ours: float, active: float) -> Gathered:
     scores = {UNCALIBRATED: 0.2, RANDOM: 0.3, "C4": ours, "C4-active": active}
     made = Gathered()
     for name, score in scores.items():
-        made.calibrated[name] = Found(test=[[score], [score + 0.01]], numbers=[1, 1 + LEVEL])
+        made.calibrated[name] = StrategyScores(test=[[score], [score + 0.01]], numbers=[1, 1 + LEVEL])
     for level in LEVELS:
         for strategy, losses in {"D2": [0.9, 0.5, 0.1], "D3": [0.1, 0.1, 0.1]}.items():
             key = Key(level, CUPS[0], strategy)

@@ -67,7 +67,7 @@ LONGEST_GAP = 0.1
 
 
 @dataclass(frozen=True)
-class Found:
+class EmulatorAddresses:
     """The addresses at which drivers find the emulators.
 
     Attributes:
@@ -110,13 +110,13 @@ class BenchEmulators:
             self.close()
             raise
 
-    def found(self) -> Found:
+    def found(self) -> EmulatorAddresses:
         """Return the addresses of the emulators."""
         balance = self._weighs if self._balance is None else self._balance.balance
         gripper = None if self._gripper is None else self._gripper.gripper
         if self._arm is None:
-            return Found(self._spec, balance, None, gripper)
-        return Found(self._arm.arm, balance, self._arm.true_arm, gripper)
+            return EmulatorAddresses(self._spec, balance, None, gripper)
+        return EmulatorAddresses(self._arm.arm, balance, self._arm.true_arm, gripper)
 
     def install(self) -> None:
         """See `ArmEmulator.install`."""
@@ -210,9 +210,9 @@ class DeviceEmulators:
         self.device = device
         self.told: DeviceBalance | None = None
 
-    async def found(self) -> Found:
+    async def found(self) -> EmulatorAddresses:
         """Return the addresses of the emulators."""
-        found: Found = await self.device.call("found", deadline=4.0 * DEADLINE)
+        found: EmulatorAddresses = await self.device.call("found", deadline=4.0 * DEADLINE)
         return found
 
     async def prepare(self, seed: tuple[int, ...]) -> None:

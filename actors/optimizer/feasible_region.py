@@ -99,7 +99,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class Kind:
+class RequestGroup:
     """Requests of one kind.
 
     Attributes:
@@ -124,7 +124,7 @@ class Feasibility:
     al., Bayesian optimization with inequality constraints, ICML 2014.
     """
 
-    def __init__(self, *kinds: Kind) -> None:
+    def __init__(self, *kinds: RequestGroup) -> None:
         """Fit."""
         self._processes = [_labelled(kind) for kind in kinds]
         self._chancy = [process for process, kind in zip(self._processes, kinds, strict=True) if kind.by_chance]
@@ -157,7 +157,7 @@ def _log_positive(processes: Sequence[GaussianProcess], points: Array) -> Array:
     return total
 
 
-def _labelled(kind: Kind) -> GaussianProcess:
+def _labelled(kind: RequestGroup) -> GaussianProcess:
     """GP of the label."""
     fulfilled, refused = kind.fulfilled, kind.refused
     if len(fulfilled):

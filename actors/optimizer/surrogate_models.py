@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from actors.optimizer.feasible_region import Feasibility, Kind, Region
+from actors.optimizer.feasible_region import Feasibility, Region, RequestGroup
 from actors.optimizer.gaussian_process import (
     CONSTANT_PRIOR,
     OBLIQUE_PRIOR,
@@ -112,9 +112,9 @@ class QueryArrays:
     def feasibility(self) -> Feasibility | None:
         """Model of refusals and failures; None if there were none."""
         kinds = [
-            Kind(self.seen, self.infeasible),
-            Kind(self.known, self.really_refused),
-            Kind(self.known, self.failed, by_chance=True),
+            RequestGroup(self.seen, self.infeasible),
+            RequestGroup(self.known, self.really_refused),
+            RequestGroup(self.known, self.failed, by_chance=True),
         ]
         present = [kind for kind in kinds if len(kind.refused)]
         return Feasibility(*present) if present else None

@@ -3,7 +3,7 @@
 - `KnownPosterior` is what the pours of one calibration tell about its parameters, and what it is about: vessels,
   liquid, arm, placement and simulator. The catalogue keeps one for each calibration.
 - `resolve_prior` selects the posteriors that fit a campaign and combines them to its `CampaignMemory`.
-- `PriorSettings` is the resolved form, which a run's record contains.
+- `ResolvedPrior` is the resolved form, which a run's record contains.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def arm_of(laboratory: Mapping[str, Any]) -> str:
     return str(arm.get("model") or arm.get("kind") or "none")
 
 
-class PriorSettings(Settings):
+class ResolvedPrior(Settings):
     """Prior from earlier campaigns, as a run's record has it: nothing is looked up again."""
 
     parameters: AnyRemembered = Field(default_factory=AnyRemembered)
@@ -173,7 +173,7 @@ class PriorSettings(Settings):
     """Posteriors and parameters that are not used, with reasons."""
 
     @classmethod
-    def of(cls, memory: CampaignMemory) -> PriorSettings:
+    def of(cls, memory: CampaignMemory) -> ResolvedPrior:
         """The settings of a resolved prior."""
         rows = {
             one.name: {"mean": one.mean, "deviation": one.deviation, "runs": list(one.runs)}
@@ -200,7 +200,7 @@ def _form(value: Any) -> str:
 AnyPrior = Annotated[
     Annotated[Literal["catalogue"], Tag("word")]
     | Annotated[list[Text], Tag("list")]
-    | Annotated[PriorSettings, Tag("record")],
+    | Annotated[ResolvedPrior, Tag("record")],
     Discriminator(_form),
 ]
 """'catalogue', names of runs and files of posteriors, or a resolved prior."""
@@ -264,7 +264,7 @@ def resolve_prior(
         source: opens the catalogue; not called for a resolved prior.
     """
     report = references.report
-    if isinstance(prior, PriorSettings):
+    if isinstance(prior, ResolvedPrior):
         return prior.memory
     try:
         opened = source()

@@ -27,7 +27,7 @@ from orchestrator.campaigns.campaign_file import (
     StageSettings,
     owners_of_priors,
 )
-from orchestrator.campaigns.campaign_prior import PosteriorSource, PriorNeeds, PriorSettings, resolve_prior
+from orchestrator.campaigns.campaign_prior import PosteriorSource, PriorNeeds, ResolvedPrior, resolve_prior
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.scene_builder import SceneBuilder
 from orchestrator.campaigns.search_ranges import ParametersBase
@@ -381,7 +381,7 @@ def resolve_campaign(
         return None
     directory = file.outputs.folder if file.outputs.directory is None else root.directory / file.outputs.directory
     outputs = file.outputs.model_copy(update={"directory": str(resolved(directory))})
-    record = {"outputs": outputs} | ({} if memory is None else {"prior": PriorSettings.of(memory)})
+    record = {"outputs": outputs} | ({} if memory is None else {"prior": ResolvedPrior.of(memory)})
     return CampaignPlan(
         name=file.name,
         seed=file.seed,

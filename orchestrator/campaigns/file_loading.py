@@ -13,7 +13,7 @@ from pydantic import create_model
 
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.campaign_file import CampaignFile
-from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource, PriorSettings, no_posteriors
+from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource, ResolvedPrior, no_posteriors
 from orchestrator.campaigns.campaign_resolution import resolve_campaign
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
@@ -79,7 +79,7 @@ def campaign_from(
     if section is not None and seed is not None:
         section = section.model_copy(update={"seed": seed})
     if section is not None and memory is not None:
-        section = section.model_copy(update={"prior": PriorSettings.of(memory)})
+        section = section.model_copy(update={"prior": ResolvedPrior.of(memory)})
     plan = None if section is None else resolve_campaign(section, place, report, posteriors)
     report.raise_if_any()
     assert plan is not None, "a campaign without problems has a plan"

@@ -115,7 +115,7 @@ def dimension_quantity(dimension: Dimension, *, words: bool = False) -> Quantity
     )
 
 
-class PriorSettings(Settings):
+class RangePriorSettings(Settings):
     """Prior of a searched dimension: a normal distribution, truncated at the ends of the range."""
 
     mean: Any = None
@@ -133,7 +133,7 @@ class ActionRangeSettings(RangeSettings):
 
     def normal(self, name: str) -> NormalPrior | None:
         """The prior of the dimension; None if it is uniform or the section has a problem."""
-        prior: PriorSettings | None = self.prior
+        prior: RangePriorSettings | None = self.prior
         if self.range is None or prior is None or prior.mean is None or prior.deviation is None:
             return None
         return NormalPrior(name, float(prior.mean), float(prior.deviation))
@@ -144,7 +144,7 @@ def _action_range(dimension: Dimension) -> Any:
     width = dimension.upper - dimension.lower
     spread = Quantity(dimension.unit, DEVIATIONS[dimension.unit], 0.0, width, positive=True)
     moments = {"mean": Annotated[float, quantity], "deviation": Annotated[float, spread]}
-    prior = _section(f"{title}Prior", PriorSettings, moments)
+    prior = _section(f"{title}Prior", RangePriorSettings, moments)
     prior.required = {"mean": quantity.example, "deviation": spread.example}
     return _section(f"{title}Range", ActionRangeSettings, {"range": _range(quantity), "prior": prior})
 

@@ -69,7 +69,7 @@ def check(
     with _settings(balance, given) as (spec, emulator), _tap(record, balance, emulator is not None) as tap:
         if emulator is None and not sys.stdin.isatty():
             raise RefusalError("the check asks for loads at a terminal, with nothing piped into it")
-        hands: CheckOperator = Person() if emulator is None else EmulatedHands(partial(_put, emulator))
+        hands: CheckOperator = CheckingPerson() if emulator is None else EmulatedHands(partial(_put, emulator))
         driver = _driver(spec, tap)
         try:
             for found in check_balance(
@@ -178,7 +178,7 @@ def _put(emulator: BalanceEmulator, load: Load) -> None:
     emulator.order("put", {"times": list(load.times), "masses": list(load.masses)})
 
 
-class Person:
+class CheckingPerson:
     """`actors.balance.balance_check.CheckOperator` at this terminal."""
 
     def empty(self) -> None:

@@ -19,7 +19,16 @@ from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED
 from orchestrator.reports import figure_style as style
 from orchestrator.study.study_plan import StudyPlan
-from orchestrator.study.study_statistics import RANDOM, SHARE, Estimate, Found, Gathered, estimate, mean, running_least
+from orchestrator.study.study_statistics import (
+    RANDOM,
+    SHARE,
+    Estimate,
+    Gathered,
+    StrategyScores,
+    estimate,
+    mean,
+    running_least,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -238,7 +247,7 @@ def error(one: Estimate) -> list[list[float]]:
     return [[np.nan_to_num(one.mean - one.low)], [np.nan_to_num(one.high - one.mean)]]
 
 
-def _boxes(known: Mapping[str, Found]) -> Drawn:
+def _boxes(known: Mapping[str, StrategyScores]) -> Drawn:
     figure, axes = style.new_figure(size=(1.6 + 1.25 * len(known), 4.2))
     rows: list[list[object]] = []
     for place, (name, one) in enumerate(known.items(), start=1):
@@ -264,7 +273,7 @@ def _boxes(known: Mapping[str, Found]) -> Drawn:
     )
 
 
-def _against_simulations(known: Mapping[str, Found], uncalibrated: Found | None) -> Drawn:
+def _against_simulations(known: Mapping[str, StrategyScores], uncalibrated: StrategyScores | None) -> Drawn:
     figure, axes = style.new_figure(size=(6.4, 4.2))
     rows: list[list[object]] = []
     for name, one in known.items():
@@ -332,7 +341,7 @@ def _displayed(places: Iterable[tuple[float, float]], factors: Sequence[float]) 
     return [[place[k] / factors[k] for place in places] for k in (0, 1)]
 
 
-def _over_theta(study: StudyPlan, known: Mapping[str, Found]) -> Drawn:
+def _over_theta(study: StudyPlan, known: Mapping[str, StrategyScores]) -> Drawn:
     figure, grid = style.new_figure(1, len(known), size=(1.0 + 3.4 * len(known), 3.9), squeeze=False)
     rows: list[list[object]] = []
     names: list[str] = []
@@ -393,6 +402,6 @@ def _over_theta(study: StudyPlan, known: Mapping[str, Found]) -> Drawn:
     )
 
 
-def _largest(one: Found) -> float:
+def _largest(one: StrategyScores) -> float:
     values = [t.discrepancy for r in one.results for t in r.trials if t.discrepancy is not None]
     return float(np.percentile(values, 90)) if values else 0.0

@@ -40,7 +40,7 @@ LEVEL = 100_000
 
 
 @dataclass
-class Found:
+class StrategyScores:
     """Results of one strategy in its repetitions at the compared level.
 
     Attributes:
@@ -92,7 +92,7 @@ class Gathered:
         cpu_s, seconds: CPU time and wall time of all cells [s].
     """
 
-    calibrated: dict[str, Found] = field(default_factory=dict)
+    calibrated: dict[str, StrategyScores] = field(default_factory=dict)
     losses: dict[Key, list[list[float]]] = field(default_factory=dict)
     numbers: dict[Key, list[int]] = field(default_factory=dict)
     finals: dict[Key, dict[int, list[Final]]] = field(default_factory=dict)
@@ -136,8 +136,8 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
             # repetitions in different worlds count separately: each has its own number
             number = cell.repetition + LEVEL * levels.index(cell.level)
             if _differences(data, "test", random=True):
-                _add(found.calibrated.setdefault(RANDOM, Found()), number, data, random=True)
-            _add(found.calibrated.setdefault(cell.strategy or UNCALIBRATED, Found()), number, data)
+                _add(found.calibrated.setdefault(RANDOM, StrategyScores()), number, data, random=True)
+            _add(found.calibrated.setdefault(cell.strategy or UNCALIBRATED, StrategyScores()), number, data)
         elif cell.kind == "deployment":
             key = Key(cell.level, receivers[cell.receiver], cell.strategy)
             found.losses.setdefault(key, []).append(_losses(data))
@@ -163,7 +163,7 @@ def _differences(data: CellResult, split: str, *, random: bool) -> list[float]:
     ]
 
 
-def _add(found: Found, number: int, data: CellResult, *, random: bool = False) -> None:
+def _add(found: StrategyScores, number: int, data: CellResult, *, random: bool = False) -> None:
     found.numbers.append(number)
     found.test.append(_differences(data, "test", random=random))
     found.train.append([] if random else _differences(data, "train", random=False))

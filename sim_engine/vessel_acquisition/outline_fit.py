@@ -75,7 +75,7 @@ class Evidence(Protocol):
 
 
 @dataclass(frozen=True)
-class Fit:
+class EvidenceFit:
     """Agreement of one piece of evidence with the fitted profile.
 
     Attributes:
@@ -106,7 +106,7 @@ class FittedOutline:
     covariance: Floats
     wall: float
     floor: float
-    fits: tuple[Fit, ...]
+    fits: tuple[EvidenceFit, ...]
     height_deviation: float = 0.0
 
     @property
@@ -273,12 +273,12 @@ class _Problem:
         return float(residual @ residual + offset @ precision @ offset)
 
 
-def _fits(evidence: Sequence[Evidence], residual: Floats) -> list[Fit]:
+def _fits(evidence: Sequence[Evidence], residual: Floats) -> list[EvidenceFit]:
     fits, begin = [], 0
     for piece in evidence:
         count = len(piece.observed)
         residual_of_source = residual[begin : begin + count]
-        fits.append(Fit(piece.name, count, float(np.sqrt(np.mean(residual_of_source**2))) if count else 0.0))
+        fits.append(EvidenceFit(piece.name, count, float(np.sqrt(np.mean(residual_of_source**2))) if count else 0.0))
         begin += count
     return fits
 

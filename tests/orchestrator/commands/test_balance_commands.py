@@ -41,7 +41,7 @@ def test_the_balance_of_a_virtual_laboratory_is_checked_and_recorded_without_a_p
 def test_a_mass_that_is_mistyped_is_asked_for_again(monkeypatch, capsys):
     typed = iter(["200", "200 g", ""])
     monkeypatch.setattr(motion_control, "typed_line", lambda prompt: next(typed))
-    person = balance_commands.Person()
+    person = balance_commands.CheckingPerson()
     assert (person.reference(), person.reference()) == (0.2, None)
     assert "type '200 g' if that is what is meant" in capsys.readouterr().err
 
