@@ -208,6 +208,8 @@ class AskTell:
     ) -> None:
         """Tell what was weighed. Give the mass that was received, or the mass that was left in the pourer.
 
+        Masses are numbers of Python, NumPy or pandas. `decant.correct_pour` corrects them once the session is closed.
+
         Args:
             pour: that `ask` has returned.
             spilled_g: mass next to the receiver [g].
@@ -217,7 +219,8 @@ class AskTell:
             notes: kept with the pour in the journal; JSON-ready.
 
         Raises:
-            InvalidArgumentError: the masses do not fit the load, or another pour is asked for.
+            InvalidArgumentError: a mass is not a finite number, the masses do not fit the load or may be kilograms, or
+                another pour is asked for.
         """
         waiting = self._asked(pour)
         measured, answer = weighed_by_hand(

@@ -150,7 +150,7 @@ def correct(strategy: Strategy, request: Request, outcome: Outcome) -> None:
     """
     replace_outcome = getattr(strategy, "correct", None)
     if replace_outcome is None:
-        raise ValueError("the outcomes of this stage can't be replaced")
+        raise ValueError("the outcomes of this stage can't be replaced before it has ended")
     replace_outcome(request, outcome)
 
 

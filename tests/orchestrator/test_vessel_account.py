@@ -12,7 +12,7 @@ import pytest
 
 from actors.interfaces import LaboratoryError, ProgressCallback
 from orchestrator.daemon.daemon_store import Store
-from orchestrator.daemon.materials import Materials
+from orchestrator.daemon.materials import MaterialError, Materials, mass_of
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, LaboratoryPlaces, Transfer, VesselAccount
 from sim_engine.errors import InvalidArgumentError
@@ -264,3 +264,17 @@ def test_a_source_that_can_not_hold_what_was_entered_is_not_used(tmp_path: Path)
         account.known(series())
     with pytest.raises(InvalidArgumentError, match="mass: 412 kg is more than 20 kg; is it in grams"):
         account.weigh("bench/beaker", 412.0, 1e-3, liquid="water")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1,234 g", "mass: '1,234 g' has two meanings; write '1.234 g' or '1234 g'"),
+        ("12,5 g", "mass: '12,5 g' has a decimal comma; write '12.5 g'"),
+        ("100000 kg", "mass: 100000 kg is more than 20 kg; is it in grams?"),
+    ],
+)
+def test_a_mass_of_a_request_has_one_meaning(text: str, said: str, tmp_path: Path) -> None:
+    with pytest.raises(MaterialError) as refusal:
+        Materials(Store(tmp_path / "queue.sqlite")).weigh("lab/jug", mass_of(text, "mass"), 1e-4, "water", "ada")
+    assert str(refusal.value) == said

@@ -176,6 +176,23 @@ class _Planned:
     given_up: str | None = None
     notes: list[str] = field(default_factory=list)
 
+    def settle(self, outcome: Outcome) -> None:
+        """Take the outcome; it replaces an earlier one."""
+        self.measured = self.given_up = None
+        match outcome:
+            case Poured(measurement) if not is_sound(measurement.fractions):
+                self.given_up = "weighing: the balance gave no numbers"
+            case Poured(measurement):
+                fractions = measurement.fractions
+                assert self.action is not None
+                self.measured = MeasuredPour(
+                    self.action, fractions.spillage, fractions.poured, self.split, self.scene.name
+                )
+            case Failed(kind, reason):
+                self.given_up = f"{kind}: {reason}"
+            case _:
+                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+
 
 class DesignedPours:
     """Weigh a stratified set of pours: two actions from each of 4×4 strata, as in the paper, or a Latin hypercube.
@@ -259,23 +276,24 @@ class DesignedPours:
             raise ValueError(f"this pour was not asked for: {request}")
         self._pouring = None
         planned = self._planned[self._current]
-        match outcome:
-            case Poured(measurement) if not is_sound(measurement.fractions):
-                planned.given_up = "weighing: the balance gave no numbers"
-            case Poured(measurement):
-                fractions = measurement.fractions
-                assert planned.action is not None
-                planned.measured = MeasuredPour(
-                    planned.action, fractions.spillage, fractions.poured, planned.split, planned.scene.name
-                )
-            case Failed("invalid_action", reason) if planned.tries < MAX_TRIES:
-                planned.notes.append(reason)
-                return  # another draw of the same stratum
-            case Failed(kind, reason):
-                planned.given_up = f"{kind}: {reason}"
-            case _:
-                raise ValueError(f"a pour can't be answered by {type(outcome).__name__}")
+        if isinstance(outcome, Failed) and outcome.kind == "invalid_action" and planned.tries < MAX_TRIES:
+            planned.notes.append(outcome.reason)
+            return  # another draw of the same stratum
+        planned.settle(outcome)
         self._current += 1
+
+    def correct(self, request: Request, outcome: Outcome) -> None:
+        """Replace the outcome of a pour that was told wrongly.
+
+        Raises:
+            ValueError: there is no outcome of this request.
+        """
+        number = request.number if isinstance(request, Pour) else 0
+        planned = self._planned[number - 1] if 0 < number <= self._current else None
+        if planned is None or not isinstance(request, Pour) or planned.action != request.action:
+            raise ValueError("the strategy has no outcome of this pour")
+        planned.settle(outcome)
+        self.decisions.append(Decision(f"calibration pour {number} is corrected"))
 
     def progress(self) -> Progress:
         """Pours done, and their total number."""

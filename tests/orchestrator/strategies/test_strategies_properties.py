@@ -7,6 +7,7 @@ import json
 import math
 import random
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from orchestrator.learning.deployment.d1 import OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
 from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.learning.deployment.objectives import Objectives, Retained, Spilled
-from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Suggest
+from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Request, Suggest
 from orchestrator.learning.run_errors import LearningError
 from orchestrator.records.codec import encode_result
 from orchestrator.records.events import Event, RequestFinished
@@ -143,6 +144,29 @@ def test_designed_pours_and_scores_leave_out_what_is_no_number() -> None:
     StrategyHarness(weighed, answer=lost).run(design)
     assert len(design.measured) == 3
     assert "no numbers" in str(design.result().pours[1].given_up)
+
+
+@pytest.mark.parametrize("wrong", [Poured(PourMeasurement(0.2, 0.15, 0.01)), Failed("pour_unknown", "declared lost")])
+@pytest.mark.parametrize("name", ["D1", "D2", "D3", "D3, objectives", "designed pours"])
+def test_a_corrected_pour_leads_to_the_requests_of_one_that_was_told_rightly(name: str, wrong: Outcome) -> None:
+    def played(*, corrected: bool) -> tuple[list[Request], dict[str, Any]]:
+        designed = name == "designed pours"
+        strategy = DesignedPours((SCENE,), CALIBRATION_ACTIONS, 4, 1, 0) if designed else make(name, 1)
+        tell = strategy.tell
+
+        def told_wrongly(request: Request, outcome: Outcome) -> None:
+            tell(request, wrong if isinstance(request, Pour) else outcome)
+            if isinstance(request, Pour):
+                strategy.correct(request, outcome)
+                with pytest.raises(ValueError, match="no outcome of this pour"):
+                    strategy.correct(replace(request, number=request.number + 1), outcome)
+
+        if corrected:
+            strategy.tell = told_wrongly
+        harness = StrategyHarness(weighed if designed else narrow_cup).run(strategy)
+        return harness.asked, encode_result(strategy.result())
+
+    assert played(corrected=True) == played(corrected=False)
 
 
 # -- through scheduler and journal ---------------------------------------------------------------------------------
