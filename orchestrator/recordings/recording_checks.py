@@ -40,8 +40,8 @@ not held to the lower bound."""
 THIN = 0.02
 """Largest dynamic viscosity of a liquid that is held to it [Pa·s]."""
 
-SHORTEST_INTERVAL = 2e-3
-"""Interval of tilts below which times are suspected [s]."""
+INTERVALS = (5e-3, 0.5)
+"""Usual intervals of tilts [s]; times with shorter ones are suspected."""
 
 FINEST = 2e-7
 """Step of readings below which masses are suspected: no balance of a pouring bench shows it [kg]."""
@@ -96,7 +96,7 @@ def impossible(
     if fact and excess:
         text = f"{fact}; are vessel, fill, and the zero of the tilt those of this pour?"
         return [series.problem(line, text, "mass")]
-    return _filled(series, tilt, mass)
+    return _filled(series, tilt, mass, step)
 
 
 def _contradiction(scene: Scene, read: _Reading) -> tuple[str, int, bool]:
@@ -142,9 +142,11 @@ def _other_meanings(read: _Reading, readings: Floats, step: float | None, *, con
     def tilts(change: Callable[[Floats], Floats], cause: str, *, certain: bool = False) -> _Reading:
         return _Reading(change(read.tilts), read.times, read.read_times, read.net, "tilt", cause, certain)
 
-    if np.median(np.diff(read.times)) < SHORTEST_INTERVAL:
-        cause = "these times look like seconds; name the column time_s"
-        yield _Reading(read.tilts, 1e3 * read.times, 1e3 * read.read_times, read.net, "time", cause)
+    interval = float(np.median(np.diff(read.times)))
+    for factor, unit, name in ((60.0, "minutes", "time_min"), (1e3, "seconds", "time_s")):
+        if interval < INTERVALS[0] <= factor * interval <= INTERVALS[1]:
+            cause = f"these times look like {unit}; name the column {name}"
+            yield _Reading(read.tilts, factor * read.times, factor * read.read_times, read.net, "time", cause)
     cause = "these tilts have the other sign; tilts towards the receiver are positive"
     yield tilts(np.negative, cause, certain=bool(read.tilts.max() < TILT_MARGIN < -read.tilts.min()))
     text = "these tilts look like angles from {}; tilts count from upright: write {} minus these"
@@ -156,20 +158,28 @@ def _other_meanings(read: _Reading, readings: Floats, step: float | None, *, con
     yield _Reading(read.tilts, read.times, read.read_times, -read.net, "mass", cause)
 
 
-def _filled(series: TimeSeries, tilt: Column, mass: Column) -> list[Problem]:
-    """The problem of cells that were filled with the value above; or none.
+def _filled(series: TimeSeries, tilt: Column, mass: Column, step: float | None) -> list[Problem]:
+    """The problem of cells that were filled with the value above, or interpolated; or none.
 
     Balance and arm have clocks of their own: a mass in every line, most of them repeated, is no reading in every line.
     """
     if len(mass) < 0.95 * len(tilt) or not np.isin(mass.lines, tilt.lines).mean() > 0.95:
         return []
-    described = arrivals(mass.times, mass.values, float(np.diff(np.unique(np.round(mass.values, 9))).min(initial=1e-2)))
-    if described.rising < FEWEST_RISING or described.repeated < FILLED * described.rising:
+    changes = np.diff(mass.values)
+    finest = float(np.diff(np.unique(np.round(mass.values, 9))).min(initial=1e-2))
+    described = arrivals(mass.times, mass.values, step or finest)
+    rising = changes[np.abs(changes) > 1e-9]
+    between = np.abs(rising / step - np.round(rising / step)) > 0.05 if step else np.zeros(0, dtype=bool)
+    if described.rising >= FEWEST_RISING and described.repeated >= FILLED * described.rising:
+        share, what = described.repeated / described.rising, "repeat the one before while it rises"
+        place = 1 + int(np.flatnonzero(changes == 0.0)[0])
+    elif between.sum() >= FEWEST_RISING and between.mean() > 0.5:
+        share, what = float(between.mean()), f"lie between steps of {1e3 * (step or 0.0):g} g"
+        place = 1 + int(np.flatnonzero(np.abs(changes) > 1e-9)[between.argmax()])
+    else:
         return []
-    share = described.repeated / described.rising
-    repeated = 1 + int(np.flatnonzero(np.diff(mass.values) == 0.0)[0])
     text = (
-        f"every line has a mass, and {100 * share:.0f} % of them repeat the one before while it rises: cells look "
-        "filled with the value above; leave a cell empty in a line in which no reading arrived"
+        f"every line has a mass, and {100 * share:.0f} % of them {what}: cells look filled with the value above, or "
+        "interpolated; leave a cell empty in a line in which no reading arrived"
     )
-    return [series.problem(int(mass.lines[repeated]), text, "mass")]
+    return [series.problem(int(mass.lines[place]), text, "mass")]

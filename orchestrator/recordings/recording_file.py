@@ -42,6 +42,9 @@ Floats = NDArray[np.float64]
 LONGEST_GAP = 1.0
 """Time without a value above which a warning is given [s]."""
 
+LONGEST_INTERVAL = 20.0
+"""Largest median interval of tilts that a recording may have [s]."""
+
 UPRIGHT = math.radians(5.0)
 """Rise of the tilt from which the cup counts as pouring [rad]."""
 
@@ -279,6 +282,10 @@ def _checked(path: Path, section: RecordingFile, scene: Scene, series: TimeSerie
     if len(poured) < 2:
         text = "has fewer than two readings of the mass after the first tilt; do both columns use the same clock?"
         problems.append(series.problem(int(mass.lines[-1]), text, "mass"))
+    elif len(tilt) > 1 and (interval := float(np.median(np.diff(tilt.times)))) > LONGEST_INTERVAL:
+        text = f"the tilts are {interval:.3g} s apart, too far for a pour; if that is in milliseconds, name the column "
+        text += "time_ms"
+        problems.append(series.problem(int(tilt.lines[1]), text, "time"))
     if problems:
         raise ConfigError(problems)
     end = float(tilt.times[-1])
@@ -302,8 +309,6 @@ def _checked(path: Path, section: RecordingFile, scene: Scene, series: TimeSerie
             width = column.times[i] - column.times[i - 1]
             more = "" if len(missing) == 1 else f"; there are {len(missing)} gaps above {LONGEST_GAP:g} s"
             text = f"no {name} for {width:.3g} s before this line: {effect}{more}. Record at 10 Hz or faster"
-            if np.median(np.diff(column.times)) > 20.0:
-                text += "; if the times are in milliseconds, name their column time_ms"
             warnings.append(series.problem(int(column.lines[i]), text, name))
     balance = section.balance
     if balance.step is None:

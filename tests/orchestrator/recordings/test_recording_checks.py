@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from orchestrator.campaigns.shipped import shipped
@@ -29,6 +30,7 @@ def misread(
     folder: Path,
     *,
     header: str = "time_s,tilt_deg,mass_g",
+    time: Callable[[float], float] = float,
     tilt: Callable[[float], float] = float,
     mass: Callable[[float], float] = float,
     filled: bool = False,
@@ -40,14 +42,14 @@ def misread(
     _, *rows = (SAMPLES / "dose-1.csv").read_text(encoding="utf-8").splitlines()
     lines, above = [header], ["", ""]
     for row in rows:
-        time, *cells = row.split(",")
+        moment, *cells = row.split(",")
         changed = [
             f"{change(float(cell)):.7g}" if cell else "" for change, cell in zip((tilt, mass), cells, strict=True)
         ]
         if filled:
             above = [cell or before for cell, before in zip(changed, above, strict=True)]
             changed = above if above[0] else changed
-        lines.append(",".join([time, *changed]))
+        lines.append(",".join([f"{time(float(moment)):.7g}", *changed]))
     path.with_suffix(".csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
@@ -75,6 +77,8 @@ def misread(
             "the balance is below the pourer, or its cell hangs upside",
         ),
         ({"header": "time_ms,tilt_deg,mass_g"}, "time", "these times look like seconds; name the column time_s"),
+        ({"time": lambda time: time / 60.0}, "time", "these times look like minutes; name the column time_min"),
+        ({"time": lambda time: 1e3 * time}, "time", "if that is in milliseconds, name the column time_ms"),
         ({"filled": True}, "mass", "every line has a mass, and 63 % of them repeat the one before while it rises"),
         (
             {"settings": lambda text: text.replace("mass: 300 g", "mass: 120 g")},
@@ -127,3 +131,17 @@ def test_a_pour_in_which_nothing_flows_can_be_fitted(tmp_path: Path) -> None:
     still = load_recording(written(tmp_path, [f"{k / 10},{min(k, 20)},180" for k in range(60)]))
     fit = fit_recordings([still], ("grip", "lag"))
     assert {value.name: value.identified for value in fit.values}["grip"] is False
+
+
+def test_interpolated_readings_are_refused(tmp_path: Path) -> None:
+    """danielhrisca/asammdf#1219: an export of signals of several clocks interpolates all of them."""
+    given = load_recording(SAMPLES / "dose-1.yaml")
+    path = misread(tmp_path)
+    masses = 1e3 * np.interp(given.tilt_times, given.read_times, given.readings)
+    rows = zip(given.tilt_times, np.degrees(given.tilts), masses, strict=True)
+    text = "\n".join(["time_s,tilt_deg,mass_g", *(f"{time},{angle:.3f},{mass:.3f}" for time, angle, mass in rows)])
+    path.with_suffix(".csv").write_text(text, encoding="utf-8")
+    with pytest.raises(
+        ConfigError, match=r"lie between steps of 0\.1 g: cells look filled with the value above, or interpolated"
+    ):
+        load_recording(path)
