@@ -14,7 +14,7 @@ from typing import Any
 
 from machine import started
 
-from orchestrator.daemon.daemon_client import Client
+from orchestrator.daemon.api.daemon_client import Client
 
 PATIENCE = 120.0
 """Longest time to wait for any event [s]."""

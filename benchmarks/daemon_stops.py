@@ -30,8 +30,8 @@ from machine import started
 from ruamel.yaml import YAML
 
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.daemon_client import Client
-from orchestrator.daemon.submissions import Files, pack
+from orchestrator.daemon.api.daemon_client import Client
+from orchestrator.daemon.rigs.submissions import Files, pack
 
 ROOT = Path(__file__).parents[1]
 READERS = 200

@@ -48,8 +48,8 @@ from scipy import stats
 
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.daemon.submissions import Files, pack
+from orchestrator.daemon.api.daemon_client import Client, DaemonError
+from orchestrator.daemon.rigs.submissions import Files, pack
 from orchestrator.records.events import Kind
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader
 from orchestrator.records.journal_check import check_journal

@@ -17,8 +17,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from orchestrator.daemon.daemon_client import Client, DaemonError, order_body
-from orchestrator.daemon.pour_request import PourIn
+from orchestrator.daemon.api.daemon_client import Client, DaemonError, order_body
+from orchestrator.daemon.rigs.pour_request import PourIn
 from sim_engine.resources import require
 
 if TYPE_CHECKING:

@@ -42,8 +42,8 @@ from orchestrator.campaigns.pour_table import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.campaigns.scene_builder import DEFAULTS, NEEDED
 from orchestrator.campaigns.yaml.section_validation import sections_in
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
-from orchestrator.daemon import daemon_settings as daemon
-from orchestrator.daemon.notifications import NotifySettings
+from orchestrator.daemon.state import daemon_settings as daemon
+from orchestrator.daemon.state.notifications import NotifySettings
 from orchestrator.extra_commands.physics_command import kept_records
 from orchestrator.learning.campaign_plan import OutputSettings
 from orchestrator.learning.deployment.disturbances import RiskSettings

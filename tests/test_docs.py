@@ -22,7 +22,7 @@ from orchestrator.campaigns.search_ranges import EXAMPLES
 from orchestrator.campaigns.vessel_file import VesselFile
 from orchestrator.campaigns.yaml.section_validation import sections_in
 from orchestrator.cli import console as common
-from orchestrator.daemon.daemon_settings import DaemonFile
+from orchestrator.daemon.state.daemon_settings import DaemonFile
 from orchestrator.records.journal import Kind
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.study.study_file import StudyFile

@@ -25,8 +25,8 @@ import pytest
 from ruamel.yaml import YAML
 
 from actors.runtime.child_process import child_environment
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.daemon_client import Client
+from orchestrator.daemon.api.daemon_client import Client
+from orchestrator.daemon.state.access_tokens import Role, token_of
 from tests.support.other_environments import ALONE, python_with, told
 from tests.support.station_process import station_process
 from tests.support.waiting import PATIENCE, wait_for

@@ -79,7 +79,7 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
         case "recording" | "study" as kind:
             return file_kind(kind).check(path)
         case "daemon":
-            from orchestrator.daemon.daemon_settings import load_settings
+            from orchestrator.daemon.state.daemon_settings import load_settings
 
             return f"daemon, rigs: {', '.join(rig.name for rig in load_settings(path).rigs)}", []
         case _:

@@ -31,9 +31,9 @@ from orchestrator.cli.command_results import (
     ValidateSolverOutput,
     VesselOutput,
 )
-from orchestrator.daemon.daemon_store import QuestionOut
-from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, StatusOut
-from orchestrator.daemon.station_schemas import AccountOut, ContentOut, PourOut
+from orchestrator.daemon.api.schemas import CampaignDetailOut, CampaignOut, StatusOut
+from orchestrator.daemon.integrations.station_schemas import AccountOut, ContentOut, PourOut
+from orchestrator.daemon.state.daemon_store import QuestionOut
 from orchestrator.learning.dispense import Dose
 from orchestrator.learning.single_action import WeighedPour
 from orchestrator.records.journal_check import JournalCheck

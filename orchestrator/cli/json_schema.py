@@ -38,7 +38,7 @@ def study_schema() -> dict[str, Any]:
 
 def daemon_schema() -> dict[str, Any]:
     """Schema of the settings file of a daemon."""
-    from orchestrator.daemon.daemon_settings import DaemonFile
+    from orchestrator.daemon.state.daemon_settings import DaemonFile
 
     return _schema(DaemonFile, "Daemon")
 

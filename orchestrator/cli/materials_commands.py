@@ -22,7 +22,7 @@ from orchestrator.cli.console import RefusalError, Refused, print_json, print_me
 from orchestrator.cli.queue_commands import State, Url, connected_client
 
 if TYPE_CHECKING:
-    from orchestrator.daemon.daemon_client import Client
+    from orchestrator.daemon.api.daemon_client import Client
     from orchestrator.materials.vessel_account import VesselAccount
 
 VesselName = Annotated[
@@ -55,7 +55,7 @@ def _opened(url: str | None, state: Path | None) -> Iterator[Client | VesselAcco
 def _daemon_answers(folder: Path) -> bool:
     if not (folder / "url").is_file():
         return False
-    from orchestrator.daemon.daemon_client import Client, DaemonError
+    from orchestrator.daemon.api.daemon_client import Client, DaemonError
 
     try:
         with Client(None, folder) as client:

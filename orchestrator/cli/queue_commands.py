@@ -1,6 +1,6 @@
 """The daemon's commands: `decant server start`, and the commands that call the daemon over HTTP.
 
-The HTTP client is in `orchestrator.daemon.daemon_client`.
+The HTTP client is in `orchestrator.daemon.api.daemon_client`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from orchestrator.cli.console import RefusalError, print_json, print_message, pr
 from orchestrator.cli.shell_completion import files_of, queued_campaigns
 
 if TYPE_CHECKING:
-    from orchestrator.daemon.daemon_client import Client
+    from orchestrator.daemon.api.daemon_client import Client
 
 CampaignId = Annotated[
     str,
@@ -66,7 +66,7 @@ def start(
 
     _require_extra()
     from orchestrator.daemon import server_process
-    from orchestrator.daemon.daemon_settings import load_settings
+    from orchestrator.daemon.state.daemon_settings import load_settings
 
     try:
         chosen = load_settings(
@@ -96,7 +96,7 @@ def _require_extra() -> None:
 def connected_client(url: str | None, state: Path | None) -> Iterator[Client]:
     """Open a client of the daemon; its refusals end the command."""
     _require_extra()
-    from orchestrator.daemon.daemon_client import Client
+    from orchestrator.daemon.api.daemon_client import Client
 
     with Client(url, state) as client:
         yield client
@@ -126,7 +126,7 @@ def submit(
 ) -> None:
     """Add a campaign to the daemon's queue, with copies of all files that it refers to."""
     from orchestrator.cli.foreground_run import read_campaign
-    from orchestrator.daemon.submissions import pack
+    from orchestrator.daemon.rigs.submissions import pack
 
     plan = read_campaign(campaign, laboratory, seed)
     if (parameters, receiver, iterations) != (None, None, None):

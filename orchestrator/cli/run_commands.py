@@ -27,7 +27,7 @@ from orchestrator.cli.shell_completion import catalogued, catalogued_runs
 
 if TYPE_CHECKING:
     from orchestrator.catalogue.catalogue import Catalogue
-    from orchestrator.daemon.daemon_client import RemoteCatalogueClient
+    from orchestrator.daemon.api.daemon_client import RemoteCatalogueClient
     from orchestrator.records.run_record import Row
 
 NEWEST = 20
@@ -539,7 +539,7 @@ def _client(daemon: bool = False) -> Iterator[Catalogue | RemoteCatalogueClient]
     """Open a client of this machine's catalogue or of the daemon's."""
     if daemon:
         from orchestrator.cli.queue_commands import connected_client
-        from orchestrator.daemon.daemon_client import RemoteCatalogueClient
+        from orchestrator.daemon.api.daemon_client import RemoteCatalogueClient
 
         with connected_client(None, None) as client, _refusing():
             yield RemoteCatalogueClient(client)

@@ -122,7 +122,7 @@ def queued_campaigns(incomplete: str) -> list[str]:
     from orchestrator.learning.run_errors import RunError
 
     try:
-        from orchestrator.daemon.daemon_client import Client
+        from orchestrator.daemon.api.daemon_client import Client
 
         with Client() as client:
             return [one["id"] for one in client.get("/campaigns", limit=50) if one["id"].startswith(incomplete)]

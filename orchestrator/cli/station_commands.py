@@ -11,7 +11,7 @@ import typer
 from orchestrator.cli.command_options import Assignments, Json
 from orchestrator.cli.console import RefusalError, Refused, print_json, print_message
 from orchestrator.cli.queue_commands import State, Url, connected_client
-from orchestrator.daemon.pour_request import PourIn, described
+from orchestrator.daemon.rigs.pour_request import PourIn, described
 
 
 def order(
@@ -35,7 +35,7 @@ def order(
             raise RefusalError(f"--set: {text!r} should be name=value, for example angular_velocity='60 deg/s'")
         action[name] = value
     with connected_client(url, state) as client:
-        from orchestrator.daemon.daemon_client import order_body
+        from orchestrator.daemon.api.daemon_client import order_body
 
         body = order_body(
             lambda: PourIn(
@@ -96,7 +96,7 @@ def serve_sila(
     require("unitelabs", "the SiLA 2 server")
     import asyncio
 
-    from orchestrator.daemon import sila_server
+    from orchestrator.daemon.integrations import sila_server
 
     with connected_client(url, state) as client:
         client.get("/status")
@@ -112,7 +112,7 @@ def serve_sila(
 
 def backup(file: Annotated[Path, typer.Argument(help="Archive to write (.zip).")], state: State = None) -> None:
     """Back up a daemon's state, also while it runs: queue, orders, materials, campaigns, runs and tokens."""
-    from orchestrator.daemon.state_backup import back_up
+    from orchestrator.daemon.state.state_backup import back_up
     from orchestrator.learning.run_errors import RunError
     from orchestrator.records.run_registry import state_directory
 
@@ -127,7 +127,7 @@ def restore(
     state: State = None,
 ) -> None:
     """Restore a backup into a new state directory. The queue is paused: check the pours made since the backup."""
-    from orchestrator.daemon import state_backup
+    from orchestrator.daemon.state import state_backup
     from orchestrator.learning.run_errors import RunError
     from orchestrator.records.run_registry import state_directory
 

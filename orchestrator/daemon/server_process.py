@@ -29,13 +29,13 @@ from pythonjsonlogger.json import JsonFormatter
 from actors.interfaces import LaboratoryError
 from actors.runtime.ray_cluster import check_cluster
 from actors.simulators.job_runner import few_arenas
-from orchestrator.daemon.access_tokens import Tokens
-from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
-from orchestrator.daemon.emergency_stop import StopProtocol
 from orchestrator.daemon.http_api import serve_app
-from orchestrator.daemon.madsci_node import create_node
-from orchestrator.daemon.notifications import OCCASIONS, Notifier, NotifyError, pass_on
-from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.daemon.integrations.madsci_node import create_node
+from orchestrator.daemon.rigs.emergency_stop import StopProtocol
+from orchestrator.daemon.rigs.supervisor import Supervisor
+from orchestrator.daemon.state.access_tokens import Tokens
+from orchestrator.daemon.state.daemon_settings import DaemonSettings, MadsciSettings
+from orchestrator.daemon.state.notifications import OCCASIONS, Notifier, NotifyError, pass_on
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.records.run_registry import make_state_directory, use_state_directory

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.daemon_client import Client
-from orchestrator.daemon.submissions import pack
+from orchestrator.daemon.api.daemon_client import Client
+from orchestrator.daemon.rigs.submissions import pack
 from orchestrator.records.journal import JournalReader
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import finished_results

@@ -16,8 +16,8 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from orchestrator.daemon.access_tokens import Role
 from orchestrator.daemon.http_api import create_app
+from orchestrator.daemon.state.access_tokens import Role
 from tests.support.daemon_thread import Real
 from tests.support.hypothesis_examples import examples
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.daemon.access_tokens import Role, token_of
+from orchestrator.daemon.state.access_tokens import Role, token_of
 from orchestrator.learning.requests import Poured
 from orchestrator.records.codec import decode_outcome
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind

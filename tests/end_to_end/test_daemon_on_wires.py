@@ -16,8 +16,8 @@ import pytest
 
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.ur_controller.controller_process import VirtualController
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.daemon_client import Client, DaemonError
+from orchestrator.daemon.api.daemon_client import Client, DaemonError
+from orchestrator.daemon.state.access_tokens import Role, token_of
 from orchestrator.records.journal import Kind
 from orchestrator.runs.motion_approval import SafetyRecord, write_record
 from tests.end_to_end.test_daemon_killed import Laboratory, opened

@@ -15,8 +15,8 @@ from typing import Any
 from rich.console import Console
 
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.event_feed import PASSING as PASSED_BY
-from orchestrator.daemon.event_feed import event_json
+from orchestrator.daemon.state.event_feed import PASSING as PASSED_BY
+from orchestrator.daemon.state.event_feed import event_json
 from orchestrator.records.events import Event, PourProgressed, StrategyProgressed
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader
 from orchestrator.reports.console_progress import ProgressDisplay

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 
 from actors.runtime.child_process import child_environment
 from orchestrator.cli.app import app
-from orchestrator.daemon.daemon_store import FORMAT as STORE_FORMAT
-from orchestrator.daemon.daemon_store import Store, StoreError
+from orchestrator.daemon.state.daemon_store import FORMAT as STORE_FORMAT
+from orchestrator.daemon.state.daemon_store import Store, StoreError
 from orchestrator.learning.requests import Failed, Pour, Poured, Simulate
 from orchestrator.records.codec import CodecError
 from orchestrator.records.events import (

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from actors.interfaces import LaboratoryError, ProgressCallback
-from orchestrator.daemon.daemon_store import Store
-from orchestrator.daemon.materials import MaterialError, Materials, mass_of
+from orchestrator.daemon.rigs.materials import MaterialError, Materials, mass_of
+from orchestrator.daemon.state.daemon_store import Store
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, LaboratoryPlaces, Transfer, VesselAccount
 from sim_engine.errors import InvalidArgumentError

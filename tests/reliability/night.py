@@ -40,7 +40,7 @@ from actors.interfaces import LaboratoryError, NotPouredError, OperatorQuestion,
 from actors.laboratory_settings import LaboratorySettings
 from actors.places import UnattendedSettings
 from orchestrator.campaigns.file_loading import load_laboratory
-from orchestrator.daemon.notifications import Notification, Notifier
+from orchestrator.daemon.state.notifications import Notification, Notifier
 from orchestrator.materials.vessel_account import LaboratoryPlaces, VesselAccount
 from sim_engine.action import DEG, Action
 from sim_engine.vessel.shapes import VesselGrip, VesselSpec

@@ -37,10 +37,10 @@ from actors.bench.bench_operators import BenchContents
 from actors.bench.liquid_supply import LiquidSupply
 from actors.laboratory import WarmSimulators
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.daemon.daemon_settings import load_settings
+from orchestrator.daemon.api.daemon_client import Client, DaemonError
+from orchestrator.daemon.rigs.submissions import pack
 from orchestrator.daemon.server_process import serve
-from orchestrator.daemon.submissions import pack
+from orchestrator.daemon.state.daemon_settings import load_settings
 from orchestrator.materials.vessel_account import FILE_NAME, VesselAccount
 from tests.reliability import strikes
 from tests.reliability.formula import LOG, Formula

@@ -14,9 +14,9 @@ import pytest
 from ruamel.yaml import YAML
 
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.daemon_client import Client
-from orchestrator.daemon.submissions import Files, pack
+from orchestrator.daemon.api.daemon_client import Client
+from orchestrator.daemon.rigs.submissions import Files, pack
+from orchestrator.daemon.state.access_tokens import Role, token_of
 from tests.end_to_end.test_daemon_killed import Laboratory, opened
 from tests.support.small_campaign import write_campaign
 from tests.support.stop_requests import CASES, StopCase, stopped_by

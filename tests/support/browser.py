@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 import pytest
 import uvicorn
 
-from orchestrator.daemon.access_tokens import Role, Tokens
-from orchestrator.daemon.emergency_stop import StopProtocol
 from orchestrator.daemon.http_api import serve_app
+from orchestrator.daemon.rigs.emergency_stop import StopProtocol
+from orchestrator.daemon.state.access_tokens import Role, Tokens
 from tests.support.small_campaign import write_campaign
 from tests.support.toy_daemon import CAMPAIGN, Make, Served, held, serving
 from tests.support.waiting import PATIENCE

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import uvicorn
 
-from orchestrator.daemon.access_tokens import Role, Tokens, token_of
-from orchestrator.daemon.daemon_client import Client
-from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.api.daemon_client import Client
 from orchestrator.daemon.http_api import serve_app
-from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.daemon.rigs.supervisor import Supervisor
+from orchestrator.daemon.state.access_tokens import Role, Tokens, token_of
+from orchestrator.daemon.state.daemon_settings import DaemonSettings
 from tests.support.waiting import PATIENCE
 
 

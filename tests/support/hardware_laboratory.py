@@ -7,7 +7,7 @@ from pathlib import Path
 
 from actors.emulators.ur_controller.controller_process import VirtualController
 from orchestrator.campaigns.file_loading import load_laboratory
-from orchestrator.daemon.daemon_settings import Rig
+from orchestrator.daemon.state.daemon_settings import Rig
 from tests.support.waiting import wait_for
 
 HOME = (-14.0, -91.0, -115.0, -154.0, -104.0, 0.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.campaigns.file_loading import load_laboratory
-from orchestrator.daemon.daemon_settings import Rig
+from orchestrator.daemon.state.daemon_settings import Rig
 from tests.support.toy_daemon import Served
 from tests.support.waiting import PATIENCE
 

@@ -20,14 +20,14 @@ from typing import Any
 import uvicorn
 
 from actors.runtime.child_process import child_environment
-from orchestrator.daemon import ordering, rig_worker
-from orchestrator.daemon.campaign_queue import CampaignQueue
-from orchestrator.daemon.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.daemon.http_api import serve_app
-from orchestrator.daemon.madsci_node import create_node
-from orchestrator.daemon.materials import Materials
-from orchestrator.daemon.pour_orders import OrderBook
-from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.daemon.integrations.madsci_node import create_node
+from orchestrator.daemon.rigs import ordering, rig_worker
+from orchestrator.daemon.rigs.campaign_queue import CampaignQueue
+from orchestrator.daemon.rigs.materials import Materials
+from orchestrator.daemon.rigs.pour_orders import OrderBook
+from orchestrator.daemon.rigs.supervisor import Supervisor
+from orchestrator.daemon.state.daemon_settings import DaemonSettings, MadsciSettings
 from orchestrator.materials.vessel_account import VesselAccount
 from tests.support.station import BEAKER, VIAL, rigs_in
 from tests.support.toy_daemon import HeldBench, HeldLaboratory
@@ -97,7 +97,7 @@ class CountingBench(HeldBench):
 
 async def serve(folder: Path, stage: str, port: int = 0, node_port: int = 0) -> None:
     import actors.laboratory
-    from orchestrator.daemon.access_control import Tokens
+    from orchestrator.daemon.api.access_control import Tokens
     from tests.support.toy_campaign import ToyOptimizer, ToySimulators
 
     def open_laboratory(spec: Any, **arguments: Any) -> HeldLaboratory:

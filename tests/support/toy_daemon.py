@@ -14,13 +14,13 @@ import pytest
 
 from actors.interfaces import OperatorQuestion, PourProgress, ProgressCallback
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.access_tokens import Role, Tokens, token_of
-from orchestrator.daemon.daemon_settings import DaemonSettings
-from orchestrator.daemon.daemon_store import AT_REST
 from orchestrator.daemon.http_api import serve_app
-from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.submissions import pack
-from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.rigs.submissions import pack
+from orchestrator.daemon.rigs.supervisor import Supervisor
+from orchestrator.daemon.state.access_tokens import Role, Tokens, token_of
+from orchestrator.daemon.state.daemon_settings import DaemonSettings
+from orchestrator.daemon.state.daemon_store import AT_REST
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from tests.support.small_campaign import write_campaign

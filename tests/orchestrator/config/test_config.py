@@ -16,7 +16,7 @@ from orchestrator.campaigns.file_loading import load_campaign, load_laboratory, 
 from orchestrator.campaigns.fingerprint import fingerprint
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.command_options import call
-from orchestrator.daemon.daemon_settings import load_settings
+from orchestrator.daemon.state.daemon_settings import load_settings
 from orchestrator.learning.calibration.continuous_calibration import C4Settings
 from orchestrator.learning.campaign_plan import DeploymentSettings
 from orchestrator.learning.deployment.d1 import D1Settings

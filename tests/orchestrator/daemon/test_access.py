@@ -17,9 +17,9 @@ from typing import Any
 import pytest
 
 from orchestrator.catalogue.catalogue import Catalogue
-from orchestrator.daemon.access_control import DRAIN
-from orchestrator.daemon.access_tokens import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
-from orchestrator.daemon.submissions import SubmissionBundleError, unpack
+from orchestrator.daemon.api.access_control import DRAIN
+from orchestrator.daemon.rigs.submissions import SubmissionBundleError, unpack
+from orchestrator.daemon.state.access_tokens import FAILURES, WINDOW, Role, TokenFileError, Tokens, TooManyFailuresError
 from orchestrator.records.run_registry import enter
 from tests.support.browser import on_port
 from tests.support.toy_daemon import Served, held, run, serving

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
-from orchestrator.daemon.access_tokens import Role
+from orchestrator.daemon.state.access_tokens import Role
 from orchestrator.records.run_registry import VARIABLE, use_state_directory
 from tests.orchestrator.test_catalogue import made
 from tests.support.daemon_thread import Real

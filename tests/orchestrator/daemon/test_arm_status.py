@@ -13,8 +13,8 @@ import pytest
 from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import DeviceCheck
 from orchestrator.campaigns.file_loading import load_laboratory
-from orchestrator.daemon import rig_worker
-from orchestrator.daemon.daemon_settings import Rig
+from orchestrator.daemon.rigs import rig_worker
+from orchestrator.daemon.state.daemon_settings import Rig
 from tests.support.hardware_laboratory import hardware_rig
 from tests.support.toy_daemon import Served, held, run, serving
 from tests.support.waiting import PATIENCE

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.daemon.state_backup import BackupError, back_up, restore
+from orchestrator.daemon.state.state_backup import BackupError, back_up, restore
 from tests.support.station import content, order, rigs_in, set_up, until_pour
 from tests.support.toy_daemon import held, run, serving
 

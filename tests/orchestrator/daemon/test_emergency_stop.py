@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon import PHYSICAL
-from orchestrator.daemon.access_tokens import Role
-from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.daemon.daemon_settings import NO_RIG, Rig
-from orchestrator.daemon.daemon_store import StoreError
+from orchestrator.daemon.api.daemon_client import Client, DaemonError
+from orchestrator.daemon.state.access_tokens import Role
+from orchestrator.daemon.state.daemon_settings import NO_RIG, Rig
+from orchestrator.daemon.state.daemon_store import StoreError
 from tests.orchestrator.daemon.test_madsci_node import node
 from tests.orchestrator.daemon.test_sila_server import needs_cdk, sila
 from tests.support.browser import OnPort, on_port

@@ -11,12 +11,12 @@ from typing import Any
 import httpx
 import pytest
 
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.daemon_client import Client
-from orchestrator.daemon.daemon_settings import MadsciSettings
-from orchestrator.daemon.madsci_node import PERSON, create_node, new_ulid
-from orchestrator.daemon.ordering import Ordering
-from orchestrator.daemon.pour_request import PourIn
+from orchestrator.daemon.api.daemon_client import Client
+from orchestrator.daemon.integrations.madsci_node import PERSON, create_node, new_ulid
+from orchestrator.daemon.rigs.ordering import Ordering
+from orchestrator.daemon.rigs.pour_request import PourIn
+from orchestrator.daemon.state.access_tokens import Role, token_of
+from orchestrator.daemon.state.daemon_settings import MadsciSettings
 from tests.support.other_environments import line, python_with, running, told
 from tests.support.station import order, rigs_in, set_up, until_pour
 from tests.support.station_process import node_process, station_process

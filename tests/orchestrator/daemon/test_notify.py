@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.daemon import notifications as notify
-from orchestrator.daemon.notifications import QUEUE, Notifier, NotifyError
+from orchestrator.daemon.state import notifications as notify
+from orchestrator.daemon.state.notifications import QUEUE, Notifier, NotifyError
 from tests.support.waiting import PATIENCE, wait_for
 
 

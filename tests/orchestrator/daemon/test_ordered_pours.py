@@ -206,6 +206,6 @@ async def _pours(served: Served, body: dict[str, object]) -> bool:
 
 
 def _admin() -> object:
-    from orchestrator.daemon.access_tokens import Role
+    from orchestrator.daemon.state.access_tokens import Role
 
     return Role.ADMIN

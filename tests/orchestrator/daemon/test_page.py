@@ -21,8 +21,8 @@ from actors.emulators.ur_controller.controller_process import VirtualController
 from actors.interfaces import Notice, OperatorQuestion
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.file_loading import load_laboratory
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.daemon_settings import Rig
+from orchestrator.daemon.state.access_tokens import Role, token_of
+from orchestrator.daemon.state.daemon_settings import Rig
 from orchestrator.records.run_registry import VARIABLE
 from tests.support.browser import OnPort, browser, on_port
 from tests.support.hardware_laboratory import hardware_rig

@@ -16,9 +16,9 @@ import httpx
 import pytest
 
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.daemon.submissions import pack
+from orchestrator.daemon.api.daemon_client import Client, DaemonError
+from orchestrator.daemon.rigs.submissions import pack
+from orchestrator.daemon.state.access_tokens import Role, token_of
 from tests.support.station import order, setting_up
 from tests.support.station_process import STAGES, station_process
 from tests.support.toy_daemon import campaign_in

@@ -10,7 +10,7 @@ import pytest
 
 from actors.interfaces import OperatorQuestion
 from orchestrator.cli import queue_commands
-from orchestrator.daemon.access_tokens import Role
+from orchestrator.daemon.state.access_tokens import Role
 from tests.support.cli_inputs import invoke
 from tests.support.toy_daemon import HeldLaboratory, run, serving
 

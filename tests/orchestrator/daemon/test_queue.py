@@ -22,11 +22,11 @@ from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.cli import queue_commands
 from orchestrator.cli.app import app
 from orchestrator.cli.queue_commands import submit
-from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
-from orchestrator.daemon.daemon_store import QueueItem
-from orchestrator.daemon.pour_request import SubmissionIn
-from orchestrator.daemon.run_readout import Pours
-from orchestrator.daemon.submissions import Submission, SubmissionError, pack, prepare, run_request
+from orchestrator.daemon.rigs.pour_request import SubmissionIn
+from orchestrator.daemon.rigs.submissions import Submission, SubmissionError, pack, prepare, run_request
+from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
+from orchestrator.daemon.state.daemon_store import QueueItem
+from orchestrator.daemon.state.run_readout import Pours
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.runs.run_service import RunHandle, RunRequest
 from sim_engine.prediction_band import CalibrationResidual
@@ -81,7 +81,7 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
         read.append(item.id)
         return run_request(settings, item, rig)
 
-    monkeypatch.setattr("orchestrator.daemon.query_routes.run_request", counted)
+    monkeypatch.setattr("orchestrator.daemon.api.query_routes.run_request", counted)
 
     async def work() -> None:
         async with serving(tmp_path, held) as served:
@@ -189,7 +189,7 @@ def test_a_campaign_for_no_rig_there_is_is_refused_with_those_there_are(tmp_path
     async def work() -> None:
         async with serving(tmp_path, HeldLaboratory) as served:
             from orchestrator.campaigns.file_loading import load_campaign
-            from orchestrator.daemon.submissions import pack
+            from orchestrator.daemon.rigs.submissions import pack
 
             text, files = pack(load_campaign(served.campaign))
             told = await served.post("/campaigns", {"text": text, "files": files, "rig": "lefft"}, status=422)

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 from actors.laboratory import WarmSimulators
-from orchestrator.daemon import server_process, supervisor
+from orchestrator.daemon import server_process
+from orchestrator.daemon.rigs import supervisor
 from orchestrator.daemon.server_process import MOST, RENEWED, DaemonRestart, RayWatch
 from tests.support.toy_daemon import held, run, serving
 from tests.support.waiting import wait_async, wait_for

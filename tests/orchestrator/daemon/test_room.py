@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from fastapi.testclient import TestClient
 
-from orchestrator.daemon import rig_worker as lane
-from orchestrator.daemon.daemon_settings import DaemonSettings
-from orchestrator.daemon.daemon_store import StoreError
 from orchestrator.daemon.http_api import create_app
-from orchestrator.daemon.run_readout import prune_recordings
+from orchestrator.daemon.rigs import rig_worker as lane
+from orchestrator.daemon.state.daemon_settings import DaemonSettings
+from orchestrator.daemon.state.daemon_store import StoreError
+from orchestrator.daemon.state.run_readout import prune_recordings
 from tests.support.toy_daemon import run, serving
 
 

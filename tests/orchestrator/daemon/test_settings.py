@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.cli.app import app
-from orchestrator.daemon.daemon_settings import DaemonSettings, load_settings
+from orchestrator.daemon.state.daemon_settings import DaemonSettings, load_settings
 
 LABORATORY = "{name: numbers, bench: {liquid: {particles: 400}}}\n"
 

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from actors.runtime.child_process import child_environment
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.daemon_client import Client
+from orchestrator.daemon.api.daemon_client import Client
+from orchestrator.daemon.state.access_tokens import Role, token_of
 from sim_engine.resources import installed
 from tests.support.other_environments import line, python_with, running, told
 from tests.support.station_process import station_process
@@ -276,7 +276,7 @@ def test_with_tls_only_clients_of_the_authority_reach_the_station(tmp_path: Path
     ],
 )
 def test_an_address_that_others_reach_needs_tls(options: list[str], problem: str) -> None:
-    from orchestrator.daemon.sila_server import SilaServerError, check_address
+    from orchestrator.daemon.integrations.sila_server import SilaServerError, check_address
 
     chosen = dict(zip(options[::2], map(Path, options[1::2]), strict=True))
     with pytest.raises(SilaServerError, match=problem):

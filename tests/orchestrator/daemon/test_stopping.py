@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.daemon.access_tokens import Role
+from orchestrator.daemon.state.access_tokens import Role
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from tests.support.toy_daemon import HeldLaboratory, held, run, serving
 
@@ -143,7 +143,7 @@ def test_an_emergency_stop_is_latched_until_somebody_clears_it(tmp_path: Path) -
 
 def test_one_emergency_stop_is_for_all_rigs(tmp_path: Path) -> None:
     from orchestrator.campaigns.file_loading import load_laboratory
-    from orchestrator.daemon.daemon_settings import Rig
+    from orchestrator.daemon.state.daemon_settings import Rig
 
     laboratory = tmp_path / "numbers.yaml"
     laboratory.write_text("{name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}\n")

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.cli.app import app
-from orchestrator.daemon.access_tokens import Role
+from orchestrator.daemon.state.access_tokens import Role
 from tests.support.daemon_thread import Real
 
 UNIT = Path(__file__).parents[3] / "configs" / "systemd" / "decant.service"

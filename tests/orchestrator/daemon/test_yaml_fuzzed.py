@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.daemon_settings import DaemonSettings
-from orchestrator.daemon.submissions import Files, Submission, SubmissionError, pack, prepare
+from orchestrator.daemon.rigs.submissions import Files, Submission, SubmissionError, pack, prepare
+from orchestrator.daemon.state.daemon_settings import DaemonSettings
 from tests.support.hypothesis_examples import examples
 from tests.support.small_campaign import write_campaign
 

@@ -17,7 +17,7 @@ import decant
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.catalogue.export import write_tables
 from orchestrator.catalogue.run_reading import TABLES, read_run
-from orchestrator.daemon.event_feed import event_json
+from orchestrator.daemon.state.event_feed import event_json
 from orchestrator.learning.strategy_registry import OBJECTIVES
 from orchestrator.records.events import Event
 from orchestrator.records.run_registry import VARIABLE

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from orchestrator.daemon.pour_request import CallerId, Quantity, RequestModel
-from orchestrator.daemon.schemas import ResponseModel
+from orchestrator.daemon.api.schemas import ResponseModel
+from orchestrator.daemon.rigs.pour_request import CallerId, Quantity, RequestModel
 
 ResourceId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,59}$")]
 

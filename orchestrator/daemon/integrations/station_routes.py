@@ -11,13 +11,8 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, HTTPException, Query, Response
 
-from orchestrator.daemon.access_control import Daemon, Operator, Orders, Queue, Viewer
-from orchestrator.daemon.campaign_queue import RequestRefusedError
-from orchestrator.daemon.materials import MaterialError, mass_of
-from orchestrator.daemon.ordering import Ordering
-from orchestrator.daemon.pour_request import PourIn
-from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.station_schemas import (
+from orchestrator.daemon.api.access_control import Daemon, Operator, Orders, Queue, Viewer
+from orchestrator.daemon.integrations.station_schemas import (
     AccountOut,
     HandPourIn,
     LiquidIn,
@@ -28,7 +23,12 @@ from orchestrator.daemon.station_schemas import (
     VesselIn,
     WeighingIn,
 )
-from orchestrator.daemon.submissions import SubmissionError
+from orchestrator.daemon.rigs.campaign_queue import RequestRefusedError
+from orchestrator.daemon.rigs.materials import MaterialError, mass_of
+from orchestrator.daemon.rigs.ordering import Ordering
+from orchestrator.daemon.rigs.pour_request import PourIn
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.rigs.submissions import SubmissionError
 from orchestrator.learning.run_errors import RunError
 
 LONGEST_WAIT = 600.0

@@ -34,10 +34,10 @@ from orchestrator.campaigns.campaign_checks import check_vessels, touch
 from orchestrator.campaigns.file_loading import laboratory_record, load_laboratory, vessel_from
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.campaigns.yaml.yaml_source import Document
-from orchestrator.daemon.daemon_settings import Rig
-from orchestrator.daemon.daemon_store import QueueItem, Store
-from orchestrator.daemon.materials import Materials, liquid_of, mass_of
-from orchestrator.daemon.pour_request import PourIn
+from orchestrator.daemon.rigs.materials import Materials, liquid_of, mass_of
+from orchestrator.daemon.rigs.pour_request import PourIn
+from orchestrator.daemon.state.daemon_settings import Rig
+from orchestrator.daemon.state.daemon_store import QueueItem, Store
 from orchestrator.learning.campaign_plan import (
     CampaignPlan,
     DeploymentPlan,

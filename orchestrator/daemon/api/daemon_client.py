@@ -23,8 +23,8 @@ import httpx
 from pydantic import ValidationError
 
 from orchestrator.daemon import PHYSICAL, PORT
-from orchestrator.daemon.access_tokens import Role, token_of
-from orchestrator.daemon.pour_request import PourIn, problems_text
+from orchestrator.daemon.rigs.pour_request import PourIn, problems_text
+from orchestrator.daemon.state.access_tokens import Role, token_of
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.run_registry import state_directory
 

@@ -15,7 +15,7 @@ from typing import Any
 from actors.balance.readings import typed_weight
 from actors.interfaces import LaboratoryError
 from actors.interfaces import OperatorQuestion as BenchQuestion
-from orchestrator.daemon.daemon_store import QuestionOut, Store
+from orchestrator.daemon.state.daemon_store import QuestionOut, Store
 from orchestrator.runs.resume import parse_answer
 
 GIVE_UP = "give up"

@@ -24,7 +24,7 @@ from orchestrator.campaigns.yaml.section_validation import validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 from orchestrator.daemon import PORT
-from orchestrator.daemon.notifications import NotifySettings, problem_of
+from orchestrator.daemon.state.notifications import NotifySettings, problem_of
 from orchestrator.records.run_registry import state_directory
 from sim_engine.settings.model import Count, FilePath, Name, Settings, Switch, Text
 from sim_engine.settings.quantity import Quantity

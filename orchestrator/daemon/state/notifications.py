@@ -24,7 +24,7 @@ from sim_engine.settings.model import Settings, Text
 from sim_engine.settings.quantity import Quantity
 
 if TYPE_CHECKING:
-    from orchestrator.daemon.event_feed import SentEvent
+    from orchestrator.daemon.state.event_feed import SentEvent
 
 QUEUE = 50
 """Largest number of waiting messages per receiver; further messages are dropped and counted."""

@@ -19,7 +19,7 @@ from typing import Any
 from orchestrator.campaigns.file_loading import liquid_from, vessel_from
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document
-from orchestrator.daemon.daemon_store import ENDED, Store
+from orchestrator.daemon.state.daemon_store import ENDED, Store
 from orchestrator.learning.dispense import ENOUGH
 from orchestrator.learning.run_errors import RunError
 from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, VesselAccount, VesselContent

@@ -16,13 +16,13 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from actors.interfaces import InvalidActionError, LaboratoryError
-from orchestrator.daemon.campaign_queue import CampaignQueue, RequestRefusedError
-from orchestrator.daemon.daemon_store import QueueItem
-from orchestrator.daemon.materials import SURE, Materials
-from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, settled_pour
-from orchestrator.daemon.pour_request import PourIn, SubmissionIn
-from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.submissions import Submission, planned_order, prepare
+from orchestrator.daemon.rigs.campaign_queue import CampaignQueue, RequestRefusedError
+from orchestrator.daemon.rigs.materials import SURE, Materials
+from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, settled_pour
+from orchestrator.daemon.rigs.pour_request import PourIn, SubmissionIn
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.rigs.submissions import Submission, planned_order, prepare
+from orchestrator.daemon.state.daemon_store import QueueItem
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.run_tasks import POUR
 

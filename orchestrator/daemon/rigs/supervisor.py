@@ -12,11 +12,11 @@ import asyncio
 import shutil
 
 from actors.interfaces import LaboratoryError
-from orchestrator.daemon.campaign_queue import CampaignQueue
-from orchestrator.daemon.daemon_settings import DaemonSettings
-from orchestrator.daemon.emergency_stop import EmergencyStops
-from orchestrator.daemon.pour_orders import OrderBook
-from orchestrator.daemon.rig_worker import SharedServices
+from orchestrator.daemon.rigs.campaign_queue import CampaignQueue
+from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
+from orchestrator.daemon.rigs.pour_orders import OrderBook
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.state.daemon_settings import DaemonSettings
 from orchestrator.live_view.live_server import LiveView
 
 LEAVING = 10.0

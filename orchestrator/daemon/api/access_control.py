@@ -20,12 +20,12 @@ from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.exceptions import HTTPException as AnyHTTPException
 
-from orchestrator.daemon.access_tokens import Person, Role, Tokens, TooManyFailuresError
-from orchestrator.daemon.campaign_queue import CampaignQueue
-from orchestrator.daemon.daemon_settings import LOOPBACK
-from orchestrator.daemon.emergency_stop import EmergencyStops, is_stop, not_stopped, route_scope
-from orchestrator.daemon.ordering import Ordering
-from orchestrator.daemon.rig_worker import SharedServices
+from orchestrator.daemon.rigs.campaign_queue import CampaignQueue
+from orchestrator.daemon.rigs.emergency_stop import EmergencyStops, is_stop, not_stopped, route_scope
+from orchestrator.daemon.rigs.ordering import Ordering
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.state.access_tokens import Person, Role, Tokens, TooManyFailuresError
+from orchestrator.daemon.state.daemon_settings import LOOPBACK
 
 Message = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[Message]]
@@ -123,7 +123,7 @@ async def _refuse(receive: Receive, send: Send, status: int, detail: str, *, dra
     Args:
         drain: whether the rest of the body follows; a client that expects 100-continue sends none after a refusal.
     """
-    from orchestrator.daemon.event_feed import text
+    from orchestrator.daemon.state.event_feed import text
 
     await respond_early(receive, send, status, text({"detail": detail}).encode(), drain=drain)
 

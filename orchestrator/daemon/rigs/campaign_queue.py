@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime
 
-from orchestrator.daemon.daemon_store import ENDED, PAUSED, STOPPED, WITHDRAWN, DesiredState, QueueItem
-from orchestrator.daemon.emergency_stop import EmergencyStops
-from orchestrator.daemon.rig_worker import SharedServices
+from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.state.daemon_store import ENDED, PAUSED, STOPPED, WITHDRAWN, DesiredState, QueueItem
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.run_tasks import POUR
 

@@ -30,13 +30,13 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ValidationError, WithJsonSchema
 from starlette.exceptions import HTTPException as AnyHTTPException
 
-from orchestrator.daemon.access_control import refused
-from orchestrator.daemon.daemon_settings import MadsciSettings, networks
-from orchestrator.daemon.daemon_store import ENDED, QueueItem
-from orchestrator.daemon.emergency_stop import StopForms
-from orchestrator.daemon.ordering import Ordering
-from orchestrator.daemon.pour_request import PourIn, SubmissionIn, described, problems_text
-from orchestrator.daemon.supervisor import Supervisor
+from orchestrator.daemon.api.access_control import refused
+from orchestrator.daemon.rigs.emergency_stop import StopForms
+from orchestrator.daemon.rigs.ordering import Ordering
+from orchestrator.daemon.rigs.pour_request import PourIn, SubmissionIn, described, problems_text
+from orchestrator.daemon.rigs.supervisor import Supervisor
+from orchestrator.daemon.state.daemon_settings import MadsciSettings, networks
+from orchestrator.daemon.state.daemon_store import ENDED, QueueItem
 from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 

@@ -22,7 +22,7 @@ from actors.bench.night_consent import MOTIONS
 from actors.interfaces import LaboratoryError
 from actors.laboratory import reached
 from actors.laboratory_settings import LaboratorySettings
-from orchestrator.daemon.daemon_settings import DaemonSettings
+from orchestrator.daemon.state.daemon_settings import DaemonSettings
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.records.codec import CodecError
 from orchestrator.records.journal_file import JournalError

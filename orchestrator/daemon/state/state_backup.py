@@ -13,7 +13,7 @@ import time
 import zipfile
 from pathlib import Path, PurePosixPath
 
-from orchestrator.daemon.daemon_store import ENDED, PAUSED, DesiredState, Store, StoreError
+from orchestrator.daemon.state.daemon_store import ENDED, PAUSED, DesiredState, Store, StoreError
 from orchestrator.materials.vessel_account import FILE_NAME as ACCOUNT
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import LEDGER_NAME

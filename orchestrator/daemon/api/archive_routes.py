@@ -23,10 +23,10 @@ from orchestrator.catalogue.annotations import Note
 from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
-from orchestrator.daemon.access_control import Daemon, Operator, Viewer
-from orchestrator.daemon.materials import Materials
-from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.run_readout import REPORT
+from orchestrator.daemon.api.access_control import Daemon, Operator, Viewer
+from orchestrator.daemon.rigs.materials import Materials
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.state.run_readout import REPORT
 from orchestrator.learning.run_errors import RunError
 from sim_engine.resources import MissingExtraError
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.daemon.pour_request import Moment, RequestModel
+from orchestrator.daemon.rigs.pour_request import Moment, RequestModel
 from orchestrator.reports.run_summary import PourSummary
 
 

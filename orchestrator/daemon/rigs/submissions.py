@@ -24,9 +24,9 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.yaml.file_access import confined, out_of_bounds, resolved
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.catalogue.catalogue import posterior_source
-from orchestrator.daemon.daemon_settings import ANY_RIG, NO_RIG, DaemonSettings, Rig
-from orchestrator.daemon.daemon_store import DesiredState, QueueItem
-from orchestrator.daemon.pour_orders import PlannedOrder, PourOrder
+from orchestrator.daemon.rigs.pour_orders import PlannedOrder, PourOrder
+from orchestrator.daemon.state.daemon_settings import ANY_RIG, NO_RIG, DaemonSettings, Rig
+from orchestrator.daemon.state.daemon_store import DesiredState, QueueItem
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal import JOURNAL_NAME

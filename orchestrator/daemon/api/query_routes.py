@@ -23,14 +23,14 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.access_control import Daemon, Queue, Stops, Viewer
-from orchestrator.daemon.campaign_queue import CampaignQueue
-from orchestrator.daemon.daemon_store import ENDED, QuestionOut, QueueItem
-from orchestrator.daemon.emergency_stop import EmergencyStops
-from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.run_readout import REPORT, summary_of
-from orchestrator.daemon.schemas import CampaignDetailOut, CampaignOut, RigOut, StatusOut
-from orchestrator.daemon.submissions import run_request
+from orchestrator.daemon.api.access_control import Daemon, Queue, Stops, Viewer
+from orchestrator.daemon.api.schemas import CampaignDetailOut, CampaignOut, RigOut, StatusOut
+from orchestrator.daemon.rigs.campaign_queue import CampaignQueue
+from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.rigs.submissions import run_request
+from orchestrator.daemon.state.daemon_store import ENDED, QuestionOut, QueueItem
+from orchestrator.daemon.state.run_readout import REPORT, summary_of
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import free_space

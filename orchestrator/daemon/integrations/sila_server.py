@@ -31,8 +31,8 @@ from urllib.parse import quote
 from sila import UndefinedExecutionError, ValidationError
 from unitelabs.cdk import Connector, ConnectorBaseConfig, Logger, SiLAServerConfig, run, sila
 
-from orchestrator.daemon.daemon_client import Client, DaemonError, order_body
-from orchestrator.daemon.pour_request import PourIn
+from orchestrator.daemon.api.daemon_client import Client, DaemonError, order_body
+from orchestrator.daemon.rigs.pour_request import PourIn
 from orchestrator.learning.run_errors import RunError
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 

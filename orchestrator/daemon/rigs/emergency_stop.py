@@ -26,8 +26,8 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from orchestrator.daemon import PHYSICAL
-from orchestrator.daemon.daemon_store import DesiredState
-from orchestrator.daemon.rig_worker import RigWorker, SharedServices
+from orchestrator.daemon.rigs.rig_worker import RigWorker, SharedServices
+from orchestrator.daemon.state.daemon_store import DesiredState
 from orchestrator.learning.run_errors import RunError
 
 STOP_PATH = "/api/v1/emergency-stop"

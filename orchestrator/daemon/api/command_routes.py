@@ -17,15 +17,9 @@ from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.access_control import Admin, Daemon, EarlyResponse, Operator, Orders, Queue, Stops, Viewer
-from orchestrator.daemon.campaign_queue import RequestRefusedError
-from orchestrator.daemon.daemon_store import ENDED, QuestionOut, QueueItem
-from orchestrator.daemon.emergency_stop import UNSTORED, recorded_reason
-from orchestrator.daemon.pour_request import SubmissionIn
-from orchestrator.daemon.query_routes import campaign_out, found_item, status
-from orchestrator.daemon.remote_operator import AnswerError
-from orchestrator.daemon.rig_worker import SharedServices
-from orchestrator.daemon.schemas import (
+from orchestrator.daemon.api.access_control import Admin, Daemon, EarlyResponse, Operator, Orders, Queue, Stops, Viewer
+from orchestrator.daemon.api.query_routes import campaign_out, found_item, status
+from orchestrator.daemon.api.schemas import (
     AnswerIn,
     CampaignOut,
     ClearIn,
@@ -35,7 +29,13 @@ from orchestrator.daemon.schemas import (
     StoppedOut,
     WhatMovesOut,
 )
-from orchestrator.daemon.submissions import SubmissionError, run_request
+from orchestrator.daemon.rigs.campaign_queue import RequestRefusedError
+from orchestrator.daemon.rigs.emergency_stop import UNSTORED, recorded_reason
+from orchestrator.daemon.rigs.pour_request import SubmissionIn
+from orchestrator.daemon.rigs.remote_operator import AnswerError
+from orchestrator.daemon.rigs.rig_worker import SharedServices
+from orchestrator.daemon.rigs.submissions import SubmissionError, run_request
+from orchestrator.daemon.state.daemon_store import ENDED, QuestionOut, QueueItem
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.motion_approval import campaign_pours, envelope, envelope_lines, pour_count, required_checksum
 

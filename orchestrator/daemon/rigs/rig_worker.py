@@ -18,15 +18,15 @@ from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
-from orchestrator.daemon.daemon_settings import NO_RIG, DaemonSettings, Rig
-from orchestrator.daemon.daemon_store import ENDED, PAUSED, STOPPED, DesiredState, QueueItem, Store
-from orchestrator.daemon.event_feed import Feed
-from orchestrator.daemon.materials import Materials
-from orchestrator.daemon.notifications import Counts
-from orchestrator.daemon.pour_orders import OrderBook, OrderError, PourOrder, renew_load, settled_pour
-from orchestrator.daemon.remote_operator import Asking, RemoteOperator, RunQuestions
-from orchestrator.daemon.run_readout import Pours, found_at, prune_recordings
-from orchestrator.daemon.submissions import run_request
+from orchestrator.daemon.rigs.materials import Materials
+from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, renew_load, settled_pour
+from orchestrator.daemon.rigs.remote_operator import Asking, RemoteOperator, RunQuestions
+from orchestrator.daemon.rigs.submissions import run_request
+from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
+from orchestrator.daemon.state.daemon_store import ENDED, PAUSED, STOPPED, DesiredState, QueueItem, Store
+from orchestrator.daemon.state.event_feed import Feed
+from orchestrator.daemon.state.notifications import Counts
+from orchestrator.daemon.state.run_readout import Pours, found_at, prune_recordings
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView, recorder_of
