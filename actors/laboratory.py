@@ -18,7 +18,7 @@ from actors.balance.display_behaviour import IDEAL
 from actors.balance.scale_model import ScaleSettings
 from actors.bench.bench_factory import MakeDevice, OpenBench, open_bench
 from actors.bench.virtual_bench import BenchEmulators
-from actors.dosing.display_belief import DisplayBelief
+from actors.dosing.display_belief import IDEAL_DISPLAY, DisplayBelief
 from actors.dosing.dose_series import DoseForecast, predict_dose
 from actors.interfaces import (
     Bench,
@@ -142,16 +142,18 @@ def predicted_dose(
     Raises:
         InvalidActionError: the dose is impossible.
     """
-    return predict_dose(scene, dose, seed, spec.dosing, count, _expected_display(spec.balance))
+    return predict_dose(scene, dose, seed, spec.dosing, count, expected_display(spec.balance))
 
 
-def _expected_display(balance: BalanceSettings | None) -> DisplayBelief | None:
-    """The display of a balance according to its settings; None if they do not state its step."""
+def expected_display(balance: BalanceSettings | None) -> DisplayBelief | None:
+    """The display of a balance according to its settings; None if they state nothing about it."""
     match balance:
         case SerialBalanceSettings(virtual=ScaleSettings() as sheet, interval=interval):
             step, behaviour = sheet.resolution, sheet.behaviour
         case SerialBalanceSettings(step=float() as step, interval=interval):
             behaviour = IDEAL
+        case SerialBalanceSettings(interval=interval) if "interval" in balance.model_fields_set:
+            step, behaviour = IDEAL_DISPLAY.step, IDEAL
         case _:
             return None
     equal = max(1.0 - interval / behaviour.conversion_interval, 0.0) if behaviour.conversion_interval > 0.0 else 0.0

@@ -497,7 +497,19 @@ def dosing_harder() -> str:
 
 def dosing_balances() -> str:
     """Doses with displays that repeat, delay and lose readings."""
+    return _dosing_balances(pairs=False)
+
+
+def dosing_pairs() -> str:
+    """The same for all pairs of two behaviours."""
+    return _dosing_balances(pairs=True)
+
+
+def _dosing_balances(*, pairs: bool) -> str:
     data = json.loads((FOLDER / "data" / "dosing-balances.json").read_text(encoding="utf-8"))["rows"]
+    data = {name: row for name, row in data.items() if (" + " in name) == pairs}
+    if not data:
+        return "not measured"
     head = (
         *("balance", "mean error g", "95 % g", "worst g", "interval covers"),
         *("innovations", "weighed after s", "false stops"),
@@ -733,6 +745,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "dosing-spout": dosing,
     "dosing-harder": dosing_harder,
     "dosing-balances": dosing_balances,
+    "dosing-pairs": dosing_pairs,
     "dosing-faults": dosing_faults,
     "dosing-particles": dosing_particles,
     "command-line": command_line,

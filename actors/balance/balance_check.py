@@ -35,11 +35,14 @@ STEP_TIME = 15.0
 RISE_TIME = 10.0
 """Duration of the slow rise of the load, for repeated readings [s]."""
 
+FEWEST, LONGEST_INTERVAL = 3, 5.0
+"""Fewest readings of an observation, for which it takes longer; longest time that each of them may take [s]."""
+
 RISE_STEPS = 1.5
 """Rise per reading of that load, in display steps."""
 
-FLOW = DosingSettings().largest_fine_flow
-"""Flow at the end of a dose for which its tolerance is stated [kg/s]."""
+FLOW, SLOWEST_FLOW = DosingSettings().largest_fine_flow, DosingSettings().smallest_flow
+"""Flows at the end of a dose for which its tolerance is stated [kg/s]."""
 
 SLOW = 1.0
 """Lag beyond which a dose is stopped late [s]."""
@@ -217,7 +220,11 @@ class _Check:
 
     def _dose(self, found: StepResponse) -> DeviceCheck:
         tolerance = dose_tolerance(FLOW, found.error, self._gaps, self._step, self._noise)
-        said = f"±{_g(tolerance)} (95 %) can be met at {1e3 * FLOW:g} g/s at the end; right: {_g(DOSE)} or less"
+        slowest = dose_tolerance(SLOWEST_FLOW, found.error, self._gaps, self._step, self._noise)
+        said = (
+            f"±{_g(tolerance)} (95 %) can be met at {1e3 * FLOW:g} g/s at the end, ±{_g(slowest)} at "
+            f"{1e3 * SLOWEST_FLOW:g} g/s; right: {_g(DOSE)} or less"
+        )
         advice = "weigh doses on a finer or faster balance, or ask for a wider tolerance"
         return DeviceCheck("dose", *_state(tolerance <= DOSE, said, advice))
 
@@ -258,14 +265,15 @@ class _Check:
             LaboratoryError: it sends no weights.
         """
         seen: list[Weight] = []
-        end = time.monotonic() + seconds / self._scale
-        while time.monotonic() < end:
+        begin = time.monotonic()
+        end, latest = (begin + length / self._scale for length in (seconds, seconds + FEWEST * LONGEST_INTERVAL))
+        while (now := time.monotonic()) < end or (len(seen) < FEWEST and now < latest):
             weight = self._driver.read()
             if np.isfinite(weight.mass) and weight.time > self._read_at:
                 self._read_at = weight.time
                 seen.append(weight)
             time.sleep(0.005)
-        if len(seen) < 3:
+        if len(seen) < FEWEST:
             raise LaboratoryError(
                 f"only {len(seen)} weights came in {seconds:g} s (last: {self._driver.read().status})"
             )

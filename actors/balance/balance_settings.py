@@ -8,6 +8,7 @@ the balance reports several stable readings in a row and they agree.
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from dataclasses import dataclass
@@ -19,9 +20,11 @@ from pydantic import Field
 from actors.balance.balance_interface import BalanceDriver
 from actors.balance.dialect_registry import dialects, drivers
 from actors.balance.dialects.dialect import Dialect, LineSettings
+from actors.balance.display_quality import dose_tolerance
 from actors.balance.scale_model import Duration, Error, PositiveDuration, PositiveMass, ScaleSettings
 from actors.balance.serial_port import tcp_address
 from actors.balance.weighing_plan import Placement
+from actors.dosing_settings import DosingSettings
 from actors.interfaces import DeviceCheck, LaboratoryError
 from sim_engine.settings.model import (
     NOT_IN_FINGERPRINT,
@@ -127,6 +130,12 @@ AUTO = "auto"
 
 USUAL_BAUDS = (300, 600, 1200, 2400, 4800, 9600, 14_400, 19_200, 28_800, 38_400, 57_600, 115_200)
 """Usual speeds of balances [bits per second]."""
+
+OBSERVED = 6.0
+"""Longest time for which the readings of a balance are observed [s]."""
+
+SLOW_DOSE = 1e-3
+"""Usual tolerance of a dose [kg]."""
 
 COARSE = 0.5e-3
 """Displays with larger steps cannot resolve small spills [kg]."""
@@ -272,6 +281,8 @@ class BalanceKind(ABC, Generic[B]):
             coarse = weight.step > COARSE
             advice = "spills of less than a few steps can't be told apart; a finer balance would help" if coarse else ""
             checks.append(DeviceCheck("balance step", "warn" if coarse else "ok", f"{1e3 * weight.step:g} g", advice))
+            if self.spec.position in (Placement.RECEIVER, Placement.EVERYTHING):
+                checks.append(_doses(driver, weight.step, self.spec.time_scale))
             if tare:
                 driver.tare()
                 checks.append(DeviceCheck("balance tare", "ok", "it obeyed, and rests at zero"))
@@ -284,6 +295,23 @@ class BalanceKind(ABC, Generic[B]):
         finally:
             driver.close()
         return checks
+
+
+def _doses(driver: BalanceDriver, step: float, time_scale: float) -> DeviceCheck:
+    """The tolerance of doses with the readings of some seconds."""
+    times, end = [driver.read().time], time.monotonic() + OBSERVED / max(time_scale, 1.0)
+    while time.monotonic() < end and len(times) < 10:
+        time.sleep(0.01)
+        if (moment := driver.read().time) > times[-1]:
+            times.append(moment)
+    if len(times) < 3:
+        text = f"{len(times) - 1} new readings in {OBSERVED:g} s; doses need one each second or more"
+        return DeviceCheck("balance readings", "warn", text, "set a faster output")
+    interval = time_scale * (times[-1] - times[0]) / (len(times) - 1)
+    tolerance = dose_tolerance(DosingSettings().smallest_flow, 0.0, (interval,), step, 0.0)
+    text = f"one each {interval:.2f} s; doses can be within {1e3 * tolerance:.2g} g in 95 % of the cases"
+    slow = tolerance > SLOW_DOSE
+    return DeviceCheck("balance readings", "warn" if slow else "ok", text, "set a faster output" if slow else "")
 
 
 def balance_kind(spec: BalanceSettings) -> BalanceKind[Any]:

@@ -29,7 +29,7 @@ from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing_plan import GRIP, Placement
 from actors.bench.consent import Setup, grams, start_question
 from actors.bench.pour_procedure import BenchProcedure, PourReport, largest_tilt
-from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult
+from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult, check_display
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, after_dose, check_dose, series_of, source_of, unknown_amount
 from actors.dosing_settings import DosingSettings
@@ -52,6 +52,9 @@ LOOK_INTERVAL = 0.01
 
 BEFORE_PLACING, AFTER_PLACING = 0.5, 2.0
 """Readings are recorded for so long before and after the receiver is put on the balance [s]."""
+
+READINGS_PLACED, LONGEST_INTERVAL = 4, 5.0
+"""Readings that have to come after it was put on; longest time for each of them [s]."""
 
 LIGHTEST_RECEIVER = 5e-3
 """Smallest rise of the reading that counts as a receiver [kg]."""
@@ -158,7 +161,7 @@ class DoseProcedure(BenchProcedure):
         place = f" {dose.position}" if dose.position else ""
         problem = ""
         while True:
-            await self._sleep(BEFORE_PLACING)
+            await self._readings_for(BEFORE_PLACING, 1)
             before = self._readings.all[-3:]
             await self._consent.ask(
                 OperatorQuestion(
@@ -169,7 +172,7 @@ class DoseProcedure(BenchProcedure):
                     about="dose_receiver",
                 )
             )
-            await self._sleep(AFTER_PLACING)
+            await self._readings_for(AFTER_PLACING, READINGS_PLACED)
             after = self._readings.all[-3:]
             if not before or not after:
                 raise BalanceError("the balance sends no weight; look at its cable and its display")
@@ -186,7 +189,15 @@ class DoseProcedure(BenchProcedure):
         rng = np.random.default_rng((self._seed, 41))
         step = self._readings.step or 1e-4
         self._series = series_of(self._scene, dose, self._settings, placed, rng, step=step)
+        check_display(self._series.belief.display, dose.limit, self._settings)
         self._zero = after[-1].mass
+
+    async def _readings_for(self, seconds: float, count: int) -> None:
+        """Wait for a time, and longer until so many readings have come; a balance that sends none ends the wait."""
+        begin, end = len(self._readings.all), self._now() + seconds + LONGEST_INTERVAL * count
+        await self._sleep(seconds)
+        while len(self._readings.all) < begin + count and self._now() < end:
+            await self._sleep(TICK)
 
     async def _out_and_home(self) -> DoseResult:
         setup, path = self._setup, self._path

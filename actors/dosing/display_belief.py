@@ -36,11 +36,11 @@ UNKNOWN_REPEATS = (0.3, 1.5)
 """Beta distribution of the probability of a repeat before the first reading: most balances never repeat one, and a few
 repeat every second one."""
 
+KNOWN_REPEATS = 10.0
+"""Readings that the knowledge about repeats should amount to before a dose is refused because of them."""
+
 LONGEST_MEMORY = 150.0
 """Readings that the knowledge about repeats amounts to at most, so that a balance whose mode was changed is noticed."""
-
-SMALLEST_STEP = 0.1e-3
-"""Steps of finer displays are examined like this one [kg]; noise moves their last digits."""
 
 RISING = (0.03, 0.97)
 """Part of a step of the load in which every new reading differs from the one before."""
@@ -58,8 +58,6 @@ class DisplayBelief:
         step: of the display [kg].
         interval: mean time between two readings [s].
         jitter: standard deviation of the time at which a reading arrives [s].
-        rest: time constant with which the last few steps of a change are shown [s]: the filters of some balances get
-            slower as soon as the load hardly moves.
         longest: longest time between two readings [s].
     """
 
@@ -68,7 +66,6 @@ class DisplayBelief:
     step: float = 1e-4
     interval: float = 0.1
     jitter: float = 0.0
-    rest: float = 0.0
     longest: float = 0.0
 
     @classmethod
@@ -83,7 +80,7 @@ class DisplayBelief:
             step: of the display [kg].
         """
         repeats = Repeats(cls().repeats)
-        if len(masses) < 4:
+        if len(masses) < 2:
             return cls(step=step)
         low, high = (float(np.median(part)) for part in (masses[:3], masses[-3:]))
         for before, after in itertools.pairwise(masses):
@@ -93,12 +90,7 @@ class DisplayBelief:
         middle = float(np.median(gaps))
         # the median, because a lost reading leaves a gap of two intervals
         jitter = 1.48 * float(np.median(np.abs(gaps - middle))) / math.sqrt(2.0)
-        # from five steps off to one step off
-        off = np.abs(np.asarray(masses) - high) / max(step, SMALLEST_STEP)
-        near, nearer = (int(np.flatnonzero(np.append(True, off > limit))[-1]) for limit in (5.5, 0.9))
-        late = float(times[min(nearer, len(times) - 1)] - times[min(near, len(times) - 1)])
-        rest, longest = late / math.log(5.5), float(np.max(gaps))
-        return cls(repeats.beta(), step=step, interval=middle, jitter=jitter, rest=rest, longest=longest)
+        return cls(repeats.beta(), step=step, interval=middle, jitter=jitter, longest=float(np.max(gaps)))
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> DisplayBelief:
@@ -121,8 +113,14 @@ class DisplayBelief:
     @property
     def numbers(self) -> tuple[float, ...]:
         """The belief as numbers, for `of`."""
-        times = (self.interval, self.jitter, self.rest, self.longest)
+        times = (self.interval, self.jitter, self.longest)
         return (*self.repeats[0], *self.repeats[1], self.noise, self.step, *times)
+
+    @property
+    def new_reading_interval(self) -> float:
+        """Mean time between two new readings [s], as far as the share of repeated ones is known."""
+        (repeated, new), _ = self.repeats
+        return self.interval * ((repeated + new) / new if repeated + new > KNOWN_REPEATS else 1.0)
 
     def draws(self, rng: np.random.Generator) -> Iterator[bool]:
         """Whether each of the following readings repeats the one before, without end."""

@@ -26,10 +26,12 @@ from enum import StrEnum
 
 import numpy as np
 
+from actors.balance.display_quality import FLOW_ERROR, dose_tolerance
 from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats
+from actors.dosing.display_belief import REPEATS, DisplayBelief
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
 from actors.dosing_settings import DosingSettings
-from actors.interfaces import DoseProgress, DoseTarget
+from actors.interfaces import DoseProgress, DoseTarget, InvalidActionError
 
 
 @dataclass(frozen=True)
@@ -85,16 +87,47 @@ FINE_WEBER = 0.8
 for a second or two; a faster flow would add more to the error than it saves in spilled liquid."""
 
 
-def fine_flow(cup: CupFlow, tilt: float, settings: DosingSettings) -> float:
+def fine_flow(
+    cup: CupFlow, tilt: float, settings: DosingSettings, limit: float = math.inf, interval: float = 0.0
+) -> float:
     """Flow at the end of a dose: slow, but fast enough to leave the lip [kg/s].
 
     Args:
         cup: the source vessel.
         tilt: at which it pours [rad].
         settings: lower and upper bound.
+        limit: tolerance of the dose [kg]; a slow balance needs a slower flow.
+        interval: between two readings [s].
     """
     clean = cup.clean_flow(tilt, FINE_WEBER) * cup.density
-    return min(max(clean, settings.smallest_flow), settings.largest_fine_flow)
+    seen = limit / unseen(1.0, interval) if interval > 0.0 else math.inf
+    return min(max(min(clean, seen), settings.smallest_flow), settings.largest_fine_flow)
+
+
+def unseen(flow: float, interval: float) -> float:
+    """Amount [kg] within which a flow [kg/s] is known between two readings with an interval [s], with 95 %."""
+    return 2.0 * FLOW_ERROR * flow * interval / math.sqrt(3.0)
+
+
+def check_display(display: DisplayBelief, limit: float, settings: DosingSettings) -> None:
+    """Check that the readings of a balance follow each other fast enough for a dose.
+
+    Args:
+        display: of the balance.
+        limit: tolerance of the dose [kg].
+        settings: of the dose.
+
+    Raises:
+        InvalidActionError: between two readings more flows unseen, with the tolerance that the balance supports.
+    """
+    interval, slowest = display.new_reading_interval, settings.smallest_flow
+    if unseen(slowest, interval) > limit:
+        supported = math.ceil(1e4 * dose_tolerance(slowest, 0.0, (interval,), display.step, 0.0)) / 10.0
+        raise InvalidActionError(
+            f"the balance is too slow for a tolerance of {1e3 * limit:.3g} g: a new reading each {interval:.2g} s; "
+            f"doses with it are within {supported:g} g in 95 % of the cases; set a faster output, or ask for a "
+            f"tolerance of {supported:g} g"
+        )
 
 
 class DosePhase(StrEnum):
@@ -127,18 +160,21 @@ LATEST_ONSET = math.radians(1.5)
 SEEN_AFTER = 0.5
 """Time until a stream is seen on a balance that repeats no reading [s]."""
 
-LONGEST_DOUBT = 1.2
-"""Time with implausible readings after which the cup is turned back [s]."""
+LONGEST_DOUBT = (1.2, 2.5)
+"""Time with implausible readings after which the cup is turned back: [s], and at least so many readings."""
 
-EARLIEST_WEIGHING = 1.5
+EARLIEST_WEIGHING = 2.0
 """Time after which a reading at rest may be completed with the rise that the balance still lags behind [lags]."""
 
 LARGEST_REMAINDER = (1e-3, 0.1e-3)
 """Largest such rise, and its largest standard deviation [kg]."""
 
+RECORDED_HOLD = 1.1
+"""Longest time with one and the same reading in recorded pours [s]."""
+
 LONGEST_HOLD = 1.6
 """Time with one and the same reading, while the flow should change it, after which the cup is turned back and weighed
-[s]. Recorded pours have up to 1.1 s."""
+[s]."""
 
 IMPROBABLE_HOLD = math.log(0.005)
 """Logarithm of the probability of such a row of equal readings after which this happens earlier."""
@@ -146,8 +182,8 @@ IMPROBABLE_HOLD = math.log(0.005)
 STALE = 0.01
 """Largest probability that a reading which counts as weighed is an old one."""
 
-MOST_EQUAL = 12
-"""Equal readings that count as weighed, however often the display repeats one."""
+MOST_EQUAL, LONGEST_EQUAL = 12, 3.0
+"""Equal readings that count as weighed, however often the display repeats one; the same for so long a time [s]."""
 
 SILENCE = (2.5, 1.3, 4.5)
 """Time without a reading after which the cup is turned back: at least the first and at most the last factor times the
@@ -163,17 +199,30 @@ DRIBBLES = 0.3e-3
 """Mass that arrives late in addition, where the last stream is too slow to leave the lip cleanly [kg]: about half of
 what runs down the outside. Later doses know it from the ones before."""
 
-SLOW_FILTER, LONGEST_FILTER = 2.5, 3.0
-"""Time constants of a filter that gets slower at rest, after which its reading counts; largest such time [s]."""
+RUN_OFF = 2.8
+"""Time after the return until liquid has run off the lip, and until filters that get slower at rest have come to their
+end [s]; the display's lag comes on top."""
 
 AT_REST = 0.8
 """Time for which a reading has to stay the same until it counts as weighed [s]. The filters of some balances get slower
 as soon as the load hardly moves."""
 
-LATE_DROPS = 0.14e-3
-"""Standard deviation of what still falls into the receiver after it was weighed [kg]."""
+LATE_TIME = 0.9
+"""Time in which late liquid arrives, and in which filters that get slower at rest come to their end [s]."""
 
-LONGEST_SETTLING = (10.0, 12.0)
+REST_BAND = (0.2e-3, 0.3)
+"""Standard deviation of what a reading still rises: [kg], and display steps."""
+
+LARGEST_RISE = (0.1e-3, 0.4)
+"""Largest such rise of a weighed reading: [kg], or display steps."""
+
+LAG_REST = 0.04e-3
+"""Standard deviation of a weighed reading for each second of the display's lag [kg/s]."""
+
+LATE_DROPS = (0.03e-3, 0.043e-3)
+"""Mean and standard deviation of what still falls into the receiver after it was weighed [kg]."""
+
+LONGEST_SETTLING = (10.0, 15.0)
 """Time without rest of the balance after which the amount is unknown: [s], and at least so many readings."""
 
 LONGEST_CHECK = (4.0, 8.0)
@@ -248,7 +297,7 @@ class DoseController:
         self._top_ups = self._pauses = 0
         self._suspected: DoseEnd | None = None
         self._paused = False
-        self._remainder = 0.0
+        self._remainder = step / math.sqrt(12.0)
         self._interval, self._longest_gap = belief.display.interval, belief.display.longest
         self._before_silence: float | None = None
         self._unchanged_since = 0.0
@@ -346,7 +395,7 @@ class DoseController:
         if self._rising >= 2:
             self._enter(DosePhase.POUR)
             return self._pour()
-        self.fine_flow = fine_flow(self._cup, max(early, 0.1), self._settings)
+        self.fine_flow = fine_flow(self._cup, max(early, 0.1), self._settings, self._order.limit, self._interval)
         if self._must_stop():
             return self._return()
         if ahead < early:
@@ -393,43 +442,57 @@ class DoseController:
     def _settle(self) -> float:
         waited = self._now - self._since
         lag = float(np.median(self._estimator.lag))
-        old = min(self._estimator.repeats.in_a_row(STALE) + 1, MOST_EQUAL)
+        longest = math.ceil(LONGEST_EQUAL / self._interval) + 1
+        old = min(self._estimator.repeats.in_a_row(STALE) + 1, MOST_EQUAL, longest)
         needed = max(old, math.ceil(AT_REST / self._interval) + 1, 4)
         last = [r for r in self._recent if r.time > self._since][-needed:]
-        if len(last) == needed and waited > max(0.5, EARLIEST_WEIGHING * lag, self._slow_filter(lag)):
+        if len(last) == needed and waited > RUN_OFF + EARLIEST_WEIGHING * lag:
+            begin = self._since + 0.4 * RUN_OFF + EARLIEST_WEIGHING * lag
+            final, deviation, rise = self._approached([r for r in self._recent if r.time > begin] or last, lag)
             half = needed // 2
             early, late = (math.fsum(r.mass for r in part) / half for part in (last[:half], last[-half:]))
             spread = max(r.mass for r in last) - min(r.mass for r in last)
             flat = spread <= max(2.0 * self._step_size, 1.5e-4) and abs(late - early) <= max(
                 0.6 * self._step_size, 5e-5
             )
-            behind = self._behind(last[-1].time) if flat else None
-            if behind is not None:
-                self._weighed(late + behind)
-                return 0.0
-            if waited > max(0.5, 3.0 * lag) and (flat or all(r.stable for r in last)):
-                self._remainder = 0.0
-                self._weighed(late)
+            flat = flat and abs(rise) <= max(LARGEST_RISE[0], LARGEST_RISE[1] * self._step_size)
+            early_enough = flat and self._behind(last[-1].time)
+            late_enough = waited > 3.0 * lag and (flat or all(r.stable for r in last))
+            if early_enough or late_enough:
+                self._remainder = deviation
+                self._weighed(final + LATE_DROPS[0])
                 return 0.0
         if waited > self._patience(LONGEST_SETTLING):
             self._finish(self._end or (DoseEnd.CONNECTION_LOST if self._silent() else DoseEnd.UNSTABLE), known=False)
         return 0.0
 
-    def _slow_filter(self, lag: float) -> float:
-        """Time after which a filter that gets slower at rest has come to its end [s]; 0 for other balances."""
-        rest = self._belief.display.rest
-        return min(SLOW_FILTER * rest, LONGEST_FILTER) if rest > 2.0 * lag + self._interval else 0.0
+    def _approached(self, readings: Sequence[DoseReading], lag: float) -> tuple[float, float, float]:
+        """The reading that these ones approach, its standard deviation, and how far it is from the last one [kg]."""
+        times, masses = (np.array(values) for values in zip(*((r.time, r.mass) for r in readings), strict=True))
+        # a filter's lag, a filter that gets slower at rest, and liquid that runs off late have similar times
+        shape = np.exp((times[-1] - times) / max(LATE_TIME, lag))
+        shape_mean, centred = float(shape.mean()), shape - shape.mean()
+        step, rounded = self._step_size, self._step_size**2 / 12.0
+        new = max(1.0 - float(self._estimator.repeats.weights(1) @ REPEATS), min(self._interval / RECORDED_HOLD, 1.0))
+        variance = (rounded + self._noise**2) / new
+        stiffness = float(centred @ centred) + variance / (REST_BAND[0] ** 2 + (REST_BAND[1] * step) ** 2)
+        rise = -float(centred @ masses) / stiffness
+        # readings whose last digit no noise moves are rounded alike: they show a rest, but no rise within one step
+        alike = 1.0 - min(4.0 * self._noise / step, 1.0)
+        scatter = variance * (1.0 / len(readings) + shape_mean**2 / stiffness)
+        deviation = math.sqrt(alike * rounded + (1.0 - alike) * scatter + (LAG_REST * lag) ** 2)
+        approached = float(masses.mean()) + shape_mean * rise
+        return alike * float(masses[len(masses) // 2 :].mean()) + (1.0 - alike) * approached, deviation, rise
 
-    def _behind(self, time: float) -> float | None:
-        """Mass that a reading at this time still lags behind [kg]; None while the particles do not agree about it."""
+    def _behind(self, time: float) -> bool:
+        """Whether the particles agree about the mass that a reading at this time still lags behind."""
         e = self._estimator
         expected = max(3.0 * e.deviation(), 1.5e-4)
         if self._doubt_since is not None or any(abs(one) >= expected for one in self._innovations):
-            return None
+            return False
         rise = e.mass - e.predicted(time)
-        middle, (largest, deviation) = float(np.median(rise)), LARGEST_REMAINDER
-        self._remainder = float(rise.std())
-        return middle if abs(middle) < largest and self._remainder < deviation else None
+        largest, deviation = LARGEST_REMAINDER
+        return abs(float(np.median(rise))) < largest and float(rise.std()) < deviation
 
     def _weighed(self, mass: float) -> None:
         assert self._zero is not None
@@ -460,9 +523,9 @@ class DoseController:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of a weighed amount: two roundings, two readings, and late drops [kg]."""
-        rounded = self._step_size / math.sqrt(12.0)
-        return math.sqrt(2.0 * (rounded**2 + self._noise**2) + LATE_DROPS**2 + self._remainder**2)
+        """Standard deviation of a weighed amount: zero, last readings, and late drops [kg]."""
+        zero = self._step_size**2 / 12.0 + self._noise**2 / 4.0
+        return math.sqrt(zero + self._remainder**2 + LATE_DROPS[1] ** 2)
 
     def _patience(self, limit: tuple[float, float]) -> float:
         """The larger one of a time and of a number of readings [s]."""
@@ -608,7 +671,7 @@ class DoseController:
             self._pause()
         elif self._now - self._begin > s.time_limit:
             self._turn_back(DoseEnd.TIME_LIMIT)
-        elif self._doubt_since is not None and self._now - self._doubt_since > LONGEST_DOUBT:
+        elif self._doubt_since is not None and self._now - self._doubt_since > self._patience(LONGEST_DOUBT):
             self._pause()
         elif self._holds_too_long():
             self._pause(self._lost_stream())

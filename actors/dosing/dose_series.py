@@ -20,7 +20,14 @@ import numpy as np
 
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.display_belief import IDEAL_DISPLAY, DisplayBelief
-from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DoseResult, fine_flow
+from actors.dosing.dose_controller import (
+    DoseController,
+    DoseEnd,
+    DoseOrder,
+    DoseResult,
+    check_display,
+    fine_flow,
+)
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget, InvalidActionError
@@ -184,7 +191,7 @@ class DoseSeries:
             durations.append(duration)
             ends[result.end] += 1
         tilt = float(np.median(self._cup.tilt_for(widened.volume, np.zeros_like(widened.volume))))
-        fine = fine_flow(self._cup, max(tilt, 0.1), self._settings)
+        fine = fine_flow(self._cup, max(tilt, 0.1), self._settings, order.limit, widened.display.interval)
         low, high = (float(np.quantile(amounts, q)) for q in (0.05, 0.95))
         return DoseForecast(
             float(np.mean(amounts)),
@@ -275,12 +282,13 @@ def predict_dose(
         display: of the balance; None: as earlier doses from the source have shown, or an ideal one.
 
     Raises:
-        InvalidActionError: see `check_dose`.
+        InvalidActionError: see `check_dose` and `check_display`.
     """
     check_dose(scene, dose)
     knowledge = source_of(scene, dose).knowledge
     if display is None:
         display = DisplayBelief.of(knowledge.display) if knowledge is not None and knowledge.display else IDEAL_DISPLAY
+    check_display(display, dose.limit, settings)
     rng = np.random.default_rng((seed, 32))
     series = series_of(scene, dose, settings, (), rng, step=display.step, display=display)
     return series.forecast(DoseOrder(dose.amount, dose.limit, receiver_mass=0.2), seed=seed, count=count)

@@ -22,6 +22,7 @@ from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.bench.pour_feasibility import vessel as built
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import InvalidActionError, LaboratoryError, UnreachablePlaceError
+from actors.laboratory_settings import LaboratorySettings
 from actors.places import PlaceSettings
 from orchestrator.campaigns.yaml.file_access import why_not_writable
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
@@ -440,6 +441,19 @@ class _Checker:
                 )
                 self.add((("dispense", "doses", i, "amount"), ("dispense", "doses")), text)
 
+    def display(self, plan: DispensePlan, laboratory: LaboratorySettings) -> None:
+        """The balance must be fast enough for the tolerance of every dose, as far as its settings state it."""
+        from actors.dosing.dose_controller import check_display
+        from actors.laboratory import expected_display
+
+        display = expected_display(laboratory.balance)
+        for i, dose in enumerate(plan.doses):
+            try:
+                if display is not None:
+                    check_display(display, dose.limit, laboratory.dosing)
+            except InvalidActionError as error:
+                self.add((("dispense", "doses", i), ("dispense",)), str(error))
+
     def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
         """Recorded pours were possible: if their vessels touch, the description of the scene is wrong."""
         vessels = self.scene(scene, role)
@@ -539,6 +553,7 @@ def check_campaign(
             )
             checker.add((("dispense",), ("laboratory",)), text)
         checker.doses(plan.dispense, simulated=plan.laboratory.arm is None)
+        checker.display(plan.dispense, lab)
     return list(dict.fromkeys(checker.problems))
 
 

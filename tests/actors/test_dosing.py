@@ -13,11 +13,20 @@ from actors.balance.display_behaviour import DisplayBehaviour
 from actors.dosing import dose_controller
 from actors.dosing.cup_flow import CupFlow
 from actors.dosing.display_belief import REPEATS, DisplayBelief, Repeats
-from actors.dosing.dose_controller import DoseController, DoseEnd, DoseOrder, DoseResult, TiltCommand
+from actors.dosing.dose_controller import (
+    DoseController,
+    DoseEnd,
+    DoseOrder,
+    DoseResult,
+    TiltCommand,
+    check_display,
+    fine_flow,
+)
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, calibrated_knowledge, draw_lags
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
+from actors.interfaces import InvalidActionError
 from sim_engine.hydrostatics import level, tilting_cup_outflow
 from sim_engine.liquids import Liquid
 from sim_engine.vessel.shapes import cylinder
@@ -216,6 +225,22 @@ def test_a_balance_that_sends_seldom_is_not_lost(interval: float, lost: float) -
     assert result.amount == pytest.approx(record.received, abs=0.3e-3)
 
 
+def test_a_balance_that_is_too_slow_for_a_tolerance_is_refused_with_the_one_that_it_supports() -> None:
+    settings = DosingSettings()
+    for interval, limit in ((0.1, 1e-3), (1.0, 1e-3), (2.0, 1.5e-3)):
+        check_display(DisplayBelief(interval=interval), limit, settings)
+    with pytest.raises(InvalidActionError, match=r"1 g: a new reading each 2 s; .* ask for a tolerance of 1\.5 g"):
+        check_display(DisplayBelief(interval=2.0), 1e-3, settings)
+    held = DisplayBelief.expected(1e-4, 0.1, repeated=0.97)  # sent ten times a second, converted each 3 s
+    with pytest.raises(InvalidActionError, match=r"each 3\.3 s"):
+        check_display(held, 1e-3, settings)
+
+
+def test_a_slow_balance_gets_a_slower_flow_at_the_end() -> None:
+    flows = [fine_flow(CUP, 1.0, DosingSettings(), 1e-3, interval) for interval in (0.1, 1.0, 5.0)]
+    assert flows == pytest.approx([8e-3, 5.8e-3, 4e-3], rel=0.02)
+
+
 def test_a_balance_that_sends_seldom_and_is_lost_ends_the_dose_below_its_amount() -> None:
     bench, controller = known_display(1.0)
     record, result = bench.dose(controller, DosingFault("line cut", 3.0)), controller.result
@@ -383,7 +408,7 @@ def test_a_forecast_says_amount_time_and_whether_the_source_holds_enough() -> No
     forecast = series.forecast(DoseOrder(0.05), seed=1, count=4)
     assert forecast.amount == pytest.approx(0.05, abs=1.5e-3)
     assert forecast.interval[0] < forecast.amount < forecast.interval[1]
-    assert 4.0 < forecast.duration <= forecast.longest < 15.0
+    assert 4.0 < forecast.duration <= forecast.longest < 17.0
     assert forecast.enough > 0.999
     assert forecast.ends == {DoseEnd.REACHED: 4}
     assert a_series(0.04).forecast(DoseOrder(0.05), seed=1, count=2).enough < 0.001

@@ -26,7 +26,7 @@ from actors.arm.planning.kinematics import pourer_motion
 from actors.arm.ur_settings import UrArmSettings
 from actors.balance.balance_settings import SerialBalanceSettings
 from actors.bench.virtual_bench import BenchEmulators
-from actors.interfaces import DoseSource, DoseTarget, PourProgress, UnknownPourError
+from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, PourProgress, UnknownPourError
 from actors.laboratory_settings import LaboratorySettings
 from actors.liquid_devices import SimulatedPumpSettings, SourceSettings
 from actors.runtime.child_process import child_environment
@@ -65,7 +65,7 @@ ACTION = Action(
 )
 
 
-def dosing_spec(dialect: str = "kcp", pace: float = PACE) -> LaboratorySettings:
+def dosing_spec(dialect: str = "kcp", pace: float = PACE, **balance: Any) -> LaboratorySettings:
     spec = load_laboratory(LABORATORIES / "virtual-dosing.yaml")
     assert spec.arm is not None
     assert spec.bench is not None
@@ -73,7 +73,7 @@ def dosing_spec(dialect: str = "kcp", pace: float = PACE) -> LaboratorySettings:
     return spec.with_values(
         in_process=True,
         arm=spec.arm.with_values(time_scale=pace, warning_time=0.2, approach_speed=90 * DEG),
-        balance=spec.balance.with_values(dialect=dialect, time_scale=pace, reconnect_time=1.0),
+        balance=spec.balance.with_values(dialect=dialect, time_scale=pace, reconnect_time=1.0, **balance),
         bench=spec.bench.with_values(time_scale=pace),
         operator=spec.operator.with_values(time=1.0),
     )
@@ -142,6 +142,31 @@ def test_a_dose_over_other_balances(open_stage: OpenStage, dialect: str) -> None
     async def scenario() -> None:
         async with open_stage(dosing_spec(dialect)) as stage:
             check_amount(stage, await dosed(stage, 50), 50)
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.slow
+def test_a_dose_over_a_balance_that_is_read_each_second(open_stage: OpenStage) -> None:
+    async def scenario() -> None:
+        async with open_stage(dosing_spec(interval=1.0)) as stage:
+            about = (await dosed(stage, 50)).notes["dose"]
+            assert about["end"] in ("reached", "short")
+            assert 1e3 * about["received"] == pytest.approx(50, abs=4.0)
+            assert about["received"] == pytest.approx(about["true"], abs=0.5e-3)
+            assert 0.9 < float(np.median(np.diff(about["read_at"]))) < 1.2
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.slow
+def test_a_balance_that_is_too_slow_for_the_tolerance_pours_nothing(open_stage: OpenStage) -> None:
+    async def scenario() -> None:
+        async with open_stage(dosing_spec(interval=2.5)) as stage:
+            with pytest.raises(InvalidActionError, match=r"too slow for a tolerance of 1 g: a new reading each 2\.5 s"):
+                await dosed(stage, 50)
+            assert stage.contents.in_receiver == 0.0
+            assert "start" not in stage.heard
 
     asyncio.run(scenario())
 

@@ -122,6 +122,17 @@ def test_an_impossible_series_is_refused(campaign: Path, change: tuple[str, str]
     assert not Path("runs").exists()
 
 
+def test_a_balance_that_is_too_slow_for_the_tolerance_is_refused_before_anything_moves(campaign: Path) -> None:
+    text = shipped("laboratories/virtual-dosing.yaml").read_text(encoding="utf-8")
+    slow = campaign.parent / "slow.yaml"
+    slow.write_text(text.replace("interval: 0.1 s", "interval: 2 s"), encoding="utf-8")
+    result = decant("dose", str(campaign), "--amount", "25 g", "--laboratory", str(slow))
+    assert result.exit_code == 2
+    assert "a new reading each 2 s" in result.stderr
+    assert "ask for a tolerance of 1.5 g" in result.stderr
+    assert not Path("runs").exists()
+
+
 def test_an_amount_is_needed(campaign: Path) -> None:
     result = decant("dose", str(campaign))
     assert result.exit_code == 2
