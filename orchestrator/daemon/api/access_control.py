@@ -161,7 +161,8 @@ async def refused(request: Request, error: Exception) -> Response:
     """
     assert isinstance(error, AnyHTTPException)
     text = str(error.detail).encode("utf-8", "backslashreplace").decode("utf-8")
-    text = not_stopped(text) if is_stop(request.scope) else text
+    if is_stop(request.scope):
+        text = not_stopped("a stop is sent with POST" if error.status_code == 405 else text)
     return await http_exception_handler(request, HTTPException(error.status_code, text, dict(error.headers or {})))
 
 

@@ -185,6 +185,7 @@ def test_every_refusal_of_a_stop_begins_with_not_stopped_and_names_the_physical_
         assert found[0] == status
         assert found[1]["detail"].startswith("NOT STOPPED: ")
         assert PHYSICAL in found[1]["detail"]
+        assert ("sent with POST" in found[1]["detail"]) == (status == 405)
         assert arm.arm_stops == 0
     assert lab.do(lab.served.get("/status"))["emergency"] is None
 
