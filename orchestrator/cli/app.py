@@ -248,7 +248,6 @@ _queue(
     "decant queue answer 8 weighed 3.2 0.4   # spilled and retained [g]",
 )
 _queue(queue_commands.enable, "decant queue enable narrow-1b2c3d")
-_queue(queue_commands.move, "decant queue move narrow-1b2c3d --first   # the next to run")
 _queue(
     station_commands.order,
     "decant queue pour plan-17:4 --from beaker-1 --into vial-7 --amount '30 g'",

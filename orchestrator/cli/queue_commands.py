@@ -433,25 +433,6 @@ def enable(key: CampaignId, url: Url = None, state: State = None) -> None:
     print_message(f"motion is enabled for the coming part of the run: {found['id']}")
 
 
-def move(
-    key: CampaignId,
-    before: Annotated[str | None, typer.Option(help="Move in front of this campaign.")] = None,
-    first: Annotated[bool, typer.Option("--first", help="Move to the head of the queue.")] = False,
-    priority: Annotated[int | None, typer.Option(help="Higher priorities run first.")] = None,
-    url: Url = None,
-    state: State = None,
-) -> None:
-    """Move a queued campaign to another place."""
-    before = "" if first else before
-    if before is None and priority is None:
-        raise RefusalError("where to? --first, --before CAMPAIGN_ID or --priority N")
-    with connected_client(url, state) as client:
-        client.post(f"/campaigns/{key}/move", {"before": before, "priority": priority})
-        queue = client.get("/campaigns", state="queued")
-    for place, one in enumerate(queue, start=1):
-        print(f"{place:3d}  {one['id']}  (priority {one['priority']})")
-
-
 def shutdown(url: Url = None, state: State = None) -> None:
     """Shut the daemon down at the next safe point; a second time: at once. The queue is kept."""
     with connected_client(url, state) as client:
