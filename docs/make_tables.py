@@ -509,7 +509,7 @@ def _dosing_balances(*, pairs: bool) -> str:
     data = json.loads((FOLDER / "data" / "dosing-balances.json").read_text(encoding="utf-8"))["rows"]
     data = {name: row for name, row in data.items() if (" + " in name) == pairs}
     if not data:
-        return "not measured"
+        return "not measured\n"
     head = (
         *("balance", "mean error g", "95 % g", "worst g", "interval covers"),
         *("innovations", "weighed after s", "false stops"),
