@@ -210,7 +210,7 @@ def test_a_plan_for_another_receiver_with_another_theta_is_submitted_as_decant_p
     class Told:
         def post(self, path: str, body: Any) -> dict[str, Any]:
             sent.update(body)
-            return {"id": "x", "rig": "none", "needs_enabling": False}
+            return {"id": "x", "rig": "none", "waits_for": ""}
 
     monkeypatch.setattr(
         "orchestrator.cli.queue_commands.connected_client", lambda url, state: contextlib.nullcontext(Told())
@@ -269,7 +269,7 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
     class Client:
         def post(self, path: str, body: dict[str, Any]) -> dict[str, Any]:
             sent.append(body)
-            return {"id": "risky-1", "rig": "none", "needs_enabling": False}
+            return {"id": "risky-1", "rig": "none", "waits_for": ""}
 
     @contextlib.contextmanager
     def connected(url: Any, state: Any) -> Any:
