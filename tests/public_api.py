@@ -41,7 +41,7 @@ def public_api() -> str:
 
 
 OF_OWN_EXTRAS = tuple(
-    f"decant.{kind}" for kind in ("commands", "documents", "emulators", "files", "outputs", "stage_results")
+    f"decant.{kind}" for kind in ("commands", "documents", "emulators", "files", "nodes", "outputs", "stage_results")
 )
 """Groups that only packages of Decant itself use (`sim_engine.settings.plugin_registry.own_extras`)."""
 

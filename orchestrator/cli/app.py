@@ -204,12 +204,6 @@ _server(
     "decant server start --state ./trials --in-process",
 )
 _server(queue_commands.shutdown, "decant server stop   # finishes and weighs a pour that has begun", name="stop")
-_server(
-    station_commands.serve_sila,
-    "decant server sila   # for the daemon of this machine, on loopback",
-    "decant server sila --host 192.0.2.7 --certificate station.pem --key station.key --clients authority.pem",
-    name="sila",
-)
 _server(station_commands.backup, "decant server backup decant-2030-03-01.zip")
 _server(station_commands.restore, "decant server restore decant-2030-03-01.zip --state ./restored")
 

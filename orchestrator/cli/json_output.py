@@ -32,7 +32,7 @@ from orchestrator.cli.command_results import (
     VesselOutput,
 )
 from orchestrator.daemon.api.schemas import CampaignDetailOut, CampaignOut, StatusOut
-from orchestrator.daemon.integrations.station_schemas import AccountOut, ContentOut, PourOut
+from orchestrator.daemon.api.station_schemas import AccountOut, ContentOut, PourOut
 from orchestrator.daemon.state.daemon_store import QuestionOut
 from orchestrator.learning.dispense import Dose
 from orchestrator.learning.single_action import WeighedPour

@@ -17,11 +17,10 @@ from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException as AnyHTTPException
 
-from orchestrator.daemon.api import archive_routes, command_routes, query_routes
+from orchestrator.daemon.api import archive_routes, command_routes, query_routes, station_routes
 from orchestrator.daemon.api.access_control import Daemon, RequestGuard, Stops, refused
 from orchestrator.daemon.api.page import page_router
 from orchestrator.daemon.api.schemas import HealthOut, ProblemOut
-from orchestrator.daemon.integrations import station_routes
 from orchestrator.daemon.rigs.ordering import Ordering
 from orchestrator.daemon.rigs.supervisor import Supervisor
 from orchestrator.daemon.state.access_tokens import Tokens

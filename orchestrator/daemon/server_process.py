@@ -30,7 +30,6 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.ray_cluster import check_cluster
 from actors.simulators.job_runner import few_arenas
 from orchestrator.daemon.http_api import serve_app
-from orchestrator.daemon.integrations.madsci_node import create_node
 from orchestrator.daemon.rigs.emergency_stop import StopProtocol
 from orchestrator.daemon.rigs.supervisor import Supervisor
 from orchestrator.daemon.state.access_tokens import Tokens
@@ -39,6 +38,7 @@ from orchestrator.daemon.state.notifications import OCCASIONS, Notifier, NotifyE
 from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
 from orchestrator.records.run_registry import make_state_directory, use_state_directory
+from sim_engine.settings.plugin_registry import own_extras
 
 LISTENING, RENEWED = "DECANT_LISTENING", "DECANT_RENEWED"
 """Environment variables for the next program: file descriptor of the socket, and times of restarts [s]."""
@@ -336,9 +336,16 @@ def _socket(host: str, port: int, option: str) -> socket.socket:
 
 
 def _node_server(daemon: Supervisor, app: FastAPI, settings: MadsciSettings) -> tuple[_Server, socket.socket]:
-    """The server of the MADSci node, with its listening socket; the orders are those of the API."""
+    """The server of the MADSci node, with its listening socket; the orders are those of the API.
+
+    Raises:
+        ServeError: the package of the node is not installed.
+    """
+    nodes = own_extras("decant.nodes", "madsci")
+    if not nodes:
+        raise ServeError("madsci: this installation has no node for MADSci; remove the section")
     listening = _socket(settings.host, settings.port, "madsci: port")
-    node = create_node(daemon, app.state.ordering, settings)
+    node = nodes["madsci"](daemon, app.state.ordering, settings)
     config = uvicorn.Config(node, http=StopProtocol, ws="none", log_config=None, access_log=False, lifespan="off")
     return _Server(config), listening
 

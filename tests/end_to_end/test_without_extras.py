@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[2]
 EXTRAS = (
     "actors/contract_tests",
     "actors/emulators",
+    "orchestrator/daemon/integrations",
     "orchestrator/extra_commands",
     "orchestrator/recordings",
     "orchestrator/study",

@@ -62,7 +62,7 @@ CASES = [
     query("reason", "reason=broken+glass", reason="broken glass"),
     query("long", f"reason={'x' * 501}", note="501 characters", reason="x" * 500),
     query("two reasons", "reason=glass&reason=smoke&reason=glass", reason="glass; smoke"),
-    # curl sends what was typed, also where it should be encoded: github.com/curl/curl/issues/9271
+    # clients send what was typed, also where it should be encoded
     query("as typed", "reason=glass on the table", reason="glass on the table"),
     query("UTF-8 as typed", "reason=Gl\xc3\xa4ser", reason="Gläser"),
     query("UTF-8", "reason=Gl%C3%A4ser", reason="Gläser"),
@@ -107,6 +107,8 @@ FORMS = {
     # what clients send that have a proxy setting: RFC 9112, section 3.2.2
     "absolute form": "POST http://{host}{path} HTTP/1.1|Host: {host}|{token}",
     "absolute form of another name": "POST HTTPS://ann@lab.example:1{path}?rig= HTTP/1.1|Host: {host}|{token}",
+    # github.com/curl/curl/issues/6769: the host of the target has its port, that of the header has none
+    "absolute form, Host without port": "POST http://{host}{path} HTTP/1.1|Host: 127.0.0.1|{token}",
     "HTTP/1.0": "POST {path} HTTP/1.0|{token}",
     "HTTP/1.0 that stays open": "POST {path} HTTP/1.0|Connection: keep-alive|{token}",
     "another name": "POST {path} HTTP/1.1|Host: lab.example|{token}",

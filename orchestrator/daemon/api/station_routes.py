@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, HTTPException, Query, Response
 
 from orchestrator.daemon.api.access_control import Daemon, Operator, Orders, Queue, Viewer
-from orchestrator.daemon.integrations.station_schemas import (
+from orchestrator.daemon.api.station_schemas import (
     AccountOut,
     HandPourIn,
     LiquidIn,
