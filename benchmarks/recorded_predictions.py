@@ -110,6 +110,17 @@ def seed_rows(found: dict[int, dict[str, Any]]) -> list[list[str]]:
     return rows
 
 
+def mean_row(found: dict[int, dict[str, Any]]) -> list[str]:
+    """Return the row of all seeds: mean, smallest and largest error, and number of pours in their intervals."""
+    cells = []
+    for split in ("test", "transfer"):
+        errors = [error(seed, split) for seed in found.values()]
+        cells.append(f"{fmean(errors):.3f} ({min(errors):.3f} … {max(errors):.3f})")
+    pours = [pour for seed in found.values() for pour in seed["pours"]]
+    inside = sum(pour["low"] <= pour["recorded"] <= pour["high"] for pour in pours)
+    return ["mean", *cells, f"{inside} of {len(pours)}"]
+
+
 def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]]) -> None:
     """Write predictions and tables to docs/data."""
     settings = (
@@ -122,7 +133,7 @@ def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]]) -> None
         seeds = {int(seed): {"pours": pours} for seed, pours in earlier["seeds"].items()} | seeds
     head = ["seed", "test, 4 pours", "another receiver, 16 pours", "pours inside their 90 % intervals"]
     named = " ".join(map(str, sorted(seeds)))
-    write_table("recorded", head, seed_rows(seeds), f"{command} --seeds {named}", settings)
+    write_table("recorded", head, [*seed_rows(seeds), mean_row(seeds)], f"{command} --seeds {named}", settings)
     predicted = {str(seed): one["pours"] for seed, one in sorted(seeds.items())}
     kept = {"command": command, **provenance(settings), "seeds": predicted}
     PREDICTIONS.write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

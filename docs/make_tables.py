@@ -270,11 +270,12 @@ def effects() -> str:
         cells = []
         for pour in sensitivity.POURS:
             e = found.get((name, pour))
-            cells.append(
-                "not measured yet"
-                if e is None
-                else f"{EFFECTS.get(e.effect, e.effect)}, {e.where}: {e.change:+.3f} ± {e.error}"
-            )
+            if e is None:
+                cells.append("not measured yet")
+            elif EFFECTS.get(e.effect) == "none":
+                cells.append("none")
+            else:
+                cells.append(f"{EFFECTS.get(e.effect, e.effect)}, {e.where}: {e.change:+.3f} ± {e.error}")
         rows.append((f"`{name}`", "" if info.unit == "1" else info.unit, *cells))
     return _table(("name", "unit", *(f"{pour} pour" for pour in sensitivity.POURS)), rows)
 
@@ -435,12 +436,21 @@ MACHINE = "AMD EPYC, 2 shared cores, Linux x86_64, Python 3.11"
 """The machine of tables that name no other one, as docs/evidence/results.md says."""
 
 
+MEANS_ONLY = ("recorded", "quickstart-fits", "memory")
+"""Tables of which a page shows the means alone; the figures of each seed stay in docs/data/results.json."""
+
+
 def measured(name: str) -> str:
     """A table of docs/data/results.json, with how it was measured."""
     found = json.loads((FOLDER / "data" / "results.json").read_text(encoding="utf-8"))[name]
+    head, rows = found["head"], found["rows"]
+    if name in MEANS_ONLY:
+        columns = [i for i, title in enumerate(head) if not (title == "seed" or title.isdecimal())]
+        rows = [[row[i] for i in columns] for row in rows if "mean" in row or "mean" in head]
+        head = [head[i] for i in columns]
     machine = "" if found["machine"] == MACHINE else f"{found['machine']}; "
     how = f"<sub>`{found['command']}`; {found['settings']}. {machine}{found['date']}, version {found['version']}.</sub>"
-    return f"{_table(found['head'], found['rows'])}\n{how}\n"
+    return f"{_table(head, rows)}\n{how}\n"
 
 
 HARDER = {"round rim": "round rim", "oil": "rapeseed oil", "lag 1 s": "lag of 0.9 to 1.1 s"}

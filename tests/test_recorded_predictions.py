@@ -32,3 +32,8 @@ def test_rows_have_errors_and_pours_in_their_intervals(benchmark: ModuleType) ->
         ["11", "0.000", "0.020", "2 of 2"],
         ["12", "0.010", "0.050", "1 of 2"],
     ]
+
+
+def test_mean_row_is_of_all_seeds_and_pours(benchmark: ModuleType) -> None:
+    seeds = {12: found(0.11, 0.15), 11: found(0.10, 0.12)}
+    assert benchmark.mean_row(seeds) == ["mean", "0.005 (0.000 … 0.010)", "0.035 (0.020 … 0.050)", "3 of 4"]

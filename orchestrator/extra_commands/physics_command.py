@@ -61,8 +61,9 @@ beforehand. This command measures everything and writes the page:
 decant validate-solver --full --write docs
 ```
 
-Comparisons with liquids that were really poured: [real recordings](recordings.md). Quantities without a criterion are
-in the figures and in [validation.json](../data/validation.json).
+`decant validate-solver CASE` runs one case; its name stands in brackets below. Comparisons with liquids that were
+really poured: [real recordings](recordings.md). All values are in [validation.json](../data/validation.json). A row of
+several quantities has the values that fail; if all pass, the one with the largest difference from its reference.
 
 θ of all cases unless they say otherwise: {theta}.
 N is the number of particles.
@@ -378,7 +379,7 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint:
     if older:
         parts.append(f"† Measured before the solver's sources last changed; again: `{AGAIN} CASE`\n")
     for name, record in records.items():
-        command = f"(`decant validate-solver {name}`){older.get(name, '')}"
+        command = f"(`{name}`){older.get(name, '')}"
         parts.append(f"## {record['title']}\n\n{record['about']} {command}\n")
         if table := _criteria(record["measurements"]):
             parts.append(table)
@@ -388,20 +389,63 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint:
 
 
 def _criteria(measurements: Sequence[Mapping[str, Any]]) -> str:
-    """Table of the quantities with a criterion, a row for all numbers of particles; empty if there are none."""
-    rows: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    """Table of the criteria, empty if there are none.
+
+    A row has all numbers of particles of a quantity, or of quantities whose names differ in one word. Of several
+    quantities it has the values that fail, or else the one with the largest difference from its reference.
+    """
+    rows: list[list[Mapping[str, Any]]] = []
     for m in measurements:
         if m["judged"]:
-            rows.setdefault((m["name"], shown(m["reference"], m["unit"]), m["criterion"]), []).append(m)
+            row = next((row for row in rows if _comparable(row[-1], m)), None)
+            if row is None:
+                rows.append([m])
+            else:
+                row.append(m)
     if not rows:
         return ""
-    lines = ["| quantity | N | measured | reference | criterion | |", "|---|---:|---:|---:|---|---|"]
-    for (quantity, reference, criterion), some in rows.items():
-        numbers = "; ".join(f"{m['particles']:,}" for m in some)
-        values = "; ".join(shown(m["value"], m["unit"]) for m in some)
-        words = ", ".join({"FAIL": "**fails**"}.get(verdict(m), verdict(m)) for m in some)
-        lines.append(f"| {quantity} | {numbers} | {values} | {reference} | {criterion} | {words} |")
+    lines = ["| quantity | N | measured | reference | criterion | met |", "|---|---:|---:|---:|---|---|"]
+    for row in rows:
+        names = list(dict.fromkeys(m["name"] for m in row))
+        chosen = [m for m in row if not m["passed"]]
+        if len(names) == 1 or row[0]["reference"] is None:
+            chosen = row
+        elif not chosen:
+            chosen = [max(row, key=lambda m: abs(m["value"] - m["reference"]))]
+        values = [shown(m["value"], m["unit"]) for m in chosen]
+        if chosen is row:
+            values = [*(value.split()[0] for value in values[:-1]), values[-1]]
+            values = [v if m["passed"] else f"{v} (**fails**)" for v, m in zip(values, row, strict=True)]
+        else:
+            words = dict(zip(names, _differing(names), strict=True))
+            places = [f"{words[m['name']]}, N = {m['particles']:,}" for m in chosen]
+            values = [f"{value} ({place})" for value, place in zip(values, places, strict=True)]
+        references = "; ".join(dict.fromkeys(shown(m["reference"], m["unit"]) for m in chosen))
+        numbers = "; ".join(f"{n:,}" for n in dict.fromkeys(m["particles"] for m in row))
+        met = f"{sum(m['passed'] for m in row)} of {len(row)}"
+        cells = _joined(names), numbers, "; ".join(values), references, row[0]["criterion"]
+        lines.append(f"| {' | '.join(cells)} | {met if all(m['passed'] for m in row) else f'**{met}**'} |")
     return "\n".join(lines) + "\n"
+
+
+def _comparable(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two measurements share a row: the same criterion and unit, and at most one word of the names differs."""
+    if any(one[key] != other[key] for key in ("criterion", "unit")):
+        return False
+    words, others = one["name"].split(), other["name"].split()
+    return len(words) == len(others) and sum(a != b for a, b in zip(words, others, strict=True)) <= 1
+
+
+def _differing(names: Sequence[str]) -> list[str]:
+    """The word of each name in which it differs from the others."""
+    columns = zip(*map(str.split, names), strict=True)
+    return [word.rstrip(",") for column in columns if len(set(column)) > 1 for word in column]
+
+
+def _joined(names: Sequence[str]) -> str:
+    """A common name: 'kept at 60°, 70°' of 'kept at 60°' and 'kept at 70°'."""
+    columns = zip(*map(str.split, names), strict=True)
+    return " ".join(", ".join(dict.fromkeys(c)).replace(",,", ",") for c in columns)
 
 
 def register(app: typer.Typer) -> None:

@@ -132,29 +132,26 @@ def wall(results: Path) -> str:
 
 
 def table(rows: Sequence[dict[str, Any]], took: str) -> str:
-    """By target and fault: how they ended, what was told and asked, what was wrong; what all of it took."""
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    """By target: faults, ends of the first lives, and unknown pours; what all of it took. The list has each case."""
+    groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
-        groups[row["case"]["target"], row["case"]["fault"]].append(row)
+        groups[row["case"]["target"]].append(row)
     wrong = sum(bool(row["wrong"]) for row in rows)
     cpu = sum(row["cpu_s"] for row in rows)
     lines = [
         f"{len(rows)} cases were run, {wrong} ended otherwise than they should. They took {cpu:.0f} seconds of a core: "
         f"{cpu / 120:.0f} minutes of two{took}.",
         "",
-        "| struck | faults | the first life of the program | questions at the bench | unknown pours | as undisturbed |",
-        "|---|---|---|---|---|---|",
+        "| struck | faults | the first life of the program | unknown pours | as undisturbed |",
+        "|---|---|---|---|---|",
     ]
-    order = {name: i for i, name in enumerate((*TARGETS, *FAULTS))}
-    faults: dict[tuple[str, ...], list[str]] = defaultdict(list)
-    """Faults of a target with the same outcome share a row."""
-    for (target, fault), some in sorted(groups.items(), key=lambda item: tuple(order[name] for name in item[0])):
-        ended = counted(row["ended"] for row in some)
-        heard = counted(about for row in some for about in row["heard"]) or "–"
-        good = sum(not row["wrong"] for row in some)
-        asked = sum(row["asked"] for row in some)
-        faults[target, ended, heard, str(asked), f"{good} of {len(some)}"].append(fault)
-    lines += [f"| {target} | {', '.join(some)} | {' | '.join(cells)} |" for (target, *cells), some in faults.items()]
+    for target in sorted(groups, key=TARGETS.index):
+        cases = groups[target]
+        faults = sorted({row["case"]["fault"] for row in cases}, key=FAULTS.index)
+        ended = counted(row["ended"].partition(",")[0] for row in cases)
+        undisturbed = sum(not row["wrong"] for row in cases)
+        unknown = sum(row["asked"] for row in cases)
+        lines.append(f"| {target} | {', '.join(faults)} | {ended} | {unknown} | {undisturbed} of {len(cases)} |")
     return "\n".join(lines) + "\n"
 
 
