@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import inspect
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, create_model
 
 from orchestrator.campaigns.yaml.file_access import missing_file, resolved
 from orchestrator.campaigns.yaml.yaml_source import Place, Report
 from sim_engine.settings.model import Example, FilePath, Name, Problems, Settings
-from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.mesh_shape import Axis, MeshShape, usual_up
 from sim_engine.vessel.shapes import VESSELS, LengthUnit, ProfileShape, Shape, VesselGrip, VesselSpec
 
 MESH_SUFFIXES = (".stl", ".obj", ".ply", ".glb")
@@ -31,8 +31,8 @@ class VesselBase(Settings):
     unit: LengthUnit | None = None
     """Unit of the mesh's coordinates."""
 
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
-    """Axis of the mesh that points out of the opening; z unless given."""
+    up: Axis | None = None
+    """Axis of the mesh that points out of the opening; unless given y for GLB and z for other files."""
 
     grip: VesselGrip | None = None
     """How wide the vessel is where a gripper holds it; from its shape unless given."""
@@ -81,7 +81,7 @@ def resolve_vessel(section: VesselBase, place: Place, report: Report) -> VesselS
             report.add(place.at("mesh"), f"{suffix} is not a mesh; use STL, OBJ, PLY or GLB")
         elif (missing := missing_file(path)) is not None:
             report.add(place.at("mesh"), missing)
-        shape = MeshShape(path=path, unit=section.unit, up=section.up or "z")
+        shape = MeshShape(path=path, unit=section.unit, up=section.up or usual_up(path))
     if shape is None or report.is_broken_within(place):
         return None
     return VesselSpec(name=section.name, shape=shape, grip=section.grip)

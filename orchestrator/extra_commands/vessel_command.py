@@ -21,9 +21,9 @@ from orchestrator.cli.command_options import Json, add_group, grouped
 from orchestrator.cli.console import RefusalError, print_json, print_note, print_warning, waiting_for
 
 if TYPE_CHECKING:
+    from sim_engine.vessel.mesh_shape import Axis
     from sim_engine.vessel.shapes import LengthUnit
     from sim_engine.vessel_acquisition.measurements import Radii
-    from sim_engine.vessel_acquisition.mesh_repair import Axis
     from sim_engine.vessel_acquisition.outline_fit import Evidence, FittedOutline
     from sim_engine.vessel_acquisition.point_cloud import Scan
 
@@ -228,7 +228,7 @@ def mesh(
     file: Annotated[Path, typer.Argument(help="Mesh: STL, OBJ, PLY or GLB.", metavar="MESH")],
     out: Out,
     unit: Unit = None,
-    up: Up = "z",
+    up: Annotated[str | None, typer.Option(help="Axis out of the opening; default: y of a GLB, z of others.")] = None,
     drop_bodies: Annotated[
         bool, typer.Option("--drop-bodies", help="Leave out separate bodies in the cavity, such as the liquid.")
     ] = False,
@@ -243,10 +243,11 @@ def mesh(
 
     def work(notes: list[str]) -> Made:
         from sim_engine.resources import require
+        from sim_engine.vessel.mesh_shape import usual_up
         from sim_engine.vessel_acquisition.mesh_repair import mended
 
         require("manifold3d", "the repair of a mesh")
-        thick, axis = _quantity(wall, "--wall", "m", "3 mm"), _axis(up)
+        thick, axis = _quantity(wall, "--wall", "m", "3 mm"), _axis(up) if up else usual_up(file)
         result = mended(file, unit=_unit(unit), wall=thick, up=axis, drop_bodies=drop_bodies)
         notes += result.notes
         return _written_mesh(out, vessel, result.vertices, result.faces, notes, result.warnings, up=axis)

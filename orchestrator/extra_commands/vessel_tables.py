@@ -19,9 +19,9 @@ from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.cli.console import RefusalError, print_note
 from sim_engine.settings.quantity import QuantityError, typed_quantity
 from sim_engine.vessel.mesh import UNITS, scale_of, to_z
-from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.mesh_shape import Axis, MeshShape
 from sim_engine.vessel.shapes import LengthUnit, VesselError
-from sim_engine.vessel_acquisition.mesh_repair import Axis, likely_unit
+from sim_engine.vessel_acquisition.mesh_repair import likely_unit
 
 Floats = NDArray[np.float64]
 

@@ -1,12 +1,13 @@
 """Vessels from mesh files.
 
-`read_mesh` checks formats, units, axes and closedness. `build_mesh_vessel` computes solid, cavity, brim, opening and
-lip, and keeps them in the cache by content.
+`load_triangles` reads a file of any format, `read_mesh` checks units, axes and closedness. `build_mesh_vessel` computes
+solid, cavity, brim, opening and lip, and keeps them in the cache by content.
 """
 
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -53,18 +54,87 @@ class MeshFile(Protocol):
         ...
 
 
-def check_size(shape: MeshFile) -> None:
+def check_size(path: Path) -> None:
     """Refuse a file that is too large, before it is read.
 
     Raises:
         VesselError: it is too large.
         OSError: it does not exist.
     """
-    size = shape.path.stat().st_size
+    size = path.stat().st_size
     if size > LARGEST_FILE:
         raise VesselError(
-            f"{shape.path.name}: {size / 1e6:.0f} MB; simplify it to at most {MOST_FACES:,} triangles, some 50 MB"
+            f"{path.name}: {size / 1e6:.0f} MB; simplify it to at most {MOST_FACES:,} triangles, some 50 MB"
         )
+
+
+def load_triangles(path: Path) -> Any:
+    """All triangles of a file as one `trimesh.Trimesh`, in the unit and the axes of the file.
+
+    Raises:
+        VesselError: the format is unknown, or the file is no mesh, damaged, or too large.
+        OSError: it cannot be read.
+    """
+    import trimesh
+
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in FORMATS:
+        raise VesselError(f"{path.name}: '{kind}' is not a mesh format known here; use {', '.join(FORMATS)}")
+    check_size(path)
+    content = path.read_bytes()
+    if content.startswith(b"version https://git-lfs"):
+        raise VesselError(
+            f"{path.name}: is a pointer of Git LFS, a text of {len(content)} bytes that stands for the mesh; fetch the "
+            "mesh itself with 'git lfs pull'"
+        )
+    if kind == "obj":
+        content = _with_absolute_indices(content)
+    elif kind == "stl" and b"\0" in content[80:84]:  # binary; text has no byte 0
+        end = 84 + 50 * int.from_bytes(content[80:84], "little")
+        if len(content) < end:
+            raise VesselError(
+                f"{path.name}: is cut off: it has {len(content):,} bytes, and its {(end - 84) // 50:,} triangles need "
+                f"{end:,}; copy or export it again"
+            )
+        content = content[:end]  # some programs append bytes, for which trimesh takes the file for text
+    try:
+        # without materials: textures are often missing, and the reader would print the traceback of its search
+        mesh = trimesh.load(io.BytesIO(content), file_type=kind, force="mesh", process=True, skip_materials=True)
+    except Exception as problem:  # trimesh's readers raise various errors for damaged files
+        raise VesselError(f"{path.name}: not a readable {kind.upper()} file ({problem})") from problem
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise VesselError(
+            f"{path.name}: no triangles in it; a vessel needs a closed mesh, not points or lines (of points, decant "
+            "vessel points makes one)"
+        )
+    if len(mesh.faces) > MOST_FACES:
+        raise VesselError(f"{path.name}: {len(mesh.faces):,} triangles; simplify it to at most {MOST_FACES:,}")
+    return mesh
+
+
+def _with_absolute_indices(content: bytes) -> bytes:
+    """An OBJ file whose faces count from its first vertex, not back from the face's own line.
+
+    trimesh counts back from the last vertex of the file (mikedh/trimesh#2364).
+    """
+    if not re.search(rb"(?m)^\s*f\s.*-\d", content):
+        return content
+    counts = {b"v": 0, b"vt": 0, b"vn": 0}
+    lines = content.splitlines()
+    for number, line in enumerate(lines):
+        key, *words = line.split() or [b""]
+        if key in counts:
+            counts[key] += 1
+        elif key == b"f":
+            corners = [
+                b"/".join(
+                    b"%d" % (count + 1 + int(index)) if index.startswith(b"-") else index
+                    for index, count in zip(word.split(b"/"), counts.values(), strict=False)
+                )
+                for word in words
+            ]
+            lines[number] = b"f " + b" ".join(corners)
+    return b"\n".join(lines)
 
 
 def read_mesh(shape: MeshFile) -> tuple[Floats, Integers]:
@@ -77,22 +147,7 @@ def read_mesh(shape: MeshFile) -> tuple[Floats, Integers]:
         VesselError: unreadable, not closed, or of an implausible size.
         OSError: the file cannot be read.
     """
-    import trimesh
-
-    kind = shape.path.suffix.lower().lstrip(".")
-    if kind not in FORMATS:
-        raise VesselError(f"{shape.path.name}: '{kind}' is not a mesh format known here; use {', '.join(FORMATS)}")
-    content = shape.path.read_bytes()
-    try:
-        loaded = trimesh.load(io.BytesIO(content), file_type=kind, process=True, skip_materials=True)
-    except Exception as problem:  # trimesh's readers raise various errors for damaged files
-        raise VesselError(f"{shape.path.name}: not a readable {kind.upper()} file ({problem})") from problem
-    if isinstance(loaded, trimesh.Scene):
-        loaded = loaded.to_mesh() if len(loaded.geometry) else None
-    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise VesselError(f"{shape.path.name}: no triangles in it; a vessel needs a closed mesh, not points or lines")
-    if len(loaded.faces) > MOST_FACES:
-        raise VesselError(f"{shape.path.name}: {len(loaded.faces):,} triangles; simplify it to at most {MOST_FACES:,}")
+    loaded = load_triangles(shape.path)
     if not np.all(np.isfinite(loaded.vertices)):
         raise VesselError(f"{shape.path.name}: some vertices are not finite numbers")
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
@@ -210,7 +265,7 @@ def build_mesh_vessel(spec: VesselSpec, shape: MeshFile, *, use_cache: bool = Tr
         shape: its shape.
         use_cache: whether the result is taken from the cache, or stored there.
     """
-    check_size(shape)
+    check_size(shape.path)
     key = f"vessel-{FORMAT_VERSION}-{spec.content_hash()}"
     if use_cache:
         stored = cache.load_arrays(key)

@@ -12,6 +12,14 @@ if TYPE_CHECKING:
     from sim_engine.vessel.vessel import Vessel
 
 
+Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
+
+
+def usual_up(path: Path) -> Axis:
+    """The axis of a file that points upwards unless it is given: y in a GLB, as glTF 2.0 defines (3.4), else z."""
+    return "y" if path.suffix.lower() == ".glb" else "z"
+
+
 class MeshShape(Shape):
     """A closed mesh of the vessel's solid (STL, OBJ, PLY, GLB). `unit` None: metres if the size is then plausible.
 
@@ -21,7 +29,7 @@ class MeshShape(Shape):
     kind: ClassVar[str] = "mesh"
     path: Annotated[Path, BY_CONTENT]
     unit: LengthUnit | None = None
-    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    up: Axis = "z"
 
     def content(self) -> bytes:
         """See `Shape.content`: the file's bytes, not its path.

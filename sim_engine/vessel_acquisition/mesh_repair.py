@@ -9,10 +9,9 @@ Steps that may change the cavity compare its volume before and after (`exact_cav
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +20,14 @@ from sim_engine.resources import MissingExtraError, installed
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 from sim_engine.vessel.exact_cavity import exact_cavity, fillers
 from sim_engine.vessel.mesh import (
-    FORMATS,
-    MOST_FACES,
     UNITS,
-    check_size,
+    load_triangles,
     scale_of,
     to_z,
     typical_wall,
     wall_thickness,
 )
-from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.mesh_shape import Axis, MeshShape
 from sim_engine.vessel.mesh_surface import components
 from sim_engine.vessel.shapes import LengthUnit, VesselError
 from sim_engine.vessel_acquisition.surface_repair import (
@@ -48,7 +45,6 @@ from sim_engine.vessel_acquisition.wall_thickening import fits_grid, thickened
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
-Axis = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 SMALLEST, LARGEST = 0.030, 0.400
 """Smallest and largest plausible extent of vessels on a bench [m]."""
@@ -173,23 +169,7 @@ def _require_igl() -> None:
 
 
 def _read(path: Path) -> Any:
-    import trimesh
-
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in FORMATS:
-        raise VesselError(f"{path.name}: '{kind}' is not a mesh format known here; use {', '.join(FORMATS)}")
-    check_size(MeshShape(path=path))
-    try:
-        # without materials: textures are often missing, and the reader would print the traceback of its search
-        mesh = trimesh.load(
-            io.BytesIO(path.read_bytes()), file_type=kind, force="mesh", process=True, skip_materials=True
-        )
-    except Exception as problem:  # trimesh's readers raise various errors for damaged files
-        raise VesselError(f"{path.name}: not a readable {kind.upper()} file ({problem})") from problem
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise VesselError(f"{path.name}: no triangles in it; if it has points only, use decant vessel points")
-    if len(mesh.faces) > MOST_FACES:
-        raise VesselError(f"{path.name}: {len(mesh.faces):,} triangles; simplify it to at most {MOST_FACES:,}")
+    mesh = load_triangles(path)
     if not np.all(np.isfinite(mesh.vertices)):
         mesh.update_faces(np.isfinite(mesh.vertices).all(axis=1)[mesh.faces].all(axis=1))
         mesh.remove_unreferenced_vertices()

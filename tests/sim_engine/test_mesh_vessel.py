@@ -273,6 +273,12 @@ def test_metres_need_no_unit(build: Make) -> None:
         ("cup.step", b"ISO-10303-21;", "use stl, obj, ply, glb"),
         ("cup.glb", b"glTF but not really", "not a readable GLB file"),
         ("cup.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles|not a readable"),
+        (
+            "cup.stl",
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:aa\nsize 1234567\n",
+            "a pointer of Git LFS, .* fetch the mesh itself with 'git lfs pull'",
+        ),
+        ("cup.stl", bytes(80) + b"\x00\x03\0\0" + bytes(50), "is cut off: it has 134 bytes, and its 768 triangles"),
     ],
 )
 def test_file_that_is_no_mesh_is_refused(tmp_path: Path, name: str, content: bytes, message: str) -> None:

@@ -77,6 +77,40 @@ def test_a_vessel_holds_what_it_holds_however_its_mesh_was_saved(
             assert re.search(pattern, text), text
 
 
+def padded_stl() -> tuple[str, bytes]:
+    """Zeros after the last triangle, as in files that were copied in blocks."""
+    return "cup.stl", bytes(cup().export(file_type="stl")) + bytes(37)
+
+
+def relative_obj() -> tuple[str, bytes]:
+    """Every triangle after its own corners, with indices that count back (mikedh/trimesh#2364)."""
+    corners = cup().triangles
+    blocks = ["".join(f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in each) for each in corners]
+    return "cup.obj", "".join(f"vn 0 0 1\n{each}f -3//-1 -2//-1 -1//-1\n" for each in blocks).encode()
+
+
+def y_up_glb() -> tuple[str, bytes]:
+    """As every program writes it that follows glTF: metres, y up."""
+    mesh = cup()
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2.0, [1.0, 0.0, 0.0]))
+    mesh.apply_scale(1e-3)
+    return "cup.glb", bytes(mesh.export(file_type="glb"))
+
+
+@pytest.mark.parametrize("form", [padded_stl, relative_obj, y_up_glb])
+def test_a_vessel_is_read_as_its_format_is_defined(
+    tmp_path: Path, form: Callable[[], tuple[str, bytes]], capfd: pytest.CaptureFixture[str]
+) -> None:
+    name, content = form()
+    (tmp_path / name).write_bytes(content)
+    out = tmp_path / "made.yaml"
+    result = CliRunner().invoke(app, ["vessel", "mesh", str(tmp_path / name), str(out)])
+    assert result.exit_code == 0, result.output
+    assert 1e6 * build_vessel(load_vessel(out)).capacity == pytest.approx(CUP, rel=0.01)
+    (tmp_path / "named.yaml").write_text(f"name: cup\nmesh: {name}\nunit: {'m' if name.endswith('glb') else 'mm'}\n")
+    assert 1e6 * build_vessel(load_vessel(tmp_path / "named.yaml")).capacity == pytest.approx(CUP, rel=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [path.stem for path in sorted(MESHES.glob("*.gz"))])
 def test_what_is_simulated_and_drawn_is_the_repaired_vessel(
