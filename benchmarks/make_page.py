@@ -68,7 +68,6 @@ def page_text(records: dict[str, Any]) -> str:
         sections.targets(pours),
         sections.beside_the_peer(pours),
         sections.passes(records["profile"]),
-        sections.limit(),
         sections.cost(scaling),
         sections.memory(scaling),
         sections.start_up(records["start-up"]),

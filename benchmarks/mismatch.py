@@ -293,7 +293,7 @@ def write_steep(runs: list[dict[str, Any]]) -> None:
     )
     cliffs, milder = (_steep_command(levels, "--first 20001 --seeds 48") for levels in (CLIFFS, MILDER))
     write_table("cliffs", head, steep_rows(CLIFFS, runs), cliffs, settings)
-    write_table("milder", head, steep_rows(MILDER, runs), milder, settings)
+    write_table("milder", head, steep_rows(MILDER, runs), milder, "settings of the steep walls")
     head = ["pours", "number", *(f"in {100 * share:.0f} % (interval score)" for share in SHARES)]
     some = [run for run in runs if run["level"] in CLIFFS]
     write_table("intervals", head, interval_rows(some), cliffs, "all pours of the table above, as observed")

@@ -12,6 +12,9 @@ from standard_pour import LEFT, LEFT_LIMIT
 TARGETS = {2_000: (1.5, 0.6), 5_000: (5.0, 2.0), 10_000: (12.0, 5.0)}
 """Required and target CPU seconds of the standard pour, by particles."""
 
+LEAST_SHARE = 0.05
+"""Share of a pass from which the table of the profile has it; the picture has all."""
+
 SLOWEST = 3
 """Number of checked files that are shown by name."""
 
@@ -139,7 +142,8 @@ def passes(record: Record) -> str:
             *(f"{100 * r[moment]['share'].get(name, 0.0):.1f} %" for moment in moments),
             f"{r[moments[0]]['calls_per_step'][name]:.2g}",
         )
-        for name in r[moments[0]]["share"]
+        for name, share in r[moments[0]]["share"].items()
+        if share >= LEAST_SHARE
     ]
     if r["slower"] > 1.0:
         clock = f"With the clock the pour takes {r['slower']:.2f} times as long"
@@ -147,7 +151,8 @@ def passes(record: Record) -> str:
         clock = "The cost of the clock is within the noise of two pours"
     about = prose(
         f"""A clock around every pass of the kernel, in one standard pour with {r["particles"]:,} particles. {clock};
-        the passes make up {100 * r["explained"]:.0f} % of the time measured from outside."""
+        the passes make up {100 * r["explained"]:.0f} % of the time measured from outside. The table has those of
+        {100 * LEAST_SHARE:.0f} % or more."""
     )
     return f"""## {title}
 
@@ -247,10 +252,10 @@ def engines(record: Record) -> str:
     ]
     about = prose(
         """The packages that can compile the solver, in alternating processes: CPU seconds of the standard pour, the
-        fractions that it leaves in the pourer with the most particles, and CPU seconds of a process up to its first
-        pour, with a warm cache and with an empty one; peak memory; installed size. Decide by the differences, since all
-        processes share one busy core. Taichi is the default where both are installed: pours cost the same, and all
-        other figures and the golden outcomes are from it. Quadrants starts faster, is smaller, and is maintained."""
+        fractions that it leaves in the pourer with the most particles, CPU seconds of a process up to its first pour
+        with a warm and an empty cache, peak memory, installed size. Compare rows only: all processes share one busy
+        core. Taichi is the default, because all other figures are from it and pours cost the same. Quadrants starts
+        faster, is smaller, and is maintained."""
     )
     head = (
         "",
@@ -338,25 +343,6 @@ def pool(record: Record) -> str:
     ]
     shown = table(("", "", "required", ""), rows, "lrll")
     return f"## {title}\n\n{about}\n\n{shown}\n{settings([record])}"
-
-
-def limit() -> str:
-    """Return the section on what limits the ratio to the peer."""
-    return """## Why not 30 times
-
-30 times the peer would be 0.41 CPU s at 2,000 particles and 1.50 at 5,000. Both solvers make about 6 M
-particle-iterations/s; Decant needs 22 times fewer. Ratios with a part of the work for nothing, at 2,000 and 5,000:
-
-| without | ratios | what stands in the way |
-|---|---:|---|
-| neighbour lists | 26, 30 | lists for three steps have 45 % more pairs, which cost as much |
-| steps before liquid leaves | 27, 30 | a quarter of the work; longer steps saved at most 6 % |
-| half of the lists, and densities as fast as displacements (2.8 → 1.2 ns a pair) | 27, 31 | roots and polynomials |
-| a second iteration in every step | 20, 23 | 2 to 4 % fewer iterations: compression asks for it |
-
-30 needs 8.4 M particle-iterations/s. Plain C on a lattice at rest, without walls, forces, sweeps and surfaces, makes
-6.5 M with lists built in every step, 13 M with lists kept for 8 (`benchmarks/core_limit.py`, commit 46022671).
-"""
 
 
 def machines(records: Iterable[Record]) -> str:

@@ -133,6 +133,8 @@ def write(options: argparse.Namespace, seeds: dict[int, dict[str, Any]]) -> None
         seeds = {int(seed): {"pours": pours} for seed, pours in earlier["seeds"].items()} | seeds
     head = ["seed", "test, 4 pours", "another receiver, 16 pours", "pours inside their 90 % intervals"]
     named = " ".join(map(str, sorted(seeds)))
+    if sorted(seeds) == [*range(min(seeds), max(seeds) + 1)]:
+        named = f"$(seq {min(seeds)} {max(seeds)})"
     write_table("recorded", head, [*seed_rows(seeds), mean_row(seeds)], f"{command} --seeds {named}", settings)
     predicted = {str(seed): one["pours"] for seed, one in sorted(seeds.items())}
     kept = {"command": command, **provenance(settings), "seeds": predicted}

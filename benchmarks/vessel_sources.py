@@ -1,13 +1,16 @@
 """Measure the accuracy of `decant vessel`: shipped vessels from each vessel source, with the errors of real tools.
 
-Writes the table of docs/evidence/results.md. Run from the project's root: python benchmarks/vessel_sources.py
+Writes docs/data/vessel-sources.json and the table of docs/evidence/results.md. Run from the project's root:
+python benchmarks/vessel_sources.py
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +26,7 @@ from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel
 from tests.support.measured_vessel import FOCAL, MeasuredVessel, vessel
 
-PAGE = Path("docs/evidence/results.md")
+PAGE, DATA = Path("docs/evidence/results.md"), Path("docs/data/vessel-sources.json")
 PARTICLES = 600
 LOAD = 0.15
 OFFSETS = {
@@ -136,17 +139,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=4, help="seeds per simulated pour")
     asked = parser.parse_args()
-    cells: dict[str, dict[str, str]] = {}
+    sources: dict[str, dict[str, list[float]]] = {}
     for row in measure(asked.seeds):
-        spilled = max(row.spillage, key=abs)
-        shown = f"{1e3 * row.profile:.2f}; {100 * row.capacity:+.1f}; {spilled:+.3f}"
-        cells.setdefault(row.source, {})[row.vessel] = shown
-    lines = [f"| source | {' | '.join(OFFSETS)} |", f"|---|{'---|' * len(OFFSETS)}"]
-    lines += [f"| {source} | {' | '.join(found[name] for name in OFFSETS)} |" for source, found in cells.items()]
-    text = "\n".join(lines)
-    page = PAGE.read_text()
+        errors = [round(1e3 * row.profile, 2), round(100 * row.capacity, 1), round(max(row.spillage, key=abs), 3)]
+        sources.setdefault(row.source, {})[row.vessel] = errors
+    text = json.dumps(sources, indent=1)
+    DATA.write_text(re.sub(r"\[\s+([^\]]+?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text) + "\n")
     marked = r"(<!-- vessel sources -->\n).*?(<!-- end of vessel sources -->)"
-    PAGE.write_text(re.sub(marked, lambda m: f"{m[1]}{text}\n{m[2]}", page, flags=re.S))
+    PAGE.write_text(re.sub(marked, lambda m: f"{m[1]}{table(sources)}{m[2]}", PAGE.read_text(), flags=re.S))
+
+
+def table(sources: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
+    """Return the largest errors of each source, with their vessels.
+
+    Args:
+        sources: by source and vessel: errors of profile [mm] and capacity [%], and change of the spillage.
+    """
+    lines = ["| source | profile, mm | capacity, % | spillage |", "|---|---|---|---|"]
+    for source, vessels in sources.items():
+        cells = []
+        for column, form in enumerate((".2f", "+.1f", "+.3f")):
+            vessel_name, errors = max(vessels.items(), key=lambda item: abs(item[1][column]))
+            cells.append(f"{errors[column]:{form}} ({vessel_name})" if errors[column] else "0")
+        lines.append(f"| {source} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":
