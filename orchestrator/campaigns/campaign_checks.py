@@ -525,6 +525,14 @@ def check_campaign(
     for at, assumed in _assumed(plan):
         if assumed:
             warn(checker.problem((at,), assumed))
+    planned: list[int | None] = [0 if plan.calibration is None else plan.calibration.pour_count]
+    planned += [] if plan.deployment is None else [plan.deployment.settings.pours, plan.deployment.confirm]
+    if plan.outputs.pour_recordings and lab.mode == "virtual" and lab.arm is None and any(planned):
+        text = (
+            f"records doses alone in laboratory '{lab.name}': its bench has no arm, whose tilt a recorded pour needs; "
+            "name a laboratory with an arm"
+        )
+        warn(checker.problem((("outputs", "pour_recordings"),), text))
     if plan.calibration is not None:
         calibration, section = plan.calibration, ("calibration",)
         if calibration.records is None:
@@ -543,7 +551,11 @@ def check_campaign(
             role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
             checker.reachable(plan.deployment, scene, role)
     if plan.dispense is not None and lab.places:
-        checker.add((("dispense",),), f"is poured without places; laboratory '{lab.name}' has some")
+        text = (
+            f"laboratory '{lab.name}' has places, between which the arm carries the vessels; those of doses can't "
+            "be carried yet. Name a laboratory without 'places', in which a person puts them under the arm"
+        )
+        checker.add((("dispense",),), text)
     if plan.dispense is not None:
         balance = plan.laboratory.balance
         if plan.laboratory.arm is not None and (balance is None or balance.placement not in ("receiver", "everything")):

@@ -19,6 +19,7 @@ from orchestrator.campaigns.search_ranges import Actions, Motion, Parameters
 from orchestrator.campaigns.vessel_file import VesselFile
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import (
+    LEAST_TRAINING_POURS,
     CalibrationSettings,
     DeploymentSettings,
     Design,
@@ -124,9 +125,12 @@ class PoursSettings(PoursFromFile):
         if self.count is None and problems.valid("count", "from", "from_run"):
             text = "needs 'count' (pours to make on the bench), 'from' (a CSV file of weighed pours) or 'from_run'"
             problems.add(text, key=True)
-        if self.count is not None and self.held_out >= self.count:
-            text = f"keeps {self.held_out} of {self.count} pours for testing, so that none is left to fit"
-            problems.add(text, "holdout")
+        if self.count is not None and (left := max(0, self.count - self.held_out)) < LEAST_TRAINING_POURS:
+            text = (
+                f"keeps {self.held_out} of {self.count} pours for testing, so that {left or 'none'} is left to fit; a "
+                f"calibration needs {LEAST_TRAINING_POURS}"
+            )
+            problems.add(text, "count" if self.holdout is None else "holdout")
 
     @property
     def held_out(self) -> int:

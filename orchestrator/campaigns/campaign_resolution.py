@@ -38,6 +38,7 @@ from orchestrator.campaigns.yaml.section_validation import PlacedProblems
 from orchestrator.campaigns.yaml.yaml_source import Place, Report
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import (
+    LEAST_TRAINING_POURS,
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
@@ -48,7 +49,7 @@ from orchestrator.learning.campaign_plan import (
 )
 from orchestrator.learning.deployment.objectives import STOPS, Objectives
 from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import Loss
+from sim_engine.outcome import MINIMUM_POURED, Loss
 from sim_engine.scene import Scene
 from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.shapes import VesselSpec
@@ -230,6 +231,13 @@ def resolve_calibration(
     settings = None
     if not report.is_broken(place.at("strategy")):
         train = count - holdout if records is None else records.training_pours
+        source = at.at("from" if pours.source is not None else "from_run")
+        if records is not None and train < LEAST_TRAINING_POURS and not report.is_broken(source):
+            text = (
+                f"has {train or 'no'} training pour{'s' * (train != 1)} with at least {MINIMUM_POURED:.0%} poured; a "
+                f"calibration needs {LEAST_TRAINING_POURS}"
+            )
+            report.add(source, text)
         problems = PlacedProblems(place, report, frozenset(CalibrationSection.model_fields))
         settings = section.settings.settled(tuple(searched), train, problems)
     if scene is None or len(others) < len(receivers) - 1 or actions is None or settings is None or not searched:

@@ -42,6 +42,9 @@ from sim_engine.settings.model import (
 )
 from sim_engine.settings.quantity import Quantity
 
+LEAST_TRAINING_POURS = 2
+"""Least number of training pours with enough poured that a calibration can use."""
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 

@@ -24,7 +24,12 @@ from orchestrator.learning.calibration.campaign_memory import (
     verdicts,
 )
 from orchestrator.learning.calibration.posterior_summary import PosteriorFound, posterior_found
-from orchestrator.learning.campaign_plan import CalibrationPlan, CalibrationSettings, MeasuredPour
+from orchestrator.learning.campaign_plan import (
+    LEAST_TRAINING_POURS,
+    CalibrationPlan,
+    CalibrationSettings,
+    MeasuredPour,
+)
 from orchestrator.learning.requests import Decision, Outcome, Request, Simulate, Simulated, Slots, Suggest
 from orchestrator.learning.run_errors import LearningError
 from orchestrator.learning.stage_result import DisplayedMap, ResultPart, StageResult, displayed_map
@@ -151,10 +156,10 @@ class Calibration(ABC, Generic[S]):
         """
         self._train = [pour for pour in measured if pour.split == "train"]
         self._usable = [pour for pour in self._train if pour.spillage is not None]
-        if len(self._usable) < 2:
+        if len(self._usable) < LEAST_TRAINING_POURS:
             raise LearningError(
-                f"calibration needs at least 2 training pours with ≥ {MINIMUM_POURED:.0%} poured, got "
-                f"{len(self._usable)} of {len(self._train)}; make more pours, or let them tilt farther (max_angle)"
+                f"calibration needs at least {LEAST_TRAINING_POURS} training pours with ≥ {MINIMUM_POURED:.0%} poured, "
+                f"got {len(self._usable)} of {len(self._train)}; make more pours, or let them tilt farther (max_angle)"
             )
         self._plan = plan
         self._settings = cast(S, plan.settings)

@@ -107,6 +107,18 @@ BAD_CAMPAIGNS = {
     ),
     "nothing to calibrate": (CAMPAIGN, "[0 N/m, 0.1 N/m]", "0.1 N/m", "10:1: calibration: has nothing to search"),
     "all pours held out": (CAMPAIGN, "holdout: 2", "holdout: 8", "keeps 8 of 8 pours for testing"),
+    "all pours but one held out": (
+        CAMPAIGN,
+        "holdout: 2",
+        "holdout: 7",
+        "pours.holdout: keeps 7 of 8 pours for testing, so that 1 is left to fit; a calibration needs 2",
+    ),
+    "a single pour": (
+        CAMPAIGN,
+        "count: 8, holdout: 2",
+        "count: 1",
+        "pours.count: keeps 0 of 1 pours for testing, so that 1 is left to fit; a calibration needs 2",
+    ),
     "too few simulations": (CAMPAIGN, "simulations: 20", "simulations: 4", "8 random parameters don't fit into 4"),
     "too many pours": (
         CAMPAIGN,
@@ -293,6 +305,11 @@ BAD_RECORDS = {
         "height varies in the file and is not searched; add it to calibration.actions",
     ),
     "no training pours": (CSV, CSV.replace("train", "test"), "has no pour with split 'train'"),
+    "a single training pour": (
+        CSV,
+        CSV.replace("train", "test", 1),
+        "calibration.pours.from: has 1 training pour with at least 5% poured; a calibration needs 2",
+    ),
     "only a header": (CSV, CSV.splitlines()[0], "has no pours"),
 }
 

@@ -58,9 +58,9 @@ def test_cells_of_a_study_are_kept_in_the_language_of_campaigns(name: str, tmp_p
     theta = study.base.parameters.model_copy(update={"cohesion": 0.0123456789})
     kinds: set[tuple[str, str]] = set()
     for cell in cells_of(study):
-        if cell.kind in ("calibration", "uncalibrated") or (cell.kind, cell.arm) in kinds:
+        if cell.kind in ("calibration", "uncalibrated") or (cell.kind, cell.strategy) in kinds:
             continue  # those read pours from a journal
-        kinds.add((cell.kind, cell.arm))
+        kinds.add((cell.kind, cell.strategy))
         stage = f"deployment:{cell.receiver.removeprefix('deployment-')}"
         needed = {"calibration": plans.calibrated(theta), stage: Deployed.model_construct(recommended=None)}
         plan = campaign_of(study, cell, lambda other, needed=needed: needed, tmp_path / cell.id).campaign  # type: ignore[misc]

@@ -77,3 +77,10 @@ def test_tilts_faster_than_the_laboratory_allows_are_told_with_the_limit(tmp_pat
     # at 200 deg/s² a turn of 120 deg comes to 155 deg/s on its way
     slow = fast.replace("angular_acceleration: 600 deg/s^2", "angular_acceleration: 200 deg/s^2")
     assert warnings(write(tmp_path, "good.yaml", slow)) == []
+
+
+def test_a_bench_without_an_arm_that_should_record_pours_is_told_of_before_they_are_made(folder: Path) -> None:
+    recorded = "outputs: {pour_recordings: true}\n"
+    (told,) = warnings(write(folder, "bad.yaml", CAMPAIGN + recorded))
+    assert told.startswith("bad.yaml:14:28: outputs.pour_recordings: records doses alone in laboratory 'lab'")
+    assert warnings(write(folder, "weighed.yaml", RECORDED + recorded)) == []
