@@ -39,6 +39,13 @@ RULER, BALANCE, ANGLE = 5e-4, 5e-4, 0.005
 DOUBTFUL = 3.0
 """Number of standard deviations above which a check fails."""
 
+UNTARED = 4.0
+"""Gain of a fit's log likelihood from which the masses of tables are taken for those of an untared balance. With 80 g
+too much it is 4.5 to 16 for the shipped vessels, a hemisphere, a paraboloid and a flask; at most 1 for tared masses."""
+
+SMALLEST_TARE = 0.05
+"""Smallest mass that counts as a missing tare, as a share of a table's largest."""
+
 LEVEL = 2.0
 """Angle of a rim from which it counts as not level [deg]."""
 
@@ -61,6 +68,9 @@ class Sizes:
     ] = None
     fill: Annotated[Path | None, typer.Option(help="Table of levels and masses: level_mm, mass_g.")] = None
     tilt: Annotated[Path | None, typer.Option(help="Table of tilts and retained masses: tilt_deg, mass_g.")] = None
+    tare: Annotated[
+        str | None, typer.Option(help="Mass of the empty vessel that the tables' masses contain; '0 g' for none.")
+    ] = None
     wall: Wall = None
     floor: Annotated[str | None, typer.Option(help="Thickness of the floor; default: as the wall.")] = None
 
@@ -352,7 +362,13 @@ def _turned(
             "how deep is it inside, from floor to rim? Say it with --height, for example --height '95 mm'"
         )
     evidence += _measured(sizes, vessel, height)
-    outline = find_outline(height, evidence, wall, floor, height_deviation=off)
+
+    def fitted(measurements: Sequence[Evidence]) -> FittedOutline:
+        return find_outline(height, measurements, wall, floor, height_deviation=off)
+
+    outline = fitted(evidence)
+    if sizes.tare is None:
+        _check_tared(sizes, vessel, evidence, outline, fitted)
     width = 2.0 * (float(outline.radii.max()) + wall)
     extent = np.array([width, width, height + floor])
     if not fits_grid(extent, min(wall, floor)):
@@ -383,6 +399,7 @@ def _measured(sizes: Sizes, vessel: Vessel, height: float) -> list[Evidence]:
         heights, widths = read_diameters(sizes.diameters, height)
         evidence.append(Radii("callipers", heights, widths / 2.0, np.full(len(heights), CALLIPERS)))
     volume_error = vessel.volume(BALANCE)
+    tare = 1e3 * (_quantity(sizes.tare, "--tare", "kg", "104 g") or 0.0)
     if sizes.fill is not None:
         levels, masses = read_fill_table(
             sizes.fill,
@@ -390,15 +407,59 @@ def _measured(sizes: Sizes, vessel: Vessel, height: float) -> list[Evidence]:
             density=1e-6 * BALANCE / volume_error,
             ruler=1e3 * RULER,
             balance=1e3 * BALANCE,
+            tare=tare,
         )
         volumes = np.array([vessel.volume(mass) for mass in masses / 1e3])
         radius = float(np.sqrt(volumes.max() / (np.pi * levels.max() / 1e3)))
         evidence.append(FillTable(levels / 1e3, volumes, RULER, volume_error, radius))
     if sizes.tilt is not None:
-        tilts, masses = read_tilt_table(sizes.tilt, angle=float(np.degrees(ANGLE)), balance=1e3 * BALANCE)
+        tilts, masses = read_tilt_table(sizes.tilt, angle=float(np.degrees(ANGLE)), balance=1e3 * BALANCE, tare=tare)
         volumes = np.array([vessel.volume(mass) for mass in masses / 1e3])
         evidence.append(TiltTable(np.radians(tilts), volumes, ANGLE, volume_error))
     return evidence
+
+
+def _check_tared(
+    sizes: Sizes,
+    vessel: Vessel,
+    evidence: Sequence[Evidence],
+    outline: FittedOutline,
+    fitted: Callable[[Sequence[Evidence]], FittedOutline],
+) -> None:
+    """Refuse tables whose masses seem to contain the empty vessel: without a constant they fit far better."""
+    from scipy.optimize import minimize_scalar
+
+    from sim_engine.vessel_acquisition.measurements import FillTable, TiltTable
+
+    volumes = [volume for piece in evidence if isinstance(piece, FillTable | TiltTable) for volume in piece.observed]
+    least, most = min(volumes, default=0.0), max(volumes, default=0.0)
+
+    def without(offset: float) -> FittedOutline:
+        return fitted(
+            [
+                replace(piece, observed=piece.observed - offset) if isinstance(piece, FillTable | TiltTable) else piece
+                for piece in evidence
+            ]
+        )
+
+    # a search takes ten fits: only if the likelihood rises
+    if least < SMALLEST_TARE * most or without(0.2 * least).likelihood <= outline.likelihood:
+        return
+    search = minimize_scalar(
+        lambda offset: -without(float(offset)).likelihood,
+        bounds=(0.0, 0.999 * least),
+        method="bounded",
+        options={"xatol": 0.01 * least, "maxiter": 15},
+    )
+    offset, corrected = float(search.x), without(float(search.x))
+    if offset < SMALLEST_TARE * most or corrected.likelihood - outline.likelihood < UNTARED:
+        return
+    raise RefusalError(
+        f"{sizes.fill or sizes.tilt}: all masses seem to contain about {1e3 * offset / vessel.volume(1.0):.0f} g that "
+        "are not liquid, as on a balance that was not tared with the empty vessel: without them the vessel holds "
+        f"{1e6 * corrected.capacity:.0f} mL, with them {1e6 * outline.capacity:.0f} mL. Weigh the empty vessel and say "
+        "its mass, for example --tare '104 g'; if the masses are of the liquid alone, say --tare '0 g'"
+    )
 
 
 def _doubts(outline: FittedOutline, vessel: Vessel) -> list[str]:
@@ -605,7 +666,7 @@ def register(app: typer.Typer) -> None:
     add(
         profile,
         "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
-        "decant vessel profile cup.yaml --height '95 mm' --fill fill.csv --wall '3 mm' --brimful '322 g'",
+        "decant vessel profile cup.yaml --height '95 mm' --fill fill.csv --tare '104 g' --wall '3 mm'",
     )
     add(
         photo,

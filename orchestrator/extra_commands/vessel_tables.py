@@ -79,7 +79,7 @@ def read_diameters(text: str, height: float) -> tuple[Floats, Floats]:
 
 
 def read_fill_table(
-    path: Path, *, height: float, density: float, ruler: float, balance: float
+    path: Path, *, height: float, density: float, ruler: float, balance: float, tare: float = 0.0
 ) -> tuple[Floats, Floats]:
     """Read a table of levels above the inner bottom [mm] and the masses below them [g], sorted by level.
 
@@ -87,11 +87,12 @@ def read_fill_table(
         height: height of the rim [mm].
         density: density of the weighed liquid [g/mm³].
         ruler, balance: standard deviations of a level [mm] and of a mass [g].
+        tare: contained in each mass, and subtracted [g].
 
     Raises:
         RefusalError: with the file, the line, and a correction (exit code 2).
     """
-    rows = _read_rows(path, "level_mm", upper=height)
+    rows = _read_rows(path, "level_mm", upper=height, tare=tare)
     rows.sort(key=lambda row: row[1:])
     table = _monotonic(path, rows, "a higher level holds more", 1.0, ruler, balance)
     for line, level, mass in rows:
@@ -105,16 +106,17 @@ def read_fill_table(
     return table
 
 
-def read_tilt_table(path: Path, *, angle: float, balance: float) -> tuple[Floats, Floats]:
+def read_tilt_table(path: Path, *, angle: float, balance: float, tare: float = 0.0) -> tuple[Floats, Floats]:
     """Read a table of tilts [deg] and the masses that the vessel retains at them [g], sorted by tilt.
 
     Args:
         angle, balance: standard deviations of a tilt [deg] and of a mass [g].
+        tare: contained in each mass, and subtracted [g].
 
     Raises:
         RefusalError: with the file, the line, and a correction (exit code 2).
     """
-    rows = _read_rows(path, "tilt_deg", upper=90.0)
+    rows = _read_rows(path, "tilt_deg", upper=90.0, tare=tare)
     rows.sort(key=lambda row: (row[1], -row[2]))
     return _monotonic(path, rows, "a vessel that is tilted further holds less", -1.0, angle, balance)
 
@@ -146,7 +148,7 @@ def _monotonic(
     return values, masses
 
 
-def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, float, float]]:
+def _read_rows(path: Path, column: str, *, upper: float, tare: float) -> list[tuple[int, float, float]]:
     """Read line number, value of a column and mass [g] of each row; see `read_fill_table`."""
     wanted = (COLUMNS[column], COLUMNS["mass_g"])
     problems: list[Problem] = []
@@ -170,11 +172,12 @@ def _read_rows(path: Path, column: str, *, upper: float) -> list[tuple[int, floa
         if len(numbers) != len(names):
             raise RefusalError(f"{at}: should be two numbers, {column} and mass_g")
         values = {name.standard: n * name.factor for name, n in zip(columns, numbers, strict=True) if name is not None}
-        value, mass = values[column], values["mass_g"]
+        value, mass = values[column], values["mass_g"] - tare
         if not 0.0 < value <= upper * (1.0 + 1e-9):
             raise RefusalError(f"{at}: {column} is {value:g}; should be above 0 and at most {upper:g}")
         if not 0.0 <= mass < 1e5:
-            raise RefusalError(f"{at}: mass_g is {mass:g}; should be at least 0")
+            least = f"the {tare:g} g of --tare" if tare else "0"
+            raise RefusalError(f"{at}: mass_g is {values['mass_g']:g}; should be at least {least}")
         rows.append((row.line, value, mass))
         if len(rows) > MOST_ROWS:
             raise RefusalError(f"{at}: more than {MOST_ROWS:,} rows")

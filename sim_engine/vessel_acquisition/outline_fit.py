@@ -99,6 +99,7 @@ class FittedOutline:
         wall, floor: thickness [m].
         fits: of all evidence.
         height_deviation: standard deviation of the height of the rim [m].
+        likelihood: logarithm of the probability of the measurements, up to a constant that depends on their deviations.
     """
 
     heights: Floats
@@ -108,6 +109,7 @@ class FittedOutline:
     floor: float
     fits: tuple[EvidenceFit, ...]
     height_deviation: float = 0.0
+    likelihood: float = 0.0
 
     @property
     def deviations(self) -> Floats:
@@ -201,7 +203,8 @@ def find_outline(
     )
     excess = float(best.residual @ best.residual) / max(len(observed) - best.determined, 1.0)
     fits = tuple(_fits(evidence, best.residual))
-    return FittedOutline(heights, best.radii, best.covariance * max(excess, 1.0), wall, floor, fits, height_deviation)
+    covariance = best.covariance * max(excess, 1.0)
+    return FittedOutline(heights, best.radii, covariance, wall, floor, fits, height_deviation, best.likelihood)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -169,6 +170,40 @@ def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) 
     found = load_vessel(tmp_path / "made.yaml")
     capacities = [volume(np.array(found.drawn(seed).shape.outline().inner)) for seed in range(200)]  # type: ignore[attr-defined]
     assert 1e6 * np.std(capacities) == pytest.approx(told, rel=0.25)
+
+
+CALLIPERS = "5 mm: 64.4 mm, 50 mm: 67.4 mm, 95 mm: 70.4 mm"
+
+
+@pytest.mark.parametrize("diameters", [None, pytest.param(CALLIPERS, marks=pytest.mark.slow)])
+def test_a_fill_table_of_a_balance_that_was_not_tared_is_refused_with_both_capacities(
+    tmp_path: Path, diameters: str | None
+) -> None:
+    table = tmp_path / "fill.csv"
+    table.write_text("level_mm,mass_g\n10,131.2\n30,196.0\n60,300.1\n90,412.4\n")  # of a cup of 332 mL, 100 g too much
+    sources: dict[str, Any] = {"height": "95 mm", "fill": table, "wall": "3 mm", "diameters": diameters}
+    with pytest.raises(DecantError, match=r"fill\.csv: .* not tared with the empty vessel") as refusal:
+        vessel(tmp_path / "cup.yaml", **sources)
+    assert not (tmp_path / "cup.yaml").exists()
+    (mass,) = re.findall(r"about (\d+) g", str(refusal.value))
+    (capacity,) = re.findall(r"without them the vessel holds (\d+) mL", str(refusal.value))
+    assert float(mass) == pytest.approx(100.0, abs=6.0)
+    assert float(capacity) == pytest.approx(332.0, abs=6.0)
+    assert "--tare '0 g'" in str(refusal.value)
+    assert 1e6 * made(tmp_path, {**sources, "tare": "100 g"}) == pytest.approx(332.0, rel=0.01)
+
+
+def test_the_masses_of_a_table_contain_the_tare(tmp_path: Path) -> None:
+    table = tmp_path / "fill.csv"
+    table.write_text("level_mm,mass_g\n10,131.2\n30,196.0\n60,300.1\n")
+    with pytest.raises(DecantError, match=r"fill\.csv:2: mass_g is 131.2; should be at least the 150 g of --tare"):
+        vessel(tmp_path / "cup.yaml", height="95 mm", fill=table, wall="3 mm", tare="150 g")
+
+
+@pytest.mark.parametrize("name", ["narrow", *(pytest.param(each, marks=pytest.mark.slow) for each in ("bowl", "cone"))])
+def test_tared_fill_tables_of_the_shipped_vessels_are_read_without_a_question(tmp_path: Path, name: str) -> None:
+    of = measured(name)
+    assert made(tmp_path, fill(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.02)
 
 
 def test_a_brimful_cup_that_weighs_otherwise_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
