@@ -49,7 +49,8 @@ REALTIME = (Path(__file__).parent / "end_to_end", Path(__file__).parent / "relia
 """Folders whose tests watch other processes: each is `realtime`."""
 
 WITH_PROCESSES = tuple(
-    Path(__file__).parent / name for name in ("actors", "plugins", "orchestrator/commands", "orchestrator/daemon")
+    Path(__file__).parent / name
+    for name in ("actors", "plugins", "orchestrator/cli", "orchestrator/daemon", "orchestrator/extra_commands")
 )
 """Folders where many tests start processes or threads: a stalled machine may fail one, which is tried once more."""
 

@@ -60,6 +60,27 @@ def test_every_file_name_is_unique() -> None:
     assert [name for name, count in names.items() if count > 1] == []
 
 
+def test_tests_mirror_the_product() -> None:
+    """`actors/arm/ur/ur_driver.py` is tested in `tests/actors/arm/ur/test_ur_driver.py` and `test_ur_driver_losses.py`.
+
+    A file about a whole package has the package's name. What spans packages stands in a folder named by its subject.
+    """
+    known = {path.parent / path.stem.replace("__init__", path.parent.name) for path in modules().values()}
+    tests = ROOT / "tests"
+    wrong = []
+    for path in [path for layer in LAYERS for path in (tests / layer).rglob("*.py") if path.name != "conftest.py"]:
+        folder, words = ROOT / path.relative_to(tests).parent, path.stem.split("_")
+        tested = {folder / "_".join(words[1:end]) for end in range(2, len(words) + 1)}
+        if words[0] != "test" or not tested & known:
+            wrong.append(str(path.relative_to(ROOT)))
+    assert wrong == []
+
+
+def test_every_file_of_tests_has_a_name_of_its_own() -> None:
+    names = collections.Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
+    assert [name for name, count in names.items() if count > 1] == []
+
+
 def test_no_import_is_written_as_text() -> None:
     """import-linter and the test of circles see imports only."""
     pattern = re.compile(r'"((?:sim_engine|actors|orchestrator|decant)(?:\.\w+)+:\w+)"')

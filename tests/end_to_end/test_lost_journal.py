@@ -28,7 +28,7 @@ from tests.support.waiting import PATIENCE
 
 CAMPAIGN = small_campaign.CAMPAIGN.replace("directory: runs,", "directory: runs, figures: false, recording: false,")
 
-pytestmark = pytest.mark.slow  # the same losses of a toy run: tests/orchestrator/test_journal.py
+pytestmark = pytest.mark.slow  # the same losses of a toy run: tests/orchestrator/records/test_journal.py
 
 RUN = ("run", "small.yaml", "--in-process")
 RESUME = (*RUN, "--resume", "--run")

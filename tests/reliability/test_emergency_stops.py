@@ -1,7 +1,7 @@
 """An emergency stop with every body, while the arm of a virtual bench tilts: real processes, sockets, device protocols.
 
-One daemon takes all requests; every pour is a campaign of its own. `tests/orchestrator/daemon/test_emergency_stop.py`
-sends the same requests to a daemon without devices.
+One daemon takes all requests; every pour is a campaign of its own.
+`tests/orchestrator/daemon/rigs/test_emergency_stop.py` sends the same requests to a daemon without devices.
 """
 
 from __future__ import annotations

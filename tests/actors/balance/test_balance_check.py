@@ -13,8 +13,7 @@ from actors.balance.scale_model import SETTLED, Load, ScaleSettings
 from actors.balance.serial_balance import SerialBalance
 from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.interfaces import DeviceCheck
-
-from .conftest import SOON, spec_for
+from tests.actors.balance.conftest import SOON, spec_for
 
 SCALE = 5.0
 """Bench seconds per second: a busy machine reads a little late, and lateness counts five times."""

@@ -19,8 +19,7 @@ from actors.balance.balance_interface import (
 from actors.balance.balance_settings import SettlingRule
 from actors.balance.dialect_registry import dialects, encoders
 from actors.balance.scale_model import Load
-
-from .conftest import SOON
+from tests.actors.balance.conftest import SOON
 
 
 @pytest.mark.slow

@@ -13,8 +13,7 @@ from actors.balance.weighing import Weighings
 from actors.balance.weighing_plan import Placement
 from actors.interfaces import LaboratoryError, OperatorQuestion
 from actors.runtime.remote_object import LocalDevice
-
-from .conftest import spec_for
+from tests.actors.balance.conftest import spec_for
 
 LOADED, SPILLED, RETAINED = 0.2003, 0.0046, 0.0121
 POURER, RECEIVER, TRAY = 0.0873, 0.1421, 0.4096

@@ -1,0 +1,440 @@
+"""Meshes and points as scanners and CAD programs save them.
+
+`tests/data/meshes` holds one cup (345 mL) in seven unusual forms, and a bowl of sheet metal (655 mL). Forms that are
+made here follow public reports; each test names its own.
+"""
+
+from __future__ import annotations
+
+import gzip
+import logging
+import re
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+from orchestrator.campaigns.file_loading import load_vessel
+from orchestrator.cli.app import app
+from orchestrator.cli.file_commands import validate
+from orchestrator.extra_commands.vessel_tables import read_points
+from orchestrator.reports.pour_figures import section
+from sim_engine.errors import DecantError
+from sim_engine.vessel.exact_cavity import exact_cavity
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselError, VesselSpec
+from sim_engine.vessel.vessel import build_vessel
+from sim_engine.vessel_acquisition.mesh_repair import RepairedMesh, mended
+from tests.support.measured_vessel import vessel
+
+MESHES = Path(__file__).parents[2] / "data" / "meshes"
+TRUTH = {"thin_bowl.stl": 655.0}
+CUP = 345.0
+"""Capacities [mL]."""
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECANT_CACHE_DIR", str(tmp_path / "cache"))
+
+
+def unpacked(name: str, folder: Path) -> Path:
+    path = folder / name
+    path.write_bytes(gzip.decompress((MESHES / f"{name}.gz").read_bytes()))
+    return path
+
+
+def capacity(found: RepairedMesh) -> float:
+    """By the triangles [mL]."""
+    return 1e6 * exact_cavity(found.vertices, found.faces).volume
+
+
+@pytest.mark.parametrize(
+    ("name", "notes", "warnings", "drop"),
+    [
+        ("inner_faces.stl", ["192 inner face"], [], False),
+        ("holes.stl", [r"27 hole\(s\) closed"], [], False),
+        ("unmerged_0.1um.stl", ["corners less than 1 µm apart were joined"], [], False),
+        ("noise_0.3mm.stl", ["noisy; the thinnest part of its walls has about 2.1 mm"], [], False),
+        ("liquid_surface_sheet.stl", [], ["an open surface of 41.1 cm², 60 to 60 mm above the underside"], False),
+        ("liquid_body.stl", ["was left out: it holds 130 mL with it and 345 mL without it"], [], True),
+        ("cup_texture.ply", [], [], False),
+        ("thin_bowl.stl", ["walls of 0.66 mm are too thin .* thickened outwards to 1.2 mm"], [], False),
+    ],
+)
+def test_a_vessel_holds_what_it_holds_however_its_mesh_was_saved(
+    tmp_path: Path, name: str, notes: list[str], warnings: list[str], drop: bool
+) -> None:
+    found = mended(unpacked(name, tmp_path), unit="mm", wall=None, drop_bodies=drop)
+    assert capacity(found) == pytest.approx(TRUTH.get(name, CUP), rel=0.02 if "noise" in name else 0.005)
+    for expected, said in ((notes, found.notes), (warnings, found.warnings)):
+        assert len(said) == len(expected), said
+        for pattern, text in zip(expected, said, strict=True):
+            assert re.search(pattern, text), text
+
+
+def padded_stl() -> tuple[str, bytes]:
+    """Zeros after the last triangle, as in files that were copied in blocks."""
+    return "cup.stl", bytes(cup().export(file_type="stl")) + bytes(37)
+
+
+def relative_obj() -> tuple[str, bytes]:
+    """Every triangle after its own corners, with indices that count back (mikedh/trimesh#2364)."""
+    corners = cup().triangles
+    blocks = ["".join(f"v {x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in each) for each in corners]
+    return "cup.obj", "".join(f"vn 0 0 1\n{each}f -3//-1 -2//-1 -1//-1\n" for each in blocks).encode()
+
+
+def y_up_glb() -> tuple[str, bytes]:
+    """As every program writes it that follows glTF: metres, y up."""
+    mesh = cup()
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2.0, [1.0, 0.0, 0.0]))
+    mesh.apply_scale(1e-3)
+    return "cup.glb", bytes(mesh.export(file_type="glb"))
+
+
+@pytest.mark.parametrize("form", [padded_stl, relative_obj, y_up_glb])
+def test_a_vessel_is_read_as_its_format_is_defined(
+    tmp_path: Path, form: Callable[[], tuple[str, bytes]], capfd: pytest.CaptureFixture[str]
+) -> None:
+    name, content = form()
+    (tmp_path / name).write_bytes(content)
+    out = tmp_path / "made.yaml"
+    result = CliRunner().invoke(app, ["vessel", "mesh", str(tmp_path / name), str(out)])
+    assert result.exit_code == 0, result.output
+    assert 1e6 * build_vessel(load_vessel(out)).capacity == pytest.approx(CUP, rel=0.01)
+    (tmp_path / "named.yaml").write_text(f"name: cup\nmesh: {name}\nunit: {'m' if name.endswith('glb') else 'mm'}\n")
+    assert 1e6 * build_vessel(load_vessel(tmp_path / "named.yaml")).capacity == pytest.approx(CUP, rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [path.stem for path in sorted(MESHES.glob("*.gz"))])
+def test_what_is_simulated_and_drawn_is_the_repaired_vessel(
+    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "cup.yaml"
+    vessel(out, mesh=unpacked(name, tmp_path), unit="mm", drop_bodies=True)
+    assert out.with_suffix(".png").stat().st_size > 10_000
+    shown = capfd.readouterr()
+    assert "Traceback" not in shown.err
+    built = build_vessel(load_vessel(out))
+    assert 1e6 * built.capacity == pytest.approx(TRUTH.get(name, CUP), rel=0.02)
+    if "noise" in name:
+        assert built.wall_thickness == pytest.approx(2e-3, rel=0.2)
+    # the picture's outlines enclose the solid whose distance is simulated
+    drawn = np.vstack(section(built.solid_vertices, built.solid_faces))
+    points = np.column_stack([drawn[:, 0], np.zeros(len(drawn)), drawn[:, 1]])
+    assert np.abs(built.grid.sample(points)).max() < 0.5 * built.grid.spacing
+
+
+@pytest.mark.slow
+def test_a_body_in_the_cavity_is_kept_with_a_warning_unless_it_is_dropped(tmp_path: Path) -> None:
+    found = mended(unpacked("liquid_body.stl", tmp_path), unit="mm", wall=None)
+    assert capacity(found) == pytest.approx(129.0, rel=0.02)
+    (warning,) = found.warnings
+    assert "it holds 130 mL with it and 345 mL without it" in warning
+    assert "--drop-bodies" in warning
+
+
+def test_a_missing_texture_is_not_mentioned(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = unpacked("cup_texture.ply", tmp_path)
+    with caplog.at_level(logging.INFO):
+        mended(path, unit="mm", wall=None)
+        read_points(path, "mm", "z", [])
+    assert capfd.readouterr() == ("", "")
+    assert not caplog.records
+
+
+def cup(parts: int = 48) -> trimesh.Trimesh:
+    """The cup of the data [mm]."""
+    outline = [(0, 0), (35, 0), (40, 90), (38, 90), (33, 3), (0, 3)]
+    return trimesh.creation.revolve(np.array(outline, float), sections=parts)
+
+
+def flipped() -> trimesh.Trimesh:
+    """Faces whose order of corners says nothing (shapeways.com/tutorials/errors: face normals)."""
+    mesh = cup()
+    faces = np.array(mesh.faces)
+    turned = np.random.default_rng(1).random(len(faces)) < 0.3
+    faces[turned] = faces[turned][:, ::-1]
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def fins() -> trimesh.Trimesh:
+    """Single triangles that stand on edges: edges of three faces (github.com/mikedh/trimesh/issues/122 and 1573)."""
+    mesh = cup().subdivide().subdivide()
+    rng = np.random.default_rng(2)
+    chosen = rng.choice(len(mesh.faces), 40, replace=False)
+    tips = mesh.triangles_center[chosen] + mesh.face_normals[chosen] * rng.uniform(-1.0, 1.0, (40, 1))
+    new = np.column_stack([mesh.faces[chosen, 0], mesh.faces[chosen, 1], len(mesh.vertices) + np.arange(40)])
+    return trimesh.Trimesh(np.vstack([mesh.vertices, tips]), np.vstack([mesh.faces, new]), process=False)
+
+
+def solids_with_a_common_face() -> trimesh.Trimesh:
+    """Wall and floor as two CAD solids whose contact is one set of faces (shapeways.com/tutorials/errors: internal)."""
+    wall = trimesh.creation.revolve(
+        np.array([(33, 3), (33, 0), (35, 0), (40, 90), (38, 90), (33, 3)], float), sections=48
+    )
+    floor = trimesh.creation.revolve(np.array([(0, 0), (33, 0), (33, 3), (0, 3)], float), sections=48)
+    both = trimesh.util.concatenate([wall, floor])
+    both.merge_vertices()
+    both.update_faces(both.unique_faces())
+    return both
+
+
+def doubled() -> trimesh.Trimesh:
+    """Every face twice, once for each side, as programs without back faces save them."""
+    mesh = cup()
+    return trimesh.Trimesh(mesh.vertices, np.vstack([mesh.faces, mesh.faces[:, ::-1]]), process=False)
+
+
+@pytest.mark.parametrize("make", [flipped, solids_with_a_common_face, doubled])
+def test_edges_of_several_faces_and_mixed_orientations_are_read(
+    tmp_path: Path, make: Callable[[], trimesh.Trimesh]
+) -> None:
+    make().export(tmp_path / "cup.obj")
+    found = mended(tmp_path / "cup.obj", unit="mm", wall=None)
+    assert capacity(found) == pytest.approx(CUP, rel=0.01)
+    assert not found.warnings
+
+
+@pytest.mark.slow
+def test_triangles_that_stand_on_the_surface_do_not_change_the_cavity(tmp_path: Path) -> None:
+    fins().export(tmp_path / "cup.obj")
+    assert capacity(mended(tmp_path / "cup.obj", unit="mm", wall=None)) == pytest.approx(CUP, rel=0.01)
+
+
+@pytest.mark.slow
+def test_an_inner_and_an_outer_surface_without_a_rim_become_a_wall(tmp_path: Path) -> None:
+    mesh = cup()
+    mesh.update_faces(~((mesh.face_normals[:, 2] > 0.9) & (mesh.triangles_center[:, 2] > 80.0)))
+    mesh.export(tmp_path / "cup.stl")
+    found = mended(tmp_path / "cup.stl", unit="mm", wall=None)
+    assert capacity(found) == pytest.approx(CUP, rel=0.02)
+    assert "a new surface was made" in found.warnings[0]
+
+
+@pytest.mark.slow
+def test_a_rim_that_is_not_level_is_a_warning_with_its_angle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for degrees in (1.0, 5.0):
+        mesh = cup()
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(degrees), [1.0, 0.0, 0.0]))
+        mesh.export(tmp_path / f"{degrees:.0f}.stl")
+        vessel(tmp_path / f"cup{degrees:.0f}.yaml", mesh=tmp_path / f"{degrees:.0f}.stl", unit="mm")
+        said = capsys.readouterr().err
+        assert ("warning: its rim is 5.0° off level" in said) == (degrees == 5.0), said
+
+
+def test_a_mesh_in_metres_that_is_called_millimetres_is_refused_with_the_likely_unit(tmp_path: Path) -> None:
+    cup().apply_scale(1e-3).export(tmp_path / "cup.stl")
+    with pytest.raises(VesselError, match=r"cup\.stl: its largest extent of 0\.09 mm is not .*'m' \(90 mm\)"):
+        mended(tmp_path / "cup.stl", unit="mm", wall=None)
+
+
+def test_a_mesh_that_is_not_closed_is_refused_in_a_vessel_file_with_the_command_that_repairs_it(tmp_path: Path) -> None:
+    path = unpacked("inner_faces.stl", tmp_path)
+    with pytest.raises(VesselError, match=r"decant vessel mesh inner_faces\.stl NEW\.yaml"):
+        build_vessel(VesselSpec(name="cup", shape=MeshShape(path=path, unit="mm")))
+
+
+def with_liquid(kind: str) -> trimesh.Trimesh:
+    """A cup with a thick wall, and its liquid as CAD assemblies save it: a body, or the surface with both sides.
+
+    A body has faces in common with the cup if both have the same corners.
+    """
+    outline = [(0, 0), (40, 0), (46, 90), (38, 90), (35, 49), (32, 8), (0, 8)]
+    mesh = trimesh.creation.revolve(np.array(outline, float), sections=16)
+    if kind == "alone":
+        return mesh
+    if kind == "surface":
+        disc = trimesh.creation.revolve(np.array([(0, 49), (30, 49)], float), sections=16)
+        disc = trimesh.Trimesh(disc.vertices, np.vstack([disc.faces, disc.faces[:, ::-1]]), process=False)
+        return trimesh.util.concatenate([mesh, disc])
+    low, high = ((8.5, 31), (49.0, 34)) if kind == "body" else ((8.0, 32), (49.0, 35))
+    liquid = trimesh.creation.revolve(np.array([(0, low[0]), low[::-1], high[::-1], (0, high[0])], float), sections=16)
+    return trimesh.util.concatenate([mesh, liquid])
+
+
+def vessel_file(folder: Path, kind: str) -> Path:
+    with_liquid(kind).export(folder / "cup.stl")
+    (folder / "cup.yaml").write_text("name: cup\nmesh: cup.stl\nunit: mm\n")
+    return folder / "cup.yaml"
+
+
+def test_a_quiet_command_prints_warnings(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["validate", "--quiet", str(vessel_file(tmp_path, "body"))])
+    assert result.exit_code == 0
+    assert "fills a part of the cavity and counts as solid" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("kind", "warning"),
+    [
+        ("alone", None),
+        (
+            "body",
+            r"a separate body of 68 × 68 × 40 mm fills .* holds (\d+) mL with it and (\d+) mL without it.*"
+            r"decant vessel mesh cup\.stl NEW\.yaml --drop-bodies",
+        ),
+        ("body that touches", "faces are shared by two bodies, which both count as solid"),
+    ],
+)
+def test_a_body_in_the_cavity_of_a_mesh_in_a_vessel_file_is_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str, warning: str | None
+) -> None:
+    path = vessel_file(tmp_path, kind)
+    for _ in range(2):  # computed, and from the cache
+        validate([path])
+        out, err = capsys.readouterr()
+        assert "ok (vessel, holds" in out
+        if warning is None:
+            assert "warning" not in err
+        else:
+            found = re.search(f"warning: .*cup.yaml: .*{warning}", " ".join(err.split()))
+            assert found, err
+            assert [float(text) for text in found.groups()] == pytest.approx(
+                [176.0, 312.0][: len(found.groups())], 0.03
+            )
+
+
+def test_a_surface_without_thickness_in_the_cavity_of_a_mesh_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(DecantError) as refused:
+        validate([vessel_file(tmp_path, "surface")])
+    assert refused.value.exit_code == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "bound no solid: a sheet without thickness" in said
+    assert "decant vessel mesh cup.stl NEW.yaml" in said
+
+
+def test_bodies_that_touch_along_an_edge_are_drawn() -> None:
+    """Edges of four faces; their outlines meet there (github.com/mikedh/trimesh/issues/145)."""
+    boxes = [trimesh.creation.box(bounds=[(x, -1, x), (x + 1, 1, x + 1)]) for x in (0.0, 1.0)]
+    both = trimesh.util.concatenate(boxes)
+    both.merge_vertices()
+    outlines = section(np.asarray(both.vertices, float), np.asarray(both.faces, np.int64))
+    area = sum(0.5 * np.sum(o[:, 0] * np.roll(o[:, 1], -1) - np.roll(o[:, 0], -1) * o[:, 1]) for o in outlines)
+    assert abs(area) == pytest.approx(2.0)
+
+
+# -- points
+
+
+def header(
+    data: str, fields: str = "x y z", size: str = "4 4 4", kind: str = "F F F", count: str = "1 1 1", n: int = 4
+):
+    return (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {fields}\nSIZE {size}\nTYPE {kind}\n"
+        f"COUNT {count}\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA {data}\n"
+    ).encode()
+
+
+POINTS = np.array([[1, 2, 3], [4, 5, 6], [np.nan, np.nan, np.nan], [70, 8, 90]], dtype=np.float32)
+PADDED = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("a", "V4"), ("rgb", "<u4"), ("ring", "<u2", (2,))])
+
+
+def as_text() -> bytes:
+    rows = "\n".join(f"{i} " + " ".join(map(str, row)) + " 4.2e+06" for i, row in enumerate(POINTS))
+    return header("ascii", "i x y z rgb", "2 4 4 4 4", "U F F F F", "1 1 1 1 1") + rows.encode()
+
+
+def as_records() -> bytes:
+    """Padding is called '_' (github.com/PDAL/PDAL/issues/3255); two bytes (github.com/dimatura/pypcd/issues/36)."""
+    rows = np.zeros(len(POINTS), PADDED)
+    rows["x"], rows["y"], rows["z"] = POINTS.T
+    return header("binary", "x y z _ rgb ring", "4 4 4 1 4 2", "F F F U U U", "1 1 1 4 1 2") + rows.tobytes()
+
+
+def literals(data: bytes) -> bytes:
+    """LZF without any copy."""
+    return b"".join(bytes([len(data[k : k + 32]) - 1]) + data[k : k + 32] for k in range(0, len(data), 32))
+
+
+def as_columns() -> bytes:
+    """Compressed: literals, and an overlapping copy of 32 zeros; then padding (as PCL writes to whole pages)."""
+    columns = POINTS.T.tobytes()
+    zeros = b"\x00\x00" + bytes([(7 << 5) | 0, 30 - 9, 0])  # one literal 0, and a copy of 30 from one byte before
+    body = literals(columns) + zeros + bytes([0, 0])
+    small, large = len(body), len(columns) + 32
+    return (
+        header("binary_compressed", "x y z extra", "4 4 4 8", "F F F F", "1 1 1 1")
+        + struct.pack("<II", small, large)
+        + body
+        + b"\0" * 100
+    )
+
+
+def as_stored_columns() -> bytes:
+    """'Compressed', but stored as it is (github.com/MapIV/pypcd4/issues/37)."""
+    columns = POINTS.T.tobytes()
+    return header("binary_compressed") + struct.pack("<II", len(columns), len(columns)) + columns
+
+
+@pytest.mark.parametrize("make", [as_text, as_records, as_columns, as_stored_columns])
+def test_pcd_is_read_in_every_encoding_and_missing_points_are_left_out(
+    tmp_path: Path, make: Callable[[], bytes]
+) -> None:
+    path = tmp_path / "cloud.pcd"
+    path.write_bytes(make())
+    notes: list[str] = []
+    np.testing.assert_allclose(read_points(path, "mm", "z", notes), 1e-3 * POINTS[[0, 1, 3]], rtol=1e-6)
+    assert notes == ["1 of 4 points without a measurement (not a number, or 0, 0, 0) were left out"]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"not a cloud", "its header has no line 'DATA'"),
+        (header("ascii", "x y intensity"), r"has the fields x, y, intensity; should have x, y and z"),
+        (header("binary") + b"\0" * 30, r"has 2 of 4 points: it was cut off"),
+        (header("ascii") + b"1 2 3\n4 5 6\n", r"has 2 of 4 points: it was cut off"),
+        (header("zip"), "has DATA zip; should be ascii, binary or binary_compressed"),
+        (header("binary_compressed") + struct.pack("<II", 9, 40), "has 40 bytes of points; 4 points need 48"),
+        (header("binary_compressed") + struct.pack("<II", 3, 48) + b"\xff\xff\xff", "refer to a place before"),
+        (header("binary", size="4 4 3"), "is a damaged PCD file"),
+        (header("ascii") + b"nan nan nan\n" * 4, r"none of its 4 points has finite x, y and z"),
+    ],
+)
+def test_a_damaged_pcd_file_is_one_clear_error(tmp_path: Path, content: bytes, said: str) -> None:
+    (tmp_path / "cloud.pcd").write_bytes(content)
+    with pytest.raises(DecantError, match=said) as refused:
+        read_points(tmp_path / "cloud.pcd", "mm", "z", [])
+    assert refused.value.exit_code == 2
+
+
+def test_points_in_metres_that_are_called_millimetres_are_refused_with_the_likely_unit(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "cloud.xyz", 1e-3 * POINTS)
+    with pytest.raises(DecantError, match=r"largest extent of 0\.087 mm is not a vessel's size.*'m' \(87 mm\)"):
+        read_points(tmp_path / "cloud.xyz", "mm", "z", [])
+
+
+def test_ply_with_other_elements_and_colours_is_read_without_a_word(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Elements of scanners beside vertices: a camera, and no faces (MeshLab, Stanford's range scans)."""
+    (tmp_path / "cloud.ply").write_text(
+        "ply\nformat ascii 1.0\ncomment TextureFile ../scan 1.png\nobj_info num_cols 2\nelement vertex 3\n"
+        "property float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty float confidence\n"
+        "element camera 1\nproperty float view_px\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+        "1 2 3 255 0.5\n4 5 6 255 0.5\n70 8 90 255 0.5\n0.5\n"
+    )
+    np.testing.assert_allclose(read_points(tmp_path / "cloud.ply", "mm", "z", []), 1e-3 * POINTS[[0, 1, 3]], rtol=1e-6)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_thin_wall_of_a_round_vessel_is_thickened_with_a_note(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "bowl.yaml"
+    vessel(out, height="50 mm", diameters="1 mm: 100 mm, 25 mm: 150 mm, 50 mm: 160 mm", wall="0.4 mm")
+    assert "a wall of 0.4 mm and a floor of 0.4 mm are too thin" in capsys.readouterr().err
+    assert "wall: 1.2" in out.read_text()
