@@ -58,6 +58,25 @@ GOOD_ACTION = ("--set", "angular_velocity=100", "--set", "x_offset=70")
 """Pours into the narrow cup of the campaign without touching it."""
 
 
+def series(*amounts: float, refill_below: str = "0 g", outputs: str = "directory: runs") -> str:
+    """Write the text of a campaign that pours amounts [g] into A1, A2, …"""
+    doses = ", ".join(f"{{amount: {amount} g, position: A{place}}}" for place, amount in enumerate(amounts, 1))
+    return f"""\
+name: series
+seed: 3
+laboratory: {{name: small, bench: {{liquid: {{particles: 400}}, time_scale: 0}}}}
+liquid: {{name: water, mass: 100 g}}
+pourer: beaker.yaml
+receiver: narrow.yaml
+motion: {{x_offset: 70 mm, height: 60 mm}}
+dispense:
+  refill_below: {refill_below}
+  doses: [{doses}]
+on_unknown: repeat
+outputs: {{{outputs}}}
+"""
+
+
 def write_campaign(folder: Path, text: str = CAMPAIGN) -> Path:
     """Write the campaign and its vessels; returns the campaign's file."""
     for name, vessel in (("beaker", BEAKER), ("tumbler", TUMBLER), ("narrow", NARROW)):

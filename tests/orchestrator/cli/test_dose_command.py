@@ -70,20 +70,7 @@ def test_doses_are_poured_weighed_and_recorded(campaign: Path) -> None:
     assert (predicted["filled"], predicted["left_g"]) == (False, pytest.approx((left or 0.0) - 15.0, abs=1.5))
 
 
-SERIES = """\
-name: series
-seed: 3
-laboratory: {name: small, bench: {liquid: {particles: 400}, time_scale: 0}}
-liquid: {name: water, mass: 100 g}
-pourer: beaker.yaml
-receiver: narrow.yaml
-motion: {x_offset: 70 mm, height: 60 mm}
-dispense:
-  refill_below: 40 g
-  doses: [{amount: 20 g, position: A1}, {amount: 25 g, position: A2}, {amount: 20 g, position: A3}]
-on_unknown: repeat
-outputs: {directory: runs}
-"""
+SERIES = small_campaign.series(20, 25, 20, refill_below="40 g")
 
 
 @pytest.mark.slow

@@ -38,24 +38,12 @@ from orchestrator.runs.run_tasks import run_task
 from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.vessel import build_vessel
 from tests.support.rerun_recordings import Contents, timeline, views
-from tests.support.small_campaign import write_campaign
+from tests.support.small_campaign import series, write_campaign
 from tests.support.waiting import PATIENCE
 
 AMOUNT = 0.025
 
-SERIES = """\
-name: series
-seed: 3
-laboratory: {name: small, bench: {liquid: {particles: 400}, time_scale: 0}}
-liquid: {name: water, mass: 100 g}
-pourer: beaker.yaml
-receiver: narrow.yaml
-motion: {x_offset: 70 mm, height: 60 mm}
-dispense:
-  doses: [{amount: 25 g, position: A1}]
-on_unknown: repeat
-outputs: {directory: runs}
-"""
+SERIES = series(25)
 
 
 def dose_events(folder: Path) -> tuple[Any, list[Event], list[tuple[float, DoseProgress]]]:

@@ -33,7 +33,7 @@ from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.vessel.shapes import cylinder
 from sim_engine.vessel.vessel import build_vessel
 from tests.support.output_schema import validated
-from tests.support.small_campaign import write_campaign
+from tests.support.small_campaign import series, write_campaign
 from tests.support.workbooks import workbook
 
 SAMPLES = shipped("recordings/dose-1.yaml").parent
@@ -417,19 +417,7 @@ def test_bad_input_of_the_commands(
     assert "Traceback" not in result.stderr
 
 
-SERIES = """\
-name: series
-seed: 3
-laboratory: {name: small, bench: {liquid: {particles: 400}, time_scale: 0}}
-liquid: {name: water, mass: 100 g}
-pourer: beaker.yaml
-receiver: narrow.yaml
-motion: {x_offset: 70 mm, height: 60 mm}
-dispense:
-  doses: [{amount: 25 g, position: A1}, {amount: 20 g, position: A2}]
-on_unknown: repeat
-outputs: {directory: runs, figures: false, recording: false, pour_recordings: true}
-"""
+SERIES = series(25, 20, outputs="directory: runs, figures: false, recording: false, pour_recordings: true")
 
 
 @pytest.mark.slow

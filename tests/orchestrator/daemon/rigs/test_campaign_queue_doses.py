@@ -14,23 +14,11 @@ from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseProgress, PourProgress, ProgressCallback
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
-from tests.support.small_campaign import write_campaign
+from tests.support.small_campaign import series, write_campaign
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
 from tests.support.toy_daemon import HeldBench, HeldLaboratory, run, serving
 
-SERIES = """\
-name: series
-seed: 3
-laboratory: {name: numbers, bench: {liquid: {particles: 400}, time_scale: 0}}
-liquid: {name: water, mass: 100 g}
-pourer: beaker.yaml
-receiver: narrow.yaml
-motion: {x_offset: 70 mm, height: 60 mm}
-dispense:
-  doses: [{amount: 20 g, position: A1}, {amount: 25 g, position: A2}]
-on_unknown: repeat
-outputs: {recording: false, figures: false}
-"""
+SERIES = series(20, 25, outputs="recording: false, figures: false")
 
 
 class DosingBench(HeldBench):
