@@ -1,4 +1,4 @@
-"""Opening laboratories, and the optimiser in them."""
+"""`laboratory`: opening laboratories, and the optimiser in them."""
 
 from __future__ import annotations
 

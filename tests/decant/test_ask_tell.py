@@ -1,4 +1,6 @@
-"""Pours that the caller makes: each is asked for once, and its outcome is told once, also over several processes."""
+"""`ask_tell`: pours that the caller makes: each is asked for once, and its outcome is told once, also over several
+processes.
+"""
 
 from __future__ import annotations
 

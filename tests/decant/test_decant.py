@@ -1,4 +1,4 @@
-"""`import decant`: light, typed, and the page about it true."""
+"""`decant`: `import decant`: light, typed, and the page about it true."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The library's station: ten pours from a program, as in the tutorial, and a campaign whose progress is shown."""
+"""`station`: the library's station: ten pours from a program, as in the tutorial, and a campaign whose progress is
+shown.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Contact between vessels: found before anything moves, described in words, quick enough to ask for every action."""
+"""`collision`: contact between vessels: found before anything moves, described in words, quick enough to ask for
+every action.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Liquid that runs down the outside of the pourer: when it does, where it drips, and what a simulation makes of it."""
+"""`dribbling`: liquid that runs down the outside of the pourer: when it does, where it drips, and what a simulation
+makes of it.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The packages that can compile the solver: choice, check of the first pour, and the same physics."""
+"""`engine_package`: the packages that can compile the solver: choice, check of the first pour, and the same physics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Tilted vessels at rest and the tilting-cup equation, against tables, integrals and particle solvers."""
+"""`hydrostatics`: tilted vessels at rest and the tilting-cup equation, against tables, integrals and particle
+solvers.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The table of liquids, against values printed elsewhere than its formulas come from."""
+"""`liquids`: the table of liquids, against values printed elsewhere than its formulas come from."""
 
 from __future__ import annotations
 

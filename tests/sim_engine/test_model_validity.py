@@ -1,4 +1,6 @@
-"""Dimensionless numbers of planned pours: that they scale as they must, and on which side of a limit one is warned."""
+"""`model_validity`: dimensionless numbers of planned pours: that they scale as they must, and on which side of a
+limit one is warned.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pourer's motion: what the arm executes and the solver replays."""
+"""`motion`: the pourer's motion: what the arm executes and the solver replays."""
 
 from __future__ import annotations
 

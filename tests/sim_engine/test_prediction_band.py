@@ -1,4 +1,4 @@
-"""Where a single pour lies, given its simulations and what the simulator lacks."""
+"""`prediction_band`: where a single pour lies, given its simulations and what the simulator lacks."""
 
 from __future__ import annotations
 

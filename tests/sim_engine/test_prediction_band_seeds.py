@@ -1,4 +1,4 @@
-"""What several seeds come to."""
+"""`prediction_band`: what several seeds come to."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nuisances of a bench: the simulator applies them as what they are: a receiver elsewhere, a slow clock."""
+"""`scene`: nuisances of a bench: the simulator applies them as what they are: a receiver elsewhere, a slow clock."""
 
 from __future__ import annotations
 

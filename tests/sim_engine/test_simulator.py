@@ -1,4 +1,4 @@
-"""The simulator of pours: one after another in one process."""
+"""`simulator`: the simulator of pours: one after another in one process."""
 
 from __future__ import annotations
 

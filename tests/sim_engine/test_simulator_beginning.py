@@ -1,4 +1,4 @@
-"""When a simulation has to begin."""
+"""`simulator`: when a simulation has to begin."""
 
 from __future__ import annotations
 

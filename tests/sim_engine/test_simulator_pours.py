@@ -1,4 +1,4 @@
-"""Simulated pours: what goes in comes out, and physics that anybody can check."""
+"""`simulator`: simulated pours: what goes in comes out, and physics that anybody can check."""
 
 from __future__ import annotations
 

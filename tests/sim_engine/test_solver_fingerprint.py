@@ -1,4 +1,4 @@
-"""Results belong together as long as what simulates a pour does the same."""
+"""`solver_fingerprint`: results belong together as long as what simulates a pour does the same."""
 
 from __future__ import annotations
 

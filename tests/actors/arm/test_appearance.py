@@ -1,4 +1,4 @@
-"""An arm is drawn where its kinematics say that it is."""
+"""`appearance`: an arm is drawn where its kinematics say that it is."""
 
 from __future__ import annotations
 

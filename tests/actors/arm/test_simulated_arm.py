@@ -1,4 +1,6 @@
-"""The arm of numbers: scaled time, what it reads back, and a stop that does not queue behind the motion."""
+"""`simulated_arm`: the arm of numbers: scaled time, what it reads back, and a stop that does not queue behind the
+motion.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The commissioning check of a balance, on emulators with an injected lag, drift, scatter and error of scale."""
+"""`balance_check`: the commissioning check of a balance, on emulators with an injected lag, drift, scatter and
+error of scale.
+"""
 
 from __future__ import annotations
 

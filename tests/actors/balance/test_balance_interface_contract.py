@@ -1,4 +1,4 @@
-"""Our own balances do what every balance has to do."""
+"""`balance_interface`: our own balances do what every balance has to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a weight counts."""
+"""`balance_settings`: when a weight counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finding out what is at the other end of the line, and saying what was tried where that fails."""
+"""`dialect_detection`: finding out what is at the other end of the line, and saying what was tried where that fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Habits of real displays, on the virtual bench of doses, the emulated serial balance and the simulated balance.
+"""`display_behaviour`: habits of real displays, on the virtual bench of doses, the emulated serial balance and the
+simulated balance.
 
 The recordings of Bluetooth balances in github.com/miharekar/visualizer have gaps with medians of 0.09 to 0.12 s,
 standard deviations of 0.021 to 0.046 s, and largest values of 0.22 to 0.46 s; in one of the six, 22 % of the readings

@@ -1,4 +1,6 @@
-"""What is reported about a display: arrivals, repeated readings during a rise, and the tolerance of a dose."""
+"""`display_quality`: what is reported about a display: arrivals, repeated readings during a rise, and the tolerance
+of a dose.
+"""
 
 from __future__ import annotations
 

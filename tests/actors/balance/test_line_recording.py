@@ -1,4 +1,6 @@
-"""Raw bytes recorded and played. Nothing here was recorded on a real balance: sources say 'virtual' or 'typed'."""
+"""`line_recording`: raw bytes recorded and played. Nothing here was recorded on a real balance: sources say
+'virtual' or 'typed'.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Units of balances and of people who type."""
+"""`readings`: units of balances and of people who type."""
 
 from __future__ import annotations
 

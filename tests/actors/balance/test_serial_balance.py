@@ -1,4 +1,6 @@
-"""The driver through the real pyserial, against virtual balances of every dialect: weights, tare, refusals."""
+"""`serial_balance`: the driver through the real pyserial, against virtual balances of every dialect: weights, tare,
+refusals.
+"""
 
 from __future__ import annotations
 

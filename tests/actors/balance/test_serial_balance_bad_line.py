@@ -1,4 +1,4 @@
-"""The driver at a bad line: silence, damage, late answers, lost and taken ports."""
+"""`serial_balance`: the driver at a bad line: silence, damage, late answers, lost and taken ports."""
 
 from __future__ import annotations
 

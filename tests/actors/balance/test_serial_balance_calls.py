@@ -1,4 +1,6 @@
-"""Several calls of the driver at a time: interrupts, streams, pace, and the driver behind its device."""
+"""`serial_balance`: several calls of the driver at a time: interrupts, streams, pace, and the driver behind its
+device.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The driver where more comes than weights: tares, net and gross, other protocols, numbers that are no mass."""
+"""`serial_balance`: the driver where more comes than weights: tares, net and gross, other protocols, numbers that
+are no mass.
+"""
 
 from __future__ import annotations
 

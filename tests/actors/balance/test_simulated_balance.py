@@ -1,4 +1,4 @@
-"""The virtual balance behaves as its data sheet says, and a pour's seed decides every reading."""
+"""`simulated_balance`: the virtual balance behaves as its data sheet says, and a pour's seed decides every reading."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The lag of a display, from readings whose lag is known."""
+"""`step_response`: the lag of a display, from readings whose lag is known."""
 
 from __future__ import annotations
 

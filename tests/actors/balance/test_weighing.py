@@ -1,4 +1,4 @@
-"""A whole pour's weighings on virtual balances over serial lines, with somebody who does what is asked."""
+"""`weighing`: a whole pour's weighings on virtual balances over serial lines, with somebody who does what is asked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Wherever the balance stands, a pour has the same masses, and nothing is assumed where a weighing is missing."""
+"""`weighing_plan`: wherever the balance stands, a pour has the same masses, and nothing is assumed where a weighing
+is missing.
+"""
 
 from __future__ import annotations
 

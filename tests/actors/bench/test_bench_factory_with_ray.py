@@ -1,4 +1,6 @@
-"""The wired bench in processes of its own: what a stopped arm says survives the way here, and so does a dead driver."""
+"""`bench_factory`: the wired bench in processes of its own: what a stopped arm says survives the way here, and so
+does a dead driver.
+"""
 
 from __future__ import annotations
 

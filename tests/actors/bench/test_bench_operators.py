@@ -1,4 +1,6 @@
-"""Parts of the wired bench by themselves: what is cut out of a history, kept in a journal, asked, and carried."""
+"""`bench_operators`: parts of the wired bench by themselves: what is cut out of a history, kept in a journal,
+asked, and carried.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Wanted amounts over real wires: the virtual controller's registers, virtual serial balances, and faults in the flow.
+"""`dose_procedure`: wanted amounts over real wires: the virtual controller's registers, virtual serial balances,
+and faults in the flow.
 
 The bench runs at half the speed of the clock, so that a busy machine does not count as a lost connection.
 """

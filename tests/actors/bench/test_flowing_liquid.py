@@ -1,4 +1,6 @@
-"""Liquid that follows an emulated arm: a lost answer is made up for; an emulator that has ended ends the flow."""
+"""`flowing_liquid`: liquid that follows an emulated arm: a lost answer is made up for; an emulator that has ended
+ends the flow.
+"""
 
 from __future__ import annotations
 

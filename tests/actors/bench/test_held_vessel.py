@@ -1,4 +1,4 @@
-"""A pour with a gripper: what the operator is asked, and what happens to a pourer that slips away."""
+"""`held_vessel`: a pour with a gripper: what the operator is asked, and what happens to a pourer that slips away."""
 
 from __future__ import annotations
 

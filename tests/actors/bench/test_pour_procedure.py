@@ -1,4 +1,6 @@
-"""A whole pour over wires: what is asked in which order, when the arm may move, what is measured and kept."""
+"""`pour_procedure`: a whole pour over wires: what is asked in which order, when the arm may move, what is measured
+and kept.
+"""
 
 from __future__ import annotations
 

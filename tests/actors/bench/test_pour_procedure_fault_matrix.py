@@ -1,4 +1,5 @@
-"""Every fault in every phase of a pour: what the arm does, what is recorded, what the operator is told.
+"""`pour_procedure`: every fault in every phase of a pour: what the arm does, what is recorded, what the operator is
+told.
 
 In all of them: nothing moves after a fault until somebody has consented, the pourer is never tilted again, and no
 weight is lost. Faults are real ones, of the controller's process, of the driver's worker, and of the balance's line.

@@ -1,4 +1,6 @@
-"""A program that was stopped for longer than its virtual controller remembers: what was poured then is not known."""
+"""`pour_procedure`: a program that was stopped for longer than its virtual controller remembers: what was poured
+then is not known.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""An arm that carries the vessels between places, pours the receiver back, and accounts for every gram."""
+"""`vessel_handling`: an arm that carries the vessels between places, pours the receiver back, and accounts for
+every gram.
+"""
 
 from __future__ import annotations
 

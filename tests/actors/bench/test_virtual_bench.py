@@ -1,4 +1,6 @@
-"""A whole pour on the bench of numbers: seeds, checkpoints, what is hidden, and what happens when something fails."""
+"""`virtual_bench`: a whole pour on the bench of numbers: seeds, checkpoints, what is hidden, and what happens when
+something fails.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A virtual bench whose arm has nothing at its far end: the liquid follows what the driver read back."""
+"""`virtual_bench`: a virtual bench whose arm has nothing at its far end: the liquid follows what the driver read
+back.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Doses of wanted amounts: the flow of the cup, the estimate, and whole doses on the virtual bench."""
+"""`dose_controller`: doses of wanted amounts: the flow of the cup, the estimate, and whole doses on the virtual
+bench.
+"""
 
 from __future__ import annotations
 

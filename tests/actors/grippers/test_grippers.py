@@ -1,4 +1,6 @@
-"""Shipped grippers against emulators over loopback sockets, and what their protocols make of every kind of bytes."""
+"""`grippers`: shipped grippers against emulators over loopback sockets, and what their protocols make of every kind
+of bytes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Where proposals may lie: whole numbers, logarithms, linear constraints, and places that were refused."""
+"""`feasible_region`: where proposals may lie: whole numbers, logarithms, linear constraints, and places that were
+refused.
+"""
 
 import math
 

@@ -1,4 +1,6 @@
-"""CVaR is what it is called, and a surrogate over what was executed finds the action that bears errors."""
+"""`risk_measures`: CVaR is what it is called, and a surrogate over what was executed finds the action that bears
+errors.
+"""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""`suggest`: answers to questions about actions and parameters."""
+
 import math
 from dataclasses import replace
 

@@ -1,4 +1,6 @@
-"""Averaging over the ways in which a simulator can be wrong, and pours chosen by what they lose on the way."""
+"""`suggest`: averaging over the ways in which a simulator can be wrong, and pours chosen by what they lose on the
+way.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""What holds for any question: bounds, constraints, order of answers, and what must not get into a fit."""
+"""`suggest`: what holds for any question: bounds, constraints, order of answers, and what must not get into a fit."""
 
 import math
 from dataclasses import replace

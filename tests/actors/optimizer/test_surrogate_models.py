@@ -1,4 +1,4 @@
-"""What the surrogates make of simulations that are right, off, scaled or wrong."""
+"""`surrogate_models`: what the surrogates make of simulations that are right, off, scaled or wrong."""
 
 import json
 import math

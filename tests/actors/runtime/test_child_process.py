@@ -1,4 +1,6 @@
-"""Child processes: they start while the environment changes, end with their parent, and say how they ended."""
+"""`child_process`: child processes: they start while the environment changes, end with their parent, and say how
+they ended.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""However a program that uses Ray ends: no process, no folder, nothing in the home folder, nothing on the network."""
+"""`ray_cleanup`: however a program that uses Ray ends: no process, no folder, nothing in the home folder, nothing
+on the network.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""On a Ray cluster of two nodes: refused before anything starts, or at work although a node dies."""
+"""`ray_cluster`: on a Ray cluster of two nodes: refused before anything starts, or at work although a node dies."""
 
 from __future__ import annotations
 

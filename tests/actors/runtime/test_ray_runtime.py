@@ -1,4 +1,6 @@
-"""Ray's own processes die or are cut off under an open laboratory: whoever waits is told why, after seconds."""
+"""`ray_runtime`: Ray's own processes die or are cut off under an open laboratory: whoever waits is told why, after
+seconds.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calls of a blocking object from the event loop."""
+"""`remote_object`: calls of a blocking object from the event loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One simulator as the pools use it: when its kernels reach the cache."""
+"""`job_runner`: one simulator as the pools use it: when its kernels reach the cache."""
 
 from __future__ import annotations
 

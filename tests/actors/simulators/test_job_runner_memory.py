@@ -1,4 +1,4 @@
-"""Memory that was freed goes back to the system, and threads do not each keep some of their own."""
+"""`job_runner`: memory that was freed goes back to the system, and threads do not each keep some of their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pool of simulators: deaths, cancellation, deadlines, and its twin without Ray."""
+"""`pool`: the pool of simulators: deaths, cancellation, deadlines, and its twin without Ray."""
 
 from __future__ import annotations
 

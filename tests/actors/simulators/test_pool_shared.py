@@ -1,4 +1,4 @@
-"""Simulators that several laboratories share: turns for all, none lost, none left behind."""
+"""`pool`: simulators that several laboratories share: turns for all, none lost, none left behind."""
 
 from __future__ import annotations
 

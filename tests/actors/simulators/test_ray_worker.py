@@ -1,4 +1,4 @@
-"""Tasks that travel to machines without this one's files."""
+"""`ray_worker`: tasks that travel to machines without this one's files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What can be run and makes little sense is told, with what would: offsets that no stream bridges, tilts too fast."""
+"""`campaign_checks`: what can be run and makes little sense is told, with what would: offsets that no stream
+bridges, tilts too fast.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Every bad campaign or record gets an error that says where it is, what is wrong and what would be right."""
+"""`campaign_file`: every bad campaign or record gets an error that says where it is, what is wrong and what would
+be right.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""`deployment.risk` and `deployment.window` as people write them: what they mean, what is wrong, what a run keeps."""
+"""`campaign_resolution`: `deployment.risk` and `deployment.window` as people write them: what they mean, what is
+wrong, what a run keeps.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What campaigns may say about strategies: their own keys, what they cost, and errors that say where."""
+"""`campaign_resolution`: what campaigns may say about strategies: their own keys, what they cost, and errors that
+say where.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Campaign files mean what they say, and say where they are wrong."""
+"""`file_loading`: campaign files mean what they say, and say where they are wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An arm and its cell in a laboratory's file mean what they say, and say where they are wrong."""
+"""`file_loading`: an arm and its cell in a laboratory's file mean what they say, and say where they are wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arm of a laboratory's file is of one of the kinds that are installed, ours as everybody's."""
+"""`file_loading`: the arm of a laboratory's file is of one of the kinds that are installed, ours as everybody's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Bad vessels, parameters, laboratories and values of the command line, and campaigns that no vessel can serve."""
+"""`file_loading`: bad vessels, parameters, laboratories and values of the command line, and campaigns that no
+vessel can serve.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A balance in a laboratory's file means what it says, and says where it is wrong."""
+"""`file_loading`: a balance in a laboratory's file means what it says, and says where it is wrong."""
 
 from __future__ import annotations
 

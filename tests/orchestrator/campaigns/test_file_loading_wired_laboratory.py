@@ -1,4 +1,6 @@
-"""A laboratory over wires in a file: what fits together, what doesn't, and what may change during a run."""
+"""`file_loading`: a laboratory over wires in a file: what fits together, what doesn't, and what may change during a
+run.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What a run keeps of its campaign loads to the same plan: shipped campaigns, cells of studies, and generated ones."""
+"""`run_snapshot`: what a run keeps of its campaign loads to the same plan: shipped campaigns, cells of studies, and
+generated ones.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Tables of weighed pours as spreadsheet programs, pandas and numpy save them: read with a note, or one clear error.
+"""`saved_table`: tables of weighed pours as spreadsheet programs, pandas and numpy save them: read with a note, or
+one clear error.
 
 Every dialect holds the same pours. Sources of the dialects, all public reports of other programs:
 

@@ -1,4 +1,6 @@
-"""Constraints between dimensions of an action: what a file may say, and that no strategy asks for anything else."""
+"""`search_ranges`: constraints between dimensions of an action: what a file may say, and that no strategy asks for
+anything else.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files that come with Decant load, fit their schemas, and say what they should."""
+"""`shipped`: the files that come with Decant load, fit their schemas, and say what they should."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The catalogue of runs: what is found in it, and that it is right whatever happened to the runs or to itself."""
+"""`catalogue`: the catalogue of runs: what is found in it, and that it is right whatever happened to the runs or to
+itself.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every command line has: a version, completion, quiet; and what every verb of this one takes."""
+"""`app`: what every command line has: a version, completion, quiet; and what every verb of this one takes."""
 
 from __future__ import annotations
 

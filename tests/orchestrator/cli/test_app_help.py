@@ -1,4 +1,4 @@
-"""What the command's help teaches, and what it says before anything has begun."""
+"""`app`: what the command's help teaches, and what it says before anything has begun."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the command refuses, with which words, and how soon."""
+"""`app`: what the command refuses, with which words, and how soon."""
 
 from __future__ import annotations
 

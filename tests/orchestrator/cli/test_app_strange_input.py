@@ -1,4 +1,4 @@
-"""Bad input of every kind that a person, a spreadsheet or a camera may make: one clear error, exit code 2."""
+"""`app`: bad input of every kind that a person, a spreadsheet or a camera may make: one clear error, exit code 2."""
 
 from __future__ import annotations
 

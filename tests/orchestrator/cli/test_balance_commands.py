@@ -1,4 +1,6 @@
-"""`decant balance check`: for a virtual laboratory it asks nobody; otherwise it says what it needs."""
+"""`balance_commands`: `decant balance check`: for a virtual laboratory it asks nobody; otherwise it says what it
+needs.
+"""
 
 from __future__ import annotations
 

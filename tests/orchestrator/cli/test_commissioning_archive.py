@@ -1,4 +1,6 @@
-"""The recordings of a commissioning day in one file, and their replay. Nothing here was recorded on a real rig."""
+"""`commissioning_archive`: the recordings of a commissioning day in one file, and their replay. Nothing here was
+recorded on a real rig.
+"""
 
 from __future__ import annotations
 

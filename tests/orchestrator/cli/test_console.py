@@ -1,4 +1,6 @@
-"""People who wait are told what for: soon at a terminal, now and then in a file, never if they want it quiet."""
+"""`console`: people who wait are told what for: soon at a terminal, now and then in a file, never if they want it
+quiet.
+"""
 
 from __future__ import annotations
 

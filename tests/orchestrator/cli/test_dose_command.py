@@ -1,4 +1,4 @@
-"""`decant dose`: predicted amounts, doses in a journal, and refusals before anything moves."""
+"""`dose_command`: `decant dose`: predicted amounts, doses in a journal, and refusals before anything moves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`decant validate`: every problem of every file, quickly, and nothing started."""
+"""`file_commands`: `decant validate`: every problem of every file, quickly, and nothing started."""
 
 from __future__ import annotations
 

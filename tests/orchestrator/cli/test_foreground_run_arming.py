@@ -1,4 +1,6 @@
-"""Hardware moves only for somebody who asked for it, read what it will do, and typed its name. At a real terminal."""
+"""`foreground_run`: hardware moves only for somebody who asked for it, read what it will do, and typed its name. At
+a real terminal.
+"""
 
 from __future__ import annotations
 

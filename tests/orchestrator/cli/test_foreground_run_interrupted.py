@@ -1,4 +1,4 @@
-"""What people are told when they stop a run: that nothing is lost only where nothing is."""
+"""`foreground_run`: what people are told when they stop a run: that nothing is lost only where nothing is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Commands with --json print their models; catalogue and daemon return what their documented schema says."""
+"""`json_output`: commands with --json print their models; catalogue and daemon return what their documented schema
+says.
+"""
 
 from __future__ import annotations
 

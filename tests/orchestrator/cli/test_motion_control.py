@@ -1,4 +1,6 @@
-"""Jogging: small steps as typed, each axis confirmed once, limits told in words, Ctrl-C stops the arm."""
+"""`motion_control`: jogging: small steps as typed, each axis confirmed once, limits told in words, Ctrl-C stops the
+arm.
+"""
 
 from __future__ import annotations
 

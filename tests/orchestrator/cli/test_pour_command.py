@@ -1,4 +1,6 @@
-"""`decant pour`: what a careful person tries first. Planned without moving, with an empty pourer, slowly."""
+"""`pour_command`: `decant pour`: what a careful person tries first. Planned without moving, with an empty pourer,
+slowly.
+"""
 
 from __future__ import annotations
 

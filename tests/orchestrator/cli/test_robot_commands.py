@@ -1,4 +1,6 @@
-"""`decant robot check` before a bench in every wrong state: it says what is wrong and what to do, and nothing moves."""
+"""`robot_commands`: `decant robot check` before a bench in every wrong state: it says what is wrong and what to do,
+and nothing moves.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shell completion, as bash, zsh and fish ask for it."""
+"""`shell_completion`: shell completion, as bash, zsh and fish ask for it."""
 
 from __future__ import annotations
 

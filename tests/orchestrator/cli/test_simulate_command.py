@@ -1,4 +1,4 @@
-"""`decant simulate`: what it prints, writes, and says about what it does not know."""
+"""`simulate_command`: `decant simulate`: what it prints, writes, and says about what it does not know."""
 
 from __future__ import annotations
 

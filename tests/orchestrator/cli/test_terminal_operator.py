@@ -1,4 +1,4 @@
-"""The person at the bench is asked in the terminal: at a real pseudo-terminal, by typing."""
+"""`terminal_operator`: the person at the bench is asked in the terminal: at a real pseudo-terminal, by typing."""
 
 from __future__ import annotations
 

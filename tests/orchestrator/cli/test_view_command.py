@@ -1,4 +1,6 @@
-"""`decant view`: recordings are served without a display, beside each other; pours are simulated again."""
+"""`view_command`: `decant view`: recordings are served without a display, beside each other; pours are simulated
+again.
+"""
 
 from __future__ import annotations
 

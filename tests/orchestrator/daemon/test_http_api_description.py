@@ -1,4 +1,4 @@
-"""The API's description, as committed, is that of the API."""
+"""`http_api`: the API's description, as committed, is that of the API."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The operator's page in a real Chromium: what somebody with wet hands, a keyboard or a screen reader finds there."""
+"""`http_api`: the operator's page in a real Chromium: what somebody with wet hands, a keyboard or a screen reader
+finds there.
+"""
 
 from __future__ import annotations
 

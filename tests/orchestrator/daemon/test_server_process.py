@@ -1,4 +1,6 @@
-"""A daemon whose Ray has died begins anew: what it finishes before, what it leaves, and when people have to mend it."""
+"""`server_process`: a daemon whose Ray has died begins anew: what it finishes before, what it leaves, and when
+people have to mend it.
+"""
 
 from __future__ import annotations
 

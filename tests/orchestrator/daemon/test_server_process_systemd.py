@@ -1,4 +1,4 @@
-"""The unit file that Decant comes with, as systemd itself reads it."""
+"""`server_process`: the unit file that Decant comes with, as systemd itself reads it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""`decant validate-solver`: what a person sees of the solver's cases, and the page that it writes."""
+"""`physics_command`: `decant validate-solver`: what a person sees of the solver's cases, and the page that it
+writes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`decant vessel`: shipped cups, measured with the errors of real tools, through every door."""
+"""`vessel_command`: `decant vessel`: shipped cups, measured with the errors of real tools, through every door."""
 
 from __future__ import annotations
 

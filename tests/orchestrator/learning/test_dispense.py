@@ -1,4 +1,6 @@
-"""A series of wanted amounts: one dose after the other, none repeated, out of sources that are tracked and filled."""
+"""`dispense`: a series of wanted amounts: one dose after the other, none repeated, out of sources that are tracked
+and filled.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is recommended is poured again, by pours that took no part in choosing it."""
+"""`single_action`: what is recommended is poured again, by pours that took no part in choosing it."""
 
 from __future__ import annotations
 

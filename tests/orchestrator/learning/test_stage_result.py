@@ -1,4 +1,6 @@
-"""What stages learnt, written and read back by its kind; and what is written after a run, whoever drove it."""
+"""`stage_result`: what stages learnt, written and read back by its kind; and what is written after a run, whoever
+drove it.
+"""
 
 from __future__ import annotations
 

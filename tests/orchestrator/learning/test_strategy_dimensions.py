@@ -1,4 +1,6 @@
-"""What holds for every strategy in two, four and six dimensions, with integer and logarithmic axes among them."""
+"""`strategy`: what holds for every strategy in two, four and six dimensions, with integer and logarithmic axes
+among them.
+"""
 
 from __future__ import annotations
 

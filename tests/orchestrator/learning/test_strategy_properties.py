@@ -1,4 +1,6 @@
-"""What holds for every strategy, C1 to C4 and D1 to D3: whoever finishes first, whatever fails, wherever it stops."""
+"""`strategy`: what holds for every strategy, C1 to C4 and D1 to D3: whoever finishes first, whatever fails,
+wherever it stops.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The paper's own methods, as campaigns and studies name them, are what the paper has and not our changes to them."""
+"""`strategy_registry`: the paper's own methods, as campaigns and studies name them, are what the paper has and not
+our changes to them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A live view shows everything to everybody who looks, early or late, and nobody who looks is in anybody's way."""
+"""`live_server`: a live view shows everything to everybody who looks, early or late, and nobody who looks is in
+anybody's way.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recording has what people want to see, and watching never holds up or breaks a run."""
+"""`rerun_subscriber`: the recording has what people want to see, and watching never holds up or breaks a run."""
 
 from __future__ import annotations
 

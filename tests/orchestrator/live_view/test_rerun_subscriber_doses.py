@@ -1,4 +1,4 @@
-"""The recording of a dose has what the viewer's tab "Dosing" shows."""
+"""`rerun_subscriber`: the recording of a dose has what the viewer's tab "Dosing" shows."""
 
 from __future__ import annotations
 

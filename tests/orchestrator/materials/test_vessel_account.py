@@ -1,4 +1,6 @@
-"""The account of vessels: one content for doses, orders, pours by hand and weighings, in every process and restart."""
+"""`vessel_account`: the account of vessels: one content for doses, orders, pours by hand and weighings, in every
+process and restart.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The first day of a rig: its steps, its explanations, and what the command refuses."""
+"""`first_day`: the first day of a rig: its steps, its explanations, and what the command refuses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recorded pours that cannot be: refused with the likely cause; right ones pass without a word.
+"""`recording_checks`: recorded pours that cannot be: refused with the likely cause; right ones pass without a word.
 
 The wrong ones are the shipped dose with one column misread, as a person or a program misreads it. Public reports:
 

@@ -1,4 +1,4 @@
-"""Recorded pours: their files, what is refused, replay, fit, and export from runs."""
+"""`recording_file`: recorded pours: their files, what is refused, replay, fit, and export from runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requests and outcomes survive the journal bit for bit: a replay must tell what the live run told."""
+"""`codec`: requests and outcomes survive the journal bit for bit: a replay must tell what the live run told."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Those who watch see everything and change nothing."""
+"""`events`: those who watch see everything and change nothing."""
 
 from __future__ import annotations
 

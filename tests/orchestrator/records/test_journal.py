@@ -1,4 +1,4 @@
-"""The journal keeps what was written, refuses what it should, and is held by one process at a time."""
+"""`journal`: the journal keeps what was written, refuses what it should, and is held by one process at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A full disk takes no weighing away. The disk is a real one: a small file system in memory, filled to the brim."""
+"""`journal`: a full disk takes no weighing away. The disk is a real one: a small file system in memory, filled to
+the brim.
+"""
 
 from __future__ import annotations
 

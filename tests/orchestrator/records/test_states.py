@@ -1,4 +1,4 @@
-"""The states of a campaign, its stages and their seeds."""
+"""`states`: the states of a campaign, its stages and their seeds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person at the terminal, or a reader of a CI log, gets to see of a run."""
+"""`console_progress`: what a person at the terminal, or a reader of a CI log, gets to see of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The report of a run: everything on one page, nothing beside it, honest about what is not finished or not known."""
+"""`html_report`: the report of a run: everything on one page, nothing beside it, honest about what is not finished
+or not known.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Report pages in a real Chromium: they open from a file, ask nobody for anything, and show all their figures."""
+"""`html_report`: report pages in a real Chromium: they open from a file, ask nobody for anything, and show all
+their figures.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One simulated pour as a picture: vessels cut open, particles, shares of the liquid."""
+"""`pour_figures`: one simulated pour as a picture: vessels cut open, particles, shares of the liquid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of a planned path shows the arm, the vessels, and all that is written on it."""
+"""`pour_figures`: the picture of a planned path shows the arm, the vessels, and all that is written on it."""
 
 from __future__ import annotations
 

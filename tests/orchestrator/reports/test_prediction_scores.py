@@ -1,4 +1,4 @@
-"""How predictions of weighed pours are scored, tabled and drawn."""
+"""`prediction_scores`: how predictions of weighed pours are scored, tabled and drawn."""
 
 from __future__ import annotations
 

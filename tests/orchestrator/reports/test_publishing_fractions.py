@@ -1,4 +1,6 @@
-"""A fraction is what its name says, wherever it is published: it is compared with the masses beside it."""
+"""`publishing`: a fraction is what its name says, wherever it is published: it is compared with the masses beside
+it.
+"""
 
 from __future__ import annotations
 

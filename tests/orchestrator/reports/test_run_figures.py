@@ -1,4 +1,4 @@
-"""Figures say what the strategies' results say, in the units that people read."""
+"""`run_figures`: figures say what the strategies' results say, in the units that people read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The summary of a run: its table for people, its file for programs."""
+"""`run_summary`: the summary of a run: its table for people, its file for programs."""
 
 from __future__ import annotations
 

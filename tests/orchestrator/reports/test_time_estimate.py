@@ -1,4 +1,4 @@
-"""What is told of the time that is left comes true."""
+"""`time_estimate`: what is told of the time that is left comes true."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What is not simulated is told where people meet it: once per campaign, for its best actions, for a single pour."""
+"""`validity_warnings`: what is not simulated is told where people meet it: once per campaign, for its best actions,
+for a single pour.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A bench that says more than 'failed': nothing was poured, or nobody knows what was."""
+"""`request_executor`: a bench that says more than 'failed': nothing was poured, or nobody knows what was."""
 
 from __future__ import annotations
 

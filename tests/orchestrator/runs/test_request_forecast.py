@@ -1,4 +1,6 @@
-"""While the arm pours, the pool makes what later stages will ask for; what is decided stays the same."""
+"""`request_forecast`: while the arm pours, the pool makes what later stages will ask for; what is decided stays the
+same.
+"""
 
 from __future__ import annotations
 

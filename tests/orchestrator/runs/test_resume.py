@@ -1,4 +1,6 @@
-"""A run that was killed anywhere goes on as if nothing had happened: same requests, same outcomes, nothing twice."""
+"""`resume`: a run that was killed anywhere goes on as if nothing had happened: same requests, same outcomes,
+nothing twice.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pour that had begun when its run died: nobody knows what came of it, and a person is asked."""
+"""`resume`: a pour that had begun when its run died: nobody knows what came of it, and a person is asked."""
 
 from __future__ import annotations
 

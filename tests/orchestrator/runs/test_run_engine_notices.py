@@ -1,4 +1,6 @@
-"""What happens to a laboratory in mid-campaign: told, written down, and the end of a run that has lost its bench."""
+"""`run_engine`: what happens to a laboratory in mid-campaign: told, written down, and the end of a run that has
+lost its bench.
+"""
 
 from __future__ import annotations
 

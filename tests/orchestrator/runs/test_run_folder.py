@@ -1,4 +1,4 @@
-"""Folders of runs: their names, which one is resumed, and what is kept in them."""
+"""`run_folder`: folders of runs: their names, which one is resumed, and what is kept in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""One way to run a campaign, whoever calls it: checked, started, paused, stopped, resumed, recorded, published."""
+"""`run_service`: one way to run a campaign, whoever calls it: checked, started, paused, stopped, resumed, recorded,
+published.
+"""
 
 from __future__ import annotations
 

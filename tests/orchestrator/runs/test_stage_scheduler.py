@@ -1,4 +1,6 @@
-"""What runs when, in which order strategies hear of it, and what becomes of a run that is paused or fails."""
+"""`stage_scheduler`: what runs when, in which order strategies hear of it, and what becomes of a run that is paused
+or fails.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stages that a plan asks for, with the real strategies and the real optimiser on a toy laboratory."""
+"""`stages`: the stages that a plan asks for, with the real strategies and the real optimiser on a toy laboratory."""
 
 from __future__ import annotations
 

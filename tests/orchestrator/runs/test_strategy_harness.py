@@ -1,4 +1,4 @@
-"""The harness that authors of strategies use: what it accepts, and what it finds."""
+"""`strategy_harness`: the harness that authors of strategies use: what it accepts, and what it finds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A study whose cells run elsewhere: its results are those of a study on this machine, also if cells are repeated.
+"""`cluster_cells`: a study whose cells run elsewhere: its results are those of a study on this machine, also if
+cells are repeated.
 
 The cluster is a stand-in that runs tasks in this process; real ones are in `tests/end_to_end/test_cluster_services.py`.
 """

@@ -1,4 +1,6 @@
-"""A study's cells are a pure function of its file, and what is wrong with the file is said with its place."""
+"""`study_plan`: a study's cells are a pure function of its file, and what is wrong with the file is said with its
+place.
+"""
 
 from __future__ import annotations
 

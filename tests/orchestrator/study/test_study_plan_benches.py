@@ -1,4 +1,6 @@
-"""The study of hidden benches: compared on all of them, scored in other vessels, beside random θ and chosen pours."""
+"""`study_plan`: the study of hidden benches: compared on all of them, scored in other vessels, beside random θ and
+chosen pours.
+"""
 
 from __future__ import annotations
 

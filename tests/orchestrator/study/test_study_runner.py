@@ -1,4 +1,4 @@
-"""Whatever of a study is killed, it goes on and comes to the same; finished cells are kept."""
+"""`study_runner`: whatever of a study is killed, it goes on and comes to the same; finished cells are kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a study shows, on results that are made up so that the right numbers are known."""
+"""`study_statistics`: what a study shows, on results that are made up so that the right numbers are known."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Taichi without what it does in vain: the same kernels, the same complaints."""
+"""`engine_startup`: Taichi without what it does in vain: the same kernels, the same complaints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Cohesion's forces against the energy that they are the gradient of, summed over all pairs, without columns."""
+"""`tension`: cohesion's forces against the energy that they are the gradient of, summed over all pairs, without
+columns.
+"""
 
 from __future__ import annotations
 

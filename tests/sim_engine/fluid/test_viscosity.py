@@ -1,4 +1,4 @@
-"""Liquids with a viscosity in SI: what walls do to them, and what becomes of them."""
+"""`viscosity`: liquids with a viscosity in SI: what walls do to them, and what becomes of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A settings class is what stands in a file, and the value that the program uses."""
+"""`model`: a settings class is what stands in a file, and the value that the program uses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Doors: what installed packages register is found, and a broken one is named and disturbs nobody."""
+"""`plugin_registry`: doors: what installed packages register is found, and a broken one is named and disturbs
+nobody.
+"""
 
 from __future__ import annotations
 

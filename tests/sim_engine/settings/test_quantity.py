@@ -1,4 +1,4 @@
-"""Quantities, values of the command line and parameter files mean what they say."""
+"""`quantity`: quantities, values of the command line and parameter files mean what they say."""
 
 from __future__ import annotations
 

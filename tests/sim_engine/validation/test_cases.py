@@ -1,4 +1,4 @@
-"""The solver against physics: the quick part of `decant validate-solver`; the full one is marked slow."""
+"""`cases`: the solver against physics: the quick part of `decant validate-solver`; the full one is marked slow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was learnt with one number of particles holds with another."""
+"""`convergence`: what was learnt with one number of particles holds with another."""
 
 from __future__ import annotations
 

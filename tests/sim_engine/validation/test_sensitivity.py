@@ -1,4 +1,6 @@
-"""What a parameter does to the spillage: found in made-up pours whose answer is known, and in a real one."""
+"""`sensitivity`: what a parameter does to the spillage: found in made-up pours whose answer is known, and in a real
+one.
+"""
 
 from __future__ import annotations
 

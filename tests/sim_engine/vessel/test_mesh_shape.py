@@ -1,4 +1,4 @@
-"""Vessels from mesh files: measured right, and refused with the reason when they can't hold a liquid."""
+"""`mesh_shape`: vessels from mesh files: measured right, and refused with the reason when they can't hold a liquid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vessels of revolution: what a user who describes a profile relies on."""
+"""`vessel`: vessels of revolution: what a user who describes a profile relies on."""
 
 from __future__ import annotations
 

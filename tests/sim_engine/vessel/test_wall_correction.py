@@ -1,4 +1,4 @@
-"""How solid walls look from inside: flat walls, corners, edges."""
+"""`wall_correction`: how solid walls look from inside: flat walls, corners, edges."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Meshes and points as scanners and CAD programs save them.
+"""`mesh_repair`: meshes and points as scanners and CAD programs save them.
 
 `tests/data/meshes` holds one cup (345 mL) in seven unusual forms, and a bowl of sheet metal (655 mL). Forms that are
 made here follow public reports; each test names its own.

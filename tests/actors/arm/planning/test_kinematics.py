@@ -1,4 +1,4 @@
-"""Kinematics of whole paths agree with the virtual controller's, which works out one pose at a time."""
+"""`kinematics`: kinematics of whole paths agree with the virtual controller's, which works out one pose at a time."""
 
 from __future__ import annotations
 

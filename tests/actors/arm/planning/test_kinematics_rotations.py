@@ -1,4 +1,4 @@
-"""Rotations with numpy alone, held against scipy's."""
+"""`kinematics`: rotations with numpy alone, held against scipy's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the pourer is, seen from joints, and where joints have to be, seen from the pourer."""
+"""`kinematics`: where the pourer is, seen from joints, and where joints have to be, seen from the pourer."""
 
 from __future__ import annotations
 

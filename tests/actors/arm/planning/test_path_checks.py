@@ -1,4 +1,4 @@
-"""Each way in which a pour can be impossible or forbidden is said in words, before anything moves."""
+"""`path_checks`: each way in which a pour can be impossible or forbidden is said in words, before anything moves."""
 
 from __future__ import annotations
 

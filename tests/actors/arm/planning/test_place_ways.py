@@ -1,4 +1,4 @@
-"""Places that cannot be used are refused before anything starts, each with one clear error."""
+"""`place_ways`: places that cannot be used are refused before anything starts, each with one clear error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A planned pour is the pour that was asked for, made gently, inside its limits, without a jump."""
+"""`pour_planner`: a planned pour is the pour that was asked for, made gently, inside its limits, without a jump."""
 
 from __future__ import annotations
 

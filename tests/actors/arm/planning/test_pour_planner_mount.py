@@ -1,4 +1,6 @@
-"""An arm on a wall, under a ceiling, or turned on its table: the same pour in the room, other joints."""
+"""`pour_planner`: an arm on a wall, under a ceiling, or turned on its table: the same pour in the room, other
+joints.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Steps in speed become ramps that joints can make; waypoints stand where something changes."""
+"""`trajectory`: steps in speed become ramps that joints can make; waypoints stand where something changes."""
 
 from __future__ import annotations
 

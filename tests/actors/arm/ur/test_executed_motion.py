@@ -1,4 +1,6 @@
-"""Pours as the planner makes them, executed: what comes back can be simulated in place of what was planned."""
+"""`executed_motion`: pours as the planner makes them, executed: what comes back can be simulated in place of what
+was planned.
+"""
 
 from __future__ import annotations
 

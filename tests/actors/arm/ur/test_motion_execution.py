@@ -1,4 +1,4 @@
-"""Whole pours on the virtual controller, as the founder of a campaign would see them."""
+"""`motion_execution`: whole pours on the virtual controller, as the founder of a campaign would see them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Stops, from wherever they come: the arm holds, says where it stands, and waits for an operator."""
+"""`motion_execution`: stops, from wherever they come: the arm holds, says where it stands, and waits for an
+operator.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What needs no controller: programs from paths, ways back, how a path was followed, bytes from a stranger."""
+"""`motion_segments`: what needs no controller: programs from paths, ways back, how a path was followed, bytes from
+a stranger.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A controller with PolyScope X: its Robot API instead of the dashboard, the other interfaces as they are."""
+"""`robot_api`: a controller with PolyScope X: its Robot API instead of the dashboard, the other interfaces as they
+are.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""What a robot reports about itself is compared with its settings, and its calibration is planned with."""
+"""`robot_comparison`: what a robot reports about itself is compared with its settings, and its calibration is
+planned with.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The UR driver, its client library and a controller at the other end do what every arm has to do."""
+"""`ur_driver`: the UR driver, its client library and a controller at the other end do what every arm has to do."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lines that are cut, processes that die, controllers that are not what they should be."""
+"""`ur_driver`: lines that are cut, processes that die, controllers that are not what they should be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Other clients on the same controller: a fieldbus, a gripper, a ROS driver, and another program that pours."""
+"""`ur_driver`: other clients on the same controller: a fieldbus, a gripper, a ROS driver, and another program that
+pours.
+"""
 
 from __future__ import annotations
 

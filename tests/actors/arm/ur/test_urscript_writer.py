@@ -1,4 +1,6 @@
-"""The program of a dose on the emulated controller: it tilts as told, within its limits, and back without news."""
+"""`urscript_writer`: the program of a dose on the emulated controller: it tilts as told, within its limits, and
+back without news.
+"""
 
 from __future__ import annotations
 

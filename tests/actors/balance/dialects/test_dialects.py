@@ -1,4 +1,6 @@
-"""Bytes to readings. The samples come from manuals, from drivers' notes, and from captures in public repositories."""
+"""`dialects`: bytes to readings. The samples come from manuals, from drivers' notes, and from captures in public
+repositories.
+"""
 
 from __future__ import annotations
 

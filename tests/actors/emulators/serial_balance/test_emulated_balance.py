@@ -1,4 +1,4 @@
-"""Virtual balances on serial lines: physics, pace, gibberish, and that none outlives its test."""
+"""`emulated_balance`: virtual balances on serial lines: physics, pace, gibberish, and that none outlives its test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Power, stops, unlocking, pausing, watchdogs: what a controller does when something is not as it should be."""
+"""`controller`: power, stops, unlocking, pausing, watchdogs: what a controller does when something is not as it
+should be.
+"""
 
 from __future__ import annotations
 

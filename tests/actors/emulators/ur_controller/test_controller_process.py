@@ -1,4 +1,6 @@
-"""The process: how it starts, that it never outlives its parent, and that no bytes on any port bring it down."""
+"""`controller_process`: the process: how it starts, that it never outlives its parent, and that no bytes on any
+port bring it down.
+"""
 
 from __future__ import annotations
 

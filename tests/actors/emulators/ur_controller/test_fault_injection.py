@@ -1,4 +1,6 @@
-"""What the unmodified client library sees when things go wrong: the traps that a driver has to live with."""
+"""`fault_injection`: what the unmodified client library sees when things go wrong: the traps that a driver has to
+live with.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Forward kinematics against the product of Denavit–Hartenberg matrices; the inverse against the forward."""
+"""`robot_kinematics`: forward kinematics against the product of Denavit–Hartenberg matrices; the inverse against
+the forward.
+"""
 
 from __future__ import annotations
 

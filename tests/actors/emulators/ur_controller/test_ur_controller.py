@@ -1,4 +1,5 @@
-"""The unmodified client library against the controller: moves, streams, paths, questions, signals, programs, dashboard.
+"""`ur_controller`: the unmodified client library against the controller: moves, streams, paths, questions, signals,
+programs, dashboard.
 
 Each scenario runs once (in a process of its own) and is judged by several tests. A test that is tried again has all of
 them run again, on other controllers: fixtures of a module are renewed for it.

@@ -1,4 +1,4 @@
-"""Files that are not files, or far too much of one: refused at once, with the place and the limit."""
+"""`file_access`: files that are not files, or far too much of one: refused at once, with the place and the limit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""YAML as people paste and share it: merge keys, and characters that look like a space or a quote.
+"""`odd_characters`: YAML as people paste and share it: merge keys, and characters that look like a space or a quote.
 
 Public reports behind the cases:
 

@@ -1,4 +1,6 @@
-"""Who gets in, and with what: tokens, roles, guessing, paths that lead elsewhere, files that blow up, sheer size."""
+"""`access_control`: who gets in, and with what: tokens, roles, guessing, paths that lead elsewhere, files that blow
+up, sheer size.
+"""
 
 from __future__ import annotations
 

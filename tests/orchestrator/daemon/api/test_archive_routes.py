@@ -1,4 +1,6 @@
-"""Former runs over the API: the same answers as `decant runs` gives on the machine itself, by role."""
+"""`archive_routes`: former runs over the API: the same answers as `decant runs` gives on the machine itself, by
+role.
+"""
 
 from __future__ import annotations
 

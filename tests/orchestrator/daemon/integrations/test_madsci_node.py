@@ -1,4 +1,6 @@
-"""The daemon as a MADSci node: the calls of madsci.client 0.8.1, replayed, and by the client where it is installed."""
+"""`madsci_node`: the daemon as a MADSci node: the calls of madsci.client 0.8.1, replayed, and by the client where
+it is installed.
+"""
 
 from __future__ import annotations
 

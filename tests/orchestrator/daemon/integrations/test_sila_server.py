@@ -1,4 +1,6 @@
-"""The SiLA 2 server, called by the unmodified client of the package sila2 in an environment of its own."""
+"""`sila_server`: the SiLA 2 server, called by the unmodified client of the package sila2 in an environment of its
+own.
+"""
 
 from __future__ import annotations
 

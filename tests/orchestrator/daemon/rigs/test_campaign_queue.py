@@ -1,4 +1,6 @@
-"""The queue of a running daemon: order, priorities, pauses, several rigs, and what was submitted staying as it was."""
+"""`campaign_queue`: the queue of a running daemon: order, priorities, pauses, several rigs, and what was submitted
+staying as it was.
+"""
 
 from __future__ import annotations
 

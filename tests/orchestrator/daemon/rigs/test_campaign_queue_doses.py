@@ -1,4 +1,4 @@
-"""A series of wanted amounts as a queued campaign: live state, pours, and report."""
+"""`campaign_queue`: a series of wanted amounts as a queued campaign: live state, pours, and report."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""An emergency stop stops, whatever comes with it: over the API, the command line, SiLA and MADSci."""
+"""`emergency_stop`: an emergency stop stops, whatever comes with it: over the API, the command line, SiLA and
+MADSci.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pours that another program orders: once each, with result, prediction and reasons for a refusal."""
+"""`pour_orders`: pours that another program orders: once each, with result, prediction and reasons for a refusal."""
 
 from __future__ import annotations
 

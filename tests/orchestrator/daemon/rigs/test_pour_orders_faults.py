@@ -1,4 +1,6 @@
-"""The fault table of `POST /pours`: every stage × cut connection, SIGKILL, repeated call. No pour is made twice."""
+"""`pour_orders`: the fault table of `POST /pours`: every stage × cut connection, SIGKILL, repeated call. No pour is
+made twice.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What people are asked over the API: written down, answered once, by whoever is there first."""
+"""`remote_operator`: what people are asked over the API: written down, answered once, by whoever is there first."""
 
 from __future__ import annotations
 

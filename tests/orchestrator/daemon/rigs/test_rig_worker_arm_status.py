@@ -1,4 +1,4 @@
-"""The standing status of a rig's arm: whether it can move, why not, and what to do, without a run."""
+"""`rig_worker`: the standing status of a rig's arm: whether it can move, why not, and what to do, without a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A disk that fills: nothing is begun, what is kept is limited, and nothing is lost."""
+"""`rig_worker`: a disk that fills: nothing is begun, what is kept is limited, and nothing is lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Campaigns that a fuzzer writes: each is queued or refused in words, and a refused one leaves nothing behind."""
+"""`submissions`: campaigns that a fuzzer writes: each is queued or refused in words, and a refused one leaves
+nothing behind.
+"""
 
 from __future__ import annotations
 

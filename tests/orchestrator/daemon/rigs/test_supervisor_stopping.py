@@ -1,4 +1,4 @@
-"""Four ways to stop, from the gentlest to the one that nobody waits for; and what each leaves behind."""
+"""`supervisor`: four ways to stop, from the gentlest to the one that nobody waits for; and what each leaves behind."""
 
 from __future__ import annotations
 

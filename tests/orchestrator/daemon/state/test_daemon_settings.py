@@ -1,4 +1,4 @@
-"""The daemon's settings: strict, with places, and safe unless somebody says otherwise."""
+"""`daemon_settings`: the daemon's settings: strict, with places, and safe unless somebody says otherwise."""
 
 from __future__ import annotations
 

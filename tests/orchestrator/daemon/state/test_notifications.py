@@ -1,4 +1,6 @@
-"""Word to people who are elsewhere, through real receivers: a web server, a mail server, a port that never answers."""
+"""`notifications`: word to people who are elsewhere, through real receivers: a web server, a mail server, a port
+that never answers.
+"""
 
 from __future__ import annotations
 

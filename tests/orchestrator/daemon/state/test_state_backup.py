@@ -1,4 +1,6 @@
-"""A backup of a working daemon, restored: nothing that was in it is lost, and nothing starts by itself."""
+"""`state_backup`: a backup of a working daemon, restored: nothing that was in it is lost, and nothing starts by
+itself.
+"""
 
 from __future__ import annotations
 

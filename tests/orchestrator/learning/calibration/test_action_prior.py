@@ -1,4 +1,4 @@
-"""The prior g over actions: what a file may say of it, and that C4 simulates where it says."""
+"""`action_prior`: the prior g over actions: what a file may say of it, and that C4 simulates where it says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Calibration pours that are chosen: where θ shows in what is to be deployed, and never the same twice for nothing."""
+"""`active_design`: calibration pours that are chosen: where θ shows in what is to be deployed, and never the same
+twice for nothing.
+"""
 
 from __future__ import annotations
 

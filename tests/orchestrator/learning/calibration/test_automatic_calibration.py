@@ -1,4 +1,6 @@
-"""A calibration with `simulations: auto` ends by itself, and names a θ that the weighed pours prefer."""
+"""`automatic_calibration`: a calibration with `simulations: auto` ends by itself, and names a θ that the weighed
+pours prefer.
+"""
 
 from __future__ import annotations
 

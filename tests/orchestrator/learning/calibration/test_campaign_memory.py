@@ -1,4 +1,6 @@
-"""A prior from earlier campaigns: how it is combined, how a calibration uses it, and when it loses its weight."""
+"""`campaign_memory`: a prior from earlier campaigns: how it is combined, how a calibration uses it, and when it
+loses its weight.
+"""
 
 from __future__ import annotations
 

@@ -1,3 +1,5 @@
+"""`continuous_calibration`: C4, the pours that it designs, and the scores of its result."""
+
 import math
 from dataclasses import replace
 

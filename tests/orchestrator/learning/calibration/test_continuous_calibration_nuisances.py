@@ -1,4 +1,4 @@
-"""A bench that is not as it was told: its nuisances are searched, found, and carried on."""
+"""`continuous_calibration`: a bench that is not as it was told: its nuisances are searched, found, and carried on."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""C1, C2 and C3: every θ simulated on every training pour."""
+"""`pointwise_calibration`: C1, C2 and C3: every θ simulated on every training pour."""
 
 import numpy as np
 import pytest

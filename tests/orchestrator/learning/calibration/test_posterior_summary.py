@@ -1,4 +1,6 @@
-"""What weighed pours say about θ beside θ*: a region, what it leaves open, and the file and picture that carry it."""
+"""`posterior_summary`: what weighed pours say about θ beside θ*: a region, what it leaves open, and the file and
+picture that carry it.
+"""
 
 from __future__ import annotations
 

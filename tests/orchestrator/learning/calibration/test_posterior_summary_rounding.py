@@ -1,4 +1,6 @@
-"""Rounding may decide which of many equally good θ becomes θ*. Plans and predictions use the posterior, and agree."""
+"""`posterior_summary`: rounding may decide which of many equally good θ becomes θ*. Plans and predictions use the
+posterior, and agree.
+"""
 
 from __future__ import annotations
 

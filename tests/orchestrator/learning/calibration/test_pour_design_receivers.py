@@ -1,4 +1,6 @@
-"""Calibration pours into several receivers: made by turns, told apart by the surrogate, and all of them count."""
+"""`pour_design`: calibration pours into several receivers: made by turns, told apart by the surrogate, and all of
+them count.
+"""
 
 from __future__ import annotations
 

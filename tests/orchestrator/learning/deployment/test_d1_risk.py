@@ -1,4 +1,4 @@
-"""D1 under errors of execution: what it chooses, what it asks for, and how that is replayed and read."""
+"""`d1`: D1 under errors of execution: what it chooses, what it asks for, and how that is replayed and read."""
 
 from __future__ import annotations
 

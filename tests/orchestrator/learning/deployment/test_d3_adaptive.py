@@ -1,4 +1,4 @@
-"""D3 with its own model: what it says of the simulator, limits that it keeps, and when it ends."""
+"""`d3`: D3 with its own model: what it says of the simulator, limits that it keeps, and when it ends."""
 
 from __future__ import annotations
 

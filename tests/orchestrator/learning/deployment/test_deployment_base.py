@@ -1,3 +1,5 @@
+"""`deployment_base`: D1, D2 and D3 on worlds whose spillage is a formula."""
+
 import json
 import math
 

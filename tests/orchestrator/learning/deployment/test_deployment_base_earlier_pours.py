@@ -1,4 +1,6 @@
-"""Pours of before a campaign, from files and former runs: refused where they don't belong, learnt from elsewhere."""
+"""`deployment_base`: pours of before a campaign, from files and former runs: refused where they don't belong,
+learnt from elsewhere.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Actions that can't be made: vessels that touch, places out of the arm's reach."""
+"""`deployment_ledger`: actions that can't be made: vessels that touch, places out of the arm's reach."""
 
 from __future__ import annotations
 

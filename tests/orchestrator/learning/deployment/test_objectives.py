@@ -1,4 +1,4 @@
-"""Several objectives: what each is, and that not pouring never wins."""
+"""`objectives`: several objectives: what each is, and that not pouring never wins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""No spillage is predicted without its spread over seeds: plans, pours, summaries."""
+"""`real_pours`: no spillage is predicted without its spread over seeds: plans, pours, summaries."""
 
 from __future__ import annotations
 

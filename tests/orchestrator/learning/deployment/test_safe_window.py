@@ -1,4 +1,4 @@
-"""The safe window: inside the true one, checked where it ends, shown, and gone on with after a kill."""
+"""`safe_window`: the safe window: inside the true one, checked where it ends, shown, and gone on with after a kill."""
 
 from __future__ import annotations
 

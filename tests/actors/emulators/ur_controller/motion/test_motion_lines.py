@@ -1,4 +1,6 @@
-"""Trapezoidal profiles: they cover their length, keep their limits, and their speed is what their distance says."""
+"""`motion_lines`: trapezoidal profiles: they cover their length, keep their limits, and their speed is what their
+distance says.
+"""
 
 from __future__ import annotations
 

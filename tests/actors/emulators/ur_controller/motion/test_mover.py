@@ -1,4 +1,4 @@
-"""The arm's targets, cycle by cycle: how long, how fast, how straight, and that they never jump."""
+"""`mover`: the arm's targets, cycle by cycle: how long, how fast, how straight, and that they never jump."""
 
 from __future__ import annotations
 

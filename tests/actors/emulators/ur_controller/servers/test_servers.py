@@ -1,4 +1,6 @@
-"""Bytes: frames however they are cut, recipes and their owners, nonsense, and packages of the primary port."""
+"""`servers`: bytes: frames however they are cut, recipes and their owners, nonsense, and packages of the primary
+port.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The language: what programs mean, and that no program, however mad, gets out of its box or hangs the controller."""
+"""`urscript`: the language: what programs mean, and that no program, however mad, gets out of its box or hangs the
+controller.
+"""
 
 from __future__ import annotations
 
