@@ -6,7 +6,8 @@
 
 Toy pours after toy simulations (`mismatch_worlds.py`), answered one by one in this process; strategy and optimiser are
 the real ones. A seed has the same world and the same scatter of pours in all arms. Runs are stored in FILE, so an
-interrupted comparison continues. `--write` makes no runs; it writes the rows of FILE to docs/evidence/results.md.
+interrupted comparison continues. `--write` makes no runs; it writes the rows of FILE to docs/data/mismatch.csv
+and docs/evidence/results.md.
 
 Primary questions, fixed before the first run. Seeds below 1000 are for tuning. Seeds from 1000 on are for answers: 1000
 to 1019; and 2000, 3000, 7000 and 8300 to 8319 for changes made after the previous answers were known (5000 to 5019 were
@@ -62,6 +63,7 @@ simulations, so D3 runs with 9, 18, 37, 111 and 222 `--simulations` (levels `cli
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -99,7 +101,8 @@ NAMES = {
 GOOD, BAD = 0.01, 0.10
 SHARES = (0.5, 0.9, 0.99)
 """Probabilities of the intervals that are compared with the pours."""
-PAGE = Path(__file__).parents[1] / "docs" / "evidence" / "results.md"
+DOCS = Path(__file__).parents[1] / "docs"
+PAGE, DATA = DOCS / "evidence" / "results.md", DOCS / "data" / "mismatch.csv"
 BUDGET_LEVELS = ("cliff, small", "cliff, moderate", "cliff, large")
 """Levels that are compared with other numbers of simulations."""
 FEWEST = 20
@@ -197,24 +200,33 @@ def held(runs: list[dict[str, Any]]) -> str:
     return f"{inside[0]} of {len(first)}, then {inside[1]} of {len(later)}" if first else ""
 
 
-def table(runs: list[dict[str, Any]], fewest: int = 1) -> str:
-    """Return Markdown: one row per level and arm with enough seeds; D2 uses no simulator and has one row."""
-    lines = [
-        "| simulator | | mean of 15 pours | pours above 10 % after the first below 1 % | best of 3 | pours 4 to 15 "
-        "| action in the end | in their 90 % bands, the first pours and all others |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+HEAD = ("simulator", "", "mean of 15 pours", "pours above 10 % after the first below 1 %", "best of 3", "pours 4 to 15",
+        "action in the end", "in their 90 % bands, the first pours and all others")  # fmt: skip
+ON_THE_PAGE = (0, 1, 2, 6, 7)
+"""Columns of the page; docs/data/mismatch.csv has all."""
+
+
+def rows_of(runs: list[dict[str, Any]], fewest: int = 1) -> list[list[str]]:
+    """Return one row per level and arm with enough seeds; D2 uses no simulator and has one row."""
+    rows = []
     for level in LEVELS | STEEP:
         for arm, name in NAMES.items():
             chosen = [run for run in runs if (run["level"], run["arm"]) == (level, arm)]
-            found = [figures(run) for run in chosen]
-            if len(found) >= fewest:
+            if len(chosen) >= fewest:
+                measured = [figures(run) for run in chosen]
                 cells = []
                 for key in ("mean", "bad", "best of 3", "from the fourth", "reported"):
-                    mean, low, high = interval([one[key] for one in found])
+                    mean, low, high = interval([run[key] for run in measured])
                     cells.append(f"{mean:.3f} ({low:.3f} … {high:.3f})")
-                lines.append(f"| {'any' if arm == 'D2' else level} | {name} | {' | '.join(cells)} | {held(chosen)} |")
-    return "\n".join(lines)
+                rows.append(["any" if arm == "D2" else level, name, *cells, held(chosen)])
+    return rows
+
+
+def table(rows: Iterable[Sequence[str]]) -> str:
+    """Return Markdown of rows below their head."""
+    head, *others = ([cell.strip() for cell in row] for row in rows)
+    lines = [f"| {' | '.join(row)} |" for row in (head, *others)]
+    return "\n".join([lines[0], f"|{'---|' * len(head)}", *lines[1:]]) + "\n"
 
 
 def steep_rows(levels: Iterable[str], runs: list[dict[str, Any]]) -> list[list[str]]:
@@ -315,19 +327,17 @@ def rounded(value: Any) -> Any:
     return round(value, 5) if isinstance(value, float) else value
 
 
-def write(text: str) -> None:
-    """Put a table into the page; rows of the page without a new value stay unchanged."""
+def write(rows: Iterable[list[str]]) -> None:
+    """Put rows into the data and the page; stored rows without a new value stay unchanged."""
+    with DATA.open(encoding="utf-8", newline="") as file:
+        stored = {tuple(row[:2]): row for row in csv.reader(file)}
+    stored |= {tuple(row[:2]): row for row in rows}
+    with DATA.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(stored.values())
     begin, end = "<!-- measured: mismatch -->\n", "<!-- end of measured -->"
     before, rest = PAGE.read_text().split(begin)
-    shown, after = rest.split(end, 1)
-    new = {_row(line): line for line in text.splitlines()}
-    lines = [new.pop(_row(line), line) for line in shown.splitlines()]
-    PAGE.write_text(before + begin + "\n".join([*lines, *new.values()]) + "\n" + end + after)
-
-
-def _row(line: str) -> tuple[str, ...]:
-    """Return the key of a table line: its simulator and its arm."""
-    return tuple(cell.strip() for cell in line.split("|")[1:3])
+    text = table([row[i] for i in ON_THE_PAGE] for row in stored.values())
+    PAGE.write_text(before + begin + text + end + rest.split(end, 1)[1])
 
 
 def main() -> None:
@@ -368,10 +378,10 @@ def main() -> None:
                         file.write(json.dumps(runs[-1]) + "\n")
             print(f"{level}, {arm}: done", file=sys.stderr)
     seeds = range(asked.first, asked.first + asked.seeds)
-    found = table([run for run in runs if run["seed"] in seeds], FEWEST if asked.write else 1)
-    print(found)
+    rows = rows_of([run for run in runs if run["seed"] in seeds], FEWEST if asked.write else 1)
+    print(table([HEAD, *rows]))
     if asked.write:
-        write(found)
+        write(rows)
 
 
 if __name__ == "__main__":

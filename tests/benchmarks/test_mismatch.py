@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import sys
 from pathlib import Path
@@ -51,7 +52,7 @@ def test_a_table_says_where_its_figures_come_from(
 def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     mismatch: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    kept, page = tmp_path / "runs.jsonl", tmp_path / "page.md"
+    kept, page, data = tmp_path / "runs.jsonl", tmp_path / "page.md", tmp_path / "rows.csv"
     asked = ["--levels", "small", "--arms", "adaptive", "--first", "0", "--seeds", "1", "--pours", "3"]
     monkeypatch.setattr(sys, "argv", ["mismatch.py", *asked, "--simulations", "8", "--out", str(kept)])
     mismatch.main()
@@ -60,9 +61,15 @@ def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     assert (run["level"], run["arm"], run["seed"], len(run["poured"])) == ("small", "adaptive", 0, 3)
     monkeypatch.setattr(mismatch, "campaign", None)  # nothing is made again
     mismatch.main()
-    rows = "| small | D3, `adaptive` | old |\n| large | D3, `adaptive` | kept |\n"
-    page.write_text(f"before\n<!-- measured: mismatch -->\n{rows}<!-- end of measured -->\nafter\n")
+    stored = [
+        mismatch.HEAD,
+        *([level, "D3, `adaptive`", *6 * [word]] for level, word in (("small", "old"), ("large", "kept"))),
+    ]
+    with data.open("w", newline="") as file:
+        csv.writer(file).writerows(stored)
+    page.write_text("before\n<!-- measured: mismatch -->\n<!-- end of measured -->\nafter\n")
     monkeypatch.setattr(mismatch, "PAGE", page)
+    monkeypatch.setattr(mismatch, "DATA", data)
     monkeypatch.setattr(mismatch, "FEWEST", 1)
     monkeypatch.setattr(sys, "argv", ["mismatch.py", "--first", "0", "--seeds", "1", "--out", str(kept), "--write"])
     mismatch.main()
@@ -72,6 +79,7 @@ def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     inside = [low <= lost <= high for low, high, lost in run["bands"]]
     assert f"| {int(inside[0])} of 1, then {sum(inside[1:])} of 2 |" in written
     assert "old" not in written
-    assert "| large | D3, `adaptive` | kept |" in written
+    assert "| large | D3, `adaptive` | kept | kept | kept |\n" in written
+    assert data.read_text().splitlines()[2] == 'large,"D3, `adaptive`",kept,kept,kept,kept,kept,kept'
     assert written.startswith("before")
     assert written.endswith("after\n")
