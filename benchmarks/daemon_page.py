@@ -87,18 +87,18 @@ def day(found: Mapping[str, Any]) -> str:
         ("pours declared lost after a kill", f"{counts.get('pours declared lost by the operator', 0)}"),
     ]
     begin, end = found["undisturbed [min]"]
-    grown = [(one["what"], one["third"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
+    grown = [(one["what"], one["end"], f"{one['an hour']:+g}") for one in found["at rest"]]
     memory = next(one for one in found["at rest"] if one["what"].startswith("memory of the daemon"))
     return (
-        "Two rigs on simulated benches without Ray, in scaled time; in the first part a fault every 90 seconds. Each "
-        "order is sent three times or more. If a pour is killed, the operator declares it lost.\n\n"
+        "Two rigs on simulated benches without Ray; in the first part a fault every 90 seconds. Each order is sent "
+        "three times or more. If a pour is killed, the operator declares it lost.\n\n"
         + markdown_table(("", ""), rows)
         + "\nLost or doubled, by the journals, the queue and the account of materials: "
         + ", ".join(f"{name} {count}" for name, count in found["lost or doubled"].items())
         + ".\n"
         + f"\nBetween campaigns, from minute {begin:.0f} to {end:.0f}, when the daemon was not restarted; "
         f"{100 * found['cpu share']:.0f} % of a core on average:\n\n"
-        + markdown_table(("", "after a third", "at the end", "an hour"), grown)
+        + markdown_table(("", "at the end", "growth in an hour"), grown)
         + f"\nAt {60 * (found['campaigns'] + found['orders']) / found['minutes']:.0f} campaigns and orders an hour the "
         f"daemon's memory grew by {memory['an hour']:+.0f} ± {memory['error']:.0f} MB an hour (standard error); the "
         "files of the runs grow until they are removed.\n"

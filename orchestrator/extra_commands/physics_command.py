@@ -61,9 +61,9 @@ beforehand. This command measures everything and writes the page:
 decant validate-solver --full --write docs
 ```
 
-`decant validate-solver CASE` runs one case; its name stands in brackets below. Comparisons with liquids that were
-really poured: [real recordings](recordings.md). All values are in [validation.json](../data/validation.json). A row of
-several quantities has the values that fail; if all pass, the one with the largest difference from its reference.
+`decant validate-solver CASE` runs one case. Comparisons with liquids that were really poured: [real
+recordings](recordings.md). All values are in [validation.json](../data/validation.json). A row of several quantities
+has the values that fail; if all pass, the one with the largest difference from its reference.
 
 θ of all cases unless they say otherwise: {theta}.
 N is the number of particles.
@@ -375,36 +375,36 @@ def page_text(records: Mapping[str, Mapping[str, Any]], theta: str, fingerprint:
     failed = sum(not m["passed"] for m in judged)
     parts = [INTRODUCTION.format(theta=theta)]
     parts.append(f"{len(judged) - failed} of {len(judged)} criteria are met.\n")
-    older = {name: " †" for name, record in records.items() if record["solver"] != fingerprint}
+    older = {name for name, record in records.items() if record["solver"] != fingerprint}
     if older:
         parts.append(f"† Measured before the solver's sources last changed; again: `{AGAIN} CASE`\n")
+    rows = [row for name, record in records.items() for row in _criteria(name, record)]
+    if rows:
+        head = ("| case | quantity | N | measured | reference | criterion | met |", "|---|---|---:|---:|---:|---|---|")
+        parts.append("\n".join([*head, *rows]) + "\n")
     for name, record in records.items():
-        command = f"(`{name}`){older.get(name, '')}"
-        parts.append(f"## {record['title']}\n\n{record['about']} {command}\n")
-        if table := _criteria(record["measurements"]):
-            parts.append(table)
+        parts.append(f"## {record['title']}\n\n{record['about']}{' †' if name in older else ''}\n")
         if record["image"] is not None:
             parts.append(f"![{record['title']}](../{IMAGES}/{record['image']})\n")
     return "\n".join(parts)
 
 
-def _criteria(measurements: Sequence[Mapping[str, Any]]) -> str:
-    """Table of the criteria, empty if there are none.
+def _criteria(case: str, record: Mapping[str, Any]) -> list[str]:
+    """Rows of the table of the criteria.
 
     A row has all numbers of particles of a quantity, or of quantities whose names differ in one word. Of several
     quantities it has the values that fail, or else the one with the largest difference from its reference.
     """
     rows: list[list[Mapping[str, Any]]] = []
-    for m in measurements:
+    for m in record["measurements"]:
         if m["judged"]:
             row = next((row for row in rows if _comparable(row[-1], m)), None)
             if row is None:
                 rows.append([m])
             else:
                 row.append(m)
-    if not rows:
-        return ""
-    lines = ["| quantity | N | measured | reference | criterion | met |", "|---|---:|---:|---:|---|---|"]
+    anchor = re.sub(r"[^\w -]", "", record["title"].lower()).replace(" ", "-")
+    lines = []
     for row in rows:
         names = list(dict.fromkeys(m["name"] for m in row))
         chosen = [m for m in row if not m["passed"]]
@@ -423,9 +423,9 @@ def _criteria(measurements: Sequence[Mapping[str, Any]]) -> str:
         references = "; ".join(dict.fromkeys(shown(m["reference"], m["unit"]) for m in chosen))
         numbers = "; ".join(f"{n:,}" for n in dict.fromkeys(m["particles"] for m in row))
         met = f"{sum(m['passed'] for m in row)} of {len(row)}"
-        cells = _joined(names), numbers, "; ".join(values), references, row[0]["criterion"]
+        cells = f"[{case}](#{anchor})", _joined(names), numbers, "; ".join(values), references, row[0]["criterion"]
         lines.append(f"| {' | '.join(cells)} | {met if all(m['passed'] for m in row) else f'**{met}**'} |")
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _comparable(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:

@@ -91,8 +91,8 @@ def test_the_page_keeps_other_cases_and_marks_those_that_another_solver_measured
     marked = (tmp_path / physics_command.PAGE_NAME).read_text(encoding="utf-8")
     assert "†" not in page
     assert "† Measured before the solver's sources last changed" in marked
-    assert "(`good`)\n" in marked
-    assert "(`bad`) †\n" in marked
+    assert "## Good\n\nLiquid stands.\n" in marked
+    assert "## Bad\n\nLiquid stands. †\n" in marked
 
 
 def test_the_page_has_one_row_for_all_numbers_of_particles_and_no_quantity_without_a_criterion() -> None:
@@ -118,7 +118,10 @@ def test_quantities_that_differ_in_one_word_share_a_row_with_the_values_that_fai
     assert "| kept at 60°, 70°, slowly | 500 | 31 mm (70°, N = 500) | 30 mm | within 2 % | **1 of 2** |" in page
     found[1]["passed"] = True
     page = physics_command.page_text({"kept": record}, "", "same")
-    assert "| 31 mm (70°, N = 500) | 30 mm | within 2 % | 2 of 2 |" in page
+    assert (
+        "| [kept](#kept) | kept at 60°, 70°, slowly | 500 | 31 mm (70°, N = 500) | 30 mm | within 2 % | 2 of 2 |"
+        in page
+    )
     found[1]["name"] = "left at 80°, slowly"
     assert physics_command.page_text({"kept": record}, "", "same").count("| 1 of 1 |") == 2
 
