@@ -100,8 +100,8 @@ def first_day(pourer: VesselSpec, density: float) -> tuple[DayStep, ...]:
         )
     steps: list[tuple[str, float, str, float | None, float, float]] = []
     for name, full, speed, outflow, purpose in _POURS:
-        rest = (full - outflow) * capacity
-        angle = float(brentq(lambda tilt, rest=rest: retained_volume(vessel, tilt) - rest, 0.0, math.radians(89.9)))
+        goal = (full - outflow) * capacity
+        angle = float(brentq(lambda tilt, goal=goal: retained_volume(vessel, tilt) - goal, 0.0, math.radians(89.9)))
         steps.append((name, full, purpose, None, math.radians(speed), angle))
     steps += [(f"dose-{1e3 * amount:.0f}-g", 0.70, "a dose", amount, 0.0, 0.0) for amount in DOSES]
     return tuple(
@@ -184,8 +184,8 @@ def practice_day(folder: Path, seed: int, wrong: str | None = None, sign: int = 
         every = slice(None, None, 3)
         columns = {
             "tilt_deg": list(zip(record.times[every], np.degrees(record.tilts[every]).round(3), strict=True)),
-            "mass_g": [(one.time - PLACED_BEFORE, round(1e3 * one.mass, 3)) for one in placed]
-            + [(one.time, round(1e3 * one.mass, 3)) for one in record.readings],
+            "mass_g": [(reading.time - PLACED_BEFORE, round(1e3 * reading.mass, 3)) for reading in placed]
+            + [(reading.time, round(1e3 * reading.mass, 3)) for reading in record.readings],
         }
         path = write_recording(
             folder / f"{step.name}.yaml",

@@ -90,19 +90,19 @@ def first_day(
         _pour_day(folder, campaign, laboratory, enable_motion=enable_motion, in_process=in_process)
     recordings = _day_of(folder)
     replays = []
-    for one in recordings:
-        text = f"replaying {one.name}"
-        with Refused(DecantError, at=f"{one.path.name}: "), waiting_for(lambda text=text: text):  # type: ignore[misc]
+    for recording in recordings:
+        text = f"replaying {recording.name}"
+        with Refused(DecantError, at=f"{recording.path.name}: "), waiting_for(lambda text=text: text):  # type: ignore[misc]
             theta = SimulationParameters(particles=max(particles, 200))
-            replays.append(replay_recording(one, parameters=theta, particles=particles > 0).document())
+            replays.append(replay_recording(recording, parameters=theta, particles=particles > 0).document())
     with waiting_for(lambda: "comparing explanations"):
-        found = diagnose(recordings, expected)
-    words = summary_words(found, replays)
+        diagnosis = diagnose(recordings, expected)
+    words = summary_words(diagnosis, replays)
     print("\n".join(words))
-    document = found.document() | {"replays": replays}
+    document = diagnosis.document() | {"replays": replays}
     with Refused(OSError):
         (folder / RESULT).write_text(json.dumps(document, indent=2, default=str) + "\n", encoding="utf-8")
-        (folder / PAGE).write_text(_page(folder, found, replays, words), encoding="utf-8")
+        (folder / PAGE).write_text(_page(folder, diagnosis, replays, words), encoding="utf-8")
     print_message(f"page: {folder / PAGE}")
     if as_json:
         from orchestrator.recordings.recording_outputs import FirstDayOutput
@@ -121,11 +121,11 @@ def _day_of(folder: Path) -> list[PourRecording]:
     if not folder.is_dir() or not any(folder.glob("*.yaml")):
         text = f"{folder}: has no recorded pour; name a --campaign whose bench pours, or --practise"
         raise RefusalError(text)
-    found = load_recordings([folder])
-    for one in found:
-        for warning in one.warnings:
+    recordings = load_recordings([folder])
+    for recording in recordings:
+        for warning in recording.warnings:
             print_warning(warning)
-    return found
+    return recordings
 
 
 def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motion: bool, in_process: bool) -> None:
@@ -157,9 +157,9 @@ def _pour_day(folder: Path, path: Path, laboratory: Path | None, *, enable_motio
     for number, step in enumerate(steps, start=1):
         if (folder / f"{step.name}.yaml").exists():
             continue
-        what = f"{1e3 * step.amount:.0f} g" if step.amount is not None else f"to {math.degrees(step.angle):.0f}°"
+        target = f"{1e3 * step.amount:.0f} g" if step.amount is not None else f"to {math.degrees(step.angle):.0f}°"
         print_message(
-            f"step {number} of {len(steps)}, {step.name}: {step.purpose} ({what}); fill {1e3 * step.fill:.0f} g"
+            f"step {number} of {len(steps)}, {step.name}: {step.purpose} ({target}); fill {1e3 * step.fill:.0f} g"
         )
         if step.misses:
             print_message("  this pour misses the receiver on purpose: put a tray below it")
@@ -183,7 +183,7 @@ def _pour_step(
 
     def filled(scenes: tuple[Scene, ...]) -> tuple[Scene, ...]:
         return tuple(
-            dataclasses.replace(one, liquid=one.liquid.model_copy(update={"mass": step.fill})) for one in scenes
+            dataclasses.replace(scene, liquid=scene.liquid.model_copy(update={"mass": step.fill})) for scene in scenes
         )
 
     assert plan.deployment is not None
@@ -209,9 +209,9 @@ def _pour_step(
     if not written:
         raise RefusalError(f"{step.name}: was not recorded: {'; '.join(left_out)}", FAILED)
     # the CSV file first: a step counts as made when its YAML file is there
-    for one in sorted(written[0].parent.iterdir(), key=lambda one: one.suffix == ".yaml"):
-        name = f"{step.name}{one.suffix}" if one.stem == written[0].stem else one.name
-        shutil.copyfile(one, folder / name)
+    for file in sorted(written[0].parent.iterdir(), key=lambda file: file.suffix == ".yaml"):
+        name = f"{step.name}{file.suffix}" if file.stem == written[0].stem else file.name
+        shutil.copyfile(file, folder / name)
 
 
 def _assignments(plan: CampaignPlan, step: DayStep) -> list[str]:
@@ -233,34 +233,34 @@ def _assignments(plan: CampaignPlan, step: DayStep) -> list[str]:
     return [f"{name}={value:.4f}" for name, value in values.items()]
 
 
-def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[str]:
+def summary_words(diagnosis: RigDiagnosis, replays: list[dict[str, Any]]) -> list[str]:
     """The answers of a first day, one a line.
 
     Args:
-        found: the explanation.
+        diagnosis: the explanation.
         replays: documents of the replays.
     """
     from orchestrator.recordings.rig_diagnosis import ADVICE
 
-    inside = sum(one.inside for one in found.doses)
+    inside = sum(dose.inside for dose in diagnosis.doses)
     words = []
-    if found.explanations:
+    if diagnosis.explanations:
         words.append(
-            f"Does the model describe this rig? {'yes' if found.describes else 'no'}: {inside} of {len(found.doses)} "
-            "doses are inside the 90 % interval predicted from the pours"
+            f"Does the model describe this rig? {'yes' if diagnosis.describes else 'no'}: {inside} of "
+            f"{len(diagnosis.doses)} doses are inside the 90 % interval predicted from the pours"
         )
     differences = [
-        abs(one["simulation"]["final_difference_g"])
-        for one in replays
-        if one["simulation"] and not one["recording"].stem.endswith("miss")
+        abs(dose["simulation"]["final_difference_g"])
+        for dose in replays
+        if dose["simulation"] and not dose["recording"].stem.endswith("miss")
     ]
     if differences:
         mean, worst = sum(differences) / len(differences), max(differences)
         words.append(
             f"Particles, nothing fitted: {mean:.2g} g from the weighed amount on average, {worst:.2g} g at most"
         )
-    main = found.main
-    if not found.explanations:
+    main = diagnosis.main
+    if not diagnosis.explanations:
         words.append(
             "Which quantity explains the difference? unknown: fewer than 4 pours have readings while they flow; a real "
             "balance below the receiver gives them"
@@ -268,21 +268,21 @@ def summary_words(found: RigDiagnosis, replays: list[dict[str, Any]]) -> list[st
     elif main is None:
         words.append("Which quantity explains the difference? nothing stands out: the tolerances explain the pours")
     else:
-        further = [one.name for one in found.explanations if one.stands_out and one is not main]
-        more = f"; also: {', '.join(further)}, less directly" if further else ""
-        words.append(f"Which quantity explains the difference? {main.name}: {main.text}{more}")
-    error = found.dose_error
+        further = [cause.name for cause in diagnosis.explanations if cause.stands_out and cause is not main]
+        others = f"; also: {', '.join(further)}, less directly" if further else ""
+        words.append(f"Which quantity explains the difference? {main.name}: {main.text}{others}")
+    error = diagnosis.dose_error
     if error is not None:
         words.append(f"How exact are doses? {1e3 * error[0]:.2g} g on average, {1e3 * error[1]:.2g} g at most")
-    if found.missed is not None:
-        words.append(f"The pour that misses on purpose put {1e3 * found.missed:.2g} g into the receiver")
-    if found.explanations:
+    if diagnosis.missed is not None:
+        words.append(f"The pour that misses on purpose put {1e3 * diagnosis.missed:.2g} g into the receiver")
+    if diagnosis.explanations:
         advice = "widen the ranges; repeat this day after changes" if main is None else ADVICE[main.name]
         words.append(f"What to calibrate next? {advice}")
     return words
 
 
-def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], words: list[str]) -> str:
+def _page(folder: Path, diagnosis: RigDiagnosis, replays: list[dict[str, Any]], words: list[str]) -> str:
     """The summary as an HTML page; its picture is written, too.
 
     Raises:
@@ -296,10 +296,10 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
 
     pictures = (
         []
-        if not found.explanations
+        if not diagnosis.explanations
         else [
             Picture.of(
-                save(diagnosis_figure(found), folder / PICTURE),
+                save(diagnosis_figure(diagnosis), folder / PICTURE),
                 "Evidence of each explanation, and the doses as predicted from the pours, minus the weighed amount.",
                 f"Evidence above {STANDS_OUT:g} counts. Lag and holds are read from the balance, the rest is fitted.",
                 wide=True,
@@ -310,23 +310,23 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
         "Explanations",
         ("quantity", "evidence", "value (90 % interval)"),
         [
-            ResultRow((one.name, f"{one.evidence:.1f}", one.text), "best" if one is found.main else "")
-            for one in found.explanations
+            ResultRow((cause.name, f"{cause.evidence:.1f}", cause.text), "best" if cause is diagnosis.main else "")
+            for cause in diagnosis.explanations
         ],
         frozenset({1}),
     )
     rows = []
-    for one in replays:
-        simulated, onset = one["simulation"], one["onset"]
+    for pour in replays:
+        simulated, onset = pour["simulation"], pour["onset"]
         rows.append(
             ResultRow(
                 (
-                    one["recording"].stem,
-                    f"{one['measured_g']:.1f}",
+                    pour["recording"].stem,
+                    f"{pour['measured_g']:.1f}",
                     "—" if simulated is None else f"{simulated['final_g']:.1f}",
                     "—" if onset is None else f"{onset['tilt_deg']:.1f}",
                     "—" if not simulated or simulated["onset"] is None else f"{simulated['onset']['tilt_deg']:.1f}",
-                    f"{one['estimator']['normalised_innovation']:.2f}",
+                    f"{pour['estimator']['normalised_innovation']:.2f}",
                 )
             )
         )
@@ -341,5 +341,5 @@ def _page(folder: Path, found: RigDiagnosis, replays: list[dict[str, Any]], word
         footer="Written by decant recording first-day.",
         words=words,
         pictures=pictures,
-        tables=[explanations, pours] if found.explanations else [pours],
+        tables=[explanations, pours] if diagnosis.explanations else [pours],
     )

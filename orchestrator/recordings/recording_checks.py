@@ -86,10 +86,10 @@ def impossible(
         step: of the display as the file states it [kg].
     """
     net = mass.values - zero
-    given = _Reading(tilt.values + grip, tilt.times, mass.times, net)
-    fact, place, excess = _contradiction(scene, given)
+    reading = _Reading(tilt.values + grip, tilt.times, mass.times, net)
+    fact, place, excess = _contradiction(scene, reading)
     line = int(mass.lines[place])
-    for other in _other_meanings(given, mass.values, step, contradicted=bool(fact)):
+    for other in _other_meanings(reading, mass.values, step, contradicted=bool(fact)):
         contradiction, _, other_excess = _contradiction(scene, other)
         if not contradiction or (other.certain and excess and not other_excess):
             return [series.problem(line, "; ".join(filter(None, (fact, other.cause))), other.quantity)]
@@ -171,15 +171,15 @@ def _filled(series: TimeSeries, tilt: Column, mass: Column, step: float | None) 
     rising = changes[np.abs(changes) > 1e-9]
     between = np.abs(rising / step - np.round(rising / step)) > 0.05 if step else np.zeros(0, dtype=bool)
     if described.rising >= FEWEST_RISING and described.repeated >= FILLED * described.rising:
-        share, what = described.repeated / described.rising, "repeat the one before while it rises"
+        share, fault = described.repeated / described.rising, "repeat the one before while it rises"
         place = 1 + int(np.flatnonzero(changes == 0.0)[0])
     elif between.sum() >= FEWEST_RISING and between.mean() > 0.5:
-        share, what = float(between.mean()), f"lie between steps of {1e3 * (step or 0.0):g} g"
+        share, fault = float(between.mean()), f"lie between steps of {1e3 * (step or 0.0):g} g"
         place = 1 + int(np.flatnonzero(np.abs(changes) > 1e-9)[between.argmax()])
     else:
         return []
     text = (
-        f"every line has a mass, and {100 * share:.0f} % of them {what}: cells look filled with the value above, or "
+        f"every line has a mass, and {100 * share:.0f} % of them {fault}: cells look filled with the value above, or "
         "interpolated; leave a cell empty in a line in which no reading arrived"
     )
     return [series.problem(int(mass.lines[place]), text, "mass")]

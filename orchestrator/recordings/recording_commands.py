@@ -97,23 +97,23 @@ def replay(
 
     theta = None if parameters is None else load_parameters(parameters)
     with Refused(ValueError, OSError, at="--fitted: "):
-        given = ReplayValues() if values is None else read_values(values)
+        settings = ReplayValues() if values is None else read_values(values)
     loaded = _loaded(recordings)
     theta = (theta or SimulationParameters()).model_copy(update={"particles": max(particles, 200)})
     simulator = PourSimulator() if particles else None
     documents = []
     try:
-        for one in loaded:
-            at, text = f"{one.path.name}: ", f"replaying {one.name}"
+        for recording in loaded:
+            at, text = f"{recording.path.name}: ", f"replaying {recording.name}"
             with Refused(DecantError, at=at), waiting_for(lambda text=text: text):  # type: ignore[misc]
-                found = replay_recording(
-                    one, given, parameters=theta, seed=seed, particles=particles > 0, simulator=simulator
+                report = replay_recording(
+                    recording, settings, parameters=theta, seed=seed, particles=particles > 0, simulator=simulator
                 )
-            print(replay_text(found))
-            documents.append(found.document())
+            print(replay_text(report))
+            documents.append(report.document())
             if png is not None:
                 with Refused(OSError, at="--png: "):
-                    print_note(f"picture  {save(replay_figure(found), png / f'{one.name}.png')}")
+                    print_note(f"picture  {save(replay_figure(report), png / f'{recording.name}.png')}")
     finally:
         if simulator is not None:
             simulator.close()
@@ -156,14 +156,14 @@ def fit(
         raise RefusalError(f"--output {output}: should be a .json file in a folder that exists")
     loaded = _loaded(recordings)
     others = _loaded(judged or ())
-    if both := sorted({one.path for one in loaded} & {one.path for one in others}):
+    if both := sorted({recording.path for recording in loaded} & {recording.path for recording in others}):
         text = f"--judge: {both[0].name} is fitted, too; judge another, or fit its beginning with --until"
         raise RefusalError(text)
     with waiting_for(lambda: f"fitting {len(loaded)} recorded pours"):
-        found = fit_recordings(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
-        judgements = [judge_recording(found, one) for one in (*(loaded if seconds is not None else ()), *others)]
-    print(fit_text(found, judgements))
-    document = found.document() | {"judged": [one.document() for one in judgements]}
+        fitted = fit_recordings(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
+        judgements = [judge_recording(fitted, pour) for pour in (*(loaded if seconds is not None else ()), *others)]
+    print(fit_text(fitted, judgements))
+    document = fitted.document() | {"judged": [recording.document() for recording in judgements]}
     if output is not None:
         with Refused(OSError, at="--output: "):
             output.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
@@ -177,22 +177,22 @@ def _loaded(paths: Sequence[Path]) -> list[PourRecording]:
     """Recorded pours; their warnings are printed."""
     from orchestrator.recordings.recording_file import load_recordings
 
-    found = load_recordings(paths)
-    for one in found:
-        for warning in one.warnings:
+    recordings = load_recordings(paths)
+    for recording in recordings:
+        for warning in recording.warnings:
             print_warning(warning)
-    return found
+    return recordings
 
 
-def replay_text(found: PourReplay) -> str:
+def replay_text(replay: PourReplay) -> str:
     """A replay in a few lines.
 
     Args:
-        found: the replay.
+        replay: the replay.
     """
-    data = found.document()
+    data = replay.document()
     read, simulated, estimator = data["arrivals"], data["simulation"], data["estimator"]
-    lines = [f"{found.recording.name}: {data['measured_g']:.4g} g measured, {_onset(data['onset'])}"]
+    lines = [f"{replay.recording.name}: {data['measured_g']:.4g} g measured, {_onset(data['onset'])}"]
     if simulated is not None:
         lines.append(
             f"  predicted by the simulation: {simulated['final_g']:.4g} g ({simulated['final_difference_g']:+.3g} g), "
@@ -206,13 +206,13 @@ def replay_text(found: PourReplay) -> str:
         f"{estimator['normalised_innovation']:.2f} (1 is right)"
     )
     fitted = data["fitted"]
-    given = [
+    fixed = [
         f"{name.replace('_', ' [')}] {fitted[name]:g}" for name in ("grip_deg", "height_mm", "fill_g") if fitted[name]
     ]
     source = f" from {', '.join(fitted['on'])}" if fitted["on"] else ""
-    kept = f"; given{source}: {', '.join(given)}" if given else ""
-    where = "fitted here" if found.values.lag is None else "given, and corrected by the readings"
-    lines.append(f"  lag {lag[0]:.2f} s ({lag[1]:.2f} to {lag[2]:.2f} s), {where}{kept}")
+    suffix = f"; given{source}: {', '.join(fixed)}" if fixed else ""
+    where = "fitted here" if replay.values.lag is None else "given, and corrected by the readings"
+    lines.append(f"  lag {lag[0]:.2f} s ({lag[1]:.2f} to {lag[2]:.2f} s), {where}{suffix}")
     lines.append(
         f"  readings: every {read['interval_s']:.3g} s, longest gap {read['longest_gap_s']:.2g} s, "
         f"{read['repeated']} of {read['rising']} repeat the one before while the mass rises"
@@ -224,28 +224,28 @@ def _onset(onset: dict[str, float] | None) -> str:
     return "nothing flowed" if onset is None else f"onset at {onset['time_s']:.2f} s and {onset['tilt_deg']:.1f}°"
 
 
-def fit_text(found: Fit, judged: Sequence[Judgement]) -> str:
+def fit_text(fit: Fit, judged: Sequence[Judgement]) -> str:
     """A fit and its judgement, separately.
 
     Args:
-        found: the fit.
+        fit: the fit.
         judged: predictions of readings that were not fitted.
     """
-    part = "" if found.until is None else f", readings of the first {found.until:g} s"
-    lines = [f"fitted on {', '.join(found.fitted_on)}{part} (90 % intervals)"]
-    lines += [f"  {one.name:<10} {one.text}" for one in found.values]
-    if found.held is not None:
-        share, low, high = (100 * one for one in found.held)
+    span = "" if fit.until is None else f", readings of the first {fit.until:g} s"
+    lines = [f"fitted on {', '.join(fit.fitted_on)}{span} (90 % intervals)"]
+    lines += [f"  {estimate.name:<10} {estimate.text}" for estimate in fit.values]
+    if fit.held is not None:
+        share, low, high = (100 * bound for bound in fit.held)
         lines.append(f"  {'held':<10} {share:.0f} % of the readings while the mass rises ({low:.0f} to {high:.0f} %)")
-    lines.append(f"  residuals  {', '.join(f'{1e3 * one:.2g}' for one in found.rms)} g (RMS)")
+    lines.append(f"  residuals  {', '.join(f'{1e3 * rms:.2g}' for rms in fit.rms)} g (RMS)")
     lines.append("predicted, not fitted" if judged else "nothing was judged; name other recordings with --judge")
-    for one in judged:
-        value, low, high = (1e3 * number for number in one.final)
-        which = "later readings" if one.fitted else "whole pour"
+    for pour in judged:
+        value, low, high = (1e3 * number for number in pour.final)
+        which = "later readings" if pour.fitted else "whole pour"
         lines.append(
-            f"  {one.name} ({which}): {value:.4g} g ({low:.4g} to {high:.4g}), measured "
-            f"{1e3 * one.measured_final:.4g} g; RMS {1e3 * one.rms:.2g} g, {100 * one.coverage:.0f} % of the readings "
-            "inside 90 %"
+            f"  {pour.name} ({which}): {value:.4g} g ({low:.4g} to {high:.4g}), measured "
+            f"{1e3 * pour.measured_final:.4g} g; RMS {1e3 * pour.rms:.2g} g, {100 * pour.coverage:.0f} % of the "
+            "readings inside 90 %"
         )
     return "\n".join(lines)
 

@@ -63,7 +63,7 @@ def export_recordings(
     written, left_out = [], []
     for pour in record.weighed:
         kind = "pour" if pour.request.dose is None else "dose"
-        number = sum(one.stage == pour.stage and one.id <= pour.id for one in record.weighed)
+        number = sum(weighed.stage == pour.stage and weighed.id <= pour.id for weighed in record.weighed)
         path = to / f"{pour.stage}-{kind}-{number}.yaml".replace("/", "-").replace(" ", "-")
         if path.exists():
             written.append(path)
@@ -144,8 +144,8 @@ def _executed(notes: Mapping[str, Any], plan: CampaignPlan) -> Pairs:
 
 def _once(pairs: Pairs) -> Pairs:
     """The first value of each time; a run's clock has milliseconds."""
-    kept: dict[float, float] = {}
+    series: dict[float, float] = {}
     for time, value in sorted(pairs, key=lambda pair: pair[0]):
         if math.isfinite(value):
-            kept.setdefault(round(float(time), 4), float(value))
-    return list(kept.items())
+            series.setdefault(round(float(time), 4), float(value))
+    return list(series.items())

@@ -198,8 +198,8 @@ class PourRecording:
         """Mass at the end: the mean of the last readings that agree within three steps [kg]."""
         net = self.net
         last = net[-1]
-        rest = len(net) - next((i for i, one in enumerate(net[::-1]) if abs(one - last) > 3.0 * self.step), len(net))
-        return float(net[max(rest, len(net) - REST) :].mean())
+        start = len(net) - next((i for i, mass in enumerate(net[::-1]) if abs(mass - last) > 3.0 * self.step), len(net))
+        return float(net[max(start, len(net) - REST) :].mean())
 
     def tilt_at(self, times: Floats) -> Floats:
         """Recorded tilt, linear between two records (N,) [rad]."""
@@ -241,7 +241,7 @@ def load_recordings(paths: Iterable[Path]) -> list[PourRecording]:
     Raises:
         ConfigError: see `load_recording`; or a folder has none.
     """
-    found: list[PourRecording] = []
+    recordings: list[PourRecording] = []
     problems: list[Problem] = []
     for path in paths:
         files = sorted(path.glob("*.yaml")) if path.is_dir() else [path]
@@ -249,12 +249,12 @@ def load_recordings(paths: Iterable[Path]) -> list[PourRecording]:
             problems.append(Problem(path, 0, 0, "", "has no recorded pour (.yaml with a .csv of the same name)"))
         for file in files:
             try:
-                found.append(load_recording(file))
+                recordings.append(load_recording(file))
             except ConfigError as error:
                 problems += error.problems
     if problems:
         raise ConfigError(problems)
-    return found
+    return recordings
 
 
 def _checked(path: Path, section: RecordingFile, scene: Scene, series: TimeSeries) -> PourRecording:
@@ -307,8 +307,8 @@ def _checked(path: Path, section: RecordingFile, scene: Scene, series: TimeSerie
         if missing:
             i = max(missing, key=lambda i: float(column.times[i] - column.times[i - 1]))
             width = column.times[i] - column.times[i - 1]
-            more = "" if len(missing) == 1 else f"; there are {len(missing)} gaps above {LONGEST_GAP:g} s"
-            text = f"no {name} for {width:.3g} s before this line: {effect}{more}. Record at 10 Hz or faster"
+            others = "" if len(missing) == 1 else f"; there are {len(missing)} gaps above {LONGEST_GAP:g} s"
+            text = f"no {name} for {width:.3g} s before this line: {effect}{others}. Record at 10 Hz or faster"
             warnings.append(series.problem(int(column.lines[i]), text, name))
     balance = section.balance
     if balance.step is None:
@@ -316,8 +316,8 @@ def _checked(path: Path, section: RecordingFile, scene: Scene, series: TimeSerie
     zero = balance.zero
     if zero is None:
         upright = poured.times <= _begin(tilt.times, tilt.values)
-        rest = [*placed.values, *poured.values[upright]][-REST:] or [poured.values[0]]
-        zero = float(np.mean(rest))
+        settled = [*placed.values, *poured.values[upright]][-REST:] or [poured.values[0]]
+        zero = float(np.mean(settled))
     recording = PourRecording(
         path,
         scene,
@@ -411,7 +411,7 @@ def write_recording(
     }
     if fill_deviation is not None:
         content["fill_deviation"] = f"{1e3 * fill_deviation:.4g} g"
-    content |= {name: dict(part) for name, part in (("placement", placement), ("balance", balance)) if part}
+    content |= {name: dict(section) for name, section in (("placement", placement), ("balance", balance)) if section}
     yaml = YAML()
     yaml.default_flow_style = None
     yaml.width = 116

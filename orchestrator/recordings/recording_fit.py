@@ -132,7 +132,7 @@ class FittedValue:
     def text(self) -> str:
         """As shown: '0.42 deg (0.11 to 0.73)'."""
         unknown = UNKNOWNS[self.name]
-        value, low, high = (one / unknown.factor for one in (self.value, self.low, self.high))
+        value, low, high = (number / unknown.factor for number in (self.value, self.low, self.high))
         unit = f" {unknown.unit}" if unknown.unit else ""
         return f"{value:.3g}{unit} ({low:.3g} to {high:.3g})" + ("" if self.identified else "; hardly identified")
 
@@ -163,32 +163,32 @@ class Fit:
 
     def __getitem__(self, name: str) -> FittedValue:
         """The value of an unknown. Raises KeyError if it was not fitted."""
-        return {one.name: one for one in self.values}[name]
+        return {estimate.name: estimate for estimate in self.values}[name]
 
     @property
     def replay_values(self) -> ReplayValues:
         """For `orchestrator.recordings.recording_replay`; the flow has no counterpart in the particle simulation."""
-        found = {one.name: one.value for one in self.values if one.name != "flow"}
-        return ReplayValues(**found, fitted_on=self.fitted_on)
+        values = {estimate.name: estimate.value for estimate in self.values if estimate.name != "flow"}
+        return ReplayValues(**values, fitted_on=self.fitted_on)
 
     def document(self) -> dict[str, Any]:
         """JSON-ready, in display units."""
         values = {}
-        for one in self.values:
-            unknown = UNKNOWNS[one.name]
-            numbers = [round(number / unknown.factor, 5) for number in (one.value, one.low, one.high)]
-            values[one.name] = {
+        for estimate in self.values:
+            unknown = UNKNOWNS[estimate.name]
+            numbers = [round(number / unknown.factor, 5) for number in (estimate.value, estimate.low, estimate.high)]
+            values[estimate.name] = {
                 "value": numbers[0],
                 "interval": numbers[1:],
                 "unit": unknown.unit or "1",
-                "identified": one.identified,
+                "identified": estimate.identified,
             }
         return {
             "fitted": values,
             "fitted_on": list(self.fitted_on),
             "until_s": self.until,
-            "rms_g": [round(1e3 * one, 4) for one in self.rms],
-            "held_readings": None if self.held is None else [round(one, 4) for one in self.held],
+            "rms_g": [round(1e3 * rms, 4) for rms in self.rms],
+            "held_readings": None if self.held is None else [round(bound, 4) for bound in self.held],
         }
 
 
@@ -223,8 +223,8 @@ class Judgement:
     def document(self) -> dict[str, Any]:
         """JSON-ready; masses in grams, angles in degrees."""
 
-        def onset(one: Onset | None) -> dict[str, float] | None:
-            return None if one is None else {"time_s": round(one.time, 3), "tilt_deg": round(math.degrees(one.tilt), 2)}
+        def onset(at: Onset | None) -> dict[str, float] | None:
+            return None if at is None else {"time_s": round(at.time, 3), "tilt_deg": round(math.degrees(at.tilt), 2)}
 
         return {
             "recording": self.name,
@@ -233,7 +233,7 @@ class Judgement:
             "rms_g": round(1e3 * self.rms, 4),
             "coverage": round(self.coverage, 3),
             "predicted_g": round(1e3 * self.final[0], 3),
-            "interval_g": [round(1e3 * one, 3) for one in self.final[1:]],
+            "interval_g": [round(1e3 * mass, 3) for mass in self.final[1:]],
             "measured_g": round(1e3 * self.measured_final, 3),
             "onset": onset(self.onset),
             "predicted_onset": onset(self.predicted_onset),
@@ -260,69 +260,69 @@ def fit_recordings(
         raise InvalidArgumentError("there is no recording to fit")
     names = tuple(name for name in UNKNOWNS if name in {*unknowns, *ALWAYS})
     lag = lag_before(recordings)
-    problem = _Problem(names, lag, [FittedReadings.of(one, until) for one in recordings])
-    found = problem.solved(np.zeros(problem.size), problem.noise)
-    weight = problem.effective_noise(found)
-    found = problem.solved(found, weight)
-    covariance: Floats = np.asarray(np.linalg.inv(problem.information(found, weight)), dtype=np.float64)
+    problem = _Problem(names, lag, [FittedReadings.of(recording, until) for recording in recordings])
+    state = problem.solved(np.zeros(problem.size), problem.noise)
+    weight = problem.effective_noise(state)
+    state = problem.solved(state, weight)
+    covariance: Floats = np.asarray(np.linalg.inv(problem.information(state, weight)), dtype=np.float64)
     values = []
     for i, name in enumerate(names):
         unknown = problem.unknowns[name]
-        middle = float(unknown.at(found[i]))
+        middle = float(unknown.at(state[i]))
         further = LIP if name == "grip" else FILM / middle if name == "lag" else 0.0
         deviation = math.hypot(unknown.deviation * float(np.sqrt(covariance[i, i])), further)
-        low, high = (float(unknown.at(found[i] + sign * QUANTILE * deviation / unknown.deviation)) for sign in (-1, 1))
+        low, high = (float(unknown.at(state[i] + sign * QUANTILE * deviation / unknown.deviation)) for sign in (-1, 1))
         values.append(FittedValue(name, middle, low, high, deviation < 0.5 * UNKNOWNS[name].deviation))
-    residuals = problem.residuals(found)
+    residuals = problem.residuals(state)
     return Fit(
         tuple(values),
-        tuple(one.name for one in recordings),
+        tuple(recording.name for recording in recordings),
         until,
-        tuple(float(np.sqrt(np.mean(part**2))) for part in residuals),
+        tuple(float(np.sqrt(np.mean(residual**2))) for residual in residuals),
         held_share(recordings),
         names,
         lag,
-        found,
+        state,
         covariance,
         float(np.sqrt(np.mean(np.concatenate(residuals) ** 2))),
     )
 
 
-def judge_recording(found: Fit, recording: PourRecording) -> Judgement:
+def judge_recording(fit: Fit, recording: PourRecording) -> Judgement:
     """Predict a recording from its tilt and fitted values, and compare it with its readings.
 
     Args:
-        found: by `fit_recordings`. If the recording is one of the fitted, only readings after `Fit.until` are judged.
+        fit: by `fit_recordings`. If the recording is one of the fitted, only readings after `Fit.until` are judged.
         recording: the pour.
 
     Raises:
         InvalidArgumentError: all its readings were fitted.
     """
-    own = recording.name in found.fitted_on
-    if own and found.until is None:
+    within = recording.name in fit.fitted_on
+    if within and fit.until is None:
         raise InvalidArgumentError(
             f"{recording.name}: all its readings were fitted, and none is left to judge; fit only its beginning, or "
             "judge another recording"
         )
     readings = FittedReadings.of(recording, None)
-    problem = _Problem(found._names, found._lag, [readings])
+    problem = _Problem(fit._names, fit._lag, [readings])
     shared = problem.shared
     mean, covariance = np.zeros(problem.size), np.eye(problem.size)
     place = [*range(shared), *range(shared, problem.size)]
-    if own:
-        first = shared + OWN * found.fitted_on.index(recording.name)
+    if within:
+        first = shared + OWN * fit.fitted_on.index(recording.name)
         place = [*range(shared), *range(first, first + OWN)]
-        mean, covariance = found._mean[place], found._covariance[np.ix_(place, place)]
+        mean, covariance = fit._mean[place], fit._covariance[np.ix_(place, place)]
     else:
-        mean[:shared], covariance[:shared, :shared] = found._mean[:shared], found._covariance[:shared, :shared]
+        mean[:shared], covariance[:shared, :shared] = fit._mean[:shared], fit._covariance[:shared, :shared]
     (predicted,), (slopes,) = problem.linearised(mean)
     variance = np.einsum("pr,pq,qr->r", slopes, covariance, slopes)
-    begin = recording.read_times[0] if found.until is None or not own else recording.tilt_times[0] + found.until
+    begin = recording.read_times[0] if fit.until is None or not within else recording.tilt_times[0] + fit.until
     since = np.maximum(predicted - np.interp(begin, recording.read_times, predicted), 0.0)
-    deviation = np.sqrt(variance + found._noise**2 + recording.step**2 / 12.0 + (MODEL_ERROR * since) ** 2)
-    judged = (recording.read_times > begin) if own else np.ones(len(recording.read_times), dtype=bool)
+    deviation = np.sqrt(variance + fit._noise**2 + recording.step**2 / 12.0 + (MODEL_ERROR * since) ** 2)
+    judged = (recording.read_times > begin) if within else np.ones(len(recording.read_times), dtype=bool)
     if not judged.any():
-        raise InvalidArgumentError(f"{recording.name}: has no reading after {found.until:g} s to judge")
+        raise InvalidArgumentError(f"{recording.name}: has no reading after {fit.until:g} s to judge")
     net, seen = recording.net, max(SEEN, 3.0 * recording.step)
     onset, expected = onset_of(recording, net, seen), onset_of(recording, predicted, seen)
     # quiet readings before the flow would count as hits
@@ -331,7 +331,7 @@ def judge_recording(found: Fit, recording: PourRecording) -> Judgement:
     half = QUANTILE * float(deviation[-1])
     return Judgement(
         recording.name,
-        own,
+        within,
         recording.read_times[flowing],
         net[flowing],
         predicted[flowing],
@@ -340,7 +340,7 @@ def judge_recording(found: Fit, recording: PourRecording) -> Judgement:
         float(np.mean(np.abs(miss) <= QUANTILE * deviation[flowing])),
         (float(predicted[-1]), float(predicted[-1]) - half, float(predicted[-1]) + half),
         recording.gain,
-        None if onset is not None and onset.time <= begin and own else onset,
+        None if onset is not None and onset.time <= begin and within else onset,
         expected,
     )
 
@@ -351,8 +351,8 @@ def held_share(recordings: Sequence[PourRecording]) -> tuple[float, float, float
     Returns:
         The share and its 90 % interval (Wilson); None without such readings.
     """
-    found = [arrivals(one.read_times, one.readings, one.step) for one in recordings]
-    count, held = sum(one.rising for one in found), sum(one.repeated for one in found)
+    counts = [arrivals(recording.read_times, recording.readings, recording.step) for recording in recordings]
+    count, held = sum(count.rising for count in counts), sum(count.repeated for count in counts)
     if not count:
         return None
     share, z = held / count, QUANTILE
@@ -400,24 +400,24 @@ class _Problem:
         self.unknowns = UNKNOWNS | {"lag": lag}
         self.shared = len(names) + 1
         self.size = self.shared + OWN * len(readings)
-        one = readings[0].recording
-        display = math.hypot(one.step / math.sqrt(12.0), one.balance.noise)
+        recording = readings[0].recording
+        display = math.hypot(recording.step / math.sqrt(12.0), recording.balance.noise)
         self.noise = np.full(len(readings), math.hypot(display, MODEL_NOISE))
 
     def _columns(self, recording: int) -> list[int]:
-        own = self.shared + OWN * recording
-        return [*range(self.shared), *range(own, own + OWN)]
+        first = self.shared + OWN * recording
+        return [*range(self.shared), *range(first, first + OWN)]
 
     def _predict(self, k: int, states: Floats) -> Floats:
         """Readings of a recording for states (N, P), which agree in height and viscosity (N, R) [kg]."""
         readings = self._readings[k]
         recording = readings.recording
-        found = {name: self.unknowns[name].at(states[:, i]) for i, name in enumerate(self._names)}
+        unknowns = {name: self.unknowns[name].at(states[:, i]) for i, name in enumerate(self._names)}
         onset, flow, fill = (states[:, self.shared + OWN * k + i] for i in range(OWN))
         count = len(states)
 
         def values(name: str) -> Floats:
-            return np.broadcast_to(np.asarray(found.get(name, self.unknowns[name].middle), dtype=float), (count,))
+            return np.broadcast_to(np.asarray(unknowns.get(name, self.unknowns[name].middle), dtype=float), (count,))
 
         changed = ReplayValues(height=float(values("height")[0]), viscosity=float(values("viscosity")[0]))
         scene = changed.scene(recording)
@@ -453,7 +453,7 @@ class _Problem:
     def residuals(self, state: Floats) -> list[Floats]:
         """Reading minus model of the fitted readings of each recording [kg]."""
         return [
-            (one.recording.net - self._predict(k, state[None])[0])[one.used] for k, one in enumerate(self._readings)
+            (pour.recording.net - self._predict(k, state[None])[0])[pour.used] for k, pour in enumerate(self._readings)
         ]
 
     def solved(self, state: Floats, noise: Floats) -> Floats:
@@ -465,8 +465,8 @@ class _Problem:
         def slopes(x: Floats) -> Floats:
             return np.vstack([*self._rows(x, noise), np.eye(self.size)])
 
-        found = least_squares(misses, state, slopes, method="trf", x_scale=1.0, ftol=1e-4, xtol=1e-3, max_nfev=25)
-        solution: Floats = found.x
+        optimum = least_squares(misses, state, slopes, method="trf", x_scale=1.0, ftol=1e-4, xtol=1e-3, max_nfev=25)
+        solution: Floats = optimum.x
         return solution
 
     def information(self, state: Floats, noise: Floats) -> Floats:
@@ -487,20 +487,20 @@ class _Problem:
         """Derivatives of the weighted residuals."""
         _, slopes = self.linearised(state)
         rows = []
-        for k, (slope, one) in enumerate(zip(slopes, self._readings, strict=True)):
-            part = np.zeros((int(one.used.sum()), self.size))
-            part[:, self._columns(k)] = -slope[:, one.used].T / noise[k]
-            rows.append(part)
+        for k, (slope, readings) in enumerate(zip(slopes, self._readings, strict=True)):
+            gradient = np.zeros((int(readings.used.sum()), self.size))
+            gradient[:, self._columns(k)] = -slope[:, readings.used].T / noise[k]
+            rows.append(gradient)
         return rows
 
 
 def lag_before(recordings: Sequence[PourRecording]) -> Unknown:
     """The lag before a fit: from the placing of the receiver, if a recording has it."""
     unknown = UNKNOWNS["lag"]
-    one = next((one for one in recordings if len(one.placed) > 5), None)
-    if one is None:
+    recording = next((recording for recording in recordings if len(recording.placed) > 5), None)
+    if recording is None:
         return unknown
-    logs = np.log(draw_lags(one.placed, 400, np.random.default_rng(0), step=one.step)[0])
+    logs = np.log(draw_lags(recording.placed, 400, np.random.default_rng(0), step=recording.step)[0])
     return replace(unknown, middle=float(np.exp(logs.mean())), deviation=max(float(logs.std()), 0.15))
 
 
@@ -516,9 +516,9 @@ def read_values(path: Path) -> ReplayValues:
     """
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        found = {name: float(one["value"]) * UNKNOWNS[name].factor for name, one in data["fitted"].items()}
+        values = {name: float(entry["value"]) * UNKNOWNS[name].factor for name, entry in data["fitted"].items()}
         fitted_on = tuple(map(str, data["fitted_on"]))
     except (KeyError, TypeError, ValueError, AttributeError):
         raise ValueError(f"{path} is no fit; 'decant recording fit --output' writes one") from None
-    found.pop("flow", None)
-    return ReplayValues(**found, fitted_on=fitted_on)
+    values.pop("flow", None)
+    return ReplayValues(**values, fitted_on=fitted_on)

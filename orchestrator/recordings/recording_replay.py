@@ -149,12 +149,12 @@ def simulate(
     times, tilts = _while_it_flows(recording)
     motion = recorded_motion(scene, action, pourer, receiver, times, tilts + place.grip + values.grip)
     task = PourTask(scene, action, parameters or SimulationParameters(particles=1000), seed, motion=motion)
-    own = simulator or PourSimulator()
+    pool = simulator or PourSimulator()
     try:
-        outcome = own.simulate(task).outcome
+        outcome = pool.simulate(task).outcome
     finally:
         if simulator is None:
-            own.close()
+            pool.close()
     if outcome.invalid is not None:
         raise InvalidSceneError(f"{recording.name}: the simulation is invalid: {outcome.invalid}")
     times = np.asarray(outcome.curve_times) + recording.tilt_times[0]
@@ -314,14 +314,14 @@ class PourReplay:
     @property
     def normalised_innovation(self) -> float:
         """Mean of (innovation / its standard deviation)², from one second before the onset on; 1 if they agree."""
-        found = (self.estimated.innovation / self.estimated.deviation)[self.compared]
-        return float(np.mean(found**2))
+        normalised = (self.estimated.innovation / self.estimated.deviation)[self.compared]
+        return float(np.mean(normalised**2))
 
     @property
     def coverage(self) -> float:
         """Share of the readings inside the estimator's `LEVEL` interval, predicted from the readings before."""
-        found = np.abs(self.estimated.innovation / self.estimated.deviation)[self.compared]
-        return float(np.mean(found <= QUANTILE))
+        normalised = np.abs(self.estimated.innovation / self.estimated.deviation)[self.compared]
+        return float(np.mean(normalised <= QUANTILE))
 
     def document(self) -> dict[str, Any]:
         """JSON-ready; masses in grams, angles in degrees."""
@@ -329,8 +329,8 @@ class PourReplay:
         def grams(value: float | None) -> float | None:
             return None if value is None else round(1e3 * value, 4)
 
-        def onset(one: Onset | None) -> dict[str, float] | None:
-            return None if one is None else {"time_s": round(one.time, 3), "tilt_deg": round(math.degrees(one.tilt), 2)}
+        def onset(at: Onset | None) -> dict[str, float] | None:
+            return None if at is None else {"time_s": round(at.time, 3), "tilt_deg": round(math.degrees(at.tilt), 2)}
 
         estimated, values = self.estimated, self.values
         same_file = self.recording.name in values.fitted_on
@@ -365,13 +365,13 @@ class PourReplay:
                 "cpu_s": round(self.cpu_s, 2),
             },
             "estimator": {
-                "final_g": [grams(one) for one in estimated.final],
-                "lag_s": [round(one, 4) for one in estimated.lag],
+                "final_g": [grams(number) for number in estimated.final],
+                "lag_s": [round(number, 4) for number in estimated.lag],
                 "innovation_rms_g": grams(_rms(estimated.innovation[self.compared])),
                 "normalised_innovation": round(self.normalised_innovation, 3),
                 "coverage": round(self.coverage, 3),
             },
-            "warnings": [str(one) for one in self.recording.warnings],
+            "warnings": [str(warning) for warning in self.recording.warnings],
         }
 
 

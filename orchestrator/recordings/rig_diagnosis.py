@@ -165,18 +165,18 @@ class RigDiagnosis:
     @property
     def main(self) -> Explanation | None:
         """The first explanation that stands out; None if nothing does."""
-        return next((one for one in self.explanations if one.stands_out), None)
+        return next((cause for cause in self.explanations if cause.stands_out), None)
 
     @property
     def describes(self) -> bool:
         """Whether half of the doses or more are inside their interval, or within 5 %."""
-        hits = [one.inside or abs(one.predicted - one.weighed) <= 0.05 * one.weighed for one in self.doses]
+        hits = [dose.inside or abs(dose.predicted - dose.weighed) <= 0.05 * dose.weighed for dose in self.doses]
         return bool(hits) and 2 * sum(hits) >= len(hits)
 
     @property
     def dose_error(self) -> tuple[float, float] | None:
         """Mean and largest distance of the weighed from the wanted amount [kg]; None without doses."""
-        errors = [abs(one.weighed - one.wanted) for one in self.doses if one.wanted > 0.0]
+        errors = [abs(dose.weighed - dose.wanted) for dose in self.doses if dose.wanted > 0.0]
         return (float(np.mean(errors)), max(errors)) if errors else None
 
     def document(self) -> dict[str, Any]:
@@ -189,21 +189,21 @@ class RigDiagnosis:
             "main": None if self.main is None else self.main.name,
             "describes": self.describes,
             "explanations": [
-                {"name": one.name, "evidence": round(one.evidence, 2), "stands_out": one.stands_out, "text": one.text}
-                for one in self.explanations
+                {"name": e.name, "evidence": round(e.evidence, 2), "stands_out": e.stands_out, "text": e.text}
+                for e in self.explanations
             ],
             "doses": [
                 {
-                    "recording": one.name,
-                    "predicted_g": grams(one.predicted),
-                    "interval_g": [grams(one.low), grams(one.high)],
-                    "weighed_g": grams(one.weighed),
-                    "wanted_g": grams(one.wanted),
+                    "recording": dose.name,
+                    "predicted_g": grams(dose.predicted),
+                    "interval_g": [grams(dose.low), grams(dose.high)],
+                    "weighed_g": grams(dose.weighed),
+                    "wanted_g": grams(dose.wanted),
                 }
-                for one in self.doses
+                for dose in self.doses
             ],
             "missed_g": None if self.missed is None else grams(self.missed),
-            "dose_error_g": None if self.dose_error is None else [grams(one) for one in self.dose_error],
+            "dose_error_g": None if self.dose_error is None else [grams(error) for error in self.dose_error],
         }
 
 
@@ -217,18 +217,18 @@ def diagnose(recordings: Sequence[PourRecording], lag: float = NOMINAL_LAG) -> R
     Raises:
         InvalidArgumentError: not all are of one pourer.
     """
-    doses = [one for one in recordings if "dose" in one.name]
-    missed = [one for one in recordings if one.name.endswith(MISS)]
-    pours = [one for one in recordings if one not in doses and one not in missed and len(one.readings) > 10]
+    doses = [recording for recording in recordings if "dose" in recording.name]
+    missed = [recording for recording in recordings if recording.name.endswith(MISS)]
+    pours = [pour for pour in recordings if pour not in doses and pour not in missed and len(pour.readings) > 10]
     arrived = missed[0].gain if missed else None
     if len(pours) < 4:
         return RigDiagnosis((), (), arrived)
-    if other := next((one for one in [*pours, *doses] if one.scene.pourer != pours[0].scene.pourer), None):
+    if other := next((pour for pour in [*pours, *doses] if pour.scene.pourer != pours[0].scene.pourer), None):
         raise InvalidArgumentError(f"{other.name}: has another pourer than {pours[0].name}; record a day with one")
     fitted, best = _fitted(pours)
-    direct = sorted([_lag(recordings, lag), *_holds(recordings)], key=lambda one: -one.evidence)
-    order = sorted([*direct, *sorted(fitted, key=lambda one: -one.evidence)], key=lambda one: not one.stands_out)
-    return RigDiagnosis(tuple(order), tuple(best.predicted(one) for one in doses), arrived)
+    direct = sorted([_lag(recordings, lag), *_holds(recordings)], key=lambda e: -e.evidence)
+    order = sorted([*direct, *sorted(fitted, key=lambda e: -e.evidence)], key=lambda e: not e.stands_out)
+    return RigDiagnosis(tuple(order), tuple(best.predicted(recording) for recording in doses), arrived)
 
 
 def _wanted(name: str) -> float:
@@ -240,17 +240,17 @@ def _wanted(name: str) -> float:
 
 def _lag(recordings: Sequence[PourRecording], nominal: float) -> Explanation:
     """The lag while the receiver was put on, against the assumed one."""
-    found = lag_before(recordings)
-    if not any(len(one.placed) > 5 for one in recordings):
+    lag = lag_before(recordings)
+    if not any(len(recording.placed) > 5 for recording in recordings):
         return Explanation("lag", -math.inf, "unknown: no recording has the placing of the receiver", True)
-    each = [lag_before([one]) for one in recordings if len(one.placed) > 5]
-    logs = np.array([math.log(one.middle) for one in each])
-    own = math.hypot(found.deviation / math.sqrt(len(each)), 0.1)
+    each = [lag_before([recording]) for recording in recordings if len(recording.placed) > 5]
+    logs = np.array([math.log(unknown.middle) for unknown in each])
+    spread = math.hypot(lag.deviation / math.sqrt(len(each)), 0.1)
     miss = float(logs.mean()) - math.log(nominal)
-    narrow, wide = math.hypot(own, LAG_TOLERANCE), math.hypot(own, LAG_WIDE)
+    narrow, wide = math.hypot(spread, LAG_TOLERANCE), math.hypot(spread, LAG_WIDE)
     evidence = 0.5 * miss**2 * (narrow**-2 - wide**-2) - math.log(wide / narrow)
     value = math.exp(float(logs.mean()))
-    low, high = value * math.exp(-1.645 * own), value * math.exp(1.645 * own)
+    low, high = value * math.exp(-1.645 * spread), value * math.exp(1.645 * spread)
     return Explanation("lag", evidence, f"{value:.2f} s ({low:.2f} to {high:.2f}), {nominal:.2f} s assumed", True)
 
 
@@ -259,14 +259,14 @@ def _holds(recordings: Sequence[PourRecording]) -> list[Explanation]:
     share = held_share(recordings)
     if share is None:
         return []
-    found = [arrivals(one.read_times, one.readings, one.step) for one in recordings]
-    count, held = sum(one.rising for one in found), sum(one.repeated for one in found)
+    counts = [arrivals(recording.read_times, recording.readings, recording.step) for recording in recordings]
+    count, held = sum(count.rising for count in counts), sum(count.repeated for count in counts)
     evidence = float(
         betaln(held + 1, count - held + 1) - xlogy(held, HOLDS_NOMINAL) - xlog1py(count - held, -HOLDS_NOMINAL)
     )
     if share[0] < HOLDS_NOMINAL:
         evidence = min(evidence, 0.0)
-    value, low, high = (100 * one for one in share)
+    value, low, high = (100 * bound for bound in share)
     text = f"{value:.0f} % of the readings repeat while the mass rises ({low:.0f} to {high:.0f} %)"
     return [Explanation("holds", evidence, text, True)]
 
@@ -277,22 +277,22 @@ def _fitted(pours: Sequence[PourRecording]) -> tuple[list[Explanation], _Fit]:
     nothing = plain.evidence({})
     liquid = pours[0].scene.liquid
     chosen, viscosity = plain, []
-    if tried := [one for one in FACTORS if _possible(liquid, one)]:
+    if tried := [factor for factor in FACTORS if _possible(liquid, factor)]:
         fits = [_fit(pours, factor, plain.state) for factor in tried]
-        evidences = [one.evidence({}) - nothing for one in fits]
+        evidences = [fit.evidence({}) - nothing for fit in fits]
         best = int(np.argmax(evidences))
         evidence = float(logsumexp(evidences)) - math.log(len(tried))
         chosen = fits[best] if evidence > STANDS_OUT else plain
-        text = f"{tried[best]:.2g} × the file's fits best of {', '.join(f'{one:.2g}' for one in tried)}"
+        text = f"{tried[best]:.2g} × the file's fits best of {', '.join(f'{factor:.2g}' for factor in tried)}"
         viscosity.append(Explanation("viscosity", evidence, text, False))
-    found = []
+    explanations = []
     for name in NOMINAL:
         at, unknown = list(SHARED).index(name), UNKNOWNS[name]
         middle, spread = SHARED[name][1] * chosen.state[at], SHARED[name][1] * math.sqrt(chosen.covariance[at, at])
-        value, low, high = ((middle + part * spread) / unknown.factor for part in (0.0, -QUANTILE, QUANTILE))
+        value, low, high = ((middle + quantile * spread) / unknown.factor for quantile in (0.0, -QUANTILE, QUANTILE))
         text = f"{value:+.2g} {unknown.unit} ({low:+.2g} to {high:+.2g})"
-        found.append(Explanation(name, plain.evidence({name}) - nothing, text, False))
-    return [*found, *viscosity], chosen
+        explanations.append(Explanation(name, plain.evidence({name}) - nothing, text, False))
+    return [*explanations, *viscosity], chosen
 
 
 def _possible(liquid: Liquid, factor: float) -> bool:
@@ -317,25 +317,25 @@ class _PourModel:
         liquid = pours[0].scene.liquid
         liquid = Liquid(**liquid.model_dump() | {"dynamic_viscosity": factor * liquid.dynamic_viscosity})
         self._cup = flow_of(replace(pours[0].scene, liquid=liquid))
-        self.pours = [FittedReadings.of(one, None) for one in pours]
-        self._fills = np.array([[one.scene.liquid.mass, one.fill_deviation] for one in pours])
-        end = max(max(one.tilt_times[-1], one.read_times[-1]) - one.tilt_times[0] for one in pours)
+        self.pours = [FittedReadings.of(pour, None) for pour in pours]
+        self._fills = np.array([[pour.scene.liquid.mass, pour.fill_deviation] for pour in pours])
+        end = max(max(pour.tilt_times[-1], pour.read_times[-1]) - pour.tilt_times[0] for pour in pours)
         self._times = np.arange(0.0, end + 2.0 * TIME_STEP, TIME_STEP)
         self._tilts = np.stack(
             [
-                np.interp(self._times + one.tilt_times[0], one.tilt_times, one.tilts) + one.placement.grip
-                for one in pours
+                np.interp(self._times + pour.tilt_times[0], pour.tilt_times, pour.tilts) + pour.placement.grip
+                for pour in pours
             ]
         )
 
     def readings(self, states: Floats, lag: Unknown) -> list[Floats]:
         """Readings of each pour for states (S, P) (S, R) [kg]."""
         shared = {name: mean + deviation * states[:, i] for i, (name, (mean, deviation)) in enumerate(SHARED.items())}
-        own = states[:, len(SHARED) :].reshape(len(states), len(self.pours), PER_POUR)
+        per_pour = states[:, len(SHARED) :].reshape(len(states), len(self.pours), PER_POUR)
         cup, rim = self._cup, shared["height"]
-        flow = np.exp(shared["flow"][:, None] + OWN[1] * own[..., 1])
-        held = shared["dry"][:, None] + OWN[0] * own[..., 0]
-        content = (self._fills[:, 0] + self._fills[:, 1] * own[..., 2]) / cup.density
+        flow = np.exp(shared["flow"][:, None] + OWN[1] * per_pour[..., 1])
+        held = shared["dry"][:, None] + OWN[0] * per_pour[..., 0]
+        content = (self._fills[:, 0] + self._fills[:, 1] * per_pour[..., 2]) / cup.density
         volume, wet = content.copy(), np.broadcast_to(shared["wet"][:, None], held.shape)
         gone = np.zeros((len(self._times), *volume.shape))
         fullest = np.repeat(content.max(axis=0)[:, None], len(self._times), axis=1)
@@ -359,17 +359,17 @@ class _PourModel:
             np.stack(
                 [
                     displayed(
-                        self._times + one.recording.tilt_times[0],
+                        self._times + pour.recording.tilt_times[0],
                         mass[:, s, k],
-                        one.recording.read_times,
+                        pour.recording.read_times,
                         lag=float(lags[s]),
                         lag_shape=float(shape[s]),
-                        fall_time=one.fall_time,
+                        fall_time=pour.fall_time,
                     )
                     for s in range(len(states))
                 ]
             )
-            for k, one in enumerate(self.pours)
+            for k, pour in enumerate(self.pours)
         ]
 
     def whitened(self, state: Floats, lag: Unknown, noise: float) -> tuple[Floats, Floats]:
@@ -387,20 +387,21 @@ class _PourModel:
             probes[len(SHARED) + j, len(SHARED) + j :: PER_POUR] = 1.0
         residuals, slopes = [], []
         shown = self.readings(np.vstack([state, state + step * probes]), lag)
-        for k, (one, readings) in enumerate(zip(self.pours, shown, strict=True)):
-            times, each = one.recording.read_times[one.used], readings[:, one.used]
+        for k, (pour, readings) in enumerate(zip(self.pours, shown, strict=True)):
+            times, each = pour.recording.read_times[pour.used], readings[:, pour.used]
             rate = np.abs(np.gradient(each[0], times))
-            display = math.hypot(one.recording.step / math.sqrt(12.0), one.recording.balance.noise)
+            display = math.hypot(pour.recording.step / math.sqrt(12.0), pour.recording.balance.noise)
             deviation = noise * np.sqrt(READING_NOISE**2 + display**2 + (FLOW_NOISE * rate) ** 2)
-            part = np.zeros((len(times), size))
+            slope = np.zeros((len(times), size))
             change = ((each[1:] - each[0]) / step).T
-            own = len(SHARED) + PER_POUR * k
-            part[:, : len(SHARED)], part[:, own : own + PER_POUR] = change[:, : len(SHARED)], change[:, len(SHARED) :]
-            residual, part = (one.recording.net[one.used] - each[0]) / deviation, part / deviation[:, None]
-            kept = np.exp(-np.diff(times) / NOISE_TIME)
-            fresh = np.sqrt(1.0 - kept**2)
-            residuals.append(np.append(residual[:1], (residual[1:] - kept * residual[:-1]) / fresh))
-            slopes.append(np.vstack([part[:1], (part[1:] - kept[:, None] * part[:-1]) / fresh[:, None]]))
+            first = len(SHARED) + PER_POUR * k
+            slope[:, : len(SHARED)] = change[:, : len(SHARED)]
+            slope[:, first : first + PER_POUR] = change[:, len(SHARED) :]
+            residual, slope = (pour.recording.net[pour.used] - each[0]) / deviation, slope / deviation[:, None]
+            correlation = np.exp(-np.diff(times) / NOISE_TIME)
+            fresh = np.sqrt(1.0 - correlation**2)
+            residuals.append(np.append(residual[:1], (residual[1:] - correlation * residual[:-1]) / fresh))
+            slopes.append(np.vstack([slope[:1], (slope[1:] - correlation[:, None] * slope[:-1]) / fresh[:, None]]))
         return np.concatenate(residuals), np.vstack(slopes)
 
 

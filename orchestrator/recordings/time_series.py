@@ -52,8 +52,8 @@ class Column:
     def __len__(self) -> int:
         return len(self.times)
 
-    def __getitem__(self, part: slice) -> Column:
-        return Column(self.times[part], self.values[part], self.lines[part])
+    def __getitem__(self, rows: slice) -> Column:
+        return Column(self.times[rows], self.values[rows], self.lines[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def read_series(path: Path, names: Mapping[str, str] | None = None) -> TimeSerie
     header = table.header
     series = TimeSeries(table, places, {})
     problems = table.misfits()
-    found: dict[str, tuple[list[float], list[float], list[int]]] = {name: ([], [], []) for name in places}
+    cells: dict[str, tuple[list[float], list[float], list[int]]] = {name: ([], [], []) for name in places}
     before, unsorted = -math.inf, 0
     for row in table.rows:
         if len(problems) >= PROBLEMS_SHOWN:
@@ -117,13 +117,13 @@ def read_series(path: Path, names: Mapping[str, str] | None = None) -> TimeSerie
         before = time
         for name, number in numbers.items():
             if number is not None:
-                times, values, lines = found[name]
+                times, values, lines = cells[name]
                 times.append(time)
                 values.append(factors[name] * number)
                 lines.append(row.line)
     columns = {
         name: Column(np.array(times), np.array(values), np.array(lines, dtype=np.int64))
-        for name, (times, values, lines) in found.items()
+        for name, (times, values, lines) in cells.items()
         if times
     }
     for name, column in columns.items():
@@ -138,7 +138,7 @@ def read_series(path: Path, names: Mapping[str, str] | None = None) -> TimeSerie
     first = min(column.times[0] for column in columns.values())
     if first > CLOCK:
         line = table.rows[0].line
-        columns = {name: Column(one.times - first, one.values, one.lines) for name, one in columns.items()}
+        columns = {name: Column(column.times - first, column.values, column.lines) for name, column in columns.items()}
         if first > 1e3 * CLOCK:
             text = f"{first:g} s is not a time in seconds; if it is in milliseconds, name the column time_ms"
             raise ConfigError([series.problem(line, text, "time")])
@@ -155,11 +155,11 @@ def _places(table: SavedTable, names: Mapping[str, str]) -> tuple[dict[str, int]
     """
     problems: list[Problem] = []
     unread: list[str] = []
-    columns = columns_of(table, COLUMNS, {theirs: own for own, theirs in names.items()}, problems, unread)
+    columns = columns_of(table, COLUMNS, {theirs: standard for standard, theirs in names.items()}, problems, unread)
     header = [str(cell) for cell in table.header.cells]
-    for own, theirs in names.items():
+    for standard, theirs in names.items():
         if theirs not in header:
-            text = f"column '{theirs}' is missing, which 'columns' names for '{own}'"
+            text = f"column '{theirs}' is missing, which 'columns' names for '{standard}'"
             problems.append(table.problem(table.header, None, "", text))
     places: dict[str, int] = {}
     factors: dict[str, float] = {}
@@ -228,8 +228,8 @@ def write_series(path: Path, columns: Mapping[str, Iterable[tuple[float, float]]
 
 def gaps(column: Column, longest: float) -> list[int]:
     """Positions before which a column has no value for more than `longest` [s]."""
-    found: list[int] = (np.flatnonzero(np.diff(column.times) > longest) + 1).tolist()
-    return found
+    places: list[int] = (np.flatnonzero(np.diff(column.times) > longest) + 1).tolist()
+    return places
 
 
 @dataclass(frozen=True)
