@@ -44,7 +44,7 @@ def set_action(
     problems: list[str] = []
     seen: set[str] = set()
     for text in assignments:
-        name, equals, value = (part.strip() for part in text.partition("="))
+        name, equals, value = (word.strip() for word in text.partition("="))
         if not equals or not value:
             problems.append(f"{text!r}: should be name=value, for example x_offset=90")
             continue
@@ -147,17 +147,17 @@ def parse_constraint(text: str, space: Space) -> Linear:
 
 def _terms(side: str, text: str) -> list[tuple[float, str | None, str]]:
     """Sign, number and word (a dimension or a unit) of each term of a sum."""
-    found: list[tuple[float, str | None, str]] = []
+    terms: list[tuple[float, str | None, str]] = []
     at = 0
-    while at < len(side) or not found:
+    while at < len(side) or not terms:
         match = _TERM.match(side, at)
         number, word = (match["number"], match["word"] or "") if match else (None, "")
-        missing = match is None or (number is None and not word) or (found and match["sign"] is None)
+        missing = match is None or (number is None and not word) or (terms and match["sign"] is None)
         if match is None or missing or (match["times"] and (number is None or not word)):
             raise QuantityError(f"{text!r} is not understood at {side[at:].strip()!r}; for example '{EXAMPLE}'")
-        found.append((-1.0 if match["sign"] in ("-", "−") else 1.0, number, word))
+        terms.append((-1.0 if match["sign"] in ("-", "−") else 1.0, number, word))
         at = match.end()
-    return found
+    return terms
 
 
 def _kind(

@@ -76,7 +76,7 @@ def senseless(
             _too_fast(plan.actions, scene, name, arm.tilt_speed_limit)
             for name in ("angular_velocity", "return_velocity")
         ]
-    return [one for one in findings if one is not None]
+    return [finding for finding in findings if finding is not None]
 
 
 def _misses(
@@ -117,13 +117,13 @@ def _misses(
     axis = next((axis for axis in actions.axes if axis.name == "x_offset"), None)
     fixed = scene.fixed.get("x_offset")
     if axis is not None:
-        part = max(0.0, min(high, axis.upper) - max(low, axis.lower)) / (axis.upper - axis.lower)
-        if part >= LEAST:
+        hitting = max(0.0, min(high, axis.upper) - max(low, axis.lower)) / (axis.upper - axis.lower)
+        if hitting >= LEAST:
             return None
         share = (
             "from no x_offset in this range can a stream hit"
-            if part == 0.0
-            else f"only from {100 * part:.0f} % of this range can a stream hit"
+            if hitting == 0.0
+            else f"only from {100 * hitting:.0f} % of this range can a stream hit"
         )
     elif fixed is not None and not low <= fixed <= high:
         share = "from this x_offset no stream can hit"
@@ -242,21 +242,21 @@ class _Checker:
     def problem(self, places: tuple[Loc, ...], text: str) -> Problem:
         """A problem at the first of these places that exists in the campaign's file."""
         document = self.document
-        found = None if document is None else next((loc for loc in places if loc in document.marks), None)
-        if document is None or found is None:
+        first = None if document is None else next((loc for loc in places if loc in document.marks), None)
+        if document is None or first is None:
             return Problem(self.source, 0, 0, "", text)
-        return document.problem(found, text)
+        return document.problem(first, text)
 
     def vessel(self, spec: VesselSpec, places: tuple[Loc, ...]) -> Vessel | None:
         if spec not in self.vessels:
             where = f" ({spec.shape.path})" if isinstance(spec.shape, MeshShape) else ""
             try:
-                found = self.vessels[spec] = built(spec)
+                cup = self.vessels[spec] = built(spec)
             except (VesselError, OSError) as error:
                 self.add(places, f"vessel '{spec.name}'{where}: {error}")
                 self.vessels[spec] = None
             else:
-                for text in found.warnings:
+                for text in cup.warnings:
                     self.warn(self.problem(places, f"vessel '{spec.name}'{where}: {text}"))
         return self.vessels[spec]
 
@@ -278,14 +278,14 @@ class _Checker:
         load = f"the {scene.liquid.name} ({scene.liquid.mass * 1e3:g} g)"
         less = wanted is not None and wanted < scene.liquid.volume
         for vessel, name in ((pourer, "pourer"), (receiver, "receiver")):
-            what, volume = (
+            purpose, volume = (
                 (load, scene.liquid.volume) if wanted is None or vessel is pourer else ("what is asked for", wanted)
             )
             try:
                 check_holds(vessel, volume)
             except VesselError as error:
                 ok = False
-                self.add(places[name], f"{role.text}: {name} can't hold {what if less else load}: {error}")
+                self.add(places[name], f"{role.text}: {name} can't hold {purpose if less else load}: {error}")
         if ok and less and not dosed and scene.liquid.volume > receiver.capacity:
             text = (
                 f"{role.text}: the receiver holds {1e6 * receiver.capacity:.4g} mL, enough for what is asked for, not "
@@ -412,8 +412,8 @@ class _Checker:
     def doses(self, plan: DispensePlan, *, simulated: bool) -> None:
         """Every dose must fit into its receiver and come out of a full source."""
         for scene in plan.scenes:
-            doses = [one for one in plan.doses if one.receiver == scene.receiver.name]
-            largest = max((one.amount + one.limit for one in doses), default=0.0)
+            doses = [planned for planned in plan.doses if planned.receiver == scene.receiver.name]
+            largest = max((planned.amount + planned.limit for planned in doses), default=0.0)
             role = _Role(f"doses from '{scene.pourer.name}' into '{scene.receiver.name}'", ("dispense",))
             if self.scene(scene, role, largest / scene.liquid.density, dosed=True) is None:
                 continue
@@ -595,10 +595,10 @@ def touch(scene: Scene, action: Action, pourer: Vessel, receiver: Vessel) -> str
         ValueError: the motion can't be made.
     """
     motion = plan_motion(scene, action, pourer, receiver)
-    found = contact_during(motion, pourer, receiver)
-    if found is None:
+    touching = contact_during(motion, pourer, receiver)
+    if touching is None:
         return None
-    contact, tilt = found
+    contact, tilt = touching
     return describe_contact(
         contact, tilt=tilt, pourer=f"pourer '{scene.pourer.name}'", receiver=f"receiver '{scene.receiver.name}'"
     )

@@ -237,7 +237,7 @@ class DeploymentSection(StageSettings):
             problems.add("stands beside 'objectives'; keep one of them", "loss", key=True)
         if not self.objectives:
             problems.add("is empty; name at least one, for example '- {name: spilled}'", "objectives")
-        names = [part.name for part in self.objectives]
+        names = [objective.name for objective in self.objectives]
         for i, name in enumerate(names):
             if name in names[:i] and problems.within("objectives", i).valid("name"):
                 problems.add(f"{name} stands twice in the list; keep one of them", "objectives", i)
@@ -267,13 +267,13 @@ def settings_in(section: Settings, kind: type[T]) -> T:
 
 def _variants(settings: Mapping[str, type[StrategySettings]], base: type[Settings]) -> dict[str, type[Settings]]:
     """The sections of all strategies: their settings, with the common keys of their kind."""
-    found: dict[str, type[Settings]] = {}
-    for name, own in settings.items():
-        learns = issubclass(own, DeploymentSettings) and own.learns_on_pours
-        bases = (own, LearningSettings if learns else base)
-        found[name] = create_model(f"{name}Settings", __base__=bases, __doc__=own.__doc__)
-        found[name].required = own.required | base.required
-    return found
+    variants: dict[str, type[Settings]] = {}
+    for name, strategy in settings.items():
+        learns = issubclass(strategy, DeploymentSettings) and strategy.learns_on_pours
+        bases = (strategy, LearningSettings if learns else base)
+        variants[name] = create_model(f"{name}Settings", __base__=bases, __doc__=strategy.__doc__)
+        variants[name].required = strategy.required | base.required
+    return variants
 
 
 CALIBRATIONS = _variants(calibrations(), CalibrationSection)

@@ -69,8 +69,8 @@ def _estimates(name: str, base: type[EstimateSettings]) -> Any:
             "mean": (Annotated[float, Quantity(info.unit, info.example)], ...),
             "deviation": (Annotated[float, width], ...),
         }
-        part = create_model(f"{name}{parameter.title().replace('_', '')}", __base__=base, __doc__=base.__doc__, **types)
-        fields[parameter] = (part | None, Field(default=None, description=info.meaning))
+        kind = create_model(f"{name}{parameter.title().replace('_', '')}", __base__=base, __doc__=base.__doc__, **types)
+        fields[parameter] = (kind | None, Field(default=None, description=info.meaning))
     return create_model(f"{name}Parameters", __base__=Settings, __doc__="Parameters by name.", **fields)
 
 
@@ -139,8 +139,8 @@ class KnownPosterior(Settings):
     @property
     def estimates(self) -> dict[str, tuple[float, float]]:
         """Mean and standard deviation [SI] by parameter."""
-        given = {name: self.parameters.value(name) for name in self.parameters.written_keys()}
-        return {name: (one.mean, one.deviation) for name, one in given.items() if one is not None}
+        written = {name: self.parameters.value(name) for name in self.parameters.written_keys()}
+        return {name: (estimate.mean, estimate.deviation) for name, estimate in written.items() if estimate is not None}
 
     def check_values(self, problems: Problems) -> None:
         """Check that it tells something."""
@@ -176,19 +176,19 @@ class ResolvedPrior(Settings):
     def of(cls, memory: CampaignMemory) -> ResolvedPrior:
         """The settings of a resolved prior."""
         rows = {
-            one.name: {"mean": one.mean, "deviation": one.deviation, "runs": list(one.runs)}
-            for one in memory.parameters
+            row.name: {"mean": row.mean, "deviation": row.deviation, "runs": list(row.runs)}
+            for row in memory.parameters
         }
         return cls.model_validate({"parameters": rows, "left_out": list(memory.left_out)})
 
     @property
     def memory(self) -> CampaignMemory:
         """The resolved prior."""
-        given = {name: self.parameters.value(name) for name in self.parameters.written_keys()}
+        estimates = {name: self.parameters.value(name) for name in self.parameters.written_keys()}
         rows = [
-            RememberedParameter(name, one.mean, one.deviation, tuple(one.runs))
-            for name, one in given.items()
-            if one is not None
+            RememberedParameter(name, estimate.mean, estimate.deviation, tuple(estimate.runs))
+            for name, estimate in estimates.items()
+            if estimate is not None
         ]
         return CampaignMemory(tuple(rows), tuple(self.left_out))
 
@@ -292,8 +292,8 @@ def resolve_prior(
 
 def _named(name: str, place: Place, references: References, source: PosteriorSource) -> KnownPosterior | None:
     if name.lower().endswith(YAML_SUFFIXES):
-        found = references.section(name, place, KnownPosterior)
-        return None if found is None or references.report.is_broken_within(found[1]) else found[0]
+        section = references.section(name, place, KnownPosterior)
+        return None if section is None or references.report.is_broken_within(section[1]) else section[0]
     try:
         return source.of_run(name)
     except (RunError, OSError) as error:
@@ -313,26 +313,26 @@ def _unfit(known: KnownPosterior, needs: PriorNeeds, source: PosteriorSource) ->
     if known.arm != (arm := arm_of(deciding(laboratory))):
         reasons.append(f"it is of another arm ({known.arm}, here {arm})")
     for name, value in known.fixed.items():
-        here = needs.fixed.get(name)
-        if here is not None and not math.isclose(value, here, rel_tol=1e-9, abs_tol=1e-12):
-            reasons.append(f"its simulations had {name} {value:g}, here it is {here:g}")
+        ours = needs.fixed.get(name)
+        if ours is not None and not math.isclose(value, ours, rel_tol=1e-9, abs_tol=1e-12):
+            reasons.append(f"its simulations had {name} {value:g}, here it is {ours:g}")
     if not set(known.estimates).intersection(needs.wanted):
         names = ", ".join(known.estimates)
         reasons.append(f"it is about {names}, which {needs.why}")
     return reasons
 
 
-def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: PosteriorSource) -> CampaignMemory:
+def _combined(posteriors: Sequence[KnownPosterior], needs: PriorNeeds, source: PosteriorSource) -> CampaignMemory:
     """Combine the posteriors that fit, parameter by parameter."""
     left_out: list[str] = []
     usable: list[KnownPosterior] = []
-    for known in found:
+    for known in posteriors:
         reasons = _unfit(known, needs, source)
         if reasons:
             left_out.append(f"{known.posterior}: {'; '.join(reasons)}")
         else:
             usable.append(known)
-    if not found:
+    if not posteriors:
         left_out.append("the catalogue has no posterior yet: a calibration with C4 makes one")
     shape, infos = shape_digest(scene_by_content(needs.scene)), SimulationParameters.info()
     for known in usable:
@@ -341,9 +341,9 @@ def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: Poster
         if known.laboratory != needs.laboratory.name and any(group_of(n) == PLACEMENT for n in known.estimates):
             text = f"it is of laboratory '{known.laboratory}', here it is '{needs.laboratory.name}'"
             left_out.append(f"{known.posterior}: its {PLACEMENT} is not transferred, {text}")
-    here = [known for known in usable if known.laboratory == needs.laboratory.name]
-    moved = {name: known.posterior for known in here for name in known.contradicts}
-    for known in here:
+    local = [known for known in usable if known.laboratory == needs.laboratory.name]
+    moved = {name: known.posterior for known in local for name in known.contradicts}
+    for known in local:
         if known.posterior in moved and any(group_of(n) == PLACEMENT for n in known.estimates):
             text = f"the pours of {moved[known.posterior]} contradict it"
             left_out.append(f"{known.posterior}: its {PLACEMENT} is not transferred, {text}")
@@ -354,7 +354,7 @@ def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: Poster
         if group == LIQUID:
             told = [known for known in told if not _liquid_differs(known, needs.scene)]
         elif group == PLACEMENT:
-            told = [known for known in here if name in known.estimates and known.posterior not in moved]
+            told = [known for known in local if name in known.estimates and known.posterior not in moved]
         same_vessel = [known for known in told if known.shape == shape]
         if group == WALLS and same_vessel:
             told = same_vessel
@@ -366,11 +366,11 @@ def _combined(found: Sequence[KnownPosterior], needs: PriorNeeds, source: Poster
         spread = usual_spread(infos[name], same_vessel=bool(same_vessel))
         mean, deviation = predicted([known.estimates[name] for known in told], spread)
         mean = min(max(mean, infos[name].lower), infos[name].upper)
-        one = RememberedParameter(name, mean, deviation, tuple(known.posterior for known in told))
+        parameter = RememberedParameter(name, mean, deviation, tuple(known.posterior for known in told))
         if not lower - 3.0 * deviation <= mean <= upper + 3.0 * deviation:
-            left_out.append(f"{one} is outside the searched range; widen the range")
+            left_out.append(f"{parameter} is outside the searched range; widen the range")
             continue
-        remembered.append(one)
+        remembered.append(parameter)
     return CampaignMemory(tuple(remembered), tuple(left_out))
 
 
@@ -384,7 +384,7 @@ def _liquid_differs(known: KnownPosterior, scene: Scene) -> str:
         "surface tension": (theirs.surface_tension, ours.surface_tension),
         "viscosity": (theirs.viscosity, ours.dynamic_viscosity),
     }
-    for name, (there, here) in pairs.items():
-        if not math.isclose(there, here, rel_tol=ALIKE):
-            return f"its {name} is {there:g}, here it is {here:g} (SI)"
+    for name, (value, expected) in pairs.items():
+        if not math.isclose(value, expected, rel_tol=ALIKE):
+            return f"its {name} is {value:g}, here it is {expected:g} (SI)"
     return ""

@@ -93,11 +93,11 @@ def _objectives(
     """The objectives that replace a loss; None if none are given."""
     if section.objectives is None:
         return None
-    names = [part.name for part in section.objectives]
-    for i, part in enumerate(section.objectives):
+    names = [objective.name for objective in section.objectives]
+    for i, objective in enumerate(section.objectives):
         if not report.is_broken(place.at("objectives", i, "name")):
             beside = frozenset(names[:i] + names[i + 1 :])
-            part.check(scene, actions, beside, PlacedProblems(place.at("objectives", i), report))
+            objective.check(scene, actions, beside, PlacedProblems(place.at("objectives", i), report))
     floor = 0.5 if section.floor is None else section.floor
     return Objectives(tuple(section.objectives), floor)
 
@@ -154,14 +154,14 @@ def _check_that_pouring_pays(loss: Loss, actions: Space, place: Place, report: R
     stops = [name for name in STOPS if name in actions.names]
     if not stops or (loss.name == "spilled_and_retained" and loss.retained_weight != 0.0):
         return
-    at, what = (
+    at, verb = (
         (place.at("retained_weight"), "with 0 the loss")
         if loss.name == "spilled_and_retained"
         else (place.at("name"), f"'{loss.name}'")
     )
     report.add(
         at,
-        f"{what} is least where next to nothing is poured, and with {' and '.join(stops)} searched a pour can stop so "
+        f"{verb} is least where next to nothing is poured, and with {' and '.join(stops)} searched a pour can stop so "
         f"early; fix {' and '.join(stops)} under motion, use spilled_and_retained with a retained_weight above 0, or "
         "'objectives' with their 'floor'",
     )
@@ -226,8 +226,8 @@ def resolve_calibration(
     elif pours.count and laboratory is not None and not laboratory.pours:
         text = f"laboratory '{laboratory.name}' has no bench to pour on; name a CSV file with 'from'"
         report.add(at.at("count"), text)
-    made = pours.source is None and pours.from_run is None
-    count, holdout = (pours.count or 0, pours.held_out) if made else (0, 0)
+    poured = pours.source is None and pours.from_run is None
+    count, holdout = (pours.count or 0, pours.held_out) if poured else (0, 0)
     settings = None
     if not report.is_broken(place.at("strategy")):
         train = count - holdout if records is None else records.training_pours
@@ -275,7 +275,7 @@ def resolve_dispense(
     pourers: list[VesselSpec | None] = (
         [builder.pourer(None, place)]
         if section.sources is None
-        else [builder.references.vessel(one, place.at("sources", i)) for i, one in enumerate(section.sources)]
+        else [builder.references.vessel(source, place.at("sources", i)) for i, source in enumerate(section.sources)]
     )
     receivers: dict[str, VesselSpec | None] = {}
     doses = []
@@ -287,15 +287,15 @@ def resolve_dispense(
             report.add(place.at("doses", i), f"two different receivers are both called '{vessel.name}'")
         limit = section.tolerance if dose.tolerance is None else dose.tolerance
         doses.append(PlannedDose(dose.amount, limit, vessel.name, dose.position or ""))
-    names = [one.name for one in pourers if one is not None]
+    names = [source.name for source in pourers if source is not None]
     if len(set(names)) < len(names):
         report.add(place.at("sources"), "two sources have the same name; give each vessel its own")
     if report.problems or laboratory is None:
         return None
-    given: set[str] = set()
+    fixed_names: set[str] = set()
     for motion in (builder.file.motion, section.motion):
-        given |= set() if motion is None else set(motion.fixed())
-    constants = {name: value for name, value in DOSE_MOTION.items() if name not in given}
+        fixed_names |= set() if motion is None else set(motion.fixed())
+    constants = {name: value for name, value in DOSE_MOTION.items() if name not in fixed_names}
     scenes = []
     for pourer, (name, receiver) in itertools.product(pourers, receivers.items()):
         assert pourer is not None
@@ -323,8 +323,8 @@ def _prior(
         return builder.prior(section.actions, place, actions, constraints)
     if not report.is_broken(place.at("strategy")):
         why = f"belongs to {owners_of_priors()}, which averages over the prior; {strategy} simulates the weighed pours"
-        own = section.actions is not None
-        builder.refuse_prior(section.actions if own else builder.file.actions, place if own else builder.root, why)
+        local = section.actions is not None
+        builder.refuse_prior(section.actions if local else builder.file.actions, place if local else builder.root, why)
     return ()
 
 
@@ -440,8 +440,8 @@ def _memory(
             why="the campaign fixes",
         )
     else:
-        what = "doses have none" if deployment is None else f"{deployment.strategy} simulates nothing"
-        report.add(place, f"tells about parameters of the simulator, and {what}; remove it", key=True)
+        reason = "doses have none" if deployment is None else f"{deployment.strategy} simulates nothing"
+        report.add(place, f"tells about parameters of the simulator, and {reason}; remove it", key=True)
         return None
 
     return resolve_prior(file.prior, needs, place, references, posteriors)

@@ -96,8 +96,8 @@ def load_vessel(path: Path | str) -> VesselSpec:
     if path.suffix.lower() in MESH_SUFFIXES:
         message = f"is a mesh; describe the vessel in a YAML file: {{name: {path.stem}, mesh: {path.name}, unit: mm}}"
         raise ConfigError([Problem(resolved(path), 0, 0, "", message)])
-    found = References(report).file(resolved(path), VesselFile)
-    vessel = None if found is None else resolve_vessel(*found, report)
+    section = References(report).file(resolved(path), VesselFile)
+    vessel = None if section is None else resolve_vessel(*section, report)
     report.raise_if_any()
     assert vessel is not None, "a vessel without problems has a spec"
     return vessel
@@ -106,10 +106,10 @@ def load_vessel(path: Path | str) -> VesselSpec:
 def load_posterior_file(path: Path) -> KnownPosterior:
     """The posterior of a file that `decant runs posterior` has written. Raises ConfigError."""
     report = Report()
-    found = References(report).file(resolved(path), KnownPosterior)
+    section = References(report).file(resolved(path), KnownPosterior)
     report.raise_if_any()
-    assert found is not None, "a file without problems has a posterior"
-    return found[0]
+    assert section is not None, "a file without problems has a posterior"
+    return section[0]
 
 
 def vessel_from(document: Document) -> VesselSpec:
@@ -143,12 +143,12 @@ def load_laboratory(path: Path, *, stored: bool = True) -> LaboratorySettings:
     """
     report = Report()
     references = References(report)
-    found = references.file(resolved(path), LaboratorySettings)
+    section = references.file(resolved(path), LaboratorySettings)
     report.raise_if_any()
-    assert found is not None, "a laboratory without problems has settings"
+    assert section is not None, "a laboratory without problems has settings"
     if not stored:
-        return found[0].ready()
-    laboratory = references.laboratory(str(resolved(path)), found[1])
+        return section[0].ready()
+    laboratory = references.laboratory(str(resolved(path)), section[1])
     report.raise_if_any()
     assert laboratory is not None, "a laboratory without problems is ready"
     return laboratory
@@ -158,10 +158,10 @@ def laboratory_record(path: Path) -> dict[str, Any]:
     """The laboratory of a file as a record, ready for JSON: loading it gives the same. Raises ConfigError."""
     report = Report()
     references = References(report)
-    found = references.file(resolved(path), LaboratorySettings)
+    section = references.file(resolved(path), LaboratorySettings)
     report.raise_if_any()
-    assert found is not None, "a laboratory without problems has settings"
-    return as_file(*found, references)
+    assert section is not None, "a laboratory without problems has settings"
+    return as_file(*section, references)
 
 
 class _LooseQuantity(Quantity):
@@ -212,11 +212,11 @@ def load_discrepancy(path: Path) -> CalibrationResidual | None:
         ConfigError: its shift is not a number ≥ 0, or its scenes are no digests.
     """
     document = Document.read(resolved(path))
-    found = document.data.get(DISCREPANCY_KEY) if isinstance(document.data, dict) else None
-    if found is None:
+    section = document.data.get(DISCREPANCY_KEY) if isinstance(document.data, dict) else None
+    if section is None:
         return None
     place, report = Place(document).at(DISCREPANCY_KEY), Report()
-    value, scenes = (found.get(SHIFT_KEY), found.get(SCENES_KEY, [])) if isinstance(found, dict) else (None, [])
+    value, scenes = (section.get(SHIFT_KEY), section.get(SCENES_KEY, [])) if isinstance(section, dict) else (None, [])
     if not isinstance(value, int | float) or isinstance(value, bool) or not 0.0 <= value < math.inf:
         report.add(place, f"needs a '{SHIFT_KEY}' from 0 on, as decant calibrate writes it")
     if not isinstance(scenes, list) or not all(isinstance(scene, str) for scene in scenes):
@@ -257,8 +257,8 @@ def load_posterior(
             continue
         section = validate(_Theta, at.at("theta"), report)
         if section is not None:
-            given = {name: v for name in section.written_keys() if (v := section.value(name)) is not None}
-            thetas.append(SimulationParameters.from_values((base or SimulationParameters()).model_dump() | given))
+            values = {name: v for name in section.written_keys() if (v := section.value(name)) is not None}
+            thetas.append(SimulationParameters.from_values((base or SimulationParameters()).model_dump() | values))
             weights.append(float(weight))
     report.raise_if_any()
     total = list(accumulate(weights))
@@ -288,9 +288,9 @@ def load_parameters(path: Path, base: SimulationParameters | None = None) -> Sim
     section = validate(_Theta, place, report)
     values: dict[str, float] = (base or SimulationParameters()).model_dump()
     if section is not None:
-        given = {name: v for name in section.written_keys() if (v := section.value(name)) is not None}
-        if not given and not report.problems:
+        written = {name: v for name in section.written_keys() if (v := section.value(name)) is not None}
+        if not written and not report.problems:
             report.add(place, f"names no parameter; known are {', '.join(values)}")
-        values |= given
+        values |= written
     report.raise_if_any()
     return SimulationParameters.from_values(values)

@@ -70,13 +70,13 @@ def deciding(value: Any) -> Any:
         }
         kind = {"kind": value.kind} if isinstance(value, Shape) else {}
         return kind | {
-            name: hashlib.sha256(found.read_bytes()).hexdigest() if mark == BY_CONTENT else deciding(found)
-            for name, (found, mark) in fields.items()
+            name: hashlib.sha256(content.read_bytes()).hexdigest() if mark == BY_CONTENT else deciding(content)
+            for name, (content, mark) in fields.items()
         }
     if isinstance(value, Mapping):
-        return {key: deciding(found) for key, found in value.items()}
+        return {key: deciding(content) for key, content in value.items()}
     if isinstance(value, list | tuple):
-        return [deciding(found) for found in value]
+        return [deciding(content) for content in value]
     return to_json(value)
 
 

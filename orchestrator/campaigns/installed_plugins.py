@@ -42,15 +42,15 @@ def installed() -> list[Plugin]:
 
 def packages() -> dict[str, tuple[str, list[str]]]:
     """Other packages that register plug-ins: version, and the plug-ins ('decant.balances: spring'). Loads nothing."""
-    found: dict[str, tuple[str, list[str]]] = {}
+    entries: dict[str, tuple[str, list[str]]] = {}
     for door in doors():
         for entry in entries_of(door.group):
             if entry.dist is not None and entry.dist.name != DISTRIBUTION:
-                _, names = found.setdefault(entry.dist.name, (entry.dist.version, []))
+                _, names = entries.setdefault(entry.dist.name, (entry.dist.version, []))
                 names.append(f"{door.group}: {entry.name}")
-    return found
+    return entries
 
 
 def broken() -> list[UnloadablePlugin]:
     """Registered plug-ins that can't be loaded, with the reason."""
-    return [one for door in doors() for one in door.broken]
+    return [plugin for door in doors() for plugin in door.broken]

@@ -39,7 +39,7 @@ def write_place(path: Path, place: PlaceSettings) -> None:
     places = document.setdefault("places", CommentedSeq())
     if not isinstance(places, CommentedSeq):
         raise DecantError(f"{path}: 'places' should be a list")
-    entry = next((one for one in places if isinstance(one, CommentedMap) and one.get("name") == place.name), None)
+    entry = next((p for p in places if isinstance(p, CommentedMap) and p.get("name") == place.name), None)
     if entry is None:
         entry = CommentedMap(name=place.name)
         places.append(entry)

@@ -154,11 +154,11 @@ class _PourReader:
 
     def read(self, renamed: Mapping[str, str]) -> None:
         table, saved = self.table, self.saved
-        found = columns_of(saved, COLUMNS, renamed, table.problems)
-        self._check_columns([column.standard for column in found if column is not None])
+        resolved = columns_of(saved, COLUMNS, renamed, table.problems)
+        self._check_columns([column.standard for column in resolved if column is not None])
         if table.problems:
             return
-        columns = [column for column in found if column is not None]
+        columns = [column for column in resolved if column is not None]
         names = {column.standard for column in columns}
         table.dimensions = tuple(
             name

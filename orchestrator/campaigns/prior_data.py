@@ -116,18 +116,18 @@ def pours_in(run: PreviousRun, scene: Scene) -> tuple[list[RecordedPour], str]:
 
 
 def _difference(theirs: Mapping[str, Any], ours: Mapping[str, Any]) -> list[str]:
-    found = []
+    differences = []
     for role in ("pourer", "receiver"):
         if theirs[role]["shape"] != ours[role]["shape"]:
-            found.append(f"its {role} '{theirs[role]['name']}' is not shaped as '{ours[role]['name']}'")
+            differences.append(f"its {role} '{theirs[role]['name']}' is not shaped as '{ours[role]['name']}'")
     for name, unit, factor in (("mass", "g", 1e3), ("density", "kg/m^3", 1.0)):
-        there, here = theirs["liquid"][name], ours["liquid"][name]
-        if not math.isclose(there, here, rel_tol=1e-6):
-            found.append(f"its liquid has {there * factor:g} {unit}, here {here * factor:g} {unit}")
+        their_value, our_value = theirs["liquid"][name], ours["liquid"][name]
+        if not math.isclose(their_value, our_value, rel_tol=1e-6):
+            differences.append(f"its liquid has {their_value * factor:g} {unit}, here {our_value * factor:g} {unit}")
     for name in ("pivot", "max_hold_time"):
         if theirs.get(name) != ours[name]:
-            found.append(f"its motion.{name} is another one")
-    return found
+            differences.append(f"its motion.{name} is another one")
+    return differences
 
 
 @dataclass(frozen=True)
@@ -165,10 +165,10 @@ def _unfit(action: Action, scene: Scene, actions: Space) -> str:
                 bounds = f"{_shown(axis.lower, dimension)} … {_shown(axis.upper, dimension)}"
                 return f"{name} {'is switched off' if value is None else 'is outside ' + bounds}"
             continue
-        here = getattr(usual, name)
-        same = value is here if value is None or here is None else abs(value - here) <= SAME
+        our_value = getattr(usual, name)
+        same = value is our_value if value is None or our_value is None else abs(value - our_value) <= SAME
         if not same:
-            return f"{name} was {_shown(value, dimension)}, here it is {_shown(here, dimension)}"
+            return f"{name} was {_shown(value, dimension)}, here it is {_shown(our_value, dimension)}"
     return ""
 
 

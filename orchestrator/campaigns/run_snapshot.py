@@ -83,15 +83,15 @@ def _calibration(base: Mapping[str, Any], plan: CalibrationPlan) -> dict[str, An
     if plan.records is not None:
         pours = {"from_run": str(plan.records.path.parent)}
     pours["design"] = "stratified" if plan.records is not None else plan.design
-    own = {"pours": pours, "random_baseline": plan.random_baseline, **written(plan.settings)}
-    return {**_common(base, CalibrationSection), **own}
+    settings = {"pours": pours, "random_baseline": plan.random_baseline, **written(plan.settings)}
+    return {**_common(base, CalibrationSection), **settings}
 
 
 def _deployment(base: Mapping[str, Any], plan: DeploymentPlan) -> dict[str, Any]:
     section = base["deployment"]
     named = next(table for table in (section, base) if "receivers" in table or "receiver" in table)
     receivers = named["receivers"] if "receivers" in named else [named["receiver"]]
-    known = {one["name"]: one for one in receivers}
+    known = {receiver["name"]: receiver for receiver in receivers}
     common = {key: value for key, value in _common(section, LearningSettings).items() if key != "receiver"}
     if plan.data is None:
         common.pop("data", None)
@@ -125,7 +125,7 @@ def written(section: Settings) -> dict[str, Any]:
 T = TypeVar("T")
 
 
-def as_file(section: Settings, place: Place, references: References, *, whole: bool = True) -> dict[str, Any]:
+def as_file(section: Settings, place: Place, references: References, *, defaults: bool = True) -> dict[str, Any]:
     """A section in the format of a file, JSON-ready: loading it gives an equal section.
 
     Defaults are written (unless the section is recorded as given), numbers keep all digits, paths are absolute, and
@@ -135,31 +135,31 @@ def as_file(section: Settings, place: Place, references: References, *, whole: b
         section: the section, without problems.
         place: place of the section.
         references: the references that read its other files.
-        whole: whether defaults are included.
+        defaults: whether defaults are included.
     """
-    whole = whole and not section.recorded_as_given
-    return _Writer(references, whole).section(section.completed() if whole else section, place)
+    defaults = defaults and not section.recorded_as_given
+    return _Writer(references, defaults).section(section.completed() if defaults else section, place)
 
 
 @dataclass(frozen=True)
 class _Writer:
     references: References
-    whole: bool
+    defaults: bool
 
     def section(self, section: Settings, place: Place) -> dict[str, Any]:
         table: dict[str, Any] = {}
         for key, name in section.written_keys().items():
             value, info = getattr(section, name), type(section).model_fields[name]
-            if value is None or not (self.whole or name in section.model_fields_set):
+            if value is None or not (self.defaults or name in section.model_fields_set):
                 continue
-            found = self._value(value, info.annotation, tuple(info.metadata), place.at(key))
-            if found != {}:  # an empty mapping has no content and could conflict with other keys
-                table[key] = found
+            content = self._value(value, info.annotation, tuple(info.metadata), place.at(key))
+            if content != {}:  # an empty mapping has no content and could conflict with other keys
+                table[key] = content
         return table
 
     def _value(self, value: Any, annotation: Any, metadata: tuple[Any, ...], place: Place) -> Any:
         if isinstance(value, Settings):
-            return as_file(value, place, self.references, whole=self.whole)
+            return as_file(value, place, self.references, defaults=self.defaults)
         if isinstance(value, str):
             return self._text(value, annotation, metadata, place)
         if isinstance(value, Mapping):
@@ -177,8 +177,8 @@ class _Writer:
         if IN_FILE in _every(FieldMark, annotation, metadata):
             return str(resolved(place.directory / value))
         model = _behind_a_path(annotation)
-        found = None if model is None else self.references.section(value, place, model)
-        return value if found is None else as_file(*found, self.references, whole=self.whole)
+        section = None if model is None else self.references.section(value, place, model)
+        return value if section is None else as_file(*section, self.references, defaults=self.defaults)
 
 
 def _parts(annotation: Any) -> list[tuple[Any, tuple[Any, ...]]]:
@@ -186,17 +186,17 @@ def _parts(annotation: Any) -> list[tuple[Any, tuple[Any, ...]]]:
     origin = typing.get_origin(annotation)
     if origin is typing.Annotated:
         inner, *metadata = typing.get_args(annotation)
-        return [(part, (*own, *metadata)) for part, own in _parts(inner)]
+        return [(part, (*inner_metadata, *metadata)) for part, inner_metadata in _parts(inner)]
     if origin in (typing.Union, type(int | str)):
-        return [found for part in typing.get_args(annotation) for found in _parts(part)]
+        return [alternative for argument in typing.get_args(annotation) for alternative in _parts(argument)]
     return [(annotation, ())]
 
 
 def _behind_a_path(annotation: Any) -> type[Settings] | None:
     """The section that may be in its own file, referenced by a path."""
-    for part, metadata in _parts(annotation):
+    for alternative, metadata in _parts(annotation):
         if any(isinstance(m, Tag) and m.tag == "inline" for m in metadata):
-            return typing.cast("type[Settings]", part)
+            return typing.cast("type[Settings]", alternative)
     return None
 
 
@@ -207,14 +207,14 @@ def _find(kind: type[T], annotation: Any, metadata: tuple[Any, ...]) -> T | None
 
 def _every(kind: type[T], annotation: Any, metadata: tuple[Any, ...]) -> list[T]:
     """All metadata of one kind in an annotation."""
-    every = [*metadata, *(m for _, own in _parts(annotation) for m in own)]
+    every = [*metadata, *(m for _, inner in _parts(annotation) for m in inner)]
     return [m for m in every if isinstance(m, kind)]
 
 
 def _items(annotation: Any, count: int) -> list[Any]:
     """Annotations of the items of a list or tuple."""
-    for part, _ in _parts(annotation):
-        if typing.get_origin(part) in (list, tuple):
-            inner = [hint for hint in typing.get_args(part) if hint is not Ellipsis]
+    for alternative, _ in _parts(annotation):
+        if typing.get_origin(alternative) in (list, tuple):
+            inner = [hint for hint in typing.get_args(alternative) if hint is not Ellipsis]
             return inner if len(inner) == count else inner[:1] * count
     return [Any] * count

@@ -194,7 +194,7 @@ def _other_kind(content: bytes) -> str:
         try:
             with zipfile.ZipFile(io.BytesIO(content)) as archive:
                 names = set(archive.namelist())
-                unpacked = sum(one.file_size for one in archive.infolist())
+                unpacked = sum(entry.file_size for entry in archive.infolist())
         except (zipfile.BadZipFile, ValueError, NotImplementedError):
             return "is a damaged workbook or archive; save the table again, as CSV"
         if unpacked > UNPACKED_LIMIT:
@@ -282,8 +282,8 @@ def _sheet_rows(content: bytes, assumed: list[str], most_lines: int) -> list[Tab
                 assumed.append(f"sheet '{sheet.title}', the first of {len(book.sheetnames)}")
             if rows:
                 _check_header(rows)
-                with zipfile.ZipFile(io.BytesIO(content)) as archive, archive.open(sheet._worksheet_path) as part:
-                    _check_seen(part, rows)
+                with zipfile.ZipFile(io.BytesIO(content)) as archive, archive.open(sheet._worksheet_path) as stream:
+                    _check_seen(stream, rows)
     except (UnreadableError, _RowError):
         raise
     except Exception as error:  # damaged workbooks raise arbitrary errors
@@ -308,11 +308,11 @@ def _check_shown(sheets: Sequence[Any]) -> None:
         )
 
 
-def _check_seen(part: IO[bytes], rows: Sequence[TableRow]) -> None:
+def _check_seen(stream: IO[bytes], rows: Sequence[TableRow]) -> None:
     """Refuse cells that a person does not see, or that have no value of their own.
 
     Args:
-        part: XML of the sheet.
+        stream: XML of the sheet.
         rows: with values.
 
     Raises:
@@ -327,7 +327,7 @@ def _check_seen(part: IO[bytes], rows: Sequence[TableRow]) -> None:
     columns: list[str] = []
     merged: list[str] = []
     places: list[int] = []
-    for _, element in ElementTree.iterparse(part):
+    for _, element in ElementTree.iterparse(stream):
         match element.tag.rpartition("}")[2]:
             case "col" if _hides(element, "width"):
                 for i in range(int(element.get("min", 1)), min(int(element.get("max", 1)), width) + 1):
@@ -397,36 +397,36 @@ def _text_rows(text: str, assumed: list[str]) -> list[TableRow]:
         begin, separator = 1, stated[1]
     comments = [i for i in range(begin, len(lines)) if _COMMENT.match(lines[i].lstrip())]
     without = set(comments)
-    kept = [i for i in range(begin, len(lines)) if i not in without and _clean(lines[i])]
-    if not kept:
+    filled = [i for i in range(begin, len(lines)) if i not in without and _clean(lines[i])]
+    if not filled:
         return []
-    header = kept[0]
+    header = filled[0]
     before = [i for i in comments if i < header]
-    if before and any(plain_number(one.strip()) for one in re.split(r"[;,\t]", lines[header])):
+    if before and any(plain_number(cell.strip()) for cell in re.split(r"[;,\t]", lines[header])):
         # numpy.savetxt writes the header as a comment
         commented = lines[before[-1]].lstrip().lstrip("#").lstrip(" ")
         if _number_of_cells(commented, lines[header]):
             header = before[-1]
             lines[header] = commented
-            kept.insert(0, header)
+            filled.insert(0, header)
             comments.remove(header)
             assumed.append(f"the header of the comment in line {header + 1}")
     if not separator:
-        top = _top_of_table([lines[i] for i in kept[:TITLE_LINES]])
-        separator = _separator(lines[kept[top]], lines[kept[top + 1]] if len(kept) > top + 1 else "")
+        top = _top_of_table([lines[i] for i in filled[:TITLE_LINES]])
+        separator = _separator(lines[filled[top]], lines[filled[top + 1]] if len(filled) > top + 1 else "")
     if not separator:
         words = len(lines[header].split())
-        if words > 1 and len(kept) > 1 and words == len(lines[kept[1]].split()):
+        if words > 1 and len(filled) > 1 and words == len(lines[filled[1]].split()):
             message = "cells are separated by spaces; save it with commas, semicolons or tabs"
             raise _RowError(message, TableRow(header + 1, (), (), lines[header]))
-        if any(one in cell for cell in _cells(lines[header], ",") for one in SEPARATORS):
+        if any(separator in cell for cell in _cells(lines[header], ",") for separator in SEPARATORS):
             message = "the whole line is one cell in quotes; save the table again, without quotes around the lines"
             raise _RowError(message, TableRow(header + 1, (), (), lines[header]))
     if separator not in ("", ","):
         assumed.append(f"{SEPARATORS.get(separator, repr(separator))} between cells")
     if comments:
         assumed.append(f"{len(comments)} comment line{'s' * (len(comments) > 1)} left out")
-    return list(_parsed(lines, kept, separator or ","))
+    return list(_parsed(lines, filled, separator or ","))
 
 
 def _number_of_cells(header: str, row: str) -> bool:
@@ -438,7 +438,7 @@ def _number_of_cells(header: str, row: str) -> bool:
 def _top_of_table(lines: Sequence[str]) -> int:
     """Position of the first line that has as many cells as the next one, and more than any line before; 0 if none."""
     pairs = [
-        [(len(_cells(line, one)), len(_cells(after, one))) for one in SEPARATORS]
+        [(len(_cells(line, separator)), len(_cells(after, separator))) for separator in SEPARATORS]
         for line, after in itertools.pairwise(lines)
     ]
     first = max((count for count, _ in pairs[0]), default=0) if pairs else 0
@@ -457,21 +457,21 @@ def _cells(line: str, separator: str) -> list[str]:
 
 def _separator(header: str, row: str) -> str:
     """The character between the cells; '' if there is only one."""
-    several = [one for one in SEPARATORS if len(_cells(header, one)) > 1]
-    for one in several:
-        others = [other for other in SEPARATORS if other != one]
-        if not any(other in cell.strip() for cell in _cells(header, one) for other in others):
-            return one
-    agreeing = [one for one in several if len(_cells(header, one)) == len(_cells(row, one))]
+    several = [separator for separator in SEPARATORS if len(_cells(header, separator)) > 1]
+    for separator in several:
+        others = [other for other in SEPARATORS if other != separator]
+        if not any(other in cell.strip() for cell in _cells(header, separator) for other in others):
+            return separator
+    agreeing = [separator for separator in several if len(_cells(header, separator)) == len(_cells(row, separator))]
     return next(iter(agreeing or several), "")
 
 
-def _parsed(lines: list[str], kept: list[int], separator: str) -> Iterator[TableRow]:
+def _parsed(lines: list[str], filled: list[int], separator: str) -> Iterator[TableRow]:
     number = 0
 
     def texts() -> Iterator[str]:
         nonlocal number
-        for number in kept:
+        for number in filled:
             yield lines[number]
 
     reader = csv.reader(texts(), delimiter=separator)
@@ -567,8 +567,8 @@ def _without_unnamed(table: SavedTable) -> SavedTable:
 
     def reduced(row: TableRow) -> TableRow:
         filled = max((i for i, cell in enumerate(row.cells) if cell != ""), default=-1) + 1
-        kept = [i for i in range(len(row.cells)) if i not in dropped and i < max(last, filled)]
-        cells, starts = tuple(row.cells[i] for i in kept), tuple(row.starts[i] for i in kept)
+        used = [i for i in range(len(row.cells)) if i not in dropped and i < max(last, filled)]
+        cells, starts = tuple(row.cells[i] for i in used), tuple(row.starts[i] for i in used)
         return TableRow(row.line, cells, starts, row.source)
 
     table.header, table.rows = reduced(header), [reduced(row) for row in table.rows]

@@ -57,20 +57,20 @@ class SceneBuilder:
 
     def space(self, actions: ActionsBase | None, motion: MotionBase | None, place: Place) -> Space | None:
         """The action space of a section; a searched dimension must not be fixed as well."""
-        own = actions is not None
-        used = actions if own else self.file.actions
+        local = actions is not None
+        used = actions if local else self.file.actions
         if used is None:
             if not self.hidden_by_problems(place, "actions"):
                 message = "searches nothing; add for example 'actions: {angular_velocity: [15 deg/s, 120 deg/s]}'"
                 self.report.add(place, message, key=True)
             return None
-        at = (place if own else self.root).at("actions")
+        at = (place if local else self.root).at("actions")
         space: Space | None = used.space()
         if space is None:
             if not self.hidden_by_problems(place, "actions"):
                 self.report.add(at, "names no dimension; add for example 'angular_velocity: [15 deg/s, 120 deg/s]'")
             return None
-        beside = [(motion, place.at("motion"))] + ([] if own else [(self.file.motion, self.root.at("motion"))])
+        beside = [(motion, place.at("motion"))] + ([] if local else [(self.file.motion, self.root.at("motion"))])
         for fixed, fixed_at in beside:
             for name in space.names:
                 if fixed is not None and name in fixed.fixed():
@@ -84,18 +84,18 @@ class SceneBuilder:
         if space is None or used is None or not used.constraints:
             return ()
         at, before = at.at("actions").at("constraints"), len(self.report.problems)
-        found = []
+        parsed = []
         for i, text in enumerate(used.constraints):
             try:
-                found.append(parse_constraint(text, space))
+                parsed.append(parse_constraint(text, space))
             except QuantityError as error:
                 self.report.add(at.at(i), str(error))
         if len(self.report.problems) == before:
             try:
-                actions_of_prior(space, LEAST_LEFT, 0, found)
+                actions_of_prior(space, LEAST_LEFT, 0, parsed)
             except ValueError:
                 self.report.add(at, "leave next to nothing of the ranges beside them; loosen one, or widen a range")
-        return tuple(found)
+        return tuple(parsed)
 
     def prior(
         self, actions: ActionsBase | None, place: Place, space: Space | None, constraints: Sequence[Linear]
@@ -106,12 +106,12 @@ class SceneBuilder:
         if space is None or not prior:
             return ()
         at, before = at.at("actions"), len(self.report.problems)
-        for one in prior:
-            axis, info = space.axes[space.names.index(one.name)], ACTION_DIMENSIONS[one.name]
-            if not axis.lower <= one.mean <= axis.upper:
-                mean, lower, upper = (f"{value / info.factor:g}" for value in (one.mean, axis.lower, axis.upper))
+        for normal in prior:
+            axis, info = space.axes[space.names.index(normal.name)], ACTION_DIMENSIONS[normal.name]
+            if not axis.lower <= normal.mean <= axis.upper:
+                mean, lower, upper = (f"{value / info.factor:g}" for value in (normal.mean, axis.lower, axis.upper))
                 text = f"{mean} {info.display_unit} is outside the range, {lower} … {upper} {info.display_unit}"
-                self.report.add(at.at(one.name, "prior", "mean"), text)
+                self.report.add(at.at(normal.name, "prior", "mean"), text)
         if constraints and len(self.report.problems) == before:
             try:
                 actions_of_prior(space, LEAST_LEFT, 0, constraints, prior)
@@ -122,8 +122,8 @@ class SceneBuilder:
 
     def refuse_prior(self, actions: ActionsBase | None, place: Place, why: str) -> None:
         """Report every prior of a section's own dimensions as unused."""
-        for one in () if actions is None else actions.prior():
-            self.report.add(place.at("actions").at(one.name, "prior"), f"{why}; remove it", key=True)
+        for normal in () if actions is None else actions.prior():
+            self.report.add(place.at("actions").at(normal.name, "prior"), f"{why}; remove it", key=True)
 
     def scene(
         self,
@@ -160,9 +160,9 @@ class SceneBuilder:
         for motion, at in ((self.file.motion, self.root.at("motion")), *motions):
             if motion is None:
                 continue
-            given = motion.fixed()
-            fixed |= given
-            origin |= {dimension: at.at(dimension) for dimension in given}
+            stated_here = motion.fixed()
+            fixed |= stated_here
+            origin |= {dimension: at.at(dimension) for dimension in stated_here}
             pivot = motion.pivot_value() or pivot
             max_hold_time = max_hold_time if motion.max_hold_time is None else motion.max_hold_time
         ok = True
@@ -171,8 +171,8 @@ class SceneBuilder:
             if dimension in origin and not constants_win and (stated is None or abs(stated - value) > 1e-6):
                 ok = False
                 info = ACTION_DIMENSIONS[dimension]
-                said = f"{value / info.factor:g} {info.display_unit}"
-                self.report.add(origin[dimension], f"the weighed pours were all made at {said}; remove this key")
+                shown = f"{value / info.factor:g} {info.display_unit}"
+                self.report.add(origin[dimension], f"the weighed pours were all made at {shown}; remove this key")
             fixed[dimension] = value
         fixed = {dimension: value for dimension, value in fixed.items() if dimension not in searched}
         for dimension in NEEDED:

@@ -179,9 +179,9 @@ class MotionBase(Settings):
 
     def fixed(self) -> dict[str, float | None]:
         """Dimensions given here, SI; None for those that are switched off."""
-        given = {name: self.value(name) for name in ACTION_DIMENSIONS}
+        raw = {name: self.value(name) for name in ACTION_DIMENSIONS}
         return {
-            name: None if isinstance(value, str) else float(value) for name, value in given.items() if value is not None
+            name: None if isinstance(value, str) else float(value) for name, value in raw.items() if value is not None
         }
 
     def pivot_value(self) -> Pivot | None:
@@ -313,8 +313,8 @@ class ParametersBase(Settings):
 
     def ranges(self) -> dict[str, ParameterRangeSettings]:
         """Searched parameters."""
-        given = {name: self.value(name) for name in self.written_keys()}
-        return {name: section for name, section in given.items() if isinstance(section, ParameterRangeSettings)}
+        values = {name: self.value(name) for name in self.written_keys()}
+        return {name: section for name, section in values.items() if isinstance(section, ParameterRangeSettings)}
 
     def searched(self) -> dict[str, Axis]:
         """Axes of the searched parameters."""
@@ -323,13 +323,13 @@ class ParametersBase(Settings):
 
     def priors(self) -> tuple[NormalPrior, ...]:
         """Searched parameters with a prior that is not uniform."""
-        found = (section.normal() for section in self.ranges().values())
-        return tuple(prior for prior in found if prior is not None)
+        normals = (section.normal() for section in self.ranges().values())
+        return tuple(prior for prior in normals if prior is not None)
 
     def completed(self) -> Self:
         """A copy with the defaults of parameters that are not given."""
-        given = {name: value for name in self.written_keys() if (value := self.value(name)) is not None}
-        return self.model_copy(update=SimulationParameters().model_dump() | given)
+        values = {name: value for name in self.written_keys() if (value := self.value(name)) is not None}
+        return self.model_copy(update=SimulationParameters().model_dump() | values)
 
     def in_force(self) -> dict[str, float]:
         """Values in SI: fixed values; for a range, the measured value or the default, clipped to the range."""

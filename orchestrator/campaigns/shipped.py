@@ -53,5 +53,5 @@ def starting_set(directory: Path | str) -> list[Path]:
 
 def _root() -> Path:
     """In an installed package the folder is next to the modules, in a checkout at the top."""
-    here = Path(__file__).parents[1]
-    return here / "configs" if (here / "configs").is_dir() else here.parent / "configs"
+    product = Path(__file__).parents[1]
+    return product / "configs" if (product / "configs").is_dir() else product.parent / "configs"

@@ -80,7 +80,7 @@ def columns_of(
         problems: problems are added here.
         unread: unknown columns are added here; None: they are problems.
     """
-    found: list[FoundColumn | None] = []
+    columns: list[FoundColumn | None] = []
     for index, cell in enumerate(table.header.cells):
         text = str(cell)
         try:
@@ -88,19 +88,19 @@ def columns_of(
         except QuantityError as error:
             if unread is not None and isinstance(error, _UnknownColumnError):
                 unread.append(text)
-                found.append(None)
+                columns.append(None)
                 continue
             problems.append(table.problem(table.header, index, text, str(error)))
-            found.append(None)
+            columns.append(None)
             continue
-        if any(other is not None and other.standard == column.standard for other in found):
+        if any(other is not None and other.standard == column.standard for other in columns):
             same = "" if text == column.standard else f" (as '{column.standard}')"
             message = f"stands twice in the header{same}; keep one"
             problems.append(table.problem(table.header, index, text, message))
         if column.factor != 1.0 or column.alias:
             table.assumed.append(f"'{text}' as {column.standard}")
-        found.append(column)
-    return found
+        columns.append(column)
+    return columns
 
 
 def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str]) -> FoundColumn:
@@ -114,9 +114,9 @@ def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str
     bracketed = _BRACKETS.fullmatch(text)
     stem, unit = (bracketed[1], bracketed[2]) if bracketed else (text, "")
     name = renamed.get(text) or renamed.get(stem, stem)
-    names = {one.name: one for one in known} | {one.standard: one for one in known}
+    names = {entry.name: entry for entry in known} | {entry.standard: entry for entry in known}
     word = re.sub(r"[\s-]+", "_", name.strip()).lower()
-    column = names.get(name) or names.get(word) or next((one for one in known if word in one.aliases), None)
+    column = names.get(name) or names.get(word) or next((entry for entry in known if word in entry.aliases), None)
     alias = column is not None and word in column.aliases
     standard = column is not None and word == column.standard.lower()
     if text in renamed and not is_unit(unit):
@@ -129,15 +129,15 @@ def _resolved(text: str, known: Sequence[KnownColumn], renamed: Mapping[str, str
     if column is None and not unit:
         column = next((c for c in known if c.unit and re.fullmatch(rf"{c.name}_[a-zµ°%_0-9]+", word)), None)
         if column is not None:
-            rest = name.strip()[len(column.name) + 1 :]
-            unit = re.sub(r"(?<=[a-z])(?=[0-9])", "^", rest.replace("_", "/"))
+            suffix = name.strip()[len(column.name) + 1 :]
+            unit = re.sub(r"(?<=[a-z])(?=[0-9])", "^", suffix.replace("_", "/"))
     if column is None:
         if text in renamed:
             raise QuantityError(f"'columns' gives it the name '{renamed[text]}', which is not known")
-        guess = did_you_mean(word, names) or did_you_mean(word, [one.standard for one in known])
+        guess = did_you_mean(word, names) or did_you_mean(word, [entry.standard for entry in known])
         shown = names[guess].standard if guess else ""
         if not guess:
-            raise _UnknownColumnError(f"unknown column; known columns: {', '.join(one.standard for one in known)}")
+            raise _UnknownColumnError(f"unknown column; known columns: {', '.join(entry.standard for entry in known)}")
         raise QuantityError(f"unknown column; did you mean '{shown}'?")
     if not column.unit:
         raise QuantityError(f"'{column.name}' has no unit; remove '{unit}'")

@@ -40,15 +40,15 @@ class VesselBase(Settings):
     def check_values(self, problems: Problems) -> None:
         """Check that the shape is given once."""
         kinds = ("profile", "mesh", *further_sources())
-        given = [key for key in kinds if self.value(key) is not None]
-        if len(given) > 1:
-            text = f"the vessel has a {given[0]} already; keep one of '{given[0]}' and '{given[1]}'"
-            problems.add(text, given[1], key=True)
+        written = [key for key in kinds if self.value(key) is not None]
+        if len(written) > 1:
+            text = f"the vessel has a {written[0]} already; keep one of '{written[0]}' and '{written[1]}'"
+            problems.add(text, written[1], key=True)
         elif self.profile is not None:
             for key in ("unit", "up"):
                 if self.value(key) is not None:
                     problems.add("belongs to a mesh; a profile has its own 'unit' inside", key, key=True)
-        elif not given and problems.valid(*kinds):
+        elif not written and problems.valid(*kinds):
             others = "".join(f", or '{key}:'" for key in kinds[2:])
             problems.add(f"has no shape; add 'profile:' with [r, z] points, or 'mesh:' with the path of a file{others}")
 

@@ -128,10 +128,10 @@ def _pours(table: RecordTable, scene: Scene, place: Place, report: Report) -> tu
 def _record_set(
     table: RecordTable, scene: Scene, place: Place, pours: PoursSettings, builder: SceneBuilder
 ) -> RecordSet | None:
-    found = _pours(table, scene, place, builder.report)
-    if found is None:
+    weighed = _pours(table, scene, place, builder.report)
+    if weighed is None:
         return None
-    return RecordSet(scene, found, table.path, pours.lip_radius, dict(pours.columns), table.assumed)
+    return RecordSet(scene, weighed, table.path, pours.lip_radius, dict(pours.columns), table.assumed)
 
 
 def _check_lip_radius(pours: PoursSettings, place: Place, builder: SceneBuilder, pourer: VesselSpec | None) -> None:
@@ -155,22 +155,22 @@ def resolve_data(
     report: Report,
 ) -> ExistingPours | None:
     """Existing pours of the deployment by scene; None after a problem, which is added to the report."""
-    found: Mapping[str, Sequence[RecordedPour]] | None = None
+    pours: Mapping[str, Sequence[RecordedPour]] | None = None
     assumed = ""
     if section.source is not None and section.run is None:
         at = place.at("from")
         path = resolved(place.directory / section.source)
-        found, assumed = _of_file(path, section, place, scenes, actions, report)
+        pours, assumed = _of_file(path, section, place, scenes, actions, report)
     elif section.run is not None and section.source is None:
         at = place.at("run")
-        path, found = _of_run(section.run, at, scenes, laboratory, report)
-    if found is None:
+        path, pours = _of_run(section.run, at, scenes, laboratory, report)
+    if pours is None:
         return None
     used: dict[str, tuple[RecordedPour, ...]] = {}
     left_out: list[str] = []
     for scene in scenes:
-        if scene.name in found:
-            fit = fitting(found[scene.name], scene, actions)
+        if scene.name in pours:
+            fit = fitting(pours[scene.name], scene, actions)
             used[scene.name] = fit.pours
             left_out += fit.left_out
     if not any(used.values()):
@@ -210,12 +210,12 @@ def _of_run(
     if laboratory is not None and previous.mode != laboratory.mode:
         report.add(place, f"was poured in a {previous.mode} laboratory, and '{laboratory.name}' is {laboratory.mode}")
         return previous.path, None
-    found = {scene.name: pours_in(previous, scene) for scene in scenes}
-    if not any(pours for pours, _ in found.values()):
-        reasons = dict.fromkeys(reason for _, reason in found.values())
+    by_scene = {scene.name: pours_in(previous, scene) for scene in scenes}
+    if not any(pours for pours, _ in by_scene.values()):
+        reasons = dict.fromkeys(reason for _, reason in by_scene.values())
         report.add(place, f"has nothing to learn from: it {'; it '.join(reasons)}")
         return previous.path, None
-    return previous.path, {name: tuple(pours) for name, (pours, _) in found.items() if pours}
+    return previous.path, {name: tuple(pours) for name, (pours, _) in by_scene.items() if pours}
 
 
 def former_run(run: str, place: Place, report: Report) -> PreviousRun | None:
@@ -225,10 +225,10 @@ def former_run(run: str, place: Place, report: Report) -> PreviousRun | None:
         report.add(place, f"{directory} {outside}")
         return None
     if not (directory / JOURNAL_NAME).is_file():
-        what = (
+        described = (
             "has no journal; name the folder of a run" if directory.is_dir() else "no such folder; name that of a run"
         )
-        report.add(place, f"{directory}: {what}, for example '../runs/narrow-20300131-1'")
+        report.add(place, f"{directory}: {described}, for example '../runs/narrow-20300131-1'")
         return None
     try:
         return read_former_run(directory)
@@ -252,23 +252,23 @@ def records_of_run(
     if laboratory is not None and laboratory.mode == "hardware" and previous.mode != "hardware":
         report.add(place, f"was poured in a virtual laboratory, and '{laboratory.name}' has a real one's liquid")
         return None
-    found: list[RecordedPour] = []
+    usable: list[RecordedPour] = []
     left_out: list[str] = []
     reasons: list[str] = []
     for scene in scenes:
         pours, why = pours_in(previous, scene)
         fit = fitting(pours, scene, actions)
-        found += [replace(pour, scene=scene.name) for pour in fit.pours] if len(scenes) > 1 else fit.pours
+        usable += [replace(pour, scene=scene.name) for pour in fit.pours] if len(scenes) > 1 else fit.pours
         left_out += fit.left_out
         reasons += [why] if why else []
-    if not found:
+    if not usable:
         report.add(place, f"has nothing to calibrate on: it {'; it '.join(reasons) or 'has ' + '; '.join(left_out)}")
         return None
     if left_out:
         text = f"has pours that this calibration could not have made ({'; '.join(left_out)})"
         report.add(place, f"{text}; change the motion, or the bounds under actions")
         return None
-    if all(pour.split != "train" for pour in found):
+    if all(pour.split != "train" for pour in usable):
         report.add(place, "has no pour with split 'train' to calibrate on")
         return None
-    return RecordSet(scenes[0], tuple(found), previous.path)
+    return RecordSet(scenes[0], tuple(usable), previous.path)

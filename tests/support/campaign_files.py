@@ -97,4 +97,4 @@ def written_out(model: type[Settings], text: str) -> str:
     section = validate(model, place, report)
     report.raise_if_any()
     assert section is not None
-    return json.dumps(as_file(section, place, References(report), whole=False))
+    return json.dumps(as_file(section, place, References(report), defaults=False))

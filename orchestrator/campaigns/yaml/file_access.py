@@ -42,8 +42,8 @@ def out_of_bounds(path: Path) -> str | None:
     roots = _roots.get()
     if roots is None:
         return None
-    there = resolved(path)
-    if any(there == root or root in there.parents for root in roots):
+    target = resolved(path)
+    if any(target == root or root in target.parents for root in roots):
         return None
     return "lies outside of the folders that this campaign may refer to"
 

@@ -79,34 +79,34 @@ class References:
                     self.report.problems.append(other)
                 read = None if other is not None else validate(model, place, self.report)
                 self._read[key] = None if read is None else (read, place)
-        found = self._read[key]
-        if found is None:
+        entry = self._read[key]
+        if entry is None:
             return None
-        section, place = found
+        section, place = entry
         assert isinstance(section, model)
         return section, place
 
     def vessel(self, value: Any, place: Place) -> VesselSpec | None:
         """A vessel; None after a problem (which is reported)."""
-        found = self.section(value, place, VesselFile)
-        if found is None:
+        loaded = self.section(value, place, VesselFile)
+        if loaded is None:
             return None
-        key = (found[1].document.path, found[1].loc)
+        key = (loaded[1].document.path, loaded[1].loc)
         if key not in self._vessels:
-            self._vessels[key] = resolve_vessel(*found, self.report)
+            self._vessels[key] = resolve_vessel(*loaded, self.report)
         return self._vessels[key]
 
     def liquid(self, value: Any, place: Place) -> Liquid | None:
         """A liquid; None after a problem."""
-        found = self.section(value, place, LiquidSettings)
-        return None if found is None or self.report.is_broken_within(found[1]) else found[0].load()
+        loaded = self.section(value, place, LiquidSettings)
+        return None if loaded is None or self.report.is_broken_within(loaded[1]) else loaded[0].load()
 
     def laboratory(self, value: Any, place: Place) -> LaboratorySettings | None:
         """A laboratory, ready for use; None after a problem."""
-        found = self.section(value, place, LaboratorySettings)
-        if found is None or self.report.is_broken_within(found[1]):
+        loaded = self.section(value, place, LaboratorySettings)
+        if loaded is None or self.report.is_broken_within(loaded[1]):
             return None
-        laboratory, at = found[0].ready(), found[1]
+        laboratory, at = loaded[0].ready(), loaded[1]
         balance = laboratory.balance
         if isinstance(balance, SerialBalanceSettings) and balance.raw_lines is not None:
             folder = str(resolved(at.directory / balance.raw_lines))

@@ -63,9 +63,9 @@ def validate(model: type[S], place: Place, report: Report) -> S | None:
                 unknown = detail["type"] == "extra_forbidden"
                 if unknown and (owners := _owners(model, loc, data)):
                     if loc[:-1] not in guessed:
-                        here = _variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1]))
+                        variants = _variant(_sections_at(model, loc[:-1], data), _node(data, loc[:-1]))
                         names = " and ".join(sorted({owner.tag_word() for owner in owners}))
-                        text = f"belongs to {names}, not to {' or '.join(one.tag_word() for one in here)}; remove it"
+                        text = f"belongs to {names}, not to {' or '.join(v.tag_word() for v in variants)}; remove it"
                         report.add(place.at(*loc), text, key=True)
                 else:
                     report.add(place.at(*loc), _message(model, detail, loc, data), key=unknown)
@@ -92,8 +92,8 @@ def _guess_variant(variants: set[type[Settings]], data: dict[str, Any], place: P
         report.broken.add((place.document.path, place.at(key).loc))
     else:
         expected = " or ".join([", ".join(map(repr, words[:-1])), repr(words[-1])])
-        said = why_unusable(next(iter(variants)).plugins, word) if isinstance(word, str) else ""
-        report.add(place.at(key), said or _one_of(word, expected))
+        reason = why_unusable(next(iter(variants)).plugins, word) if isinstance(word, str) else ""
+        report.add(place.at(key), reason or _one_of(word, expected))
     by_word = {section.tag_word(): section for section in variants}
 
     def fits(name: str) -> tuple[int, float]:
@@ -124,8 +124,8 @@ def _owners(model: type[Settings], loc: Loc, data: Any) -> set[type[Settings]]:
 
 
 def _node(data: Any, loc: Loc) -> Any:
-    for part in loc:
-        data = data[part]
+    for key in loc:
+        data = data[key]
     return data
 
 
@@ -138,8 +138,8 @@ def _cut(data: Any, loc: Loc) -> bool:
     if not target or _loc_in(data, target) != target:
         return False
     node = data
-    for part in target[:-1]:
-        node = node[part]
+    for key in target[:-1]:
+        node = node[key]
     del node[target[-1]]
     return True
 
@@ -147,12 +147,12 @@ def _cut(data: Any, loc: Loc) -> bool:
 def _loc_in(data: Any, loc: Loc) -> Loc:
     """The location without union tags and filled-in keys, which the file does not have."""
     known: list[str | int] = []
-    for part in loc:
-        in_mapping = isinstance(data, dict) and part in data
-        in_list = isinstance(data, list) and isinstance(part, int) and part < len(data)
+    for key in loc:
+        in_mapping = isinstance(data, dict) and key in data
+        in_list = isinstance(data, list) and isinstance(key, int) and key < len(data)
         if in_mapping or in_list:
-            data = data[part]
-            known.append(part)
+            data = data[key]
+            known.append(key)
     return tuple(known)
 
 
@@ -274,21 +274,21 @@ def _keys(sections: set[type[Settings]]) -> set[str]:
 def _meant(model: type[Settings], loc: Loc, data: Any) -> str | None:
     """The key most similar to a misspelt one: of the selected variant, or of another one."""
     variants = _sections_at(model, loc[:-1], data)
-    own = _keys(_variant(variants, _node(data, loc[:-1])))
-    return did_you_mean(str(loc[-1]), own) or did_you_mean(str(loc[-1]), _keys(variants))
+    keys = _keys(_variant(variants, _node(data, loc[:-1])))
+    return did_you_mean(str(loc[-1]), keys) or did_you_mean(str(loc[-1]), _keys(variants))
 
 
 def _sections_at(model: type[Settings], loc: Loc, data: Any) -> set[type[Settings]]:
     """The sections that are possible at a location of the data (several for a union)."""
     candidates: set[type[Settings]] = {model}
-    for part in loc:
-        if not isinstance(part, int):
+    for key in loc:
+        if not isinstance(key, int):
             below: set[type[Settings]] = set()
             for candidate in _variant(candidates, data):
-                if part in candidate.written_keys():
-                    below |= sections_in(candidate.model_fields[candidate.written_keys()[part]].annotation)
+                if key in candidate.written_keys():
+                    below |= sections_in(candidate.model_fields[candidate.written_keys()[key]].annotation)
             candidates = below
-        data = data[part]
+        data = data[key]
     return candidates
 
 
@@ -298,8 +298,8 @@ def sections_in(annotation: Any) -> set[type[Settings]]:
         return {annotation} if issubclass(annotation, Settings) else set()
     if isinstance(annotation, OneOf):
         return set(annotation.kinds().values())
-    found = {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
-    return {section for section in found if not section.tag or section.tag_word()}
+    sections = {section for argument in typing.get_args(annotation) for section in sections_in(argument)}
+    return {section for section in sections if not section.tag or section.tag_word()}
 
 
 def _one_of(value: Any, expected: str) -> str:
@@ -350,9 +350,9 @@ class PlacedProblems:
         """See `Problems.any`."""
         if len(self._report.problems) > self._before:
             return True
-        path, here, start = self._place.document.path, self._place.loc, len(self._place.loc)
+        path, base, start = self._place.document.path, self._place.loc, len(self._place.loc)
         return any(
-            where == path and loc[:start] == here and len(loc) > start and loc[start] not in self._common
+            where == path and loc[:start] == base and len(loc) > start and loc[start] not in self._common
             for where, loc in self._report.broken
         )
 

@@ -36,7 +36,7 @@ class Problem:
     def __str__(self) -> str:
         """`path:line:col: where: message` with the source line and a caret below."""
         place = shown_path(self.path) if self.line == 0 else f"{shown_path(self.path)}:{self.line}:{self.column}"
-        head = ": ".join(part for part in (place, _cut(self.where), _cut(self.message)) if part)
+        head = ": ".join(text for text in (place, _cut(self.where), _cut(self.message)) if text)
         if not self.source_line.strip():
             return head
         # Tabs would move the caret: both lines are shown with each tab as one space.
@@ -70,6 +70,6 @@ def _cut(text: str) -> str:
 def dotted(loc: Iterable[str | int]) -> str:
     """`('pours', 0, 'mass')` → 'pours[0].mass'."""
     text = ""
-    for part in loc:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    for key in loc:
+        text += f"[{key}]" if isinstance(key, int) else f".{key}" if text else str(key)
     return text

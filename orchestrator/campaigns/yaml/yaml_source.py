@@ -128,16 +128,16 @@ class Document:
     def get(self, loc: Loc) -> Any:
         """Plain data at a location."""
         node = self.data
-        for part in loc:
-            node = node[part]
+        for key in loc:
+            node = node[key]
         return node
 
     def known_loc(self, loc: Loc) -> Loc:
         """The location without the parts that the file does not have (union tags, filled-in keys)."""
         known: Loc = ()
-        for part in loc:
-            if (*known, part) in self.marks:
-                known = (*known, part)
+        for key in loc:
+            if (*known, key) in self.marks:
+                known = (*known, key)
         return known
 
     def problem(self, loc: Loc, message: str, *, key: bool = False) -> Problem:
@@ -174,11 +174,11 @@ class Document:
         for key_node, value_node in self._entries(node, loc, active):
             (line, column), key = _start(key_node), str(key_node.value)
             self._check_characters(key_node, loc, key=True)
-            here: Loc = (*loc, key)
+            inner: Loc = (*loc, key)
             inline = isinstance(value_node, ScalarNode) or bool(value_node.flow_style)
             value_place = _start(value_node) if not _is_empty(value_node) else (line, column)
-            self.marks[here] = SourcePosition((line, column), value_place, inline)
-            table[key] = self._plain(value_node, here, active)
+            self.marks[inner] = SourcePosition((line, column), value_place, inline)
+            table[key] = self._plain(value_node, inner, active)
         return table
 
     def _entries(self, node: MappingNode, loc: Loc, active: frozenset[int]) -> Iterator[tuple[ScalarNode, Any]]:
@@ -186,7 +186,7 @@ class Document:
 
         Source: https://yaml.org/type/merge.html; the first of several merged mappings has priority.
         """
-        own: dict[str, ScalarNode] = {}
+        local: dict[str, ScalarNode] = {}
         merged: ScalarNode | None = None
         sources: list[Node] = []
         for key_node, value_node in node.value:
@@ -200,13 +200,13 @@ class Document:
                     continue
                 merged = key_node
                 sources = value_node.value if isinstance(value_node, SequenceNode) else [value_node]
-            elif (key := str(key_node.value)) in own:
-                text = f"duplicate key; it stands in line {_start(own[key])[0]} already, keep one of them"
+            elif (key := str(key_node.value)) in local:
+                text = f"duplicate key; it stands in line {_start(local[key])[0]} already, keep one of them"
                 self._add(line, column, (*loc, key), text)
             else:
-                own[key] = key_node
+                local[key] = key_node
                 yield key_node, value_node
-        have = set(own)
+        have = set(local)
         for source in sources:
             line, column = _start(source)
             if not isinstance(source, MappingNode):
@@ -229,9 +229,9 @@ class Document:
 
     def _check_characters(self, node: ScalarNode, loc: Loc, *, key: bool = False) -> None:
         """Note a character in a text without quotes that looks like a space or a quote."""
-        if node.style is not None or (found := in_plain_text(str(node.value), key=key)) is None:
+        if node.style is not None or (odd := in_plain_text(str(node.value), key=key)) is None:
             return
-        (line, column), (index, message) = _start(node), found
+        (line, column), (index, message) = _start(node), odd
         character, source = str(node.value)[index], self.line(line)
         at = source.find(character, column - 1)
         self._refused.append(Problem(self.path, line, at + 1 if at >= 0 else column, dotted(loc), message, source))
@@ -274,25 +274,25 @@ class Document:
         line, column = (mark.line + 1, mark.column + 1) if mark is not None else (1, 1)
         if (odd := before_error(self.lines, line)) is not None:
             return Problem(self.path, odd[0], odd[1], "", f"not YAML: {odd[2]}", self.line(odd[0]))
-        what = (error.problem or "unreadable").replace("<", "").replace(">", "")
+        problem = (error.problem or "unreadable").replace("<", "").replace(">", "")
         source = self.line(line)
-        if "another document" in what:
+        if "another document" in problem:
             hint = "a file holds one document; remove the '---' line"
-        elif "'\\t'" in what or source[: len(source) - len(source.lstrip())].count("\t"):
-            what, hint = "a tab", "YAML is indented with spaces"
-        elif "mapping values are not allowed" in what:
+        elif "'\\t'" in problem or source[: len(source) - len(source.lstrip())].count("\t"):
+            problem, hint = "a tab", "YAML is indented with spaces"
+        elif "mapping values are not allowed" in problem:
             hint = (
                 "is the line indented further than the one above, or is there a second ':' in it (then quote the text)?"
             )
-        elif "end of stream" in what or "expected ',' or" in what:
+        elif "end of stream" in problem or "expected ',' or" in problem:
             hint = "is a bracket, brace or quote still open?"
-        elif "block end" in what:
+        elif "block end" in problem:
             hint = "is the line indented like its neighbours?"
-        elif "cannot start any token" in what:
+        elif "cannot start any token" in problem:
             hint = "put text that begins with such a character in quotes"
         else:
             hint = (error.context or "check brackets, quotes and indentation").strip()
-        return Problem(self.path, line, column, "", f"not YAML: {what}; {hint}", source)
+        return Problem(self.path, line, column, "", f"not YAML: {problem}; {hint}", source)
 
 
 @dataclass(frozen=True)
@@ -418,8 +418,8 @@ def telling(kind: str) -> set[str]:
 
 def wrong_kind(document: Document, wanted: str) -> Problem | None:
     """The problem of a file that is clearly of another kind than the wanted one; None otherwise."""
-    found = kind_of(document.data)
+    kind = kind_of(document.data)
     keys = set(document.data) if isinstance(document.data, dict) else set()
-    if found is None or found == wanted or keys & telling(wanted):
+    if kind is None or kind == wanted or keys & telling(wanted):
         return None
-    return Problem(document.path, 0, 0, "", f"describes a {found}, but a {wanted} is needed here ({NEEDED[wanted]})")
+    return Problem(document.path, 0, 0, "", f"describes a {kind}, but a {wanted} is needed here ({NEEDED[wanted]})")
