@@ -270,9 +270,9 @@ class AskTell:
 
     def _asked(self, pour: AskedPour) -> _Waiting:
         if self._current is None or self._current.pour != pour:
-            asked = "none" if self._current is None else f"{self._current.pour.stage} {self._current.pour.number}"
+            pending = "none" if self._current is None else f"{self._current.pour.stage} {self._current.pour.number}"
             raise InvalidArgumentError(
-                f"pour {pour.stage} {pour.number} is not the one that is asked for ({asked}); outcomes are told once"
+                f"pour {pour.stage} {pour.number} is not the one that is asked for ({pending}); outcomes are told once"
             )
         return self._current
 

@@ -99,14 +99,14 @@ class Run:
     def recommended(self) -> dict[str, Recommended]:
         """The action to use from now on, by receiver."""
         names = receiver_names(self.campaign)
-        found = {names.get(scene, scene): one.recommended for scene, one in deployments_of(self.results).items()}
-        return {name: one for name, one in found.items() if one is not None}
+        actions = {names.get(scene, scene): d.recommended for scene, d in deployments_of(self.results).items()}
+        return {name: action for name, action in actions.items() if action is not None}
 
     @property
     def predictions(self) -> dict[str, dict[str, SampleStatistics]]:
         """Outcomes of the recommended actions with new seeds, by receiver and quantity."""
         names = receiver_names(self.campaign)
-        return {names.get(scene, scene): one.over_seeds for scene, one in predictions_of(self.results).items()}
+        return {names.get(scene, scene): p.over_seeds for scene, p in predictions_of(self.results).items()}
 
     @property
     def pours(self) -> pd.DataFrame:
@@ -174,44 +174,44 @@ class Run:
         """Campaign, folder and recommended actions, in notebooks."""
         rows = [("campaign", self.campaign.name), ("state", str(self.result.state)), ("folder", str(self.directory))]
         rows.append(("done", f"{self.result.pours} pours, {self.result.simulations} simulations"))
-        for name, one in self.recommended.items():
-            rows.append((f"recommended for {name}", described(one.action_si)))
+        for name, action in self.recommended.items():
+            rows.append((f"recommended for {name}", described(action.action_si)))
         return html_table(rows)
 
     # -- rows --------------------------------------------------------------------------------------------------------
 
     def _pours(self) -> Iterator[Row]:
         names = receiver_names(self.campaign)
-        for one in read_record(self.directory).pours:
-            if one.outcome is not None:
-                scene = one.request.scene
-                row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(scene, scene), **one.row()}
-                if one.measured is not None:
-                    row["loss"] = loss_of_pour(self.campaign, one.request, one.measured)
-                yield {**row, "seconds": one.seconds}
+        for pour in read_record(self.directory).pours:
+            if pour.outcome is not None:
+                scene = pour.request.scene
+                row: Row = {"stage": pour.stage, "id": pour.id, "receiver": names.get(scene, scene), **pour.row()}
+                if pour.measured is not None:
+                    row["loss"] = loss_of_pour(self.campaign, pour.request, pour.measured)
+                yield {**row, "seconds": pour.seconds}
 
     def _simulations(self) -> Iterator[Row]:
         names = receiver_names(self.campaign)
-        for one in answers(self.directory, Simulate):
-            request = one.request
+        for answer in answers(self.directory, Simulate):
+            request = answer.request
             assert isinstance(request, Simulate)
-            row: Row = {"stage": one.stage, "id": one.id, "receiver": names.get(request.scene, request.scene)}
+            row: Row = {"stage": answer.stage, "id": answer.id, "receiver": names.get(request.scene, request.scene)}
             row |= {"purpose": request.purpose, "seed": request.seed, **displayed_action(request.action.values())}
             row |= {f"theta_{name}": value for name, value in request.parameters.model_dump().items()}
-            match one.outcome:
-                case Simulated(found):
-                    fractions = found.fractions
+            match answer.outcome:
+                case Simulated(outcome):
+                    fractions = outcome.fractions
                     row |= {"poured": fractions.poured, "spilled": fractions.spilled, "retained": fractions.retained}
-                    row |= {"spillage": fractions.spillage, "cpu_s": found.cpu_s}
-                    row["failed"] = found.invalid
+                    row |= {"spillage": fractions.spillage, "cpu_s": outcome.cpu_s}
+                    row["failed"] = outcome.invalid
                 case Failed(kind, reason):
                     row["failed"] = f"{kind}: {reason}"
             yield row
 
     def _decisions(self) -> Iterator[Row]:
-        for one in read_record(self.directory).decisions:
-            values = {f"value_{name}": value for name, value in one.values.items()}
-            yield {"time": one.time, "stage": one.stage, "text": one.text, **values}
+        for decision in read_record(self.directory).decisions:
+            values = {f"value_{name}": value for name, value in decision.values.items()}
+            yield {"time": decision.time, "stage": decision.stage, "text": decision.text, **values}
 
     def _curves(self) -> Iterator[Row]:
         for stage, result in self.results.items():
@@ -234,13 +234,13 @@ class Run:
                 yield {**row, "predicted": pour.predicted, "predicted_deviation": pour.predicted_deviation}
 
     def _outflows(self) -> Iterator[Row]:
-        for one in answers(self.directory, Simulate):
-            if isinstance(one.outcome, Simulated):
-                found = one.outcome.outcome
+        for answer in answers(self.directory, Simulate):
+            if isinstance(answer.outcome, Simulated):
+                outcome = answer.outcome.outcome
                 for time, poured, spilled in zip(
-                    found.curve_times, found.curve_poured, found.curve_spilled, strict=True
+                    outcome.curve_times, outcome.curve_poured, outcome.curve_spilled, strict=True
                 ):
-                    yield {"stage": one.stage, "id": one.id, "time_s": time, "poured": poured, "spilled": spilled}
+                    yield {"stage": answer.stage, "id": answer.id, "time_s": time, "poured": poured, "spilled": spilled}
 
 
 def open_run(directory: Path | str, campaign: CampaignPlan | None = None) -> Run:

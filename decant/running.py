@@ -279,7 +279,7 @@ def calibrate(
         except ConfigError as error:
             shown = Path("pours.csv")
             raise ConfigError(
-                replace(one, path=shown) if one.path == table else one for one in error.problems
+                replace(problem, path=shown) if problem.path == table else problem for problem in error.problems
             ) from None
         resources = checked(calibrate_task(stage), RunResources(in_process=in_process, subscribers=watch))
     directory = create_run(campaign)
@@ -292,8 +292,8 @@ def _calibration_of(campaign: CampaignPlan, table: Path) -> CampaignPlan:
     """The campaign's calibration, on the pours of a table."""
     content = {key: value for key, value in campaign.resolved.items() if key != "deployment"}
     section: dict[str, Any] = dict(content["calibration"])
-    kept = {key: value for key, value in dict(section["pours"]).items() if key in ("lip_radius", "split")}
-    section["pours"] = {**kept, "from": str(table)}
+    settings = {key: value for key, value in dict(section["pours"]).items() if key in ("lip_radius", "split")}
+    section["pours"] = {**settings, "from": str(table)}
     return build_campaign({**content, "calibration": section}, campaign.source.parent)
 
 
@@ -330,8 +330,8 @@ def plan(
         if value < 1:
             raise InvalidArgumentError(f"{name}={value!r}: should be 1 or more")
     vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
-    given = _given(theta, campaign)
-    request = plan_task(campaign, given, vessel, iterations, seeds)
+    theta_ = _given(theta, campaign)
+    request = plan_task(campaign, theta_, vessel, iterations, seeds)
     return _run(request, checked(request, RunResources(in_process=in_process, subscribers=watch)))
 
 
@@ -343,15 +343,15 @@ def _given(theta: SimulationParameters | Run | Path | str | None, campaign: Camp
         return GivenTheta(theta)
     if not isinstance(theta, Run):
         return read_theta(Path(theta).expanduser(), campaign)
-    found, recommended = theta.calibrated, theta.theta
-    if found is None or recommended is None:
+    calibrated, recommended = theta.calibrated, theta.theta
+    if calibrated is None or recommended is None:
         raise InvalidArgumentError(f"theta: run {theta.directory} has found no θ*; give one that has calibrated")
     scores = evaluation_of(theta.results)
     needed = campaign.deployment is not None and campaign.deployment.settings.needs_posterior
     return GivenTheta(
         recommended,
-        posterior_draws(found, POSTERIOR_DRAWS) if needed or recommended == found.theta else (),
-        None if scores is None else calibration_residual(theta.campaign.calibration, scores, len(found.searched)),
+        posterior_draws(calibrated, POSTERIOR_DRAWS) if needed or recommended == calibrated.theta else (),
+        None if scores is None else calibration_residual(theta.campaign.calibration, scores, len(calibrated.searched)),
     )
 
 
@@ -369,9 +369,9 @@ def checked(request: RunRequest, resources: RunResources) -> RunResources:
         )
     report = service.check(request)
     report.require()
-    found = list(report.warnings)
-    found.append("\n".join(not_simulated(campaign, found.append)))
-    for text in filter(None, dict.fromkeys(found)):
+    problems = list(report.warnings)
+    problems.append("\n".join(not_simulated(campaign, problems.append)))
+    for text in filter(None, dict.fromkeys(problems)):
         _warn(text)
     service.check_laboratory(request, resources)
     return replace(resources, recorder=lambda plan, run: recorder_of(plan, run, _warn))
@@ -399,10 +399,10 @@ def _rows(table: Any) -> list[dict[str, Any]]:
         raise InvalidArgumentError(
             f"pours: should be a pandas.DataFrame or a list of dicts, not {type(table).__name__}"
         )
-    found = list(rows)
-    if wrong := [row for row in found if not isinstance(row, Mapping)]:
+    rows_ = list(rows)
+    if wrong := [row for row in rows_ if not isinstance(row, Mapping)]:
         raise InvalidArgumentError(f"pours: every row should be a dict from column to value, not {wrong[0]!r}")
-    return [dict(row) for row in found]
+    return [dict(row) for row in rows_]
 
 
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -85,8 +85,8 @@ class StationPour:
         interval = (self.details.get("predicted") or {}).get("interval_g")
         return None if interval is None else (float(interval[0]), float(interval[1]))
 
-    def _of(self, part: str, name: str) -> float | None:
-        value = (self.details.get(part) or {}).get(name)
+    def _of(self, role: str, name: str) -> float | None:
+        value = (self.details.get(role) or {}).get(name)
         return None if value is None else float(value)
 
     def row(self) -> dict[str, Any]:
@@ -192,9 +192,9 @@ class Station:
         end = time.monotonic() + seconds
         while True:
             left = end - time.monotonic()
-            found = _pour(self._client.get(f"/pours/{id}", wait=max(min(left, 30.0), 0.0)))
-            if left <= 30.0 or found.state not in ("queued", "running", "waiting for operator"):
-                return found
+            pour = _pour(self._client.get(f"/pours/{id}", wait=max(min(left, 30.0), 0.0)))
+            if left <= 30.0 or pour.state not in ("queued", "running", "waiting for operator"):
+                return pour
 
     def cancel(self, id: str) -> StationPour:  # noqa: A002
         """Remove a pour from the queue; one that has begun is finished and weighed. Raises DecantError."""
@@ -202,13 +202,13 @@ class Station:
 
     def pours(self, limit: int = 100) -> pd.DataFrame:
         """Ordered pours, newest first; the columns' units are in `attrs['units']`. Raises DecantError."""
-        return _table([_pour(one).row() for one in self._client.get("/pours", limit=limit)])
+        return _table([_pour(pour).row() for pour in self._client.get("/pours", limit=limit)])
 
     def vessels(self) -> pd.DataFrame:
         """Vessels with their contents; the columns' units are in `attrs['units']`. Raises DecantError."""
         rows = [
-            {**{name: value for name, value in one.items() if name != "content"}, **one["content"]}
-            for one in self._client.get("/materials")["vessels"]
+            {**{name: value for name, value in vessel.items() if name != "content"}, **vessel["content"]}
+            for vessel in self._client.get("/materials")["vessels"]
         ]
         return _table(rows)
 
@@ -263,8 +263,8 @@ class Station:
         raise AssertionError("unreachable")
 
 
-def _pour(found: Mapping[str, Any]) -> StationPour:
-    return StationPour(found["id"], found["state"], found["reason"], found)
+def _pour(state: Mapping[str, Any]) -> StationPour:
+    return StationPour(state["id"], state["state"], state["reason"], state)
 
 
 def _table(rows: list[dict[str, Any]]) -> pd.DataFrame:

@@ -496,7 +496,7 @@ class DispensePlan:
 
     def scene(self, source: str, receiver: str) -> Scene:
         """The scene of a source and a receiver."""
-        return next(one for one in self.scenes if (one.pourer.name, one.receiver.name) == (source, receiver))
+        return next(s for s in self.scenes if (s.pourer.name, s.receiver.name) == (source, receiver))
 
     def tracked(self, source: str) -> str:
         """Name of a source in the account of the vessels: its id at the station, or laboratory and vessel."""
@@ -504,7 +504,7 @@ class DispensePlan:
 
     def liquid(self, source: str) -> str:
         """Name of a source's liquid."""
-        return next(one.liquid.name for one in self.scenes if one.pourer.name == source)
+        return next(s.liquid.name for s in self.scenes if s.pourer.name == source)
 
 
 class OutputSettings(Settings):

@@ -196,14 +196,14 @@ class RepeatedSimulation:
         self.decisions: list[Decision] = []
         if action is not None:
             seeds_of_all = [seeds.next() for _ in range(count)]
-            turns, missed, drawn = thetas or (parameters,), errors or (None,), scene.uncertain
+            turns, missed, uncertain = thetas or (parameters,), errors or (None,), scene.uncertain
             self._unissued = [
-                Simulate(scene.name, action, turns[i % len(turns)], s, "predict", missed[i % len(missed)], drawn)
+                Simulate(scene.name, action, turns[i % len(turns)], s, "predict", missed[i % len(missed)], uncertain)
                 for i, s in enumerate(seeds_of_all)
             ]
             among = f" and {len(set(thetas))} θ of the posterior" if thetas else ""
             among += f" under {len(errors)} draws of the pose error" if any(errors) else ""
-            among += ", each with shapes that the vessels may have" if drawn else ""
+            among += ", each with shapes that the vessels may have" if uncertain else ""
             self.decisions.append(Decision(f"simulate the planned action with {count} new seeds{among}"))
         self._thetas = len(set(thetas))
         self._touching = 0

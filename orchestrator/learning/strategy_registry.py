@@ -41,12 +41,12 @@ OBJECTIVES: PluginRegistry[type[Objective]] = PluginRegistry("decant.objectives"
 
 def calibrations() -> dict[str, type[CalibrationSettings]]:
     """Settings classes of the calibrations, by name."""
-    return {name: found for name, found in STRATEGIES.all.items() if issubclass(found, CalibrationSettings)}
+    return {name: kind for name, kind in STRATEGIES.all.items() if issubclass(kind, CalibrationSettings)}
 
 
 def deployments() -> dict[str, type[DeploymentSettings]]:
     """Settings classes of the deployments, by name."""
-    return {name: found for name, found in STRATEGIES.all.items() if issubclass(found, DeploymentSettings)}
+    return {name: kind for name, kind in STRATEGIES.all.items() if issubclass(kind, DeploymentSettings)}
 
 
 def result_kinds() -> tuple[type[StageResult], ...]:
@@ -55,12 +55,12 @@ def result_kinds() -> tuple[type[StageResult], ...]:
     from orchestrator.learning.calibration import calibration_base, calibration_scores, pour_design
     from orchestrator.learning.deployment import deployment_result
 
-    own = (
+    modules = (
         *(pour_design, calibration_base, calibration_scores, deployment_result),
         *(single_action, dispense, *own_extras("decant.stage_results").values()),
     )
     packages = {settings.__module__.partition(".")[0] for settings in STRATEGIES.all.values()}
     kinds = StageResult.KINDS.values()
-    ours = [found for module in own for found in kinds if found.__module__ == module.__name__]
-    theirs = {found for found in kinds if found.__module__.partition(".")[0] in packages}
-    return (*ours, *sorted(theirs - set(ours), key=lambda found: found.__name__))
+    ours = [kind for module in modules for kind in kinds if kind.__module__ == module.__name__]
+    theirs = {kind for kind in kinds if kind.__module__.partition(".")[0] in packages}
+    return (*ours, *sorted(theirs - set(ours), key=lambda kind: kind.__name__))

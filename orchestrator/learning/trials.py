@@ -111,7 +111,7 @@ class Trials:
 
     def abandon(self, trial: Trial) -> int:
         """Remove the simulations of a trial that have not been requested yet, and return their number."""
-        number = next(i for i, one in enumerate(self.all) if one is trial)
+        number = next(i for i, known in enumerate(self.all) if known is trial)
         queued = [place for place in self._unissued if place[0] == number]
         self._unissued = deque(place for place in self._unissued if place[0] != number)
         trial.requests = trial.requests[: len(trial.requests) - len(queued)]

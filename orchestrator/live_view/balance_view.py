@@ -101,9 +101,9 @@ class BalanceStage:
     def simulated(self, scene: str, action: Action, outcome: PourOutcome) -> None:
         """Keep a simulation for comparison with later pours."""
         if outcome.curve_times:
-            kept = self._simulated.setdefault(scene, [])
-            kept.append((action, outcome))
-            del kept[:-REMEMBERED]
+            series = self._simulated.setdefault(scene, [])
+            series.append((action, outcome))
+            del series[:-REMEMBERED]
 
     def begin(self, pour: Pour, scene: Scene) -> None:
         """Start a pour."""

@@ -73,18 +73,18 @@ def campaign_blueprint(
         return views
 
     def theta() -> list[Any]:
-        found = _picture("/learning/calibration/theta", "θ* and which θ fit the pours")
-        return [*_surrogate("calibration", "Discrepancy over θ", sliced=theta_slices), found]
+        picture = _picture("/learning/calibration/theta", "θ* and which θ fit the pours")
+        return [*_surrogate("calibration", "Discrepancy over θ", sliced=theta_slices), picture]
 
     def calibrated() -> Any:
         return _loss("calibration", "Calibration pours: spilled / poured [%]")
 
-    *discrepancies, found = theta()
+    *discrepancies, posterior = theta()
     calibrating = rrb.Horizontal(
         rrb.Vertical(_cell(), _simulation(), row_shares=[1, 1]),
         rrb.Vertical(
             rrb.Tabs(*discrepancies),
-            found,
+            posterior,
             rrb.Horizontal(calibrated(), _shares(), column_shares=[3, 4]),
             row_shares=[5, 4, 4],
         ),
@@ -167,7 +167,7 @@ def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its
     eye = rrb.EyeControls3D(position=(-0.05, -0.42, 0.22), look_target=(-0.04, 0.0, 0.08), eye_up=(0, 0, 1))
     return rrb.Spatial3DView(
         origin=f"{under}/simulation",
-        contents=[f"{under}/simulation/{what}" for what in ("pourer/**", "receiver/**", "liquid")],
+        contents=[f"{under}/simulation/{entity}" for entity in ("pourer/**", "receiver/**", "liquid")],
         name=name,
         background=BACKGROUND,
         eye_controls=eye,
@@ -175,7 +175,7 @@ def _simulation(under: str = "", name: str = "Simulated pour, by the fate of its
     )
 
 
-def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/**", **more: Any) -> Any:
+def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/**", **options: Any) -> Any:
     """Return a view of curves over the last seconds; the space to the right of the cursor holds the legend."""
     at = rr.TimeRangeBoundary.cursor_relative
     shown = [
@@ -188,7 +188,7 @@ def _recent(origin: str, name: str, before: float, *, contents: Any = "$origin/*
         axis_x=rrb.TimeAxis(view_range=rr.TimeRange(at(seconds=-before), at(seconds=LEGEND * before))),
         time_ranges=shown,
         plot_legend=rrb.Corner2D.RightTop,
-        **more,
+        **options,
     )
 
 

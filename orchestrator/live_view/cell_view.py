@@ -56,7 +56,7 @@ class CellScene:
         self._sink, self._films = sink, films
         laboratory = plan.laboratory
         self._figure: ArmFigure | None = None if laboratory.arm is None else arm_kind(laboratory.arm).figure()
-        scales = [one.time_scale for one in (laboratory.bench, laboratory.arm) if one is not None]
+        scales = [device.time_scale for device in (laboratory.bench, laboratory.arm) if device is not None]
         self.time_scale = max(scales, default=1.0) or float("inf")
         self._shown: dict[str, str] = {}
         self._trail: list[list[float]] = []
@@ -225,8 +225,8 @@ class CellScene:
     ) -> tuple[list[Track], FloatArray]:
         """Return the liquid's tracks at times (T,) [s], and the fraction of liquid spilled by then, shape (T,)."""
         radius = 0.5 * shapes.spacing(liquid.positions[0], volume)
-        kept = np.asarray(liquid.times, dtype=float)
-        at = np.clip(np.searchsorted(kept, times + 1e-6, side="left") - 1, 0, len(kept) - 1)
+        stamps = np.asarray(liquid.times, dtype=float)
+        at = np.clip(np.searchsorted(stamps, times + 1e-6, side="left") - 1, 0, len(stamps) - 1)
         some = shapes.changes(at[:, None].astype(float))  # the liquid may be recorded less often, or for a shorter time
         states = {int(index): np.asarray(liquid.states[index]) for index in at}
         swarms = shapes.swarms([liquid.positions[i] for i in at[some]], [states[int(i)] for i in at[some]], radius)
@@ -239,10 +239,10 @@ class CellScene:
 
     # ---- helpers
 
-    def _stand(self, what: str, spec: VesselSpec) -> None:
-        if self._shown.get(what) != (key := spec.content_hash()):
-            self._shown[what] = key
-            self._sink.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+    def _stand(self, entity: str, spec: VesselSpec) -> None:
+        if self._shown.get(entity) != (key := spec.content_hash()):
+            self._shown[entity] = key
+            self._sink.log(f"{PLACE}/{entity}/mesh", shapes.mesh(spec))
 
     def _tool_places(self, poses: FloatArray) -> FloatArray:
         return poses[:, :3] if self._figure is None else self._figure.tool_of(poses)

@@ -162,10 +162,10 @@ class LearningStage:
     def learnt(self, result: StageResult, now: float) -> None:
         """Log the current result of a strategy."""
         if isinstance(result, Calibrated) and result.found is not None:
-            found = result.found
-            if found.searched:
+            theta = result.found
+            if theta.searched:
                 draw = f"{PLACE}/{CALIBRATION}/theta"
-                self._picture(draw, now, lambda: png(theta_picture(found)))
+                self._picture(draw, now, lambda: png(theta_picture(theta)))
         if isinstance(result, Deployed):
             place = f"{PLACE}/{safe_name(result.scene)}/trust"
             if isinstance(result.model_check, Believed):
@@ -291,23 +291,23 @@ def slices_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossUnit
         title: title of the picture.
     """
     maps = slices(query, suggestion)
-    names = [name for name in query.space.names if any(name in one.axes for one in maps)]
+    names = [name for name in query.space.names if any(name in plane.axes for plane in maps)]
     if not names:
         return words(f"{title}: too little for slices")
     axis_of = dict(zip(query.space.names, query.space.axes, strict=True))
     column_of = {name: query.space.names.index(name) for name in names}
     figure, axes = style.new_figure(len(names), len(names), size=(15.0, 9.0), squeeze=False)
     figure.suptitle(title, fontsize=17, color=style.INK, x=0.01, ha="left")
-    means = [unit.factor * np.maximum(np.asarray(one.mean, float), 0.0) for one in maps]
-    deviations = [unit.factor * np.asarray(one.deviation, float) for one in maps]
+    means = [unit.factor * np.maximum(np.asarray(plane.mean, float), 0.0) for plane in maps]
+    deviations = [unit.factor * np.asarray(plane.deviation, float) for plane in maps]
     seen = (
         (simulated_points(query), {"marker": "o", "s": 10, "facecolor": "none", "edgecolor": style.INK}),
         (query.data.points, {"marker": "o", "s": 30, "facecolor": "white", "edgecolor": style.INK}),
         (suggestion.points, {"marker": "*", "s": 200, "facecolor": style.BEST, "edgecolor": "white"}),
     )
-    drawn: dict[str, Any] = {}
-    for one, mean, deviation in zip(maps, means, deviations, strict=True):
-        low, high = (names.index(name) for name in one.axes)
+    lines: dict[str, Any] = {}
+    for plane, mean, deviation in zip(maps, means, deviations, strict=True):
+        low, high = (names.index(name) for name in plane.axes)
         # Below the diagonal, the first axis is horizontal; above it, the panel is transposed.
         for kind, (row, column), values, every, colours in (
             ("mean", (high, low), mean, means, "viridis_r"),
@@ -318,7 +318,7 @@ def slices_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossUnit
             scales = [style.display_factor(axis.name) for axis in (across, up)]
             grid = [[axis.decode(u) / scale for u in places] for axis, scale in zip((across, up), scales, strict=True)]
             span = {"vmin": min(float(v.min()) for v in every), "vmax": max(float(v.max()) for v in every)}
-            drawn[kind] = panel.pcolormesh(*grid, values, shading="nearest", cmap=colours, rasterized=True, **span)
+            lines[kind] = panel.pcolormesh(*grid, values, shading="nearest", cmap=colours, rasterized=True, **span)
             for points, look in seen:
                 if points:
                     places_of = [column_of[across.name], column_of[up.name]]
@@ -334,7 +334,7 @@ def slices_picture(query: SurrogateQuery, suggestion: Suggestion, unit: LossUnit
         if place < len(names) - 1:
             axes[-1, place].set_xlabel(style.label(name), fontsize=13)
     for kind, text in (("mean", f"below: expected {unit.label}"), ("sd", f"above: ± σ [{unit.unit}]")):
-        bar = figure.colorbar(drawn[kind], ax=axes, pad=0.01, aspect=40)
+        bar = figure.colorbar(lines[kind], ax=axes, pad=0.01, aspect=40)
         bar.set_label(text, fontsize=13)
         bar.ax.tick_params(labelsize=12)
     held = style.display_values(dict(query.space.decode(maps[0].at)))
@@ -355,14 +355,14 @@ def words(text: str) -> Figure:
     return figure
 
 
-def theta_picture(found: CalibratedTheta) -> Figure:
+def theta_picture(best: CalibratedTheta) -> Figure:
     """Draw θ* and its posterior: one panel for each searched parameter."""
-    names = found.searched
+    names = best.searched
     figure, axes = style.new_figure(1, len(names), size=(5.0 * max(len(names), 2), 4.2), squeeze=False)
-    expected = f"expected |measured − simulated| {100 * max(found.predicted_discrepancy, 0.0):.1f} %"
+    expected = f"expected |measured − simulated| {100 * max(best.predicted_discrepancy, 0.0):.1f} %"
     figure.suptitle(f"θ*: {expected}", fontsize=17, color=style.INK, x=0.01, ha="left")
-    draws = () if found.posterior is None else found.posterior.thetas
-    chosen = found.theta.model_dump()
+    draws = () if best.posterior is None else best.posterior.thetas
+    chosen = best.theta.model_dump()
     for panel, name in zip(axes[0], names, strict=True):
         if draws:
             panel.hist([theta[name] for theta in draws], bins=24, color=style.FALLING, density=True)

@@ -107,9 +107,9 @@ class LiveView:
         wanted = list(self._ports)
         while wanted:
             if not self._process.alive or time.monotonic() > end:
-                said = self._process.last_error or "it says nothing"
+                reason = self._process.last_error or "it says nothing"
                 self.close()
-                raise LiveError(f"the live view's server does not start: {said}")
+                raise LiveError(f"the live view's server does not start: {reason}")
             if answers(self.host, wanted[0]):
                 wanted.pop(0)
             else:

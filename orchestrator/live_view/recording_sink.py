@@ -93,20 +93,20 @@ class RecordingSink:
         """The times of rows that are logged now."""
         return dict(self._now)
 
-    def log(self, entity: str, *what: Any, static: bool = False, at: Moment | None = None) -> None:
+    def log(self, entity: str, *archetypes: Any, static: bool = False, at: Moment | None = None) -> None:
         """Log a row.
 
         Args:
             entity: path of the entity.
-            what: archetypes.
+            archetypes: archetypes.
             static: whether the row is valid at all times.
             at: times of the row, if they differ from `now`.
         """
         if static:
             for end in self._ends:
-                end.stream.log(entity, *what, static=True)
+                end.stream.log(entity, *archetypes, static=True)
             return
-        batches = [batch for each in what for batch in each.as_component_batches()]
+        batches = [batch for each in archetypes for batch in each.as_component_batches()]
         arrays = [batch.as_arrow_array() for batch in batches]
         columns = [
             (batch.component_descriptor(), pa.ListArray.from_arrays([0, len(array)], array))
@@ -134,8 +134,8 @@ class RecordingSink:
                 end.take(entity, moments, columns, size)
             return
         half = len(moments) // 2
-        for part in (slice(half), slice(half, None)):
-            self.rows(entity, moments[part], [(what, array[part]) for what, array in columns])
+        for half_ in (slice(half), slice(half, None)):
+            self.rows(entity, moments[half_], [(name, array[half_]) for name, array in columns])
 
     def clear(self, entity: str, *, recursive: bool = False) -> None:
         """Hide the previous content of an entity from now on.
@@ -200,7 +200,7 @@ def moment(**times: float | int) -> dict[str, int]:
 
 def columns_of(*parts: Iterable[Any]) -> Columns:
     """Combine the `columns` of archetypes to rows of one entity."""
-    return [(column.component_descriptor(), column.as_arrow_array()) for part in parts for column in part]
+    return [(column.component_descriptor(), column.as_arrow_array()) for batch in parts for column in batch]
 
 
 @dataclass
@@ -232,15 +232,15 @@ class _End:
 
     def take(self, entity: str, moments: Sequence[Moment], columns: Columns, size: int) -> None:
         """Collect rows of a given size."""
-        rows = self._rows_of(entity, moments[0], tuple(what for what, _ in columns))
+        rows = self._rows_of(entity, moments[0], tuple(name for name, _ in columns))
         if rows.moments and rows.size + size > LARGEST:
             self.send(entity)
-            rows = self._rows_of(entity, moments[0], tuple(what for what, _ in columns))
+            rows = self._rows_of(entity, moments[0], tuple(name for name, _ in columns))
         rows.columns = rows.columns or [[] for _ in columns]
         rows.moments.extend(moments)
         rows.size += size
-        for kept, (_, array) in zip(rows.columns, columns, strict=True):
-            kept.append(array)
+        for chunks, (_, array) in zip(rows.columns, columns, strict=True):
+            chunks.append(array)
 
     def take_number(self, entity: str, at: Moment, value: float) -> None:
         """Collect one value of a curve."""
@@ -273,7 +273,7 @@ class _End:
         columns: Iterable[Any] = (
             rr.Scalars.columns(scalars=rows.numbers)
             if rows.numbers
-            else [_Column(what, pa.concat_arrays(some)) for what, some in zip(components, rows.columns, strict=True)]
+            else [_Column(key, pa.concat_arrays(some)) for key, some in zip(components, rows.columns, strict=True)]
         )
         self.stream.send_columns(entity, indexes, columns)
 
@@ -433,7 +433,7 @@ class PlaybackQueue:
             showing.shown[number] = last = int(np.searchsorted(track.times, until + _SOON, side="right"))
             if last > first:
                 moments = [moment(**showing.times(float(each))) for each in track.times[first:last]]
-                self._sink.rows(track.entity, moments, [(what, rows[first:last]) for what, rows in track.columns])
+                self._sink.rows(track.entity, moments, [(name, rows[first:last]) for name, rows in track.columns])
         if until >= film.length:
             self._sink.times(**showing.times(film.length))
             film.end()

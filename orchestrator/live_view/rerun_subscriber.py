@@ -186,12 +186,12 @@ class RerunMonitor:
         self._send(Closing(self.dropped))
         self._process.close_input()
         try:
-            said = self._process.read_line()
+            line = self._process.read_line()
         except EOFError:
             raise ChildProcessError(
                 f"the process that writes {self.path} has died; what it had written is kept"
             ) from None
-        self._report = {"complete": True} | json.loads(said)
+        self._report = {"complete": True} | json.loads(line)
         if self._report["failed"]:
             _log.warning(
                 "recording %s: %d event(s) could not be drawn; the first: %s",

@@ -67,12 +67,12 @@ class SimulatedStage:
         if len(times) == 0:
             return
         radius = 0.5 * shapes.spacing(frames.positions[0], scene.liquid.volume)
-        kept = thinned(times)
-        moments = times[kept] - times[kept[0]]
-        states = [np.asarray(frames.states[index]) for index in kept]
+        shown = thinned(times)
+        moments = times[shown] - times[shown[0]]
+        states = [np.asarray(frames.states[index]) for index in shown]
         shares = [100.0 * np.bincount(each, minlength=5) / max(len(each), 1) for each in states]
-        poses = np.asarray([frames.pourer_poses[index] for index in kept], float)
-        liquid = shapes.swarms([frames.positions[index] for index in kept], states, radius)
+        poses = np.asarray([frames.pourer_poses[index] for index in shown], float)
+        liquid = shapes.swarms([frames.positions[index] for index in shown], states, radius)
         tracks = [shapes.moving(f"{PLACE}/pourer", moments, poses), Track(f"{PLACE}/liquid", moments, liquid)]
         for state, share in enumerate(np.transpose(shares)[: len(SHARES)]):
             curve = columns_of(rr.Scalars.columns(scalars=share))
@@ -87,23 +87,23 @@ class SimulatedStage:
 
     def _set(self, scene: Scene, title: str) -> None:
         self._sink.log(f"{PLACE}/title", rr.TextDocument(f"### {title}", media_type="text/markdown"))
-        for what, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
+        for role, spec in (("pourer", scene.pourer), ("receiver", scene.receiver)):
             # Viewers of the wall clock don't see rows that are left out of it.
-            key, place = spec.content_hash(), (what, self._sink.on_wall)
+            key, place = spec.content_hash(), (role, self._sink.on_wall)
             if self._shown.get(place) != key:
-                self._shown[place] = self._shown[what, False] = key
-                self._sink.log(f"{PLACE}/{what}/mesh", shapes.mesh(spec))
+                self._shown[place] = self._shown[role, False] = key
+                self._sink.log(f"{PLACE}/{role}/mesh", shapes.mesh(spec))
 
 
 def thinned(times: NDArray[np.float64]) -> list[int]:
     """Return the indices of frames to show: at most `MAXIMUM_RATE`, and the last, which shows the spilled liquid."""
-    kept = [0]
+    frames = [0]
     for index in range(1, len(times)):
-        if times[index] - times[kept[-1]] >= 1.0 / MAXIMUM_RATE - 1e-6:
-            kept.append(index)
-    if kept[-1] != len(times) - 1:
-        kept.append(len(times) - 1)
-    return kept
+        if times[index] - times[frames[-1]] >= 1.0 / MAXIMUM_RATE - 1e-6:
+            frames.append(index)
+    if frames[-1] != len(times) - 1:
+        frames.append(len(times) - 1)
+    return frames
 
 
 def simulation_rrd(path: Path, task: PourTask, result: SimulatedPour, title: str = "") -> Path:
@@ -174,8 +174,8 @@ def find_pour(run: Path, number: int, stage: str | None = None) -> RunPour:
             stages.setdefault(pour.stage, []).append(str(pour.request.number))
         known = "; ".join(f"{name}: {', '.join(numbers)}" for name, numbers in stages.items())
         of = "" if stage is None else f" of stage {stage}"
-        found = f"weighed were {known}" if known else "none was"
-        raise InvalidArgumentError(f"{run}: there is no weighed pour {number}{of}; {found}")
+        hint = f"weighed were {known}" if known else "none was"
+        raise InvalidArgumentError(f"{run}: there is no weighed pour {number}{of}; {hint}")
     return fitting[-1]
 
 
@@ -191,8 +191,8 @@ def task_of(plan: CampaignPlan, run: Path, pour: RunPour, particles: int | None 
     measured = pour.measured
     assert measured is not None
     theta = plan.parameters
-    if (found := run / "theta.json").is_file():
-        theta = SimulationParameters.model_validate(json.loads(found.read_text(encoding="utf-8"))["theta"])
+    if (saved := run / "theta.json").is_file():
+        theta = SimulationParameters.model_validate(json.loads(saved.read_text(encoding="utf-8"))["theta"])
     if particles is not None:
         theta = theta.model_copy(update={"particles": particles})
     scene = scenes_of(plan)[pour.request.scene]

@@ -193,8 +193,8 @@ class VesselAccount:
         Raises:
             OSError: the file can't be read.
         """
-        found = self.history(vessel, 1)
-        return found[0] if found else None
+        entries = self.history(vessel, 1)
+        return entries[0] if entries else None
 
     def history(self, vessel: str = "", count: int = 1000) -> list[VesselContent]:
         """The last entries of a vessel ('' for all), the newest first.
@@ -228,7 +228,7 @@ class VesselAccount:
             InvalidArgumentError: a source can't hold what was entered for it.
             OSError: the file can't be read.
         """
-        found: dict[str, KnownSource] = {}
+        sources: dict[str, KnownSource] = {}
         for name in plan.sources if plan.as_left else ():
             entry = self.content(plan.tracked(name))
             if entry is not None and entry.mass is not None and entry.liquid == plan.liquid(name):
@@ -241,8 +241,8 @@ class VesselAccount:
                         " 'MASS'"
                     )
                 knowledge = None if entry.knowledge is None else {**entry.knowledge, "lag": None}
-                found[name] = KnownSource(mass=entry.mass, deviation=entry.deviation, knowledge=knowledge)
-        return found
+                sources[name] = KnownSource(mass=entry.mass, deviation=entry.deviation, knowledge=knowledge)
+        return sources
 
     # ---- entries of people and devices
 
@@ -350,11 +350,11 @@ class VesselAccount:
             OSError: the file can't be written.
         """
         with self._writing() as connection:
-            held, there = (_last(connection, name) or _empty(name) for name in (source, receiver))
-            mixed = held.liquid if there.liquid in ("", held.liquid) else MIXTURE
+            held, target = (_last(connection, name) or _empty(name) for name in (source, receiver))
+            mixed = held.liquid if target.liquid in ("", held.liquid) else MIXTURE
             for before, change, sign, liquid, role in (
                 (held, moved.taken, -1.0, held.liquid, "from"),
-                (there, moved.received, 1.0, mixed, "into"),
+                (target, moved.received, 1.0, mixed, "into"),
             ):
                 kind, mass, deviation = _after(before, change, sign)
                 entry = VesselContent(
@@ -506,10 +506,10 @@ class LaboratoryPlaces:
     def stands(self) -> dict[str, str | None]:
         """See `PlaceRecord.stands`."""
         with _writable():
-            found = self._account.places()
+            places = self._account.places()
         return {
             name.removeprefix(self._prefix): entry.place
-            for name, entry in found.items()
+            for name, entry in places.items()
             if name.startswith(self._prefix)
         }
 
@@ -529,8 +529,8 @@ class LaboratoryPlaces:
     def held(self, vessel: str) -> tuple[float, float] | None:
         """See `PlaceRecord.held`."""
         with _writable():
-            found = self._account.content(self._prefix + vessel)
-        return None if found is None or found.mass is None else (found.mass, found.deviation)
+            content = self._account.content(self._prefix + vessel)
+        return None if content is None or content.mass is None else (content.mass, content.deviation)
 
 
 @contextlib.contextmanager
@@ -574,14 +574,14 @@ def _read(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...
 
 
 def _last(connection: sqlite3.Connection, vessel: str) -> VesselContent | None:
-    found = _read(connection, "where vessel = ? order by id desc limit 1", (vessel,))
-    return found[0] if found else None
+    entries = _read(connection, "where vessel = ? order by id desc limit 1", (vessel,))
+    return entries[0] if entries else None
 
 
-def _write(connection: sqlite3.Connection, key: str, one: VesselContent) -> None:
-    knowledge = None if one.knowledge is None else json.dumps(one.knowledge)
-    values = (one.vessel, one.time, one.kind, one.mass, one.deviation, one.liquid, one.pour, one.by, one.note)
+def _write(connection: sqlite3.Connection, key: str, row: VesselContent) -> None:
+    knowledge = None if row.knowledge is None else json.dumps(row.knowledge)
+    values = (row.vessel, row.time, row.kind, row.mass, row.deviation, row.liquid, row.pour, row.by, row.note)
     connection.execute(
         f"insert or ignore into entry (key, {_COLUMNS}) values ({', '.join('?' * 12)})",
-        (key, *values, one.weighed, knowledge),
+        (key, *values, row.weighed, knowledge),
     )

@@ -73,13 +73,13 @@ def first_difference(expected: Any, actual: Any, path: str = "") -> str | None:
                 return f"{place}: {_short(expected[key])} became nothing"
             if key not in expected:
                 return f"{place}: nothing became {_short(actual[key])}"
-            if found := first_difference(expected[key], actual[key], place):
-                return found
+            if difference := first_difference(expected[key], actual[key], place):
+                return difference
         return None
     if isinstance(expected, list) and isinstance(actual, list) and len(expected) == len(actual):
         for index, (left, right) in enumerate(zip(expected, actual, strict=True)):
-            if found := first_difference(left, right, f"{path}[{index}]"):
-                return found
+            if difference := first_difference(left, right, f"{path}[{index}]"):
+                return difference
         return None
     if canonical(expected) == canonical(actual):
         return None
@@ -159,21 +159,21 @@ def _converter() -> Any:
 
     @c.register_unstructure_hook_factory(dataclasses.is_dataclass)
     def write_dataclass(cls: Any) -> Any:
-        own = make_dict_unstructure_fn(cls, c, **choices(cls))
+        fields = make_dict_unstructure_fn(cls, c, **choices(cls))
 
         def write(value: Any) -> dict[str, Any]:
             if not isinstance(value, cls):
                 raise CodecError(f"expected {cls.__name__}, got {type(value).__name__}")
-            return own(value)
+            return fields(value)
 
         return write
 
     @c.register_structure_hook_factory(dataclasses.is_dataclass)
     def read_dataclass(cls: Any) -> Any:
-        own = make_dict_structure_fn(cls, c, **choices(cls))
+        fields = make_dict_structure_fn(cls, c, **choices(cls))
 
         def read(data: Any, _: Any) -> Any:
-            return own({key: value for key, value in _expect(data, dict).items() if key != _TYPE}, cls)
+            return fields({key: value for key, value in _expect(data, dict).items() if key != _TYPE}, cls)
 
         return read
 
@@ -198,11 +198,11 @@ def _converter() -> Any:
         tagged: dict[Any, Any] = {_name(member): member for member in get_args(hint)}
 
         def read(data: Any, _: Any) -> Any:
-            found = tagged.get(data[_TYPE]) if isinstance(data, Mapping) and _TYPE in data else type(data)
-            if found not in get_args(hint):
+            member = tagged.get(data[_TYPE]) if isinstance(data, Mapping) and _TYPE in data else type(data)
+            if member not in get_args(hint):
                 shown = repr(data[_TYPE]) if isinstance(data, Mapping) and _TYPE in data else _short(data)
                 raise CodecError(f"expected one of {_names(hint)}, got {shown}")
-            return None if data is None else c.structure(data, cast("type[Any]", found))
+            return None if data is None else c.structure(data, cast("type[Any]", member))
 
         return read
 
@@ -340,7 +340,7 @@ def decode_result(data: Mapping[str, Any]) -> StageResult:
         return known.model_validate(from_json(data))
     except ValidationError as error:
         first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
+        place = ".".join(str(key) for key in first["loc"])
         raise RunError(f"a result of the kind '{kind}' can't be read: {place}: {first['msg']}") from None
 
 
@@ -350,8 +350,8 @@ def result_of(results: Results, stage: str, kind: type[L]) -> L:
     Raises:
         RunError: there is no such stage, or its result is of another kind.
     """
-    found = results.get(stage)
-    if not isinstance(found, kind):
-        what = "nothing" if found is None else f"a result of the kind '{found.kind}'"
-        raise RunError(f"stage {stage} should have learnt a {kind.__name__}, but there is {what}")
-    return found
+    entry = results.get(stage)
+    if not isinstance(entry, kind):
+        present = "nothing" if entry is None else f"a result of the kind '{entry.kind}'"
+        raise RunError(f"stage {stage} should have learnt a {kind.__name__}, but there is {present}")
+    return entry

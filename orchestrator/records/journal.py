@@ -191,10 +191,10 @@ class JournalReader:
 
     def last_id(self) -> int:
         """The largest request id in use; 0 before the first request."""
-        found = self._connection.execute(
+        row = self._connection.execute(
             "select max(json_extract(body, '$.id')) from event where kind = ?", [str(Kind.REQUESTED)]
         ).fetchone()
-        return int(found[0] or 0)
+        return int(row[0] or 0)
 
     def _read_header(self) -> Header:
         try:

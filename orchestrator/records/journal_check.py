@@ -147,7 +147,7 @@ def readable_lines(path: Path) -> list[LedgerLine]:
 
 def pours_in_ledger(lines: Sequence[LedgerLine]) -> list[str]:
     """One text per pour that has begun: 'pour 2 of stage calibration (began 2030-03-01 14:30:05, no outcome)'."""
-    found: dict[tuple[str, Any], str] = {}
+    pours: dict[tuple[str, Any], str] = {}
     numbers: dict[tuple[str, Any], Any] = {}
     for line in lines:
         if line.kind == BEGUN:
@@ -156,12 +156,12 @@ def pours_in_ledger(lines: Sequence[LedgerLine]) -> list[str]:
         numbers[key] = line.body.get("number", numbers.get(key))
         match line.kind:
             case "pour.started":
-                found[key] = f"began {_when(line.t)}, no outcome"
+                pours[key] = f"began {_when(line.t)}, no outcome"
             case "pour.withdrawn":
-                found.pop(key, None)
+                pours.pop(key, None)
             case "pour.finished":
-                found[key] = _outcome(line.body.get("outcome") or {})
-    return [f"{_named(*key, numbers[key])} ({text})" for key, text in found.items()]
+                pours[key] = _outcome(line.body.get("outcome") or {})
+    return [f"{_named(*key, numbers[key])} ({text})" for key, text in pours.items()]
 
 
 def _named(stage: str, key: Any, number: Any) -> str:
@@ -283,7 +283,7 @@ def traces_of_a_run(path: Path) -> list[str]:
     """
     names = [*_WRITTEN_BY_A_RUN, path.with_suffix(".reserve").name, path.with_suffix(".lock").name]
     names += [f"{path.name}-wal"] if not path.is_file() else []
-    recordings = sorted(found.name for found in path.parent.glob("*.rrd"))
+    recordings = sorted(file.name for file in path.parent.glob("*.rrd"))
     return [name for name in names if (path.parent / name).exists()] + recordings
 
 
@@ -348,9 +348,9 @@ def _checked(
     pours: tuple[str, ...],
     traces: list[str],
 ) -> JournalCheck:
-    found = connection.execute("pragma integrity_check(3)").fetchall()
-    if found != [("ok",)]:
-        problems.append(f"SQLite's integrity check of {path.name}: {'; '.join(str(row[0]) for row in found)}")
+    faults = connection.execute("pragma integrity_check(3)").fetchall()
+    if faults != [("ok",)]:
+        problems.append(f"SQLite's integrity check of {path.name}: {'; '.join(str(row[0]) for row in faults)}")
     header = connection.execute("select format from header").fetchone()
     if header is None:
         return JournalCheck(path, (*problems, f"{path.name} has no header"), pours)

@@ -81,15 +81,15 @@ class Header:
     created: float = 0.0
 
 
-def check_format(found: int, path: Path) -> None:
+def check_format(version: int, path: Path) -> None:
     """Check that this version of Decant can read and resume a journal.
 
     Raises:
         JournalFormatError: another version wrote it.
     """
-    if found != FORMAT:
+    if version != FORMAT:
         raise JournalFormatError(
-            f"{path}: written in format {found}, this version of Decant reads format {FORMAT}; "
+            f"{path}: written in format {version}, this version of Decant reads format {FORMAT}; "
             "use the version that began the run (see versions.json next to it), or begin a new run"
         )
 
@@ -269,9 +269,9 @@ class NoSpaceError(RunError):
 
 def free_space(path: Path) -> int:
     """Bytes that this user may still write on the disk of a path; the path need not exist."""
-    there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-    found = os.statvfs(there)
-    return found.f_bavail * found.f_frsize
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    space = os.statvfs(existing)
+    return space.f_bavail * space.f_frsize
 
 
 def require_space(path: Path, needed: int, purpose: str) -> None:

@@ -324,8 +324,8 @@ class RunState:
     @property
     def occupancies(self) -> dict[str, Occupancy]:
         """Use of the pool in every stage with both simulations and pours."""
-        both = (one for one in self.stages.values() if one.simulations_asked and one.pours_asked)
-        return {one.name: one.occupancy for one in both if one.occupancy.total > 0.0}
+        both = (stage for stage in self.stages.values() if stage.simulations_asked and stage.pours_asked)
+        return {stage.name: stage.occupancy for stage in both if stage.occupancy.total > 0.0}
 
     def take(self, event: Event) -> None:
         """Count an event."""

@@ -27,8 +27,8 @@ def state_directory() -> Path:
     """
     if named := os.environ.get(VARIABLE):
         return Path(named).expanduser().absolute()
-    if given := os.environ.get("STATE_DIRECTORY"):
-        return Path(given.split(":")[0])
+    if configured := os.environ.get("STATE_DIRECTORY"):
+        return Path(configured.split(":")[0])
     if shared := os.environ.get("XDG_STATE_HOME"):
         return Path(shared).expanduser().absolute() / "decant"
     try:
@@ -47,9 +47,9 @@ def make_state_directory(path: Path) -> None:
         OSError: it can't be created.
     """
     path.mkdir(parents=True, exist_ok=True, mode=0o700)
-    found = path.stat()
-    mode = stat.S_IMODE(found.st_mode)
-    if mode & 0o077 and found.st_uid == os.geteuid():
+    status = path.stat()
+    mode = stat.S_IMODE(status.st_mode)
+    if mode & 0o077 and status.st_uid == os.geteuid():
         path.chmod(mode & 0o700)
 
 

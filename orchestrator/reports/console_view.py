@@ -26,8 +26,8 @@ def summary_table(summary: RunSummary) -> RenderableType:
         parts.append(Text(f"θ*  {style.display_values(learning.calibrated_theta.model_dump())}"))
         parts += [Text(f"  {line}", style="dim") for line in learning.theta_sentences]
     parts += [_table(table) for table in (score_table(learning), receiver_table(outcome)) if table.rows]
-    for one in outcome.advice:
-        parts += _advice(one)
+    for advice in outcome.advice:
+        parts += _advice(advice)
     pools = {stage.rpartition(":")[2]: use.text for stage, use in summary.occupancy.items() if use.text}
     parts += [Text(f"  {stage}: pool {text}", style="dim") for stage, text in pools.items()]
     paths = [*files.figures.items(), *([("recording", files.recording)] if files.recording else [])]
@@ -40,11 +40,11 @@ def summary_table(summary: RunSummary) -> RenderableType:
     return Group(*parts)
 
 
-def _advice(one: Advice) -> list[RenderableType]:
-    action = ", ".join(f"{name} {value}" for name, value in one.action.items())
-    lines = [f"  into {one.receiver}: {action}" if action else f"  into {one.receiver}", *one.sentences, one.window]
+def _advice(row: Advice) -> list[RenderableType]:
+    action = ", ".join(f"{name} {value}" for name, value in row.action.items())
+    lines = [f"  into {row.receiver}: {action}" if action else f"  into {row.receiver}", *row.sentences, row.window]
     shown: list[RenderableType] = [Text(line if i == 0 else f"    {line}") for i, line in enumerate(lines) if line]
-    return shown + [Text(f"    {line}", style="yellow") for line in one.open]
+    return shown + [Text(f"    {line}", style="yellow") for line in row.open]
 
 
 def print_summary(summary: RunSummary) -> None:

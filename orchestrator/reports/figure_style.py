@@ -212,7 +212,7 @@ def at_ends(values: Mapping[str, float | None], axes: tuple[Axis, ...]) -> list[
         values: values of a point [SI].
         axes: searched axes.
     """
-    said = []
+    notes = []
     for axis in axes:
         value = values.get(axis.name)
         if value is None:
@@ -220,8 +220,8 @@ def at_ends(values: Mapping[str, float | None], axes: tuple[Axis, ...]) -> list[
         unit = axis.encode(value)
         if min(unit, 1.0 - unit) < 1e-3:
             end = "upper" if unit > 0.5 else "lower"
-            said.append(f"{axis.name.replace('_', ' ')} at its {end} end ({display_value(axis.name, value)})")
-    return said
+            notes.append(f"{axis.name.replace('_', ' ')} at its {end} end ({display_value(axis.name, value)})")
+    return notes
 
 
 def save(figure: Figure, path: Path, formats: Sequence[str] = ()) -> Path:

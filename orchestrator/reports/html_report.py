@@ -105,7 +105,7 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
     pictures = {name: _picture(name, path) for name, path in summary.files.figures.items() if path.is_file()}
     seed = "" if summary.seed is None else f" Seed {summary.seed}."
     # The paths of the machine are left out.
-    kept = {key: value for key, value in (resolved or {}).items() if key != "outputs"}
+    settings = {key: value for key, value in (resolved or {}).items() if key != "outputs"}
     return render(
         "run.html.j2",
         title=f"{summary.campaign}: {summary.run}",
@@ -122,14 +122,14 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         theta=wording.theta_table(summary.learning) if summary.learning.parameters else None,
         theta_fixed=wording.fixed_parameters(summary.learning),
         scores=wording.score_table(summary.learning),
-        theta_figures=[one for name, one in pictures.items() if name.startswith(_THETA_FIGURES)],
+        theta_figures=[pic for name, pic in pictures.items() if name.startswith(_THETA_FIGURES)],
         receivers=wording.receiver_table(summary.outcome),
-        first=[one for start in _FIRST_FIGURES for name, one in pictures.items() if name.startswith(start)],
-        figures=[one for name, one in pictures.items() if not name.startswith((*_THETA_FIGURES, *_FIRST_FIGURES))],
+        first=[pic for start in _FIRST_FIGURES for name, pic in pictures.items() if name.startswith(start)],
+        figures=[pic for name, pic in pictures.items() if not name.startswith((*_THETA_FIGURES, *_FIRST_FIGURES))],
         pours=wording.pour_tables(summary),
         not_simulated=wording.validity_table(summary.outcome),
-        notes=[(_date(one.time), one.text) for one in summary.log.notes],
-        resolved=json.dumps(kept, indent=2, ensure_ascii=False) if kept else "",
+        notes=[(_date(note.time), note.text) for note in summary.log.notes],
+        resolved=json.dumps(settings, indent=2, ensure_ascii=False) if settings else "",
         footer="Made by Decant from the run's journal.",
     )
 

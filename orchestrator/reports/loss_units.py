@@ -93,7 +93,7 @@ def deployment_unit(plan: DeploymentPlan) -> LossUnit:
     """Display unit of a deployment's loss, or of its weighted sum of objectives."""
     if plan.objectives is None:
         return loss_unit(plan.loss)
-    weights = [(part.weight, part.name.replace("_", " ")) for part in plan.objectives.parts]
+    weights = [(objective.weight, objective.name.replace("_", " ")) for objective in plan.objectives.parts]
     return LossUnit(f"{' + '.join(n if w == 1.0 else f'{w:g} × {n}' for w, n in weights)} [%]", "%", 100.0)
 
 

@@ -482,13 +482,13 @@ def _vessels_from_the_side(axes: Axes, pour: SampledPath, pourer: Vessel, receiv
     fill_section(axes, stand, facecolor=style.RECEIVED, linewidth=0.0, label="receiver")
     largest = int(np.argmax(pour.tilts))
     half = int(np.argmax(pour.tilts >= 0.5 * pour.tilts[largest]))
-    drawn = list(stand)
+    cups = list(stand)
     for index, opacity in ((0, 0.35), (half, 0.35), (largest, 1.0)):
         placed = [1e3 * place(loop, pour.poses[index]) for loop in outlines[0]]
         name = f"pourer, up to {math.degrees(float(pour.tilts[largest])):.0f} deg" if index == largest else None
         fill_section(axes, placed, facecolor=style.POURER, alpha=opacity, linewidth=0.0, label=name)
-        drawn += placed
-    return np.concatenate(drawn)
+        cups += placed
+    return np.concatenate(cups)
 
 
 def _from_above(axes: Axes, pour: SampledPath, pourer: Vessel, receiver: Vessel) -> None:

@@ -97,8 +97,8 @@ def score(rows: Iterable[ScoredRow]) -> Score:
 def scores(rows: Sequence[ScoredRow]) -> dict[str, Score]:
     """Scores by split, and for 'all' if there is more than one split."""
     splits = list(dict.fromkeys(row.split for row in rows))
-    found = {split: score(row for row in rows if row.split == split) for split in splits}
-    return {**found, "all": score(rows)} if len(splits) > 1 else found
+    by_split = {split: score(row for row in rows if row.split == split) for split in splits}
+    return {**by_split, "all": score(rows)} if len(splits) > 1 else by_split
 
 
 def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
@@ -128,17 +128,17 @@ def write_scored(path: Path, rows: Sequence[ScoredRow], dimensions: Sequence[str
     Raises:
         OSError: it can't be written.
     """
-    given = [ACTION_DIMENSIONS[name] for name in dimensions]
-    head = ["line", "split", *(column_name(dimension) for dimension in given)]
+    infos = [ACTION_DIMENSIONS[name] for name in dimensions]
+    head = ["line", "split", *(column_name(dimension) for dimension in infos)]
     head += ["measured", "predicted", "deviation", "low_90", "high_90", "inside"]
     with path.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(head)
         for row in rows:
-            values = [getattr(row.action, dimension.name) for dimension in given]
+            values = [getattr(row.action, dimension.name) for dimension in infos]
             shown = [
                 "" if value is None else f"{value / dimension.factor:.6g}"
-                for value, dimension in zip(values, given, strict=True)
+                for value, dimension in zip(values, infos, strict=True)
             ]
             predicted = row.predicted
             numbers = [

@@ -137,19 +137,19 @@ class ProgressState:
         pour, total = self.run.pour, None
         if pour is None:
             return None
-        said, confirming = pour_summary(self.plan, pour, live=True), pour.request.purpose == CONFIRM
+        text, confirming = pour_summary(self.plan, pour, live=True), pour.request.purpose == CONFIRM
         if self.plan.dispense is not None:
             total = len(self.plan.dispense.doses)
-        elif said.calibration:
+        elif text.calibration:
             total = self.plan.calibration.pour_count if self.plan.calibration is not None else None
         elif self.plan.deployment is not None:
             total = self.plan.deployment.confirm if confirming else self.plan.deployment.pours
         of = f"/{total}" if total else ""
-        line = f"{'confirming pour' if confirming else 'pour'} {said.number}{of} into {said.receiver}  {said.action}"
-        if said.predicted:
-            line += f"  predicted {said.predicted}"
+        line = f"{'confirming pour' if confirming else 'pour'} {text.number}{of} into {text.receiver}  {text.action}"
+        if text.predicted:
+            line += f"  predicted {text.predicted}"
         if pour.outcome is not None:
-            line += f"  measured {said.remark if said.state == 'failed' else said.measured}"
+            line += f"  measured {text.remark if text.state == 'failed' else text.measured}"
         return line
 
     def dose_line(self) -> str | None:

@@ -89,10 +89,10 @@ def publish(
                 _log.warning("not recorded: %s", reason)
     summary = summary_of(plan, result, RunFiles(figures=figures, recording=recording, dropped_events=dropped_events))
     write_summary(directory, summary)
-    found = theta_of(result.results)
-    theta = None if found is None else directory / THETA_FILE
-    if theta is not None and found is not None:
-        written = theta_file(found, evaluation_of(result.results), plan.calibration)
+    best = theta_of(result.results)
+    theta = None if best is None else directory / THETA_FILE
+    if theta is not None and best is not None:
+        written = theta_file(best, evaluation_of(result.results), plan.calibration)
         theta.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")
     report: Path | None = directory / REPORT_NAME
     try:
@@ -242,7 +242,7 @@ def _write_page(path: Path, page: str) -> Path:
 
 
 def theta_file(
-    found: CalibratedTheta, scored: Scores | None = None, plan: CalibrationPlan | None = None
+    best: CalibratedTheta, scored: Scores | None = None, plan: CalibrationPlan | None = None
 ) -> dict[str, Any]:
     """What `theta.json` holds: the recommended θ, what it left over, and where it is known the posterior of θ.
 
@@ -250,23 +250,23 @@ def theta_file(
     `recommended` is 'uncalibrated', so that predictions do not draw from the posterior unless they are asked to.
 
     Args:
-        found: by the calibration.
+        best: by the calibration.
         scored: θ* on the weighed pours; None: the rest is unknown.
         plan: of the calibration, whose scenes the residual belongs to.
     """
-    theta = found.theta.model_dump()
-    data: dict[str, Any] = {"theta": recommended_theta(found.theta, scored).model_dump()}
+    theta = best.theta.model_dump()
+    data: dict[str, Any] = {"theta": recommended_theta(best.theta, scored).model_dump()}
     if scored is not None and scored.gain is not None:
         data |= {"recommended": scored.gain.recommended, "why": scored.gain.text}
         if scored.gain.recommended == UNCALIBRATED:
             data["calibrated"] = theta
-    left = None if scored is None else calibration_residual(plan, scored, len(found.searched))
+    left = None if scored is None else calibration_residual(plan, scored, len(best.searched))
     if left is not None:
         data["remaining_discrepancy"] = {"shift": left.shift, "scenes": list(left.scenes)}
-    if found.posterior is not None:
-        draws = found.posterior.thetas
-        kept = draws[:: max(len(draws) // KEPT_THETAS, 1)]
-        data["posterior"] = [{"theta": theta | values, "weight": 1.0 / len(kept)} for values in kept]
+    if best.posterior is not None:
+        draws = best.posterior.thetas
+        thinned = draws[:: max(len(draws) // KEPT_THETAS, 1)]
+        data["posterior"] = [{"theta": theta | values, "weight": 1.0 / len(thinned)} for values in thinned]
     return data
 
 

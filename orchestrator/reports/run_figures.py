@@ -76,13 +76,13 @@ def draw_figures(
     Returns:
         Name of each figure → its PNG.
     """
-    drawn: dict[str, Path] = {}
+    pictures: dict[str, Path] = {}
     for name, draw in _drawings(plan, results, directory).items():
         try:
-            drawn[name] = style.save(draw(), directory / f"{safe_name(name.replace(' ', '-'))}.png", formats)
+            pictures[name] = style.save(draw(), directory / f"{safe_name(name.replace(' ', '-'))}.png", formats)
         except Exception as error:
             _log.warning("figure '%s' was not drawn: %s: %s", name, type(error).__name__, error)
-    return drawn
+    return pictures
 
 
 def figures_of(plan: CampaignPlan, results: Results) -> dict[str, Figure]:
@@ -96,41 +96,41 @@ def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = Non
     Args:
         directory: folder with the films of recommended pours.
     """
-    found: dict[str, Callable[[], Figure]] = {}
+    drawings: dict[str, Callable[[], Figure]] = {}
     calibration, evaluation, theta = calibration_of(results), evaluation_of(results), theta_of(results)
     if calibration is not None and (picture := calibration_picture(plan, calibration)) is not None:
-        found["discrepancy map"] = partial(draw_surrogate, picture)
+        drawings["discrepancy map"] = partial(draw_surrogate, picture)
         if picture.held and picture.points:
-            found["discrepancy trials"] = partial(draw_trials, picture)
+            drawings["discrepancy trials"] = partial(draw_trials, picture)
     if theta is not None and plan.calibration is not None and theta.posterior is not None:
         space, best = plan.calibration.parameters, theta.theta.model_dump()
-        found["posterior"] = partial(draw_posterior, theta.posterior, space, best)
+        drawings["posterior"] = partial(draw_posterior, theta.posterior, space, best)
     if evaluation is not None and (groups := discrepancy_groups(evaluation)):
         title = f"How far the simulator is from the balance: {plan.name}"
-        found["test discrepancy"] = partial(draw_discrepancy, groups, title=title)
+        drawings["test discrepancy"] = partial(draw_discrepancy, groups, title=title)
     for dose in (dose for dispensed in all_of(results, Dispensed) for dose in dispensed.doses if dose.signals.times):
-        found[f"dose {dose.number}"] = partial(draw_dose, dose)
+        drawings[f"dose {dose.number}"] = partial(draw_dose, dose)
     if plan.deployment is None:
-        return found
+        return drawings
     unit = deployment_unit(plan.deployment)
     if series := pour_series(plan, results, unit):
         title = f"Loss of every pour: {plan.name}"
-        found["loss against pours"] = partial(draw_losses, series, cost=unit.label, title=title)
+        drawings["loss against pours"] = partial(draw_losses, series, cost=unit.label, title=title)
     for scene, result in deployments_of(results).items():
         picture, name = deployment_picture(plan, result), receiver_name(plan, scene)
         if picture is not None:
-            found[f"loss map {name}"] = partial(draw_surrogate, replace(picture, deviation=None))
+            drawings[f"loss map {name}"] = partial(draw_surrogate, replace(picture, deviation=None))
         if picture is not None and picture.deviation is not None:
-            found[f"uncertainty of the loss {name}"] = partial(draw_surrogate, replace(picture, mean=None))
+            drawings[f"uncertainty of the loss {name}"] = partial(draw_surrogate, replace(picture, mean=None))
         if result.window is not None:
-            found[f"safe window {name}"] = partial(draw_window, result, picture, unit=unit, receiver=name)
+            drawings[f"safe window {name}"] = partial(draw_window, result, picture, unit=unit, receiver=name)
     if directory is not None:
         scenes = scenes_of(plan)
         for name, pour in recommended_pours(plan, results).items():
             if (file := film_file(directory, name)).is_file():
                 task = PourTask(scenes[pour.scene], pour.action, pour.parameters, pour.seed)
-                found[f"recommended pour {name}"] = partial(_recommended, task, file)
-    return found
+                drawings[f"recommended pour {name}"] = partial(_recommended, task, file)
+    return drawings
 
 
 def _recommended(task: PourTask, file: Path) -> Figure:
@@ -149,15 +149,15 @@ def discrepancy_groups(evaluation: Scores) -> list[DiscrepancyGroup]:
         return []
     groups = []
     for split, name in SPLITS.items():
-        own = evaluation.discrepancy[label].get(split)
-        if own is None:
+        uncalibrated = evaluation.discrepancy[label].get(split)
+        if uncalibrated is None:
             continue
         rivals = [scores.get(split) for other, scores in evaluation.discrepancy.items() if other.startswith("random ")]
         groups.append(
             DiscrepancyGroup(
                 name,
                 sum(pair.split == split and pair.theta == label for pair in evaluation.pairs),
-                own,
+                uncalibrated,
                 evaluation.discrepancy.get(UNCALIBRATED, {}).get(split),
                 [value for value in rivals if value is not None],
                 evaluation.mean_predictor.get(split),
@@ -205,7 +205,7 @@ def deployment_picture(plan: CampaignPlan, result: Deployed) -> SurrogatePicture
         best=None if result.recommended is None else result.recommended.action_si,
         best_name="best action",
         numbers=[pour.number for pour, _ in known],
-        simulated=[one.action_si for one in result.simulated],
+        simulated=[simulation.action_si for simulation in result.simulated],
         largest=unit.factor * largest_loss(plan.deployment),
         **_surrogate(result.map, unit),
     )
@@ -303,10 +303,10 @@ def draw_losses(series: Sequence[PourSeries], *, cost: str, title: str) -> Figur
     )
     style.entitle(figure, title)
     top = 0.0
-    for place, one in enumerate(series):
+    for place, losses in enumerate(series):
         panel = axes[place // columns, place % columns]
-        top = max(top, _pour_panel(panel, one))
-        style.dress(panel, title=_pour_title(one, cost), x="pour", y=cost if place % columns == 0 else "")
+        top = max(top, _pour_panel(panel, losses))
+        style.dress(panel, title=_pour_title(losses, cost), x="pour", y=cost if place % columns == 0 else "")
     for extra in range(len(series), rows * columns):
         axes[extra // columns, extra % columns].set_visible(False)
     axes[0, 0].set_ylim(0.0, TOP * top or 1.0)

@@ -60,7 +60,7 @@ def all_of(results: Results, kind: type[L]) -> list[L]:
 
 def calibration_of(results: Results) -> Calibrated | None:
     """The calibration's result, if it found a θ*."""
-    return next((found for found in all_of(results, Calibrated) if found.found is not None), None)
+    return next((calibration for calibration in all_of(results, Calibrated) if calibration.found is not None), None)
 
 
 def theta_of(results: Results) -> CalibratedTheta | None:
@@ -82,8 +82,8 @@ def gain_of(results: Results) -> CalibrationGain | None:
 
 def recommended_theta_of(results: Results) -> SimulationParameters | None:
     """The θ to simulate with: θ*, or the uncalibrated θ if the pours do not justify θ*; None before θ* was found."""
-    found = theta_of(results)
-    return None if found is None else recommended_theta(found.theta, evaluation_of(results))
+    theta = theta_of(results)
+    return None if theta is None else recommended_theta(theta.theta, evaluation_of(results))
 
 
 def deployments_of(results: Results) -> dict[str, Deployed]:

@@ -148,8 +148,8 @@ def summarise_record(
         files: figures.
     """
     about = [
-        f"Recommended for {receiver} by {one['strategy']} (degrees, millimetres, seconds): {_plain(one['action'])}."
-        for receiver, one in (catalogued.get("recommended") or {}).items()
+        f"Recommended for {receiver} by {row['strategy']} (degrees, millimetres, seconds): {_plain(row['action'])}."
+        for receiver, row in (catalogued.get("recommended") or {}).items()
     ]
     if theta := catalogued.get("theta"):
         about.append(f"θ* (SI units): {_plain(theta)}.")
@@ -189,7 +189,7 @@ def _of_record(record: RunState, run: str, check: JournalCheck | None) -> dict[s
         "standing": (*(() if check is None else _damage(check)), *standing),
         "log": RunLog(
             notes=tuple(LogEntry(time=when, stage="", text=text) for when, text, _ in record.notes),
-            decisions=tuple(LogEntry(time=one.time, stage=one.stage, text=one.text) for one in decisions),
+            decisions=tuple(LogEntry(time=d.time, stage=d.stage, text=d.text) for d in decisions),
         ),
     }
 
@@ -198,17 +198,17 @@ def _outcome(plan: CampaignPlan | None, record: RunState, **others: Any) -> RunO
     """The outcome, with the fields that come from the journal."""
     stages = (
         StageSummary(
-            stage=one.name,
-            state="open" if one.closed_at is None else "closed",
-            pours=one.pours,
-            simulations=one.simulations,
-            unusable_simulations=one.failed_simulations,
+            stage=stage.name,
+            state="open" if stage.closed_at is None else "closed",
+            pours=stage.pours,
+            simulations=stage.simulations,
+            unusable_simulations=stage.failed_simulations,
         )
-        for one in record.stages.values()
+        for stage in record.stages.values()
     )
     questions = (
-        QuestionSummary(time=one.time, stage=one.stage, question=one.text, answer=one.answer)
-        for one in record.questions
+        QuestionSummary(time=question.time, stage=question.stage, question=question.text, answer=question.answer)
+        for question in record.questions
     )
     pours = pour_summaries(plan, record)
     return RunOutcome(stages=tuple(stages), pours_made=tuple(pours), questions=tuple(questions), **others)
@@ -217,10 +217,10 @@ def _outcome(plan: CampaignPlan | None, record: RunState, **others: Any) -> RunO
 def _damage(check: JournalCheck) -> list[str]:
     if not check.problems:
         return []
-    made = f" The ledger of pours names: {'; '.join(check.pours)}." if check.pours else ""
+    pours = f" The ledger of pours names: {'; '.join(check.pours)}." if check.pours else ""
     return [
         "WARNING: the records of this run are damaged or incomplete. Numbers on this page may be wrong or missing. "
-        f"Problems: {'; '.join(check.problems)}.{made}"
+        f"Problems: {'; '.join(check.problems)}.{pours}"
     ]
 
 
@@ -281,7 +281,7 @@ def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False
 
 
 def _remark(state: str, pour: RunPour) -> str:
-    said = {
+    remark = {
         "unknown": "UNKNOWN: it had begun, and its outcome is not known",
         "under way": "under way",
         "asked": "requested, not started",
@@ -289,33 +289,33 @@ def _remark(state: str, pour: RunPour) -> str:
     }.get(state, "")
     corrected = pour.answer.startswith("corrected")
     answer = pour.answer if corrected or not pour.answer else f"the operator answered: {pour.answer}"
-    return "; ".join(filter(None, (said, answer)))
+    return "; ".join(filter(None, (remark, answer)))
 
 
 # ---- θ and receivers
 
 
 def _learning(plan: CampaignPlan, results: Results) -> RunLearning:
-    evaluation, calibration, found = evaluation_of(results), calibration_of(results), theta_of(results)
+    evaluation, calibration, theta = evaluation_of(results), calibration_of(results), theta_of(results)
     memory = wording.memory_sentences(plan.memory, None if calibration is None else calibration.memory)
     learning = RunLearning(
         calibration_gain=gain_of(results), discrepancy=_discrepancies(evaluation), theta_sentences=tuple(memory)
     )
-    if calibration is None or found is None:
+    if calibration is None or theta is None:
         return learning
-    posterior = None if found.posterior is None else found.posterior.summary()
+    posterior = None if theta.posterior is None else theta.posterior.summary()
     learning = learning.model_copy(
         update={
             "theta": recommended_theta_of(results),
-            "calibrated_theta": found.theta,
-            "predicted_discrepancy": found.predicted_discrepancy,
-            "predicted_deviation": found.predicted_deviation,
+            "calibrated_theta": theta.theta,
+            "predicted_discrepancy": theta.predicted_discrepancy,
+            "predicted_deviation": theta.predicted_deviation,
             "posterior": posterior,
-            "parameters": tuple(_parameters(plan.calibration, found, posterior)),
+            "parameters": tuple(_parameters(plan.calibration, theta, posterior)),
         }
     )
-    said = wording.theta_sentences(learning, plan.calibration, calibration.ended)
-    return learning.model_copy(update={"theta_sentences": (*memory, *said)})
+    sentences = wording.theta_sentences(learning, plan.calibration, calibration.ended)
+    return learning.model_copy(update={"theta_sentences": (*memory, *sentences)})
 
 
 def _of_memory(results: Results) -> tuple[str, ...]:
@@ -337,10 +337,10 @@ def _discrepancies(evaluation: Scores | None) -> dict[str, dict[str, float | Non
 
 
 def _parameters(
-    calibration: CalibrationPlan | None, found: CalibratedTheta, posterior: PosteriorSummary | None
+    calibration: CalibrationPlan | None, theta: CalibratedTheta, posterior: PosteriorSummary | None
 ) -> Iterator[ParameterSummary]:
     axes = {} if calibration is None else {axis.name: axis for axis in calibration.parameters.axes}
-    for name, value in found.theta.model_dump().items():
+    for name, value in theta.theta.model_dump().items():
         axis, region = axes.get(name), "—"
         if posterior is not None and name in posterior.region:
             low, high = posterior.region[name]
@@ -438,16 +438,16 @@ def _receiver_texts(result: Deployed, confirmed: Confirmed | None, unit: LossUni
 
 def pool_use(occupancies: Mapping[str, Occupancy]) -> dict[str, PoolUse]:
     """Use of the pool by stage."""
-    found = {}
-    for stage, one in occupancies.items():
-        longest = max(one.waits, default=None)
-        found[stage] = PoolUse(
-            pool_busy=one.fraction,
+    shares = {}
+    for stage, occupancy in occupancies.items():
+        longest = max(occupancy.waits, default=None)
+        shares[stage] = PoolUse(
+            pool_busy=occupancy.fraction,
             arm_longest_wait_s=longest,
-            arm_mean_wait_s=sum(one.waits) / len(one.waits) if one.waits else None,
-            text=wording.pool_line(one.fraction, longest),
+            arm_mean_wait_s=sum(occupancy.waits) / len(occupancy.waits) if occupancy.waits else None,
+            text=wording.pool_line(occupancy.fraction, longest),
         )
-    return found
+    return shares
 
 
 def _time_scale(plan: CampaignPlan) -> float | None:
@@ -455,7 +455,7 @@ def _time_scale(plan: CampaignPlan) -> float | None:
     laboratory = plan.laboratory
     if laboratory.mode != "virtual":
         return None
-    scales = (one.time_scale for one in (laboratory.arm, laboratory.bench) if one is not None)
+    scales = (settings.time_scale for settings in (laboratory.arm, laboratory.bench) if settings is not None)
     return next((scale for scale in scales if scale is not None), None)
 
 
@@ -467,7 +467,7 @@ def _settings(
     *,
     figures: bool,
 ) -> dict[str, str]:
-    found = {
+    settings = {
         "campaign": Path(versions.get("campaign", plan.source)).name,
         "seed": str(plan.seed),
         "minimised": "" if plan.deployment is None else deployment_unit(plan.deployment).label,
@@ -479,7 +479,7 @@ def _settings(
         "figures": "" if figures else "none were drawn; 'decant report' draws them",
         "records": "" if check is None else check.verdict,
     }
-    return {name: text for name, text in found.items() if text}
+    return {name: text for name, text in settings.items() if text}
 
 
 def _programs(versions: Mapping[str, Any]) -> dict[str, str]:

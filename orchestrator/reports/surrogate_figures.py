@@ -397,9 +397,9 @@ def _profile(axes: Axes, name: str, window: WindowFound, best: float, unit: Loss
         checks = [c for c in window.checks if c.inside is inside and c.axis in (None, name)]
         losses = [top if c.loss is None else unit.factor * c.loss for c in checks]
         top = max([top, *losses]) if losses else top
-        said = "simulated, inside" if inside else "simulated, outside"
+        label = "simulated, inside" if inside else "simulated, outside"
         places = [c.action_si[name] / factor for c in checks]
-        axes.plot(places, losses, marker, color=colour, markeredgecolor="white", markersize=8, label=said, zorder=4)
+        axes.plot(places, losses, marker, color=colour, markeredgecolor="white", markersize=8, label=label, zorder=4)
     axes.set_ylim(0.0, 1.08 * min(top, max([*expected, 4.0 * tolerance])))
 
 

@@ -170,8 +170,8 @@ def _unseen(plan: CalibrationPlan) -> int:
 def _scored(plan: CalibrationPlan) -> int:
     """Simulations of the evaluation: θ* and the uncalibrated θ on all pours; posterior draws and random rivals on
     unused pours."""
-    drawn = DRAWS if plan.random_baseline and plan.settings.makes_posterior else 0
-    return 2 * _weighed(plan) + (plan.random_baseline + drawn) * _unseen(plan)
+    draws = DRAWS if plan.random_baseline and plan.settings.makes_posterior else 0
+    return 2 * _weighed(plan) + (plan.random_baseline + draws) * _unseen(plan)
 
 
 def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space | None = None) -> float:
@@ -192,8 +192,8 @@ def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space | Non
     bench = laboratory.bench
     liquid = 0.0 if bench is None else PRICE * bench.theta.particles  # a virtual bench simulates its liquid
     if laboratory.arm is not None:
-        whole = laboratory.operator.time + laboratory.arm.warning_time + WAYS + motion + WEIGHINGS
-        return laboratory.arm.on_clock(whole) + liquid
+        seconds = laboratory.operator.time + laboratory.arm.warning_time + WAYS + motion + WEIGHINGS
+        return laboratory.arm.on_clock(seconds) + liquid
     if bench is None or bench.time_scale <= 0.0:
         return liquid
     return (bench.operator_time + WAYS + motion + WEIGHINGS) / bench.time_scale + liquid

@@ -55,12 +55,12 @@ def space_warnings(
     """
     corners = itertools.islice(itertools.product((0.0, 1.0), repeat=actions.dimension), MOST_CORNERS)
     tried = [actions.decode(point) for point in ((0.5,) * actions.dimension, *corners)]
-    found: dict[str, list[tuple[NotCovered, dict[str, float]]]] = {}
+    gaps: dict[str, list[tuple[NotCovered, dict[str, float]]]] = {}
     for values in tried:
-        for one in regimes_of(scene, scene.action(values), particles, adhesion).not_covered:
-            found.setdefault(one.kind, []).append((one, values))
+        for gap in regimes_of(scene, scene.action(values), particles, adhesion).not_covered:
+            gaps.setdefault(gap.kind, []).append((gap, values))
     warnings = []
-    for kind, hits in found.items():
+    for kind, hits in gaps.items():
         worst, values = max(hits, key=lambda hit: hit[0].share)
         warnings.append(
             NotSimulated(
@@ -93,11 +93,11 @@ def campaign_warnings(plan: CampaignPlan) -> dict[str, list[NotSimulated]]:
         spaces += [(scene, plan.calibration.actions) for scene in plan.calibration.scenes]
     if plan.deployment is not None:
         spaces += [(scene, plan.deployment.actions) for scene in plan.deployment.scenes]
-    found = {
+    warnings_ = {
         scene.name: space_warnings(scene, actions, particles, adhesion, names.get(scene.name, scene.name))
         for scene, actions in spaces
     }
-    return {name: warnings for name, warnings in found.items() if warnings}
+    return {name: warnings for name, warnings in warnings_.items() if warnings}
 
 
 def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list[NotCovered]]:
@@ -108,31 +108,31 @@ def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list
     """
     theta = recommended_theta_of(results) or plan.parameters
     scenes = {} if plan.deployment is None else {scene.name: scene for scene in plan.deployment.scenes}
-    found = {}
+    warnings_ = {}
     for name, result in deployments_of(results).items():
         if name in scenes and result.recommended is not None:
             action = scenes[name].action(dict(result.recommended.action_si))
-            found[name] = list(regimes_of(scenes[name], action, theta.particles, theta.lip_adhesion).not_covered)
-    return found
+            warnings_[name] = list(regimes_of(scenes[name], action, theta.particles, theta.lip_adhesion).not_covered)
+    return warnings_
 
 
 def lines(warnings: Mapping[str, Sequence[NotSimulated]]) -> list[str]:
     """Warnings of a campaign for the terminal."""
     if not warnings:
         return []
-    found = ["not simulated (docs/explanation/simulator.md has what to do):"]
-    for one in itertools.chain.from_iterable(warnings.values()):
-        at = f"(at {style.display_values(one.action_si)}; {one.hit} of {one.tried} actions tried)"
-        found.append(f"  into {one.receiver}, {one.kind}: {one.text} {at}")
-    return found
+    texts = ["not simulated (docs/explanation/simulator.md has what to do):"]
+    for warning in itertools.chain.from_iterable(warnings.values()):
+        at = f"(at {style.display_values(warning.action_si)}; {warning.hit} of {warning.tried} actions tried)"
+        texts.append(f"  into {warning.receiver}, {warning.kind}: {warning.text} {at}")
+    return texts
 
 
-def numbers_line(found: ModelValidity) -> str:
+def numbers_line(validity: ModelValidity) -> str:
     """Dimensionless numbers of a pour in one line: 'lip: Re 880 … 4 500, We 3 … 26, …; stream: …'."""
-    if found.lip is None or found.stream is None:
+    if validity.lip is None or validity.stream is None:
         return "nothing leaves the pourer, as far as hydrostatics tells"
     parts = []
-    for place, numbers in (("lip", found.lip), ("stream", found.stream)):
+    for place, numbers in (("lip", validity.lip), ("stream", validity.stream)):
         ranges = (("Re", numbers.reynolds), ("We", numbers.weber), ("Bo", numbers.bond))
         shown = (f"{name} {_number(r.smallest)} … {_number(r.largest)}" for name, r in ranges)
         parts.append(f"{place}: {', '.join(shown)}")

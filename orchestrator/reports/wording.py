@@ -79,8 +79,8 @@ def window_line(window: WindowFound, unit: LossUnit) -> str:
     parts = []
     for name, ends in window.axes.items():
         low, high = (end / style.display_factor(name) for end in (ends.low, ends.high))
-        more = {(): "", ("low",): " or less", ("high",): " or more"}.get(ends.cut_off, " or farther")
-        parts.append(f"{name.replace('_', ' ')} {low:.4g} … {high:.4g} {style.display_unit(name)}{more}")
+        beyond = {(): "", ("low",): " or less", ("high",): " or more"}.get(ends.cut_off, " or farther")
+        parts.append(f"{name.replace('_', ' ')} {low:.4g} … {high:.4g} {style.display_unit(name)}{beyond}")
     return f"safe window: {', '.join(parts)} at ≤ {tolerance}, one dimension varied at a time, {checked}"
 
 
@@ -101,8 +101,8 @@ def _advice(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice
     window, open_points = "", tuple(_open(row))
     if row.recommended is None:
         why = row.gave_up or "there is no result from which to choose an action"
-        said = (f"No action is recommended: {why}.",)
-        return Advice(receiver=row.receiver, action={}, fixed={}, sentences=said, window="", open=open_points)
+        lines = (f"No action is recommended: {why}.",)
+        return Advice(receiver=row.receiver, action={}, fixed={}, sentences=lines, window="", open=open_points)
     if row.window is not None:
         window = _sentence(window_line(row.window, unit))
     else:
@@ -127,34 +127,34 @@ def _shown(values: Mapping[str, float | None]) -> dict[str, str]:
 def _sentences(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> list[str]:
     load = "" if scene is None else f" {1e3 * scene.liquid.mass:.0f} g of {scene.liquid.name}"
     cup = "" if scene is None else f" from {scene.pourer.name}"
-    said = [f"To pour{load}{cup} into {row.receiver}, use the recommended action."]
+    lines = [f"To pour{load}{cup} into {row.receiver}, use the recommended action."]
     if (expected := row.recommended) is not None:
         mean = unit.text(expected.predicted_loss, expected.predicted_deviation)
         scatter = unit.scatter(expected.predicted_scatter).removeprefix(", a pour ")
-        said.append(f"Expect {unit.meaning} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
+        lines.append(f"Expect {unit.meaning} of {mean}{scatter and f'; single pours differ from that by {scatter}'}.")
     if row.prediction is not None:
-        said.append(_prediction(row))
+        lines.append(_prediction(row))
     if row.prediction_interval is not None:
-        said.append(_sentence(band_line(row.prediction_interval)))
+        lines.append(_sentence(band_line(row.prediction_interval)))
     if row.confirmed is not None and row.confirmed.loss is not None:
         loss = row.confirmed.loss
         times = "once more" if loss.count == 1 else f"{loss.count} more times"
-        said.append(f"Poured {times} after the choice, its measured loss was {unit.text(loss.mean, loss.deviation)}.")
+        lines.append(f"Poured {times} after the choice, its measured loss was {unit.text(loss.mean, loss.deviation)}.")
     if row.texts["best measured"]:
         best = row.texts["best measured"]
-        said.append(
+        lines.append(
             f"The smallest loss of {row.pours} weighed pours was {best}; the smallest of several is partly luck, so "
             "expect more of the next pour."
             if row.pours != 1
             else f"The loss of the only weighed pour was {best}."
         )
     if row.risk is not None:
-        said.append(_sentence(risk_line(row.risk, unit)))
+        lines.append(_sentence(risk_line(row.risk, unit)))
     if row.ended:
-        said.append(f"The search stopped: {row.ended.rstrip('.')}.")
+        lines.append(f"The search stopped: {row.ended.rstrip('.')}.")
     if _is_confirmed(row) and (trust := trust_line(row.model_check)) is not None:
-        said.append(_sentence(trust))
-    return said
+        lines.append(_sentence(trust))
+    return lines
 
 
 def _prediction(row: ReceiverSummary) -> str:
@@ -180,9 +180,9 @@ def band_line(band: PredictionInterval) -> str:
     """'nine single pours in ten spill 0.8 … 5.7 % of what is poured (simulations ± 0.3, …)'."""
     causes = {"simulations": band.simulations, "residual of calibration": band.discrepancy}
     causes["resolution"] = band.resolution or None
-    said = ", ".join(f"{name} ± {100 * value:.2f}" for name, value in causes.items() if value is not None)
+    listed = ", ".join(f"{name} ± {100 * value:.2f}" for name, value in causes.items() if value is not None)
     lacking = "" if band.discrepancy is not None else "; the residual of calibration is unknown"
-    return f"nine single pours in ten spill {band.percent(2)} of what is poured ({said}{lacking})"
+    return f"nine single pours in ten spill {band.percent(2)} of what is poured ({listed}{lacking})"
 
 
 def pool_line(busy: float | None, longest_wait: float | None) -> str:
@@ -200,25 +200,25 @@ def _is_confirmed(row: ReceiverSummary) -> bool:
 
 
 def _open(row: ReceiverSummary) -> list[str]:
-    said = []
+    lines = []
     if row.at_bounds:
-        said.append(f"Better actions may lie outside the searched range: {', '.join(row.at_bounds)}.")
+        lines.append(f"Better actions may lie outside the searched range: {', '.join(row.at_bounds)}.")
     if not _is_confirmed(row) and (alarm := trust_line(row.model_check)) is not None:
-        said.append(_sentence(alarm))
+        lines.append(_sentence(alarm))
     if row.gave_up and row.recommended is not None:
-        said.append(_sentence(row.gave_up))
+        lines.append(_sentence(row.gave_up))
     if row.recommended is not None:
-        said += _poured_again(row)
+        lines += _poured_again(row)
     if row.failed_pours:
-        what = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
+        failures = "1 pour failed" if row.failed_pours == 1 else f"{row.failed_pours} pours failed"
         why = f": {'; '.join(row.failures)}" if row.failures else ""
-        said.append(f"{what}{why}. They were not weighed.")
+        lines.append(f"{failures}{why}. They were not weighed.")
     confirming = () if row.confirmed is None else row.confirmed.pours
     if lost := [f"pour {pour.number}: {pour.failed}" for pour in confirming if pour.failed]:
-        said.append(f"Confirming pours that failed: {'; '.join(lost)}.")
+        lines.append(f"Confirming pours that failed: {'; '.join(lost)}.")
     if row.risk is None and row.recommended is not None:
-        said.append("Errors of grip, placement and speed are included only as they occurred in these pours.")
-    return said + [f"Not simulated at this action, {one.kind}: {one.text}." for one in row.not_covered]
+        lines.append("Errors of grip, placement and speed are included only as they occurred in these pours.")
+    return lines + [f"Not simulated at this action, {gap.kind}: {gap.text}." for gap in row.not_covered]
 
 
 def _poured_again(row: ReceiverSummary) -> list[str]:
@@ -243,58 +243,58 @@ def open_questions(plan: CampaignPlan, record: RunState, learning: RunLearning, 
     Args:
         dropped_events: number of events missing in the recording.
     """
-    said = []
+    lines = []
     if plan.laboratory.mode == "virtual" and (record.pours or plan.laboratory.pours):
-        said.append(
+        lines.append(
             "The bench was VIRTUAL: no robot moved and no liquid was weighed. Its true liquid "
             "is simulated, too; a real cup may behave differently."
         )
     if learning.calibrated_theta is not None:
-        said += _about_theta(learning)
+        lines += _about_theta(learning)
     elif plan.calibration is None:
-        said.append("The simulator was not calibrated in this run: its parameters are those of the campaign.")
+        lines.append("The simulator was not calibrated in this run: its parameters are those of the campaign.")
     liquids = {scene.liquid.name for scene in plan.deployment.scenes} if plan.deployment is not None else set()
     if liquids:
-        said.append(
+        lines.append(
             f"These results hold for {', '.join(sorted(liquids))}, this load, these vessels and the fixed values of "
             "the motion. For other ones, plan again."
         )
     if dropped_events:
-        said.append(f"The recording lacks {dropped_events} events, because writing was too slow.")
-    return said
+        lines.append(f"The recording lacks {dropped_events} events, because writing was too slow.")
+    return lines
 
 
 def _about_theta(learning: RunLearning) -> list[str]:
     """Open questions about θ*."""
     gain, posterior = learning.calibration_gain, learning.posterior
-    said, used = [], "calibrated"
+    lines, used = [], "calibrated"
     if gain is not None and gain.recommended != used:
-        said, used = [_sentence(gain.text)], gain.recommended
+        lines, used = [_sentence(gain.text)], gain.recommended
     if posterior is None:
-        said.append("Other θ may fit the weighed pours as well as θ*; their region was not computed.")
+        lines.append("Other θ may fit the weighed pours as well as θ*; their region was not computed.")
     elif posterior.open:
         names = ", ".join(name.replace("_", " ") for name in posterior.open)
-        said.append(f"The pours do not determine {names}: nearly the whole searched range fits them as well as θ*.")
+        lines.append(f"The pours do not determine {names}: nearly the whole searched range fits them as well as θ*.")
     unseen = [
-        f"{DISCREPANCY.text(own)} on {SPLITS[split]}"
+        f"{DISCREPANCY.text(mean)} on {SPLITS[split]}"
         for split, row in learning.discrepancy.items()
-        if split != "train" and (own := row.get(used)) is not None
+        if split != "train" and (mean := row.get(used)) is not None
     ]
     if unseen:
-        said.append(
+        lines.append(
             f"On pours that calibration did not see, the simulator's spillage was off by {' and '.join(unseen)} in the "
             "mean."
         )
     elif learning.discrepancy:
-        said.append("The simulator was not scored on pours that calibration did not see.")
-    return said
+        lines.append("The simulator was not scored on pours that calibration did not see.")
+    return lines
 
 
-def memory_sentences(memory: CampaignMemory | None, found: MemoryFound | None) -> list[str]:
+def memory_sentences(memory: CampaignMemory | None, verdict: MemoryFound | None) -> list[str]:
     """The runs that the prior comes from, and whether the pours agree with it; nothing without a prior."""
     if memory is None:
         return []
-    return [_sentence(part) for part in (memory.lines if found is None else [found.text, *memory.lines[1:]])]
+    return [_sentence(line) for line in (memory.lines if verdict is None else [verdict.text, *memory.lines[1:]])]
 
 
 def theta_sentences(learning: RunLearning, calibration: CalibrationPlan | None, ended: str | None) -> list[str]:
@@ -304,20 +304,20 @@ def theta_sentences(learning: RunLearning, calibration: CalibrationPlan | None, 
         calibration: its plan, for the searched space and the liquid.
         ended: reason of the end of an automatic calibration.
     """
-    said, gain, posterior = [], learning.calibration_gain, learning.posterior
+    lines, gain, posterior = [], learning.calibration_gain, learning.posterior
     if learning.predicted_discrepancy is not None:
         expected = DISCREPANCY.text(learning.predicted_discrepancy, learning.predicted_deviation or 0.0)
-        said.append(f"Expected {DISCREPANCY.meaning} of θ*: {expected}.")
+        lines.append(f"Expected {DISCREPANCY.meaning} of θ*: {expected}.")
     if posterior is not None and calibration is not None:
-        said += map(_sentence, posterior_lines(posterior, calibration.parameters))
-        said += identified_viscosity(posterior, calibration.scene.liquid)
+        lines += map(_sentence, posterior_lines(posterior, calibration.parameters))
+        lines += identified_viscosity(posterior, calibration.scene.liquid)
     if ended is not None:
-        said.append(f"The calibration ended because {ended}.")
+        lines.append(f"The calibration ended because {ended}.")
     if gain is not None:
-        said.append(_sentence(gain.text))
+        lines.append(_sentence(gain.text))
         if posterior is not None and gain.recommended == "calibrated":
-            said.append(POSTERIOR_ADVICE)
-    return said
+            lines.append(POSTERIOR_ADVICE)
+    return lines
 
 
 POSTERIOR_ADVICE = (
@@ -349,8 +349,8 @@ def posterior_lines(posterior: PosteriorSummary, space: Space) -> list[str]:
         if axis.name in posterior.open:
             unknown.append(f"{words} ({searched})")
         else:
-            found = style.display_interval(axis.name, *posterior.region[axis.name])
-            known.append(f"{words} {found} (searched {searched})")
+            interval = style.display_interval(axis.name, *posterior.region[axis.name])
+            known.append(f"{words} {interval} (searched {searched})")
     lines = []
     if known:
         lines.append(f"{100 * posterior.level:.0f} % of the θ that fit the pours have {', '.join(known)}")
@@ -368,7 +368,7 @@ def without_advice(plan: CampaignPlan, record: RunState, *, calibrated: bool) ->
         calibrated: whether θ* was found.
     """
     if plan.deployment is not None and any(name.startswith("deployment") for name in record.stages):
-        said = ["No action is recommended yet: the result of a deployment is written when its stage ends."]
+        lines = ["No action is recommended yet: the result of a deployment is written when its stage ends."]
         losses = {loss: pour for pour in record.weighed if (loss := minimised_loss(plan, pour)) is not None}
         known = list(losses)
         if known:
@@ -380,8 +380,8 @@ def without_advice(plan: CampaignPlan, record: RunState, *, calibrated: bool) ->
                 if len(known) > 1
                 else "The loss of the only pour so far"
             )
-            said.append(f"{of} is {unit.text(min(known))}, with {best}.")
-        return said
+            lines.append(f"{of} is {unit.text(min(known))}, with {best}.")
+        return lines
     if calibrated:
         return [
             "This run calibrated the simulator; it recommends no action. The parameters to use are in theta.json, "
@@ -398,30 +398,30 @@ def cost(record: RunState, occupancy: Mapping[str, PoolUse], time_scale: float |
     """
     weighed = [p.measured for p in record.weighed if p.measured is not None]
     begun = [pour for pour in record.pours if pour.state != "asked"]
-    found: dict[str, str] = {}
+    costs: dict[str, str] = {}
     if begun:
         failed, unknown = sum(p.state == "failed" for p in begun), len(record.unknown_pours)
-        more = "".join(f", {n} {word}" for n, word in ((failed, "failed"), (unknown, "of unknown outcome")) if n)
-        found["pours"] = f"{len(begun)} begun, {len(weighed)} weighed{more}"
+        lost = "".join(f", {n} {word}" for n, word in ((failed, "failed"), (unknown, "of unknown outcome")) if n)
+        costs["pours"] = f"{len(begun)} begun, {len(weighed)} weighed{lost}"
     if weighed:
         loaded, spilled, retained = (
             1e3 * sum(getattr(m, n) for m in weighed) for n in ("loaded", "spilled", "retained")
         )
         delivered = loaded - spilled - retained
-        found["liquid"] = (
+        costs["liquid"] = (
             f"{loaded:.0f} g: {delivered:.0f} g delivered, {spilled:.1f} g spilled, {retained:.1f} g retained"
         )
-    found["program at work"] = minutes(record.at_work_s)
+    costs["program at work"] = minutes(record.at_work_s)
     arm = [pour.seconds for pour in begun if pour.seconds]
     if arm:
         pace = f" (this bench runs {time_scale:g} times as fast as a real one)" if time_scale not in (None, 1.0) else ""
         pace = " (this bench waits for nothing)" if time_scale == 0.0 else pace
-        found["of it pouring"] = f"{minutes(sum(arm))}, {sum(arm) / len(arm):.1f} s a pour{pace}"
+        costs["of it pouring"] = f"{minutes(sum(arm))}, {sum(arm) / len(arm):.1f} s a pour{pace}"
     if record.simulations:
         each = f", {record.cpu_s / record.simulations:.1f} s each" if record.cpu_s else ""
-        found["simulations"] = f"{record.simulations}, {minutes(record.cpu_s)} of CPU time{each}"
+        costs["simulations"] = f"{record.simulations}, {minutes(record.cpu_s)} of CPU time{each}"
     pools = {f"pool during pours, {stage.rpartition(':')[2]}": use.text for stage, use in occupancy.items()}
-    return found | {name: text for name, text in pools.items() if text}
+    return costs | {name: text for name, text in pools.items() if text}
 
 
 def minutes(seconds: float) -> str:
@@ -441,27 +441,27 @@ def standing(record: RunState, run: str) -> list[str]:
     if state is State.FINISHED:
         return []
     again = f"the command that began it, with '--resume --run {run}' added"
-    said = [f"This run is not finished. Its state is '{state}'{f': {record.reason}' if record.reason else ''}."]
+    lines = [f"This run is not finished. Its state is '{state}'{f': {record.reason}' if record.reason else ''}."]
     unknown = [f"pour {pour.request.number} of {pour.stage}" for pour in record.unknown_pours]
     if unknown:
-        said.append(
+        lines.append(
             f"{' and '.join(unknown).capitalize()} had begun, and its outcome is not known. The software does "
             "not repeat it. Weigh the spilled liquid and the liquid in the pourer, and give the answer on resuming."
         )
-    said += [f"A question is open: {q.text}" for q in record.questions if q.answer is None]
+    lines += [f"A question is open: {q.text}" for q in record.questions if q.answer is None]
     match state:
         case State.FAILED:
-            said.append(f"Finished work is kept. Fix the problem above, then continue with {again}.")
+            lines.append(f"Finished work is kept. Fix the problem above, then continue with {again}.")
         case State.PAUSED | State.UNKNOWN:
-            said.append(f"Finished work is kept. Continue with {again}.")
+            lines.append(f"Finished work is kept. Continue with {again}.")
         case State.QUEUED:
-            said.append("Nothing was started yet.")
+            lines.append("Nothing was started yet.")
         case _:
-            said.append(
+            lines.append(
                 "When this page was made, the run was in progress or its process had died; the page shows the "
                 f"journal at that moment. If it no longer runs, continue with {again}."
             )
-    return said
+    return lines
 
 
 def _sentence(text: str) -> str:
@@ -470,7 +470,7 @@ def _sentence(text: str) -> str:
 
 def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
     """Names and values: the liquid, and the calibration of the simulator and the search for pours, or the doses."""
-    found: list[tuple[str, str]] = []
+    rows: list[tuple[str, str]] = []
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
         list(plan.deployment.scenes) if plan.deployment is not None else []
     )
@@ -478,26 +478,26 @@ def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
     if scenes:
         liquid = scenes[0].liquid
         volume = liquid.millilitres(liquid.mass)
-        found.append(("liquid", f"{1e3 * liquid.mass:g} g of {liquid.name} ({volume:.0f} mL)"))
-        found.append(("poured from", _listed(scene.pourer.name for scene in scenes)))
+        rows.append(("liquid", f"{1e3 * liquid.mass:g} g of {liquid.name} ({volume:.0f} mL)"))
+        rows.append(("poured from", _listed(scene.pourer.name for scene in scenes)))
     if doses := [pour.request.dose for pour in record.pours if pour.request.dose is not None]:
-        found.append(("wanted", ", ".join(f"{1e3 * dose.amount:g} g" for dose in doses)))
-        return dict(found)
+        rows.append(("wanted", ", ".join(f"{1e3 * dose.amount:g} g" for dose in doses)))
+        return dict(rows)
     if plan.calibration is not None:
-        one = plan.calibration
-        pours = f"{one.pour_count} pours, {one.holdout} of them kept for testing"
-        if one.records is not None:
-            pours = f"{len(one.records.pours)} weighed pours of {one.records.path.name}"
-        found += [
-            ("calibration", f"{one.strategy} on {pours}; {one.simulations} simulations"),
-            ("calibration: into", one.scene.receiver.name),
-            ("calibration: actions", _ranges(one.actions.axes)),
-            ("calibration: searched θ", _ranges(one.parameters.axes)),
-            ("calibration: fixed", _fixed(one.scene)),
+        calibration = plan.calibration
+        pours = f"{calibration.pour_count} pours, {calibration.holdout} of them kept for testing"
+        if calibration.records is not None:
+            pours = f"{len(calibration.records.pours)} weighed pours of {calibration.records.path.name}"
+        rows += [
+            ("calibration", f"{calibration.strategy} on {pours}; {calibration.simulations} simulations"),
+            ("calibration: into", calibration.scene.receiver.name),
+            ("calibration: actions", _ranges(calibration.actions.axes)),
+            ("calibration: searched θ", _ranges(calibration.parameters.axes)),
+            ("calibration: fixed", _fixed(calibration.scene)),
         ]
     if plan.deployment is not None:
         two = plan.deployment
-        found += [
+        rows += [
             ("pouring", f"{two.strategy}, into each receiver: {two.settings.spending}"),
             ("pouring: into", _listed(scene.receiver.name for scene in two.scenes)),
             ("pouring: minimised", deployment_unit(two).label),
@@ -505,11 +505,11 @@ def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
             ("pouring: fixed", _fixed(two.scenes[0]) if two.scenes else ""),
         ]
         if two.confirm:
-            found.append(("pouring: afterwards", f"the recommended action is poured {two.confirm} more times"))
+            rows.append(("pouring: afterwards", f"the recommended action is poured {two.confirm} more times"))
         if two.data is not None:
             count = sum(len(pours) for pours in two.data.pours.values())
-            found.append(("pouring: known before", f"{count} pours of {two.data.path.name}"))
-    return {name: value for name, value in found if value}
+            rows.append(("pouring: known before", f"{count} pours of {two.data.path.name}"))
+    return {name: value for name, value in rows if value}
 
 
 def _ranges(axes: Iterable[Axis]) -> str:
@@ -562,19 +562,17 @@ class ResultTable:
 
     def filled(self) -> ResultTable:
         """A copy without empty columns."""
-        kept = [i for i in range(len(self.header)) if i == 0 or any(row.cells[i].strip("—") for row in self.rows)]
-        rows = [ResultRow([row.cells[i] for i in kept], row.look) for row in self.rows]
-        numbers = frozenset(place for place, i in enumerate(kept) if i in self.numbers)
-        return ResultTable(self.caption, [self.header[i] for i in kept], rows, numbers)
+        columns = [i for i in range(len(self.header)) if i == 0 or any(row.cells[i].strip("—") for row in self.rows)]
+        rows = [ResultRow([row.cells[i] for i in columns], row.look) for row in self.rows]
+        numbers = frozenset(place for place, i in enumerate(columns) if i in self.numbers)
+        return ResultTable(self.caption, [self.header[i] for i in columns], rows, numbers)
 
 
 def stage_table(outcome: RunOutcome) -> ResultTable:
     """Progress of each stage."""
     rows = [
-        ResultRow(
-            [one.stage, one.state, *(str(n or "") for n in (one.pours, one.simulations, one.unusable_simulations))]
-        )
-        for one in outcome.stages
+        ResultRow([s.stage, s.state, *(str(n or "") for n in (s.pours, s.simulations, s.unusable_simulations))])
+        for s in outcome.stages
     ]
     header = ["stage", "state", "pours", "simulations", "of them unusable"]
     return ResultTable("Stages, in the order in which they ran", header, rows, frozenset({2, 3, 4})).filled()
@@ -590,14 +588,14 @@ def question_table(outcome: RunOutcome) -> ResultTable:
     rows = [
         ResultRow(
             [
-                time.strftime("%Y-%m-%d %H:%M", time.localtime(one.time)),
-                one.stage,
-                one.question,
-                "not answered" if one.answer is None else one.answer,
+                time.strftime("%Y-%m-%d %H:%M", time.localtime(question.time)),
+                question.stage,
+                question.question,
+                "not answered" if question.answer is None else question.answer,
             ],
-            "bad" if one.answer is None else "",
+            "bad" if question.answer is None else "",
         )
-        for one in outcome.questions
+        for question in outcome.questions
     ]
     return ResultTable("Questions to the operator", ["when", "stage", "question", "answer"], rows)
 
@@ -605,14 +603,14 @@ def question_table(outcome: RunOutcome) -> ResultTable:
 def theta_table(learning: RunLearning) -> ResultTable:
     """θ* with its region: the searched parameters."""
     level = "region" if learning.posterior is None else f"{100 * learning.posterior.level:.0f} % of the θ that fit"
-    searched = [one for one in learning.parameters if one.searched != NOT_SEARCHED]
-    rows = [ResultRow([one.name, one.value, one.region, one.searched]) for one in searched]
+    searched = [p for p in learning.parameters if p.searched != NOT_SEARCHED]
+    rows = [ResultRow([p.name, p.value, p.region, p.searched]) for p in searched]
     return ResultTable("θ* with its region", ["parameter", "θ*", level, "searched"], rows).filled()
 
 
 def fixed_parameters(learning: RunLearning) -> str:
     """The parameters that were not searched, with their values; empty if all were."""
-    return ", ".join(f"{one.name} {one.value}" for one in learning.parameters if one.searched == NOT_SEARCHED)
+    return ", ".join(f"{p.name} {p.value}" for p in learning.parameters if p.searched == NOT_SEARCHED)
 
 
 def score_table(learning: RunLearning) -> ResultTable:
@@ -639,7 +637,7 @@ def receiver_table(outcome: RunOutcome) -> ResultTable:
     shown = [
         row
         for row in outcome.receivers.values()
-        if row.recommended is not None or any(one is not None and one.loss is not None for one in (row.first, row.best))
+        if row.recommended is not None or any(p is not None and p.loss is not None for p in (row.first, row.best))
     ]
     heads = list(dict.fromkeys(head for row in shown for head in row.texts))
     rows = [
@@ -694,9 +692,9 @@ def _pour_table(stage: str, pours: Sequence[PourSummary]) -> ResultTable:
         rows.append(ResultRow(cells, look))
     header = ["pour", *(style.label(name) for name in searched), "loaded [g]", "spilled [g]", "retained [g]"]
     header += ["spilled / poured [%]", "expected", "measured", "remark"]
-    what = "" if pours[0].calibration else f"; expected and measured: {pours[0].loss}"
-    what += "; the best is bold" if any(pour.best for pour in pours) else ""
-    caption = f"{stage}: {len(pours)} pours into {pours[0].receiver}{what}"
+    legend = "" if pours[0].calibration else f"; expected and measured: {pours[0].loss}"
+    legend += "; the best is bold" if any(pour.best for pour in pours) else ""
+    caption = f"{stage}: {len(pours)} pours into {pours[0].receiver}{legend}"
     return ResultTable(caption, header, rows, frozenset(range(len(header) - 1))).filled()
 
 
@@ -708,8 +706,8 @@ def _bare(name: str, value: float | None) -> str:
 def validity_table(outcome: RunOutcome) -> ResultTable:
     """Effects that are not simulated in the action spaces."""
     rows = [
-        ResultRow([one.receiver, one.kind.replace("_", " "), f"{one.hit} of {one.tried}", one.text])
+        ResultRow([gap.receiver, gap.kind.replace("_", " "), f"{gap.hit} of {gap.tried}", gap.text])
         for several in outcome.not_covered.values()
-        for one in several
+        for gap in several
     ]
     return ResultTable("At the middle and the corners of the ranges", ["into", "what", "actions", "meaning"], rows)

@@ -88,11 +88,11 @@ def check_bench(
     if spec.arm is not None:
         with reached(spec) as ready:
             assert ready.arm is not None
-            found = arm_kind(ready.arm).diagnostics()
+            diagnostics = arm_kind(ready.arm).diagnostics()
             if read is not None:
-                record = read(found)
+                record = read(diagnostics)
             accept = f"decant robot check {path} --accept-safety"
-            checks += found.checks(record, accept=accept, virtual=spec.mode != "hardware")
+            checks += diagnostics.checks(record, accept=accept, virtual=spec.mode != "hardware")
             checks += balance_diagnostics(ready.balance, tare=tare)
             gripper = None if ready.gripper is None else ready.gripper.beside(ready.arm)
             checks += device_checks(gripper=gripper)
@@ -107,5 +107,5 @@ def check_bench(
     except LaboratoryError as error:
         advice = "install them into the environment that Decant runs in"
         checks.append(DeviceCheck("packages", "fail", str(error), advice))
-    checks += [DeviceCheck("plug-in", "warn", str(one), f"repair or remove {one.package}") for one in broken()]
+    checks += [DeviceCheck("plug-in", "warn", str(plugin), f"repair or remove {plugin.package}") for plugin in broken()]
     return BenchReport(spec.name, spec.mode, tuple(checks))

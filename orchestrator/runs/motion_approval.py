@@ -193,13 +193,13 @@ def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> lis
 
 
 def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) -> list[tuple[Scene, Action]]:
-    found = []
+    cases = []
     for values in actions_all_over(actions, constraints, corners=CORNERS, drawn=INTERIOR):
         try:
-            found.append((scene, scene.action(values)))
+            cases.append((scene, scene.action(values)))
         except ValueError:
             continue  # no such action
-    return found
+    return cases
 
 
 def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
@@ -225,16 +225,16 @@ def _pouring(stages: Sequence[StageDefinition]) -> tuple[bool, int]:
     return deploying < len(names), deploying
 
 
-def envelope_lines(found: Envelope) -> list[str]:
+def envelope_lines(paths: Envelope) -> list[str]:
     """The limits of the paths as text."""
-    lines = report_lines(found.worst)
-    total = len(found.reports) + len(found.refused)
+    lines = report_lines(paths.worst)
+    total = len(paths.reports) + len(paths.refused)
     lines.append(
-        f"planned        {len(found.reports)} of {total} actions from all over; others stay within their limits"
+        f"planned        {len(paths.reports)} of {total} actions from all over; others stay within their limits"
     )
-    if found.refused:
-        lines.append(f"refused        {len(found.refused)}; such pours are refused again before anything moves, e.g.")
-        lines.append(f"               {found.refused[0].splitlines()[0]}")
+    if paths.refused:
+        lines.append(f"refused        {len(paths.refused)}; such pours are refused again before anything moves, e.g.")
+        lines.append(f"               {paths.refused[0].splitlines()[0]}")
     return lines
 
 

@@ -275,11 +275,11 @@ class RequestExecutor:
     async def film(self, request: Simulate) -> SimulatedPour | None:
         """A simulation with frames for a picture; None if it fails. No decision depends on it."""
         try:
-            found = await self._pooled(request, FILM_RATE)
+            played = await self._pooled(request, FILM_RATE)
         except (InvalidActionError, SimulationError, TimeoutError):
             _raise_if_cancelled()
             return None
-        return found if found.frames is not None and found.outcome.invalid is None else None
+        return played if played.frames is not None and played.outcome.invalid is None else None
 
     async def _pooled(self, request: Simulate, rate: float) -> SimulatedPour:
         scene = self._scene(request.scene)

@@ -112,11 +112,11 @@ class RequestForecast:
         open_: list[Request] = []
         while not strategy.finished:
             simulations = sum(isinstance(request, Simulate) for request in open_)
-            asked = strategy.ask(Slots(max(self.capacity - simulations, 0), 1))
-            if any(isinstance(request, Pour) for request in asked):
+            requests = strategy.ask(Slots(max(self.capacity - simulations, 0), 1))
+            if any(isinstance(request, Pour) for request in requests):
                 return
-            open_ += asked
-            for request in asked:
+            open_ += requests
+            for request in requests:
                 if isinstance(request, Simulate):
                     self.speculation.predict(request)
             if not open_:

@@ -212,18 +212,18 @@ async def settle_unknown_pours(
         pour = history.requests[key]
         assert isinstance(pour, Pour)
         scene = scenes[pour.scene]
-        what = f"pour {pour.number} of stage {stage} ({pour.action.display(*_searched(scene, pour))})"
+        subject = f"pour {pour.number} of stage {stage} ({pour.action.display(*_searched(scene, pour))})"
         if plan.on_unknown == "repeat":
             if not virtual:
                 raise RunError(
-                    f"{what} has begun and has no outcome; 'on_unknown: repeat' is for the virtual bench only, because "
-                    "on a real one the liquid may be in the receiver already. Set on_unknown: ask"
+                    f"{subject} has begun and has no outcome; 'on_unknown: repeat' is for the virtual bench only, "
+                    "because on a real one the liquid may be in the receiver already. Set on_unknown: ask"
                 )
-            text = f"{what} had begun and has no outcome; it is repeated with the same seed on the virtual bench"
+            text = f"{subject} had begun and has no outcome; it is repeated with the same seed on the virtual bench"
             journal.log("note", text, stage=stage, kept=True)
             continue
         options = (*((REPEAT,) if virtual else ()), LOST, WEIGHED)
-        question = f"{what} had begun when the run was interrupted; what was its outcome?"
+        question = f"{subject} had begun when the run was interrupted; what was its outcome?"
         answer, outcome = await _ask(ask, question, options, scene.liquid.mass, on_waiting)
         events: list[Event] = [
             OperatorAsked(stage=stage, id=key, question=question, options=options),

@@ -159,8 +159,8 @@ class _RunEngine:
         histories = {stage.name: read_history(self._journal, stage.name) for stage in self._stages}
         self._unknown_pours = any(history.unknown_pours() for history in histories.values())
         if self._state not in RESTING:
-            found = State.UNKNOWN if self._unknown_pours else State.PAUSED
-            self._enter(found, "found interrupted: its process ended without a word")
+            state = State.UNKNOWN if self._unknown_pours else State.PAUSED
+            self._enter(state, "found interrupted: its process ended without a word")
         self._enter(State.PREPARING, "resumed" if resume else "begun")
         for stage in self._stages:
             history = histories[stage.name]
@@ -243,8 +243,8 @@ class _RunEngine:
             if path.is_file():
                 continue
             try:
-                if (found := await executor.film(request)) is not None:
-                    write_film(path, found)
+                if (frames := await executor.film(request)) is not None:
+                    write_film(path, frames)
             except (LaboratoryError, OSError) as error:  # a picture less
                 self._journal.log("warning", f"no picture of the recommended pour into {receiver}: {error}")
 

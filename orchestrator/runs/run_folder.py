@@ -113,9 +113,9 @@ def simulator_version() -> str:
     files, path = folder_digest(ROOT / "sim_engine"), None
     with contextlib.suppress(OSError, ValueError, KeyError):
         path = state_directory() / SIMULATOR_FILE
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept["files"] == files:
-            return str(kept["version"])
+        versions = json.loads(path.read_text(encoding="utf-8"))
+        if versions["files"] == files:
+            return str(versions["version"])
     version = solver_fingerprint()
     with contextlib.suppress(OSError):
         if path is not None:
@@ -155,9 +155,9 @@ def read_film(path: Path) -> SimulatedPour:
     Raises:
         OSError, ValueError: it can't be read.
     """
-    with np.load(path) as kept:
-        frames = RecordedFrames(kept["times"], list(kept["positions"]), list(kept["states"]), kept["poses"])
-        return SimulatedPour(from_json(json.loads(str(kept["outcome"])), PourOutcome), frames)
+    with np.load(path) as archive:
+        frames = RecordedFrames(archive["times"], list(archive["positions"]), list(archive["states"]), archive["poses"])
+        return SimulatedPour(from_json(json.loads(str(archive["outcome"])), PourOutcome), frames)
 
 
 def missing_plugins(versions: Mapping[str, Any]) -> list[str]:
@@ -166,21 +166,21 @@ def missing_plugins(versions: Mapping[str, Any]) -> list[str]:
     Args:
         versions: content of `versions.json`.
     """
-    here, packages = plugin_packages(), versions.get("packages") or {}
+    installed, packages = plugin_packages(), versions.get("packages") or {}
     return [
         f"{name} {packages.get(name, '')} ({', '.join(added)})"
         for name, added in (versions.get("plugins") or {}).items()
-        if name not in here
+        if name not in installed
     ]
 
 
 def read_versions(directory: Path) -> dict[str, Any]:
     """Content of `versions.json` of a run; empty if the file is missing or damaged."""
     try:
-        found = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
+        versions = json.loads((directory / VERSIONS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return versions if isinstance(versions, dict) else {}
 
 
 def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
@@ -207,21 +207,21 @@ def find_run(plan: CampaignPlan, run_id: str | None = None) -> Path:
 
 def _newest_unfinished(plan: CampaignPlan, parent: Path) -> Path:
     mine = digest(fingerprint(plan))
-    found: list[tuple[bool, float, Path]] = []
+    candidates: list[tuple[bool, float, Path]] = []
     for directory in sorted(parent.iterdir()) if parent.is_dir() else ():
         try:
             with JournalReader(directory / JOURNAL_NAME) as journal:
                 if journal.header.name == plan.name and journal.state() is not State.FINISHED:
                     same = digest(journal.header.fingerprint) == mine
-                    found.append((same, journal.header.created, directory))
+                    candidates.append((same, journal.header.created, directory))
         except JournalError:
             # Written by another program or version. A damaged run of this campaign is a candidate, and is refused
             # later.
             begun = readable_lines(directory / LEDGER_NAME)[:1]
-            found += [(True, line.t, directory) for line in begun if line.body.get("name") == plan.name]
-    if not found:
+            candidates += [(True, line.t, directory) for line in begun if line.body.get("name") == plan.name]
+    if not candidates:
         raise JournalError(f"{parent}: no unfinished run of campaign '{plan.name}'; begin one without --resume")
-    return max(found)[2]
+    return max(candidates)[2]
 
 
 def _write_json(path: Path, data: Any) -> None:

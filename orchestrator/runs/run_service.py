@@ -177,8 +177,8 @@ class RunService:
         if request.problems is not None:
             return CheckReport(tuple(request.problems()), ())
         warned: list[Problem] = []
-        found = check_campaign(request.campaign, as_written=request.as_written, warn=warned.append, doing=doing)
-        problems = [str(one) for one in found]
+        checked = check_campaign(request.campaign, as_written=request.as_written, warn=warned.append, doing=doing)
+        problems = [str(fault) for fault in checked]
         if (problem := _lacking_posterior(request.campaign)) is not None:
             problems.append(problem)
         return CheckReport(tuple(problems), tuple(dict.fromkeys(map(str, warned))))

@@ -110,7 +110,7 @@ def calibrate_task(plan: CampaignPlan) -> RunRequest:
 
 def plan_task(
     plan: CampaignPlan,
-    given: GivenTheta | None = None,
+    theta: GivenTheta | None = None,
     receiver: VesselSpec | None = None,
     iterations: int | None = None,
     seeds: int = PREDICTION_SEEDS,
@@ -123,7 +123,7 @@ def plan_task(
 
     Args:
         plan: of the campaign.
-        given: θ to plan with; the campaign's unless given.
+        theta: θ to plan with; the campaign's unless given.
         receiver: instead of the campaign's.
         iterations: as the campaign says unless given.
         seeds: number of new seeds of each prediction; at least one for each of `draws`.
@@ -135,13 +135,13 @@ def plan_task(
     from orchestrator.campaigns.run_snapshot import record_of
     from orchestrator.learning.deployment.d1 import D1Settings
 
-    given = given or GivenTheta(plan.parameters)
+    theta = theta or GivenTheta(plan.parameters)
     deployment = plan.deployment
     if deployment is None:
         raise RunTaskError(
             f"{plan.source}: has no 'deployment' section; it says which actions may be planned (actions, motion, loss)"
         )
-    if deployment.settings.needs_posterior and not given.draws:
+    if deployment.settings.needs_posterior and not theta.draws:
         raise RunTaskError(
             f"{plan.source}: deployment.risk.theta: 'posterior' needs --parameters, the theta.json of a calibration by "
             "C4 (in a program: theta), or a calibration in the same run"
@@ -154,14 +154,14 @@ def plan_task(
         changes["simulations_per_iteration"] = 1
     settings = D1Settings.like(deployment.settings, **changes)
     deployment = replace(
-        deployment, settings=settings, scenes=scenes, thetas=given.draws, left_over=given.left_over, confirm=0
+        deployment, settings=settings, scenes=scenes, thetas=theta.draws, left_over=theta.left_over, confirm=0
     )
     name = f"{plan.name.removesuffix(PLANNED)}{PLANNED}"
-    found = replace(plan, name=name, parameters=given.theta, calibration=None, deployment=deployment)
-    predictions = prediction_stages(found, deployment, max(seeds, len(draws)), draws)
+    campaign = replace(plan, name=name, parameters=theta.theta, calibration=None, deployment=deployment)
+    predictions = prediction_stages(campaign, deployment, max(seeds, len(draws)), draws)
     return RunRequest(
-        replace(found, resolved=record_of(plan.resolved, found)),
-        [*deployment_stages(found, deployment), *predictions],
+        replace(campaign, resolved=record_of(plan.resolved, campaign)),
+        [*deployment_stages(campaign, deployment), *predictions],
         as_written=receiver is None,
     )
 

@@ -105,16 +105,16 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
     Raises:
         RunError: two different scenes have the same name.
     """
-    found: list[Scene] = []
+    every: list[Scene] = []
     if plan.calibration is not None:
-        found += plan.calibration.poured
-        found += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
+        every += plan.calibration.poured
+        every += [records.scene for records in (plan.calibration.records, plan.calibration.transfer) if records]
     if plan.deployment is not None:
-        found += plan.deployment.scenes
+        every += plan.deployment.scenes
     if plan.dispense is not None:
-        found += plan.dispense.scenes
+        every += plan.dispense.scenes
     scenes: dict[str, Scene] = {}
-    for scene in found:
+    for scene in every:
         if scenes.setdefault(scene.name, scene) != scene:
             raise RunError(f"two different scenes are both named '{scene.name}'; give one of the vessels another name")
     return scenes
@@ -175,10 +175,10 @@ def calibrated_sources(
     """
     if calibration is None or CALIBRATION not in results:
         return {}
-    found = calibrated_theta(results)
-    if found.posterior is None or "tilt_zero" not in found.searched or not _justified(results):
+    theta = calibrated_theta(results)
+    if theta.posterior is None or "tilt_zero" not in theta.searched or not _justified(results):
         return {}
-    knowledge = calibrated_knowledge([row["tilt_zero"] for row in found.posterior.thetas])
+    knowledge = calibrated_knowledge([row["tilt_zero"] for row in theta.posterior.thetas])
     pourer = calibration.scene.pourer
     return {scene.pourer.name: knowledge for scene in plan.scenes if scene.pourer == pourer}
 
@@ -217,7 +217,7 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
         plain = (replace(plan, memory=None) if dropped else plan).uncalibrated
         rivals = random_parameters(plan.parameters, plan.fixed_parameters, plan.random_baseline, seed)
         pours = [*measured_pours(plan, results), *_recorded(plan.transfer)]
-        drawn = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()
+        draws = posterior_draws(calibrated_theta(results), DRAWS) if rivals else ()
         return CalibrationEvaluation(
             theta,
             rivals,
@@ -225,12 +225,12 @@ def calibration_stages(plan: CalibrationPlan, deployment: DeploymentPlan | None 
             Contexts.of(plan),
             seed,
             uncalibrated=plain,
-            drawn=drawn,
+            sampled=draws,
             train_seeds=result_of(results, CALIBRATION, Calibrated).pour_seeds,
         )
 
-    found = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
-    return [*stages, found, StageDefinition(EVALUATION, evaluation)]
+    fitting = StageDefinition(CALIBRATION, calibration, stand_in=_stand_in(plan))
+    return [*stages, fitting, StageDefinition(EVALUATION, evaluation)]
 
 
 def _stand_in(plan: CalibrationPlan) -> Calibrated:
@@ -299,10 +299,10 @@ def prediction_stages(
             theta, known = _theta(plan, results), with_posterior(deployment, results)
             costing = Costing.of(deployment, scene, theta)
             draws = known.settings.draws(known, theta, seeds, seed)
-            drawn = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
+            chosen = [draw.parameters for draw in draws] if known.settings.needs_posterior else thetas
             errors = [draw.error for draw in draws]
             left = None if deployment.left_over is None else deployment.left_over.at(scene)
-            return RepeatedSimulation(costing, action, seeds, seed, drawn, errors, left)
+            return RepeatedSimulation(costing, action, seeds, seed, chosen, errors, left)
 
         return build
 
@@ -323,20 +323,20 @@ def with_posterior(deployment: DeploymentPlan, results: Results) -> DeploymentPl
     """
     if deployment.thetas:
         return deployment
-    found = calibrated_theta(results) if CALIBRATION in results else None
-    posterior = () if found is None or found.posterior is None else found.posterior.thetas
+    theta = calibrated_theta(results) if CALIBRATION in results else None
+    posterior = () if theta is None or theta.posterior is None else theta.posterior.thetas
     if deployment.settings.needs_posterior:
         if not posterior:
             raise RunError("deployment.risk: theta: posterior, but no calibration of this campaign tells one; C4 does")
     elif (
-        found is None
+        theta is None
         or not posterior
         or not _justified(results)
-        or (deployment.settings.learns_offsets and set(SimulationParameters.nuisances()).intersection(found.searched))
+        or (deployment.settings.learns_offsets and set(SimulationParameters.nuisances()).intersection(theta.searched))
     ):
         return deployment
-    assert found is not None
-    return replace(deployment, thetas=posterior_draws(found, POSTERIOR_DRAWS))
+    assert theta is not None
+    return replace(deployment, thetas=posterior_draws(theta, POSTERIOR_DRAWS))
 
 
 def with_left_over(
@@ -350,12 +350,12 @@ def with_left_over(
     return replace(deployment, left_over=None if left is None else left.at(scene))
 
 
-def posterior_draws(found: CalibratedTheta, count: int) -> tuple[SimulationParameters, ...]:
+def posterior_draws(theta: CalibratedTheta, count: int) -> tuple[SimulationParameters, ...]:
     """At most `count` draws of the posterior of θ; none if there is no posterior."""
-    rows = () if found.posterior is None else found.posterior.thetas
+    rows = () if theta.posterior is None else theta.posterior.thetas
     count = min(count, len(rows))
-    kept = [rows[i * len(rows) // count] for i in range(count)]
-    return tuple(SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in kept)
+    spread = [rows[i * len(rows) // count] for i in range(count)]
+    return tuple(SimulationParameters.model_validate({**theta.theta.model_dump(), **row}) for row in spread)
 
 
 def with_offsets(deployment: DeploymentPlan, results: Results, best: SimulationParameters) -> DeploymentPlan:
@@ -372,16 +372,16 @@ def with_offsets(deployment: DeploymentPlan, results: Results, best: SimulationP
     if previous:
         return replace(deployment, bench=previous[-1].displacements())
     nuisances = set(SimulationParameters.nuisances())
-    found = calibrated_theta(results) if CALIBRATION in results else None
-    if found is None and deployment.memory is not None:
+    theta = calibrated_theta(results) if CALIBRATION in results else None
+    if theta is None and deployment.memory is not None:
         known = nuisances.intersection(deployment.memory.means)
         posterior = deployment.memory.thetas(best, POSTERIOR_DRAWS) if known else []
     else:
-        known = nuisances.intersection(() if found is None else found.searched)
-        if found is None or found.posterior is None or not known:
+        known = nuisances.intersection(() if theta is None else theta.searched)
+        if theta is None or theta.posterior is None or not known:
             return deployment
-        rows = found.posterior.thetas
-        posterior = [SimulationParameters.model_validate({**found.theta.model_dump(), **row}) for row in rows]
+        rows = theta.posterior.thetas
+        posterior = [SimulationParameters.model_validate({**theta.theta.model_dump(), **row}) for row in rows]
     if not posterior:
         return deployment
     worlds = drawn_worlds(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
@@ -396,13 +396,13 @@ def by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:
 
 def recommended_pours(plan: CampaignPlan, results: Results) -> dict[str, Simulate]:
     """A simulation of each receiver's recommended pour with the θ that its deployment used, by receiver."""
-    found = {}
+    simulations = {}
     for name, scene in by_receiver(plan.deployment).items() if plan.deployment is not None else ():
         result = results.get(DEPLOYMENT + name)
         if isinstance(result, Deployed) and result.recommended is not None:
             action, seed = scene.action(dict(result.recommended.action_si)), stage_seed(plan.seed, f"film:{name}")
-            found[name] = Simulate(scene.name, action, _theta(plan, results), seed, purpose="film")
-    return found
+            simulations[name] = Simulate(scene.name, action, _theta(plan, results), seed, purpose="film")
+    return simulations
 
 
 def _theta(plan: CampaignPlan, results: Results) -> SimulationParameters:
@@ -432,21 +432,21 @@ def calibrated_theta(results: Results) -> CalibratedTheta:
     Raises:
         RunError: there is none.
     """
-    found = result_of(results, CALIBRATION, Calibrated).found
-    if found is None:
+    theta = result_of(results, CALIBRATION, Calibrated).found
+    if theta is None:
         raise RunError("the calibration has found no θ*")
-    return found
+    return theta
 
 
 def measured_pours(plan: CalibrationPlan, results: Results) -> list[ScoredPour]:
     """Weighed pours of the calibration's scene: from the stage that made them, and from the records."""
-    made, scenes = [], {scene.name: scene for scene in plan.poured}
+    scored, scenes = [], {scene.name: scene for scene in plan.poured}
     for pour in result_of(results, POURS, DesignPoured).measured if POURS in results else ():
         scene = scenes.get(pour.scene, plan.scene)
         action = scene.action(dict(pour.action_si))
         measured = MeasuredPour(action, pour.spillage, pour.poured, pour.split, scene.name)
-        made.append(ScoredPour(scene.name, measured))
-    return [*made, *_recorded(plan.records)]
+        scored.append(ScoredPour(scene.name, measured))
+    return [*scored, *_recorded(plan.records)]
 
 
 def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSimulation, ...]:
@@ -456,8 +456,8 @@ def known_simulations(plan: CalibrationPlan, results: Results) -> tuple[KnownSim
     simulated = result_of(results, POURS, DesignPoured).simulated
     scenes = {scene.name: scene for scene in plan.scenes}
     return tuple(
-        KnownSimulation(dict(one.theta), one.scene, scenes[one.scene].action(dict(one.action_si)), one.spillage)
-        for one in simulated
+        KnownSimulation(dict(run.theta), run.scene, scenes[run.scene].action(dict(run.action_si)), run.spillage)
+        for run in simulated
     )
 
 

@@ -244,11 +244,11 @@ def check_strategy(make: Callable[[], Strategy], simulated: SpillModel, real: Sp
         _kept(strategy, "without a failure")
         last = StrategyHarness(simulated, real, slots=slots, order="last").run(make())
         for name, a, b in (("simulation", first.simulations, last.simulations), ("pour", first.pours, last.pours)):
-            for number, (one, other) in enumerate(zip(a, b, strict=False), 1):
-                if one != other:
+            for number, (request, other) in enumerate(zip(a, b, strict=False), 1):
+                if request != other:
                     raise AssertionError(
-                        f"with {slots} slots {name} {number} is {one!r}, but {other!r} if the simulations return in "
-                        "another order; requests depend on outcomes alone"
+                        f"with {slots} slots {name} {number} is {request!r}, but {other!r} if the simulations return "
+                        "in another order; requests depend on outcomes alone"
                     )
             if len(a) != len(b):
                 raise AssertionError(

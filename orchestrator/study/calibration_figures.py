@@ -231,30 +231,30 @@ def legend(figure: Figure, strategies: Sequence[str]) -> None:
     figure.legend([handles[n] for n in names], names, loc="outside lower center", ncols=columns, frameon=False)
 
 
-def draw_calibrations(study: StudyPlan, found: Gathered) -> list[Drawn]:
+def draw_calibrations(study: StudyPlan, pooled: Gathered) -> list[Drawn]:
     """Draw all figures for which there is data."""
-    known = {name: one for name, one in found.calibrated.items() if any(one.test)}
-    strategies = {name: one for name, one in known.items() if name not in (UNCALIBRATED, RANDOM)}
-    drawn = [_boxes(known)] if known else []
+    known = {name: scores for name, scores in pooled.calibrated.items() if any(scores.test)}
+    strategies = {name: scores for name, scores in known.items() if name not in (UNCALIBRATED, RANDOM)}
+    figures = [_boxes(known)] if known else []
     if strategies:
-        drawn.append(_against_simulations(strategies, known.get(UNCALIBRATED)))
-        drawn.append(_over_theta(study, strategies))
-    return drawn
+        figures.append(_against_simulations(strategies, known.get(UNCALIBRATED)))
+        figures.append(_over_theta(study, strategies))
+    return figures
 
 
-def error(one: Estimate) -> list[list[float]]:
+def error(estimate: Estimate) -> list[list[float]]:
     """Distances down and up for `errorbar`; zero without an interval."""
-    return [[np.nan_to_num(one.mean - one.low)], [np.nan_to_num(one.high - one.mean)]]
+    return [[np.nan_to_num(estimate.mean - estimate.low)], [np.nan_to_num(estimate.high - estimate.mean)]]
 
 
 def _boxes(known: Mapping[str, StrategyScores]) -> Drawn:
     figure, axes = style.new_figure(size=(1.6 + 1.25 * len(known), 4.2))
     rows: list[list[object]] = []
-    for place, (name, one) in enumerate(known.items(), start=1):
-        pooled = [100 * value for test in one.test for value in test]
+    for place, (name, scores) in enumerate(known.items(), start=1):
+        pooled = [100 * value for test in scores.test for value in test]
         axes.boxplot([pooled], positions=[place], widths=0.55, showfliers=False, medianprops={"color": style.INK})
         axes.plot(np.linspace(place - 0.12, place + 0.12, len(pooled)), pooled, ".", color=style.PALE, zorder=1)
-        average = estimate([mean(test) for test in one.test], SHARE).scaled(100)
+        average = estimate([mean(test) for test in scores.test], SHARE).scaled(100)
         axes.errorbar([place], [average.mean], yerr=error(average), fmt="D", color=colour(name), capsize=4, zorder=4)
         quartiles = [float(q) for q in np.percentile(pooled, [25, 50, 75])]
         rows.append([name, average.count, len(pooled), average.mean, average.low, average.high, *quartiles])
@@ -276,8 +276,8 @@ def _boxes(known: Mapping[str, StrategyScores]) -> Drawn:
 def _against_simulations(known: Mapping[str, StrategyScores], uncalibrated: StrategyScores | None) -> Drawn:
     figure, axes = style.new_figure(size=(6.4, 4.2))
     rows: list[list[object]] = []
-    for name, one in known.items():
-        curves = [_curve(name, *pair) for pair in zip(one.results, one.expected, strict=True)]
+    for name, scores in known.items():
+        curves = [_curve(name, *pair) for pair in zip(scores.results, scores.expected, strict=True)]
         curves = [curve for curve in curves if curve]
         if not curves:
             continue
@@ -347,16 +347,16 @@ def _over_theta(study: StudyPlan, known: Mapping[str, StrategyScores]) -> Drawn:
     names: list[str] = []
     box = {axis.name: axis for axis in study.calibrations[0].plan.parameters.axes}
     shown = None
-    top = 100 * max((_largest(one) for one in known.values()), default=1.0)
-    for axes, (name, one) in zip(grid[0], known.items(), strict=True):
-        found = [result.found for result in one.results if result.found is not None]
-        maps = [theta.map for theta in found if theta.map is not None]
-        names = list(maps[0].over) if maps else [*found[0].searched, *found[0].searched][:2]
+    top = 100 * max((_largest(scores) for scores in known.values()), default=1.0)
+    for axes, (name, scores) in zip(grid[0], known.items(), strict=True):
+        thetas = [result.found for result in scores.results if result.found is not None]
+        maps = [theta.map for theta in thetas if theta.map is not None]
+        names = list(maps[0].over) if maps else [*thetas[0].searched, *thetas[0].searched][:2]
         factors = [style.display_factor(axis) for axis in names]
         settings = {"cmap": "viridis", "vmin": 0.0, "vmax": top}
         if strategy_of(name) in ("C1", "C2"):
             tried: dict[tuple[float, float], list[float]] = {}
-            for result in one.results:
+            for result in scores.results:
                 for trial in result.trials:
                     if trial.discrepancy is not None:
                         place = (trial.theta[names[0]], trial.theta[names[1]])
@@ -376,7 +376,7 @@ def _over_theta(study: StudyPlan, known: Mapping[str, StrategyScores]) -> Drawn:
                 for j, y in enumerate(ys)
                 for i, x in enumerate(xs)
             ]
-        stars = [(getattr(theta.theta, names[0]), getattr(theta.theta, names[1])) for theta in found]
+        stars = [(getattr(theta.theta, names[0]), getattr(theta.theta, names[1])) for theta in thetas]
         axes.plot(
             *_displayed(stars, factors), "X", color=style.BEST, markeredgecolor="white", markersize=9,
             label="θ* of a repetition", clip_on=False, zorder=4,
@@ -402,6 +402,6 @@ def _over_theta(study: StudyPlan, known: Mapping[str, StrategyScores]) -> Drawn:
     )
 
 
-def _largest(one: StrategyScores) -> float:
-    values = [t.discrepancy for r in one.results for t in r.trials if t.discrepancy is not None]
+def _largest(scores: StrategyScores) -> float:
+    values = [t.discrepancy for r in scores.results for t in r.trials if t.discrepancy is not None]
     return float(np.percentile(values, 90)) if values else 0.0

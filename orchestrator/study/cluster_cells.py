@@ -57,7 +57,7 @@ class ClusterCells:
 
     def ended(self) -> Iterator[tuple[StudyCell, str | None]]:
         """See `CellWorkers.ended`."""
-        for cell, task in [one for one in self._running.values() if one[1].done]:
+        for cell, task in [pair for pair in self._running.values() if pair[1].done]:
             del self._running[cell.id]
             try:
                 content, problem = task.result()
@@ -85,11 +85,11 @@ def run_on_node(
     Returns:
         Its run folder, or the reason why it has none.
     """
-    if (here := code_now()) != dict(code):
-        different = ", ".join(name for name in code if here.get(name) != code[name])
+    if (version := code_now()) != dict(code):
+        different = ", ".join(name for name in code if version.get(name) != code[name])
         return None, f"{socket.gethostname()} has other code ({different}); install the same version on all machines"
     plan = _study(study)
-    cell = next(one for one in cells_of(plan) if one.id == cell_id)
+    cell = next(known for known in cells_of(plan) if known.id == cell_id)
     with tempfile.TemporaryDirectory(prefix="decant-study-") as place:
         folder = Path(place)
         for key, content in folders.items():

@@ -53,8 +53,8 @@ class Losses:
         pours: number of pours of the longest deployment.
     """
 
-    def __init__(self, study: StudyPlan, found: Gathered, *, final: bool = False) -> None:
-        keys = (found.finals if final else found.losses).keys()
+    def __init__(self, study: StudyPlan, pooled: Gathered, *, final: bool = False) -> None:
+        keys = (pooled.finals if final else pooled.losses).keys()
         names = [scene.receiver.name for compared in study.deployments for scene in compared.plan.scenes]
         self.levels = [level.name for level in study.levels if any(key.level == level.name for key in keys)]
         self.receivers = [name for name in dict.fromkeys(names) if any(key.receiver == name for key in keys)]
@@ -64,7 +64,7 @@ class Losses:
         self.unit = deployment_unit(study.deployments[0].plan)
         self.range = (0.0, largest_loss(study.deployments[0].plan))
         self.pours = max(compared.plan.pours for compared in study.deployments)
-        self._found = found
+        self._found = pooled
 
     @property
     def least_shown(self) -> float:
@@ -86,7 +86,7 @@ class Losses:
     def final(self, level: str, receivers: Sequence[str], strategy: str) -> dict[int, float]:
         """Loss of the recommended action by repetition; mean over receivers, if the repetition has all of them."""
         each = [self._found.finals.get(Key(level, receiver, strategy), {}) for receiver in receivers]
-        return _mean_of([{n: mean([pour.loss for pour in pours]) for n, pours in one.items()} for one in each])
+        return _mean_of([{n: mean([pour.loss for pour in pours]) for n, pours in rounds.items()} for rounds in each])
 
 
 def _mean_of(each: Sequence[dict[int, float]]) -> dict[int, float]:
@@ -94,18 +94,18 @@ def _mean_of(each: Sequence[dict[int, float]]) -> dict[int, float]:
     return {number: mean([values[number] for values in each]) for number in sorted(shared)}
 
 
-def draw_deployments(study: StudyPlan, found: Gathered) -> list[Drawn]:
+def draw_deployments(study: StudyPlan, pooled: Gathered) -> list[Drawn]:
     """Draw all figures for which there is data."""
-    drawn = []
-    if found.losses:
-        losses = Losses(study, found)
-        drawn = [
-            _after_pours(study, found, losses),
-            _mean_of_pours(study, found, losses),
-            _best_so_far(found, losses),
-            _against_time(study, found, losses),
+    figures = []
+    if pooled.losses:
+        losses = Losses(study, pooled)
+        figures = [
+            _after_pours(study, pooled, losses),
+            _mean_of_pours(study, pooled, losses),
+            _best_so_far(pooled, losses),
+            _against_time(study, pooled, losses),
         ]
-    return [*drawn, _finals(study, Losses(study, found, final=True))] if found.finals else drawn
+    return [*figures, _finals(study, Losses(study, pooled, final=True))] if pooled.finals else figures
 
 
 def means(
@@ -123,9 +123,9 @@ def means(
     width, rows = 0.8 / len(strategies), []
     for i in range(len(groups)):
         for j, strategy in enumerate(strategies):
-            one = of(i, strategy)
-            _mean(axes, i + (j + 0.5) * width - 0.4, one, series_style(strategy, strategies), least, strategy)
-            rows.append((i, strategy, [one.count, one.mean, one.low, one.high]))
+            estimate = of(i, strategy)
+            _mean(axes, i + (j + 0.5) * width - 0.4, estimate, series_style(strategy, strategies), least, strategy)
+            rows.append((i, strategy, [estimate.count, estimate.mean, estimate.low, estimate.high]))
         if i:
             axes.axvline(i - 0.5, color=style.PALE, linewidth=0.8, zorder=0)
     axes.set_xlim(-0.5, len(groups) - 0.5)
@@ -135,14 +135,14 @@ def means(
     return rows
 
 
-def _mean(axes: Axes, x: float, one: Estimate, shown: SeriesStyle, least: float, label: str) -> None:
+def _mean(axes: Axes, x: float, estimate: Estimate, shown: SeriesStyle, least: float, label: str) -> None:
     """Draw a mean with its interval; an interval that extends below the axis ends in an arrow."""
-    if math.isnan(one.mean):
+    if math.isnan(estimate.mean):
         return
-    middle, low, high = (max(value, least) for value in (one.mean, one.low, one.high))
-    if not math.isnan(one.low):
+    middle, low, high = (max(value, least) for value in (estimate.mean, estimate.low, estimate.high))
+    if not math.isnan(estimate.low):
         axes.plot([x, x], [low, high], color=shown.colour, linewidth=1.4, zorder=2)
-        if one.low < least < one.high:
+        if estimate.low < least < estimate.high:
             axes.plot([x], [least], "v", color=shown.colour, markersize=4, zorder=2, clip_on=False)
     axes.plot(
         [x], [middle], shown.marker, color=shown.colour, markerfacecolor=shown.face, markersize=6, label=label,
@@ -152,7 +152,7 @@ def _mean(axes: Axes, x: float, one: Estimate, shown: SeriesStyle, least: float,
 
 def _level_note(study: StudyPlan, level: str) -> str:
     """Differences of a level's bench from the others: 'particles 600, friction 0.05, receiver -2 mm'."""
-    benches = {one.name: one.bench for one in study.levels}
+    benches = {described.name: described.bench for described in study.levels}
     liquids = {name: bench.theta.model_dump() for name, bench in benches.items()}
     parts = [
         f"{name} {value:g}".replace("_", HARD_SPACE).replace(" ", HARD_SPACE)
@@ -213,13 +213,13 @@ def _grouped(
     return figure, rows
 
 
-def _after_pours(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
+def _after_pours(study: StudyPlan, pooled: Gathered, losses: Losses) -> Drawn:
     unit, receiver, pours = losses.unit, losses.receivers[0], losses.checkpoints()
     figure, rows = _grouped(
         study,
         losses,
         [str(pour) for pour in pours],
-        lambda level, i, strategy: at_pour(found.best_so_far(Key(level, receiver, strategy)), pours[i]),
+        lambda level, i, strategy: at_pour(pooled.best_so_far(Key(level, receiver, strategy)), pours[i]),
         title=f"least {unit.label}",
         x="pours",
     )
@@ -235,13 +235,13 @@ def _after_pours(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
     )
 
 
-def _mean_of_pours(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
+def _mean_of_pours(study: StudyPlan, pooled: Gathered, losses: Losses) -> Drawn:
     unit, receivers = losses.unit, losses.receivers
     figure, rows = _grouped(
         study,
         losses,
         receivers,
-        lambda level, i, strategy: [mean(pours) for pours in found.losses.get(Key(level, receivers[i], strategy), [])],
+        lambda level, i, strategy: [mean(pours) for pours in pooled.losses.get(Key(level, receivers[i], strategy), [])],
         title=f"mean {unit.label}",
         height=4.0,
     )
@@ -257,7 +257,7 @@ def _mean_of_pours(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
     )
 
 
-def _best_so_far(found: Gathered, losses: Losses) -> Drawn:
+def _best_so_far(pooled: Gathered, losses: Losses) -> Drawn:
     from matplotlib.ticker import MaxNLocator
 
     levels, receivers, strategies = losses.levels, losses.receivers, losses.strategies
@@ -268,14 +268,14 @@ def _best_so_far(found: Gathered, losses: Losses) -> Drawn:
         for j, receiver in enumerate(receivers):
             axes = panels[i][j]
             for strategy in strategies:
-                curves = found.best_so_far(Key(level, receiver, strategy))
+                curves = pooled.best_so_far(Key(level, receiver, strategy))
                 if not curves:
                     continue
                 points = [losses.mean(at_pour(curves, pour)) for pour in numbers]
                 place = [level, receiver, strategy]
                 rows += [[*place, n, e.count, e.mean, e.low, e.high] for n, e in zip(numbers, points, strict=True)]
                 shown = series_style(strategy, strategies)
-                middle = [max(one.mean, least) for one in points]
+                middle = [max(point.mean, least) for point in points]
                 axes.plot(numbers, middle, shown.line, color=shown.colour, label=strategy, linewidth=1.7)
                 for pour in losses.checkpoints():
                     # Bars next to each other instead of bands: bands of several strategies would fill the panel.
@@ -299,7 +299,7 @@ def _best_so_far(found: Gathered, losses: Losses) -> Drawn:
     )
 
 
-def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
+def _against_time(study: StudyPlan, pooled: Gathered, losses: Losses) -> Drawn:
     strategies, unit, least = losses.strategies, losses.unit, losses.least_shown
     level = study.compared if study.compared in losses.levels else losses.levels[0]
     shape = (len(SECONDS_OF_SIMULATION), len(SECONDS_OF_POUR))
@@ -309,7 +309,7 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
         for j, pour in enumerate(SECONDS_OF_POUR):
             axes, planned = grid[i][j], []
             for strategy in strategies:
-                times, values = _spent(study, found, level, losses.receivers, strategy, simulation, pour)
+                times, values = _spent(study, pooled, level, losses.receivers, strategy, simulation, pour)
                 if not times:
                     continue
                 rows += [[level, simulation, pour, strategy, t, unit.factor * v] for t, v in zip(times, values)]  # noqa: B905
@@ -345,11 +345,11 @@ def _against_time(study: StudyPlan, found: Gathered, losses: Losses) -> Drawn:
 
 
 def _spent(
-    study: StudyPlan, found: Gathered, level: str, receivers: list[str], strategy: str, simulation: float, pour: float
+    study: StudyPlan, pooled: Gathered, level: str, receivers: list[str], strategy: str, simulation: float, pour: float
 ) -> tuple[list[float], list[float]]:
     """Total time after each pour, and the smallest loss so far, averaged over receivers."""
     settings = study.deployment(strategy).plan.settings
-    curves = [curve for name in receivers for curve in found.best_so_far(Key(level, name, strategy))]
+    curves = [curve for name in receivers for curve in pooled.best_so_far(Key(level, name, strategy))]
     length = max((len(curve) for curve in curves), default=0)
     before, each = settings.simulations_before * simulation, max(pour, settings.simulations_beside * simulation)
     numbers = range(1, length + 1)

@@ -144,9 +144,9 @@ def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Loa
     assert calibration is not None
     mass, pours = calibration.scene.liquid.mass, []
     scenes = {scene.name: scene for scene in calibration.poured}
-    own = study.calibration(cell.strategy).pours if cell.strategy else 0
+    count = study.calibration(cell.strategy).pours if cell.strategy else 0
     weighed = result_of(load(cell.needs[0]), POURS, DesignPoured).measured
-    if own:
+    if count:
         chosen = load(cell.needs[1])
         weighed = (*result_of(chosen, POURS, DesignPoured).measured, *(p for p in weighed if p.split == "test"))
         calibration = replace(calibration, known=known_simulations(calibration, chosen))
@@ -154,7 +154,7 @@ def _with_pours(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Loa
         poured, scene = pour.poured * mass, scenes.get(pour.scene, calibration.scene)
         action, spilled = scene.action(dict(pour.action_si)), (pour.spillage or 0.0) * poured
         pours.append(RecordedPour(action, poured, spilled, mass - poured, pour.split, scene.name))
-    source = cell.needs[1 if own else 0]
+    source = cell.needs[1 if count else 0]
     records = RecordSet(calibration.scene, tuple(pours), directory.parent / source / JOURNAL_NAME)
     return replace(plan, calibration=replace(calibration, records=records))
 
@@ -163,8 +163,8 @@ def _calibration(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Lo
     request = calibrate_task(_with_pours(study, cell, plan, load, directory))
     if cell.strategy != "C1":
         return request
-    found = answers(directory.parent / GRID, Simulate)
-    table = [(one.request, one.outcome) for one in found if isinstance(one.request, Simulate)]
+    simulated = answers(directory.parent / GRID, Simulate)
+    table = [(reply.request, reply.outcome) for reply in simulated if isinstance(reply.request, Simulate)]
 
     def answered(stage: StageDefinition) -> StageDefinition:
         return replace(stage, build=lambda results, seed: AnsweredByTable(stage.build(results, seed), table))
@@ -185,9 +185,9 @@ def _deployment(
     compared = study.deployment(cell.strategy).plan
     deployment = replace(compared, scenes=tuple(scene for scene in compared.scenes if scene.name == cell.receiver))
     for calibration in calibrations:
-        found = load(calibration)
-        deployment = with_posterior(deployment, found)
-        plan = replace(plan, parameters=deployed_theta(found))
+        calibrated = load(calibration)
+        deployment = with_posterior(deployment, calibrated)
+        plan = replace(plan, parameters=deployed_theta(calibrated))
     return deploy_task(replace(plan, deployment=deployment))
 
 

@@ -72,8 +72,8 @@ class StrategyBudget(Settings):
 
     def changes(self) -> dict[str, Any]:
         """Settings of the strategy that the file gives."""
-        own = type(self).model_fields.keys() - StrategyBudget.model_fields.keys()
-        return {name: value for name in own if (value := getattr(self, name)) is not None}
+        keys = type(self).model_fields.keys() - StrategyBudget.model_fields.keys()
+        return {name: value for name in keys if (value := getattr(self, name)) is not None}
 
 
 def _budget_of(settings: type[StrategySettings], *keys: str, **required: str) -> Any:
@@ -178,9 +178,9 @@ def _with_others(base: type[Settings], installed: Mapping[str, type[StrategySett
     fields: Any = {}
     for name, settings in installed.items():
         if name not in base.model_fields:
-            own = settings.model_fields.keys() - {"strategy"}
+            keys = settings.model_fields.keys() - {"strategy"}
             meaning = meanings(settings)["strategy"]
-            fields[name] = (_budget_of(settings, *sorted(own)) | None, Field(None, description=meaning))
+            fields[name] = (_budget_of(settings, *sorted(keys)) | None, Field(None, description=meaning))
     name = base.__name__.replace("Base", "Settings")
     return create_model(name, __base__=base, __doc__=base.__doc__, **fields)
 
@@ -368,8 +368,8 @@ def _base(file: StudyFile, root: Place, report: Report) -> CampaignPlan | None:
     if base.memory is not None:
         report.add(root.at("campaign"), "has a 'prior', and the cells of a study begin without one; remove it there")
     if laboratory is not None:
-        found = references.section(file.laboratory, root.at("laboratory"), LaboratorySettings)
-        record = {} if found is None else as_file(*found, references)
+        section = references.section(file.laboratory, root.at("laboratory"), LaboratorySettings)
+        record = {} if section is None else as_file(*section, references)
         base = replace(base, laboratory=laboratory, resolved={**base.resolved, "laboratory": record})
     return base if file.parameters is None else _with_parameters(base, file.parameters, root.at("parameters"), report)
 
@@ -514,11 +514,11 @@ def _compared_calibrations(
             continue
         prior, known = (base.prior, base.parameter_prior) if kind.has_prior else ((), ())
         plan = replace(base, settings=settled, prior=prior, parameter_prior=known)
-        own = getattr(strategy, "pours", 0)  # only a strategy that chooses its pours has the key
-        if own:
+        count = getattr(strategy, "pours", 0)  # only a strategy that chooses its pours has the key
+        if count:
             plan = replace(plan, design="active", design_simulations=strategy.design_simulations)
         where = levels if key == "C4" or compared == ALL else (compared,)
-        strategies.append(ComparedCalibration(_label(key), plan, strategy.repetitions or 1, where, own))
+        strategies.append(ComparedCalibration(_label(key), plan, strategy.repetitions or 1, where, count))
     return tuple(strategies)
 
 

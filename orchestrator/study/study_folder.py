@@ -75,7 +75,7 @@ class CellResult(ResultPart):
     @field_validator("results", mode="before")
     @classmethod
     def _by_kind(cls, value: Any) -> Any:
-        return {name: one if isinstance(one, StageResult) else decode_result(one) for name, one in value.items()}
+        return {name: raw if isinstance(raw, StageResult) else decode_result(raw) for name, raw in value.items()}
 
 
 def read_result(folder: Path, cell: str) -> CellResult:
@@ -99,12 +99,12 @@ def write_result(folder: Path, cell: str, result: CellResult) -> None:
 
 def write_whole(path: Path, text: str) -> None:
     """Write a file atomically."""
-    part = path.with_suffix(f".{os.getpid()}.part")
-    with part.open("w", encoding="utf-8") as file:
+    temporary = path.with_suffix(f".{os.getpid()}.part")
+    with temporary.open("w", encoding="utf-8") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
-    part.replace(path)
+    temporary.replace(path)
 
 
 def finished_results(folder: Path, cells: tuple[StudyCell, ...]) -> dict[str, CellResult]:
@@ -179,12 +179,12 @@ def code_now() -> dict[str, str]:
 
     The result is cached, because a running process keeps its code when files on the disk change.
     """
-    here = versions()
+    current = versions()
     return {
-        "decant": here.decant,
+        "decant": current.decant,
         "optimiser": folder_digest(_ROOT / "actors" / "optimizer"),
         "strategies": folder_digest(_ROOT / "orchestrator" / "learning"),
-        "solver": here.simulator,
+        "solver": current.simulator,
     }
 
 

@@ -99,40 +99,40 @@ class StudyTable:
         return header, rows
 
 
-def tables(study: StudyPlan, found: Gathered) -> list[StudyTable]:
+def tables(study: StudyPlan, pooled: Gathered) -> list[StudyTable]:
     """All tables for which there is data."""
-    made = []
-    if found.calibrated:
-        made.append(_calibrations(study, found))
-    if rows := [*_calibration_effects(study, found), *_deployment_effects(study, found)]:
-        made.append(StudyTable("table-effects", "Who gains how much", _PAIRED, _EFFECT_COLUMNS, rows))
-    if found.finals:
-        made.append(_finals(found, Losses(study, found, final=True)))
-    if found.losses:
-        losses = Losses(study, found)
-        made.append(_deployments(found, losses))
-        if rows := _needed(found, losses):
+    tables_ = []
+    if pooled.calibrated:
+        tables_.append(_calibrations(study, pooled))
+    if rows := [*_calibration_effects(study, pooled), *_deployment_effects(study, pooled)]:
+        tables_.append(StudyTable("table-effects", "Who gains how much", _PAIRED, _EFFECT_COLUMNS, rows))
+    if pooled.finals:
+        tables_.append(_finals(pooled, Losses(study, pooled, final=True)))
+    if pooled.losses:
+        losses = Losses(study, pooled)
+        tables_.append(_deployments(pooled, losses))
+        if rows := _needed(pooled, losses):
             header = ("mismatch", "receiver", "loss", "D2", "D3")
-            made.append(StudyTable("table-pours", "Pours to the same loss", _NEEDED, header, rows))
-    return made
+            tables_.append(StudyTable("table-pours", "Pours to the same loss", _NEEDED, header, rows))
+    return tables_
 
 
-def _calibrations(study: StudyPlan, found: Gathered) -> StudyTable:
+def _calibrations(study: StudyPlan, pooled: Gathered) -> StudyTable:
     rows: list[TableRow] = []
-    for name, one in found.calibrated.items():
-        spent = "0" if name in (UNCALIBRATED, RANDOM) else f"{mean([float(n) for n in one.simulations]):.0f}"
+    for name, scores in pooled.calibrated.items():
+        spent = "0" if name in (UNCALIBRATED, RANDOM) else f"{mean([float(n) for n in scores.simulations]):.0f}"
         if name == "C1":
             spent += " (scored from one grid)"
-        values = [mean(test) for test in one.test]
-        trained = [mean(train) for train in one.train]
+        values = [mean(test) for test in scores.test]
+        trained = [mean(train) for train in scores.train]
         rows.append(
             [
                 name,
                 spent,
-                len(one.test),
+                len(scores.test),
                 estimate(trained, SHARE).scaled(100),
                 estimate(values, SHARE).scaled(100),
-                _thetas(one.results),
+                _thetas(scores.results),
             ]
         )
     return StudyTable(
@@ -171,20 +171,20 @@ FINAL_PAIRS = (
 """Pairs whose recommended actions are compared, as `ARMS`; D1 is the one with the most iterations."""
 
 
-def _calibration_effects(study: StudyPlan, found: Gathered) -> list[TableRow]:
+def _calibration_effects(study: StudyPlan, pooled: Gathered) -> list[TableRow]:
     rows: list[TableRow] = []
-    for first, second in (*PAIRS, *((name, "C4") for name in found.calibrated if not is_ours(name))):
-        if first in found.calibrated and second in found.calibrated:
-            one = effect(tests_of(found, first), tests_of(found, second), SHARE)
-            rows.append(_effect_row(f"{first} − {second}", "test discrepancy [%]", study.compared, "—", one, 100.0))
+    for first, second in (*PAIRS, *((name, "C4") for name in pooled.calibrated if not is_ours(name))):
+        if first in pooled.calibrated and second in pooled.calibrated:
+            gain = effect(tests_of(pooled, first), tests_of(pooled, second), SHARE)
+            rows.append(_effect_row(f"{first} − {second}", "test discrepancy [%]", study.compared, "—", gain, 100.0))
     return rows
 
 
-def _deployment_effects(study: StudyPlan, found: Gathered) -> Iterator[TableRow]:
+def _deployment_effects(study: StudyPlan, pooled: Gathered) -> Iterator[TableRow]:
     for final, pairs in ((False, ARMS), (True, FINAL_PAIRS)):
-        if not (found.finals if final else found.losses):
+        if not (pooled.finals if final else pooled.losses):
             continue
-        losses = Losses(study, found, final=final)
+        losses = Losses(study, pooled, final=final)
         longest = max(
             filter(d1_iterations, losses.strategies), key=lambda strategy: d1_iterations(strategy) or 0, default=""
         )
@@ -204,30 +204,30 @@ def _deployment_effects(study: StudyPlan, found: Gathered) -> Iterator[TableRow]
             known, losses.levels, shown, groups.items()
         ):
             if first in losses.strategies and second in losses.strategies:
-                one = effect(values(level, group, first), values(level, group, second), losses.range)
-                if one.difference.count:
-                    yield _effect_row(f"{first} − {second}", of, level, name, one, losses.unit.factor)
+                gain = effect(values(level, group, first), values(level, group, second), losses.range)
+                if gain.difference.count:
+                    yield _effect_row(f"{first} − {second}", of, level, name, gain, losses.unit.factor)
 
 
-def _effect_row(compared: str, of: str, level: str, receiver: str, one: Effect, factor: float) -> TableRow:
-    chance = "—" if one.probability is None else f"{one.probability:.3f}"
-    count = one.difference.count
-    return [compared, of, level, receiver, count, one.difference.scaled(factor), f"{one.better} of {count}", chance]
+def _effect_row(compared: str, of: str, level: str, receiver: str, gain: Effect, factor: float) -> TableRow:
+    chance = "—" if gain.probability is None else f"{gain.probability:.3f}"
+    count = gain.difference.count
+    return [compared, of, level, receiver, count, gain.difference.scaled(factor), f"{gain.better} of {count}", chance]
 
 
 def _thetas(results: Sequence[Calibrated]) -> str:
-    texts, found = [], [one.found for one in results if one.found is not None]
-    for name in found[0].searched if found else ():
-        values = [getattr(one.theta, name) for one in found]
+    texts, thetas = [], [result.found for result in results if result.found is not None]
+    for name in thetas[0].searched if thetas else ():
+        values = [getattr(theta.theta, name) for theta in thetas]
         texts.append(f"{name} {np.mean(values):.3g} ± {np.std(values):.2g}")
     return ", ".join(texts)
 
 
-def _deployments(found: Gathered, losses: Losses) -> StudyTable:
+def _deployments(pooled: Gathered, losses: Losses) -> StudyTable:
     pours = losses.checkpoints(TABLE_POURS)
     rows: list[TableRow] = []
     for place in itertools.product(losses.levels, losses.receivers, losses.strategies):
-        if curves := found.best_so_far(Key(*place)):
+        if curves := pooled.best_so_far(Key(*place)):
             rows.append([*place, len(curves), *(losses.mean(at_pour(curves, pour)) for pour in pours)])
     return StudyTable(
         "table-deployment",
@@ -239,10 +239,10 @@ def _deployments(found: Gathered, losses: Losses) -> StudyTable:
     )
 
 
-def _finals(found: Gathered, losses: Losses) -> StudyTable:
+def _finals(pooled: Gathered, losses: Losses) -> StudyTable:
     rows: list[TableRow] = []
     for level, receiver, strategy in itertools.product(losses.levels, losses.receivers, losses.strategies):
-        if by_repetition := found.finals.get(Key(level, receiver, strategy)):
+        if by_repetition := pooled.finals.get(Key(level, receiver, strategy)):
             pours = [pour for some in by_repetition.values() for pour in some]
             spilled = estimate([mean([pour.spillage for pour in some]) for some in by_repetition.values()], SHARE)
             loss = losses.mean(list(losses.final(level, [receiver], strategy).values()))
@@ -252,13 +252,13 @@ def _finals(found: Gathered, losses: Losses) -> StudyTable:
     return StudyTable("table-final", "The recommended action, poured again", CAPTION, header, rows)
 
 
-def _needed(found: Gathered, losses: Losses) -> list[TableRow]:
+def _needed(pooled: Gathered, losses: Losses) -> list[TableRow]:
     rows: list[TableRow] = []
     for level, receiver in itertools.product(losses.levels, losses.receivers):
         curves = {
             strategy: [
                 [math.inf if math.isnan(v) else v for v in (at_pour([curve], n)[0] for n in range(1, losses.pours + 1))]
-                for curve in found.best_so_far(Key(level, receiver, strategy))
+                for curve in pooled.best_so_far(Key(level, receiver, strategy))
                 if curve
             ]
             for strategy in ("D2", "D3")
@@ -343,36 +343,37 @@ def write_report(study: StudyPlan, folder: Path) -> Path:
         StudyError: a result can't be read.
     """
     results = finished_results(folder, cells_of(study))
-    found = gather(study, results)
+    pooled = gather(study, results)
     report = folder / REPORT
     report.mkdir(parents=True, exist_ok=True)
-    drawn = [*draw_calibrations(study, found), *draw_deployments(study, found)]
-    for one in drawn:
-        one.save(report)
-    shown = tables(study, found)
+    figures = [*draw_calibrations(study, pooled), *draw_deployments(study, pooled)]
+    for figure in figures:
+        figure.save(report)
+    shown = tables(study, pooled)
     for table in shown:
         write_csv(report / f"{table.name}.csv", *table.flat())
     path = report / PAGE
-    write_whole(path, _page(study, found, code_summary(results), drawn, shown, report))
+    write_whole(path, _page(study, pooled, code_summary(results), figures, shown, report))
     return path
 
 
 def _page(
-    study: StudyPlan, found: Gathered, code: str, drawn: Sequence[Drawn], shown: Sequence[StudyTable], report: Path
+    study: StudyPlan, pooled: Gathered, code: str, figures: Sequence[Drawn], shown: Sequence[StudyTable], report: Path
 ) -> str:
     return page.render(
         "study.html.j2",
         title=f"Study {study.name}",
         kicker="Report of a study: strategies side by side, repeated",
         heading=f"Study {study.name}",
-        unfinished=f"Unfinished: {found.finished} of {found.cells} cells are there." * (found.finished < found.cells),
-        lead=_summary(study, found),
+        unfinished=f"Unfinished: {pooled.finished} of {pooled.cells} cells are there."
+        * (pooled.finished < pooled.cells),
+        lead=_summary(study, pooled),
         words=plain_words(shown),
-        open=_unknown(study, found),
-        tables=[(one.name, one.title, one.caption, _table(one)) for one in shown],
+        open=_unknown(study, pooled),
+        tables=[(table.name, table.title, table.caption, _table(table)) for table in shown],
         figures=[
-            (one.name, one.title, page.Picture.of(report / f"{one.name}.png", one.title, _caption(one), wide=True))
-            for one in drawn
+            (fig.name, fig.title, page.Picture.of(report / f"{fig.name}.png", fig.title, _caption(fig), wide=True))
+            for fig in figures
         ],
         resampled=_RESAMPLED,
         settings=[*_settings(study), code],
@@ -380,12 +381,12 @@ def _page(
     )
 
 
-def _caption(one: Drawn) -> str:
-    counterpart = f"Counterpart of the paper's figure {one.number}. " if one.number else ""
-    return f"{one.caption} {counterpart}Numbers: {one.name}.csv."
+def _caption(figure: Drawn) -> str:
+    counterpart = f"Counterpart of the paper's figure {figure.number}. " if figure.number else ""
+    return f"{figure.caption} {counterpart}Numbers: {figure.name}.csv."
 
 
-def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
+def _unknown(study: StudyPlan, pooled: Gathered) -> list[str]:
     """Limitations that a reader must consider."""
     counts = [compared.repetitions for compared in study.calibrations] + [
         compared.repetitions for compared in study.deployments
@@ -396,7 +397,7 @@ def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
             f"Some strategies have {min(counts)} repetitions: below {FEWEST} no difference is tested, and intervals "
             "are wide or missing. Such numbers show that everything works, and nothing more."
         )
-    if found.finished < found.cells:
+    if pooled.finished < pooled.cells:
         notes.append("Cells are missing: what is compared may change when they are there.")
     receivers = sorted({scene.receiver.name for compared in study.deployments for scene in compared.plan.scenes})
     if receivers:
@@ -404,13 +405,13 @@ def _unknown(study: StudyPlan, found: Gathered) -> list[str]:
     return notes
 
 
-def _summary(study: StudyPlan, found: Gathered) -> str:
+def _summary(study: StudyPlan, pooled: Gathered) -> str:
     losses = (
         "" if not study.deployments else f" Deployments minimise: {deployment_unit(study.deployments[0].plan).label}."
     )
     return (
-        f"{found.simulations:,} simulations and {found.pours:,} pours on virtual benches, {minutes(found.cpu_s)} of "
-        f"CPU time of simulation, {minutes(found.seconds)} of all cells one after the other. Nothing of this was "
+        f"{pooled.simulations:,} simulations and {pooled.pours:,} pours on virtual benches, {minutes(pooled.cpu_s)} of "
+        f"CPU time of simulation, {minutes(pooled.seconds)} of all cells one after the other. Nothing of this was "
         f"poured by a physical robot.{losses}"
     )
 
@@ -447,8 +448,8 @@ def _level(level: Level) -> str:
     )
 
 
-def _table(one: StudyTable) -> ResultTable:
-    cells = [[v.text() if isinstance(v, Estimate) else str(v) for v in row] for row in one.rows]
-    columns = range(len(one.header))
-    numbers = frozenset(i for i in columns if any(isinstance(row[i], int | float | Estimate) for row in one.rows))
-    return ResultTable(one.title, one.header, [ResultRow(row) for row in cells], numbers)
+def _table(table: StudyTable) -> ResultTable:
+    cells = [[v.text() if isinstance(v, Estimate) else str(v) for v in row] for row in table.rows]
+    columns = range(len(table.header))
+    numbers = frozenset(i for i in columns if any(isinstance(row[i], int | float | Estimate) for row in table.rows))
+    return ResultTable(table.title, table.header, [ResultRow(row) for row in cells], numbers)

@@ -241,10 +241,10 @@ def cells_of(study: StudyPlan) -> tuple[StudyCell, ...]:
                 theta = f"calibration.{level.name}.C4.{number:02d}"
                 needs = (theta,) if deployment.needs_calibration else ()
                 for scene in plan.scenes:
-                    there: dict[str, str | int] = {**place, "strategy": deployment.label, "receiver": scene.name}
-                    deployed = add("deployment", plan.settings.simulations, plan.pours, *needs, **there)
+                    axes: dict[str, str | int] = {**place, "strategy": deployment.label, "receiver": scene.name}
+                    deployed = add("deployment", plan.settings.simulations, plan.pours, *needs, **axes)
                     for again in range(1, study.confirm + 1):
-                        add("final", 0, 1, deployed, *needs, **there, again=again)
+                        add("final", 0, 1, deployed, *needs, **axes, again=again)
     return tuple(cells)
 
 

@@ -292,7 +292,7 @@ def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, resources: RunReso
     directory.mkdir(parents=True, exist_ok=True)
     handle = RunService().start(request, resources)
     result = asyncio.run(handle.wait())
-    kept = CellResult(
+    cell_result = CellResult(
         results=dict(result.results),
         simulations=result.simulations,
         pours=result.pours,
@@ -301,14 +301,14 @@ def run_cell(study: StudyPlan, cell: StudyCell, folder: Path, resources: RunReso
         expected=tuple(_expected(directory)) if cell.strategy.startswith("C4") else (),
         code=code_now(),
     )
-    write_result(folder, cell.id, kept)
-    return kept
+    write_result(folder, cell.id, cell_result)
+    return cell_result
 
 
 def _expected(directory: Path) -> list[tuple[int, float]]:
     """For each θ that C4 chose: simulations requested until then, and the mean |Δ| that its surrogate expected."""
-    decisions = [one for one in read_record(directory).decisions if one.stage == CALIBRATION and "mean" in one.values]
-    return [(one.simulations_asked, one.values["mean"]) for one in decisions]
+    decisions = [d for d in read_record(directory).decisions if d.stage == CALIBRATION and "mean" in d.values]
+    return [(d.simulations_asked, d.values["mean"]) for d in decisions]
 
 
 def named_cells() -> Iterator[str]:

@@ -119,7 +119,7 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
         results: results by cell, as returned by `read_result`.
     """
     cells = cells_of(study)
-    found = Gathered(cells=len(cells))
+    pooled = Gathered(cells=len(cells))
     levels = [level.name for level in study.levels]
     order = [UNCALIBRATED, RANDOM, *(compared.label for compared in study.calibrations)]
     receivers = {scene.name: scene.receiver.name for compared in study.deployments for scene in compared.plan.scenes}
@@ -127,28 +127,28 @@ def gather(study: StudyPlan, results: Mapping[str, CellResult]) -> Gathered:
         if cell.id not in results:
             continue
         data = results[cell.id]
-        found.finished += 1
-        found.simulations += data.simulations
-        found.pours += data.pours
-        found.cpu_s += data.cpu_s
-        found.seconds += data.seconds
+        pooled.finished += 1
+        pooled.simulations += data.simulations
+        pooled.pours += data.pours
+        pooled.cpu_s += data.cpu_s
+        pooled.seconds += data.seconds
         if cell.kind in ("calibration", "uncalibrated") and study.compares(cell.level):
             # repetitions in different worlds count separately: each has its own number
             number = cell.repetition + LEVEL * levels.index(cell.level)
             if _differences(data, "test", random=True):
-                _add(found.calibrated.setdefault(RANDOM, StrategyScores()), number, data, random=True)
-            _add(found.calibrated.setdefault(cell.strategy or UNCALIBRATED, StrategyScores()), number, data)
+                _add(pooled.calibrated.setdefault(RANDOM, StrategyScores()), number, data, random=True)
+            _add(pooled.calibrated.setdefault(cell.strategy or UNCALIBRATED, StrategyScores()), number, data)
         elif cell.kind == "deployment":
             key = Key(cell.level, receivers[cell.receiver], cell.strategy)
-            found.losses.setdefault(key, []).append(_losses(data))
-            found.numbers.setdefault(key, []).append(cell.repetition)
+            pooled.losses.setdefault(key, []).append(_losses(data))
+            pooled.numbers.setdefault(key, []).append(cell.repetition)
         elif cell.kind == "final":
             key = Key(cell.level, receivers[cell.receiver], cell.strategy)
-            one = result_of(data.results, FINAL, FinalPoured)
-            pour = Final(one.loss, 1.0 if one.spillage is None else one.spillage, one.made)
-            found.finals.setdefault(key, {}).setdefault(cell.repetition, []).append(pour)
-    found.calibrated = {name: found.calibrated[name] for name in order if name in found.calibrated}
-    return found
+            final = result_of(data.results, FINAL, FinalPoured)
+            pour = Final(final.loss, 1.0 if final.spillage is None else final.spillage, final.made)
+            pooled.finals.setdefault(key, {}).setdefault(cell.repetition, []).append(pour)
+    pooled.calibrated = {name: pooled.calibrated[name] for name in order if name in pooled.calibrated}
+    return pooled
 
 
 def _differences(data: CellResult, split: str, *, random: bool) -> list[float]:
@@ -163,19 +163,19 @@ def _differences(data: CellResult, split: str, *, random: bool) -> list[float]:
     ]
 
 
-def _add(found: StrategyScores, number: int, data: CellResult, *, random: bool = False) -> None:
-    found.numbers.append(number)
-    found.test.append(_differences(data, "test", random=random))
-    found.train.append([] if random else _differences(data, "train", random=False))
+def _add(scores: StrategyScores, number: int, data: CellResult, *, random: bool = False) -> None:
+    scores.numbers.append(number)
+    scores.test.append(_differences(data, "test", random=random))
+    scores.train.append([] if random else _differences(data, "train", random=False))
     result = None if random or CALIBRATION not in data.results else result_of(data.results, CALIBRATION, Calibrated)
-    found.simulations.append(0 if result is None else result.simulations)
+    scores.simulations.append(0 if result is None else result.simulations)
     if result is not None:
-        found.results.append(result)
-        found.expected.append(data.expected)
+        scores.results.append(result)
+        scores.expected.append(data.expected)
 
 
 def _losses(data: CellResult) -> list[float]:
-    (deployed,) = (one for one in data.results.values() if isinstance(one, Deployed))
+    (deployed,) = (stage for stage in data.results.values() if isinstance(stage, Deployed))
     counted = [pour for pour in deployed.pours if pour.status in ("weighed", "failed")]
     return [math.nan if pour.loss is None else pour.loss for pour in counted]
 
@@ -286,8 +286,8 @@ def statistic(
     mean = float(of(data))
     if count < 2:
         return Estimate(mean, math.nan, math.nan, count)
-    drawn = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
-    low, high = np.quantile(of(data[drawn]), [(1 - COVERED) / 2, (1 + COVERED) / 2])
+    samples = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    low, high = np.quantile(of(data[samples]), [(1 - COVERED) / 2, (1 + COVERED) / 2])
     return Estimate(mean, float(low), float(high), count)
 
 
@@ -340,7 +340,7 @@ def _chance(differences: Sequence[float]) -> float | None:
     return float(test.pvalue)
 
 
-def tests_of(found: Gathered, strategy: str) -> dict[int, float]:
+def tests_of(pooled: Gathered, strategy: str) -> dict[int, float]:
     """Test discrepancy by repetition."""
-    one = found.calibrated[strategy]
-    return dict(zip(one.numbers, map(mean, one.test), strict=True))
+    scores = pooled.calibrated[strategy]
+    return dict(zip(scores.numbers, map(mean, scores.test), strict=True))

@@ -73,9 +73,9 @@ class SimulatedTable:
 
     def ask(self, slots: Slots) -> list[Request]:
         """Return the next simulations."""
-        asked = [self._unissued.popleft() for _ in range(min(slots.simulations, len(self._unissued)))]
-        self._open += asked
-        return list(asked)
+        requests = [self._unissued.popleft() for _ in range(min(slots.simulations, len(self._unissued)))]
+        self._open += requests
+        return list(requests)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
         """Record the outcome of a simulation. Raises ValueError if it was not requested."""

@@ -57,8 +57,8 @@ def actions_of_prior(
     region = region_of(actions, constraints)
     law = partial(_distributed, actions=actions, prior=prior) if prior else None
     if region is not None:
-        drawn = region.draw(count, np.random.default_rng(seed), even=True, law=law)
-        return tuple(tuple(map(float, row)) for row in drawn)
+        draws = region.draw(count, np.random.default_rng(seed), even=True, law=law)
+        return tuple(tuple(map(float, row)) for row in draws)
     from scipy.stats import qmc
 
     sampler = qmc.Sobol(actions.dimension, scramble=True, rng=np.random.default_rng(seed))
@@ -101,10 +101,10 @@ def region_of(actions: Space, constraints: Sequence[Linear]) -> Region | None:
 def _distributed(uniform: Array, actions: Space, prior: Sequence[NormalPrior]) -> Array:
     """Transform uniform points (m, dimension) of the unit cube to the distribution g."""
     points = uniform.copy()
-    for one in prior:
-        i = actions.names.index(one.name)
+    for normal in prior:
+        i = actions.names.index(normal.name)
         axis = actions.axes[i]
-        values = truncated_quantiles(uniform[:, i], one.mean, one.deviation, axis.lower, axis.upper)
+        values = truncated_quantiles(uniform[:, i], normal.mean, normal.deviation, axis.lower, axis.upper)
         places = [axis.encode(value) for value in values]
         points[:, i] = np.rint(np.array(places) * FINENESS) / FINENESS
     return points

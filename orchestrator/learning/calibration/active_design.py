@@ -97,10 +97,10 @@ class ActivePours(DesignedPours):
         )
         self._plan = plan
         self._questions, self._trials = OptimizerQueries(self._seeds), Trials()
-        own = [(scene, plan.actions) for scene in plan.scenes]
-        wanted = own if deployment is None else [(scene, deployment.actions) for scene in deployment.scenes]
-        self._contexts = joint_contexts([*own, *wanted])
-        self._candidates = self._places(own, CANDIDATES, plan.constraints, plan.prior)
+        pairs = [(scene, plan.actions) for scene in plan.scenes]
+        wanted = pairs if deployment is None else [(scene, deployment.actions) for scene in deployment.scenes]
+        self._contexts = joint_contexts([*pairs, *wanted])
+        self._candidates = self._places(pairs, CANDIDATES, plan.constraints, plan.prior)
         self._targets = self._places(wanted, TARGETS, (deployment or plan).constraints)
         self._aim: ContextPlace | None = None
         self._likely: list[Point] = []
@@ -256,11 +256,11 @@ class ActivePours(DesignedPours):
 
     def result(self) -> DesignPoured:
         """The pours so far in the order made, and the simulations that calibration can also use."""
-        own, names = {scene.name for scene in self._plan.scenes}, self._plan.actions.names
+        poured, names = {scene.name for scene in self._plan.scenes}, self._plan.actions.names
         simulated = []
         for trial in self._trials.all:
             (request,) = trial.requests
-            if request.scene in own and trial.cost is not None:
+            if request.scene in poured and trial.cost is not None:
                 simulated.append(
                     SimulatedPoint(
                         theta=self._plan.parameters.decode(trial.point),

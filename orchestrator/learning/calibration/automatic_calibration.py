@@ -257,14 +257,14 @@ class AutomaticCalibration(DiscrepancyOverPours[CalibrationSettings]):
 
     def result(self) -> Calibrated:
         """As in the base class, with the reason of the end and the seeds of the training pours."""
-        found = super().result()
+        calibrated = super().result()
         before = [trial for trial in self._earlier.all if trial.closed]
-        return found.model_copy(
+        return calibrated.model_copy(
             update={
                 "ended": self._ended,
                 "pour_seeds": tuple(self._seed_of_pour),
-                "simulations": self._spent + found.simulations,
-                "lost": self._earlier.lost + found.lost,
-                "trials": (*(self._row(i, trial) for i, trial in enumerate(before)), *found.trials),
+                "simulations": self._spent + calibrated.simulations,
+                "lost": self._earlier.lost + calibrated.lost,
+                "trials": (*(self._row(i, trial) for i, trial in enumerate(before)), *calibrated.trials),
             }
         )

@@ -377,33 +377,33 @@ class DesignSettings(CalibrationSettings):
 
     def settled(self, searched: tuple[str, ...], train: int, complaints: Problems) -> Self | None:
         """Derive the number of θ from the single key that gives it."""
-        given = [key for key in self.examples if getattr(self, key) is not None]
-        if len(given) > 1:
-            complaints.add(f"stands beside '{given[0]}'; keep one of them", given[1], key=True)
-        if not given and self.simulations is None and not complaints.any:
+        written = [key for key in self.examples if getattr(self, key) is not None]
+        if len(written) > 1:
+            complaints.add(f"stands beside '{written[0]}'; keep one of them", written[1], key=True)
+        if not written and self.simulations is None and not complaints.any:
             wanted, example = list(self.examples.items())[-1]
             complaints.add(f"key '{wanted}' is missing; add for example '{wanted}: {example}'", key=True, of=wanted)
-        if complaints.any or train < 1 or not searched or not (given or self.simulations):
+        if complaints.any or train < 1 or not searched or not (written or self.simulations):
             return None
-        found = self.with_thetas(searched, train, complaints)
-        if found is None:
+        completed = self.with_thetas(searched, train, complaints)
+        if completed is None:
             return None
-        key = given[0] if given else "simulations"
-        cost, limit = found.simulations_on(train), self.simulations or MOST_SIMULATIONS
+        key = written[0] if written else "simulations"
+        cost, limit = completed.simulations_on(train), self.simulations or MOST_SIMULATIONS
         if cost > limit:
             limited_by = "'simulations' allows" if self.simulations is not None else "at most are possible:"
-            text = f"makes {found.thetas} θ × {train} training pours = {cost} simulations; {limited_by} {limit}"
+            text = f"makes {completed.thetas} θ × {train} training pours = {cost} simulations; {limited_by} {limit}"
             complaints.add(text, key)
             return None
-        return found
+        return completed
 
-    def _counted(self, given: int | None, train: int, complaints: Problems) -> int | None:
+    def _counted(self, count: int | None, train: int, complaints: Problems) -> int | None:
         """Number of θ that is given or that `simulations` allows."""
-        if given is None and (self.simulations or 0) < train:
+        if count is None and (self.simulations or 0) < train:
             text = f"allows not a single θ: each is simulated on all {train} training pours"
             complaints.add(text, "simulations")
             return None
-        return (self.simulations or 0) // train if given is None else given
+        return (self.simulations or 0) // train if count is None else count
 
 
 def check_initial(

@@ -450,7 +450,7 @@ class CalibrationEvaluation:
         seed: int,
         *,
         uncalibrated: SimulationParameters | None = None,
-        drawn: Sequence[SimulationParameters] = (),
+        sampled: Sequence[SimulationParameters] = (),
         train_seeds: Sequence[int] = (),
     ) -> None:
         """Plan the simulations.
@@ -461,7 +461,7 @@ class CalibrationEvaluation:
             contexts: contexts of the regression.
             uncalibrated: θ that is used without a calibration; it is not scored if it is None. If θ* equals it, no
                 change is recommended.
-            drawn: draws from θ's posterior.
+            sampled: draws from θ's posterior.
             train_seeds: seeds of simulations on the usable training pours; empty: new ones.
         """
         unseen = [scored for scored in pours if scored.pour.split != "train"]
@@ -474,8 +474,8 @@ class CalibrationEvaluation:
             plain = {UNCALIBRATED: uncalibrated}
             self._plain = Evaluation(plain, [*unseen, *train], seed, train_seeds=train_seeds)
             self._parts.append(self._plain)
-        if drawn:  # with other seeds: a draw can be θ* itself
-            draws = {f"posterior {k}": theta for k, theta in enumerate(drawn, 1)}
+        if sampled:  # with other seeds: a draw can be θ* itself
+            draws = {f"posterior {k}": theta for k, theta in enumerate(sampled, 1)}
             self._parts.append(Evaluation(draws, unseen, seed + 1))
         self._owner: dict[Simulate, Evaluation] = {}
         self._contexts = contexts
@@ -488,12 +488,12 @@ class CalibrationEvaluation:
     @property
     def finished(self) -> bool:
         """Every simulation has been answered."""
-        return all(part.finished for part in self._parts)
+        return all(scorer.finished for scorer in self._parts)
 
     @property
     def decisions(self) -> list[Decision]:
         """Reasons for the simulations and, at the end, the recommended θ."""
-        decisions = [decision for part in self._parts for decision in part.decisions]
+        decisions = [decision for scorer in self._parts for decision in scorer.decisions]
         if self._gain is not None:
             numbers = {"gain": self._gain.gain, "gain_error": self._gain.gain_error}
             known = {name: value for name, value in numbers.items() if value is not None}
@@ -503,41 +503,41 @@ class CalibrationEvaluation:
     def ask(self, slots: Slots) -> list[Request]:
         """Return the next simulations, θ* first."""
         requests: list[Request] = []
-        for part in self._parts:
-            asked = part.ask(Slots(slots.simulations - len(requests), 0))
-            self._owner.update({request: part for request in asked if isinstance(request, Simulate)})
-            requests += asked
+        for scorer in self._parts:
+            issued = scorer.ask(Slots(slots.simulations - len(requests), 0))
+            self._owner.update({request: scorer for request in issued if isinstance(request, Simulate)})
+            requests += issued
         return requests
 
     def tell(self, request: Request, outcome: Outcome) -> None:
         """Record the outcome of a simulation. Raises ValueError if it was not requested."""
-        part = self._owner.get(request) if isinstance(request, Simulate) else None
-        if part is None:
+        owner = self._owner.get(request) if isinstance(request, Simulate) else None
+        if owner is None:
             raise ValueError(f"this simulation was not asked for: {request}")
-        part.tell(request, outcome)
+        owner.tell(request, outcome)
         if self.finished and self._plain is not None:
             compared = [
-                [pair for pair in one.result().pairs if pair.split != "transfer"]
-                for one in (self._calibrated, self._plain)
+                [pair for pair in scorer.result().pairs if pair.split != "transfer"]
+                for scorer in (self._calibrated, self._plain)
             ]
             self._gain = calibration_gain(*compared)
 
     def progress(self) -> Progress:
         """Simulations answered, and their total number."""
-        return sum((part.progress() for part in self._parts), Progress())
+        return sum((scorer.progress() for scorer in self._parts), Progress())
 
     def result(self) -> Scores:
         """Mean |r − c_s| by label and split, the random θ's median by split, and the baselines without a simulator."""
-        parts = [part.result() for part in self._parts]
+        parts = [scorer.result() for scorer in self._parts]
         mean_predictor, regression = self._without_simulator() if self.finished else ({}, {})
         return Scores(
-            simulations=sum(part.simulations for part in parts),
-            undefined={label: count for part in parts for label, count in part.undefined.items()},
-            discrepancy={label: scores for part in parts for label, scores in part.discrepancy.items()},
+            simulations=sum(result.simulations for result in parts),
+            undefined={label: count for result in parts for label, count in result.undefined.items()},
+            discrepancy={label: scores for result in parts for label, scores in result.discrepancy.items()},
             random_median=parts[1].random_median,
             posterior_mean=parts[-1].posterior_mean,
-            thetas={label: theta for part in parts for label, theta in part.thetas.items()},
-            pairs=tuple(pair for part in parts for pair in part.pairs),
+            thetas={label: theta for result in parts for label, theta in result.thetas.items()},
+            pairs=tuple(pair for result in parts for pair in result.pairs),
             mean_predictor=mean_predictor,
             regression=regression,
             gain=self._gain,

@@ -137,25 +137,25 @@ class CampaignMemory:
     @property
     def runs(self) -> tuple[str, ...]:
         """All runs that it comes from."""
-        return tuple(dict.fromkeys(run for one in self.parameters for run in one.runs))
+        return tuple(dict.fromkeys(run for parameter in self.parameters for run in parameter.runs))
 
     @property
     def groups(self) -> dict[str, tuple[RememberedParameter, ...]]:
         """The parameters by group."""
-        found = {group: tuple(one for one in self.parameters if one.name in names) for group, names in GROUPS.items()}
-        return {group: parameters for group, parameters in found.items() if parameters}
+        by_group = {group: tuple(p for p in self.parameters if p.name in names) for group, names in GROUPS.items()}
+        return {group: parameters for group, parameters in by_group.items() if parameters}
 
     @property
     def means(self) -> dict[str, float]:
         """Expected values [SI] by name."""
-        return {one.name: one.mean for one in self.parameters}
+        return {p.name: p.mean for p in self.parameters}
 
     @property
     def text(self) -> str:
         """'prior from the runs a, b: receiver_x 14.1 ± 2.9 mm (placement)'."""
         if not self.parameters:
             return "no earlier posterior fits this campaign; the prior is uniform, as without a memory"
-        parts = [f"{', '.join(map(str, one))} ({group})" for group, one in self.groups.items()]
+        parts = [f"{', '.join(map(str, members))} ({group})" for group, members in self.groups.items()]
         return f"prior from the run{'s' * (len(self.runs) > 1)} {', '.join(self.runs)}: {'; '.join(parts)}"
 
     @property
@@ -167,13 +167,13 @@ class CampaignMemory:
         """Equally likely θ (count) by the memory, evenly spread; other values as in `base`."""
         from scipy.stats import qmc
 
-        infos = [SimulationParameters.info()[one.name] for one in self.parameters]
+        infos = [SimulationParameters.info()[p.name] for p in self.parameters]
         rows = qmc.Sobol(len(infos), rng=np.random.default_rng(0)).random(2 ** math.ceil(math.log2(max(count, 2))))
         columns = [
-            truncated_quantiles(rows[:count, i], one.mean, one.deviation, info.lower, info.upper)
-            for i, (one, info) in enumerate(zip(self.parameters, infos, strict=True))
+            truncated_quantiles(rows[:count, i], p.mean, p.deviation, info.lower, info.upper)
+            for i, (p, info) in enumerate(zip(self.parameters, infos, strict=True))
         ]
-        names = [one.name for one in self.parameters]
+        names = [p.name for p in self.parameters]
         return [
             base.model_copy(update=dict(zip(names, map(float, row), strict=True))) for row in zip(*columns, strict=True)
         ]
@@ -185,8 +185,8 @@ def unit_memory(memory: CampaignMemory | None, space: Space) -> tuple[Remembered
         return None
     groups = []
     for parameters in memory.groups.values():
-        places = [(space.names.index(one.name), one) for one in parameters]
-        rows = [_on_axis(space.axes[i], one) for i, one in places]
+        places = [(space.names.index(parameter.name), parameter) for parameter in parameters]
+        rows = [_on_axis(space.axes[i], parameter) for i, parameter in places]
         groups.append(
             RememberedGroup(
                 tuple(i for i, _ in places), tuple(row[0] for row in rows), tuple(row[1] for row in rows), RELIANCE
@@ -195,11 +195,11 @@ def unit_memory(memory: CampaignMemory | None, space: Space) -> tuple[Remembered
     return tuple(groups)
 
 
-def _on_axis(axis: Axis, one: RememberedParameter) -> tuple[float, float]:
+def _on_axis(axis: Axis, parameter: RememberedParameter) -> tuple[float, float]:
     if axis.scale == "log":
-        mean = max(one.mean, axis.lower)
-        return axis.encode(mean), one.deviation / mean / math.log(axis.upper / axis.lower)
-    return axis.encode(one.mean), one.deviation / (axis.upper - axis.lower)
+        mean = max(parameter.mean, axis.lower)
+        return axis.encode(mean), parameter.deviation / mean / math.log(axis.upper / axis.lower)
+    return axis.encode(parameter.mean), parameter.deviation / (axis.upper - axis.lower)
 
 
 def remembered_point(point: Point, groups: Sequence[RememberedGroup]) -> Point:
@@ -263,21 +263,21 @@ class MemoryFound(ResultPart):
     @property
     def contradicted(self) -> bool:
         """Whether the pours contradict the memory of a group."""
-        return any(one.contradicted for one in self.groups)
+        return any(group.contradicted for group in self.groups)
 
     @property
     def questions(self) -> tuple[str, ...]:
         """What a person should check: contradictions, and a placement that the pours do not confirm, because a moved
         receiver costs most."""
-        said = []
-        for one in self.groups:
-            runs, check = ", ".join(one.runs), CHECKS[one.group]
-            if one.contradicted:
-                said.append(f"The pours contradict what {runs} found about the {one.group}: {check}")
-            elif one.group == PLACEMENT and one.probability <= CONFIRMED and not self.contradicted:
+        texts = []
+        for group in self.groups:
+            runs, check = ", ".join(group.runs), CHECKS[group.group]
+            if group.contradicted:
+                texts.append(f"The pours contradict what {runs} found about the {group.group}: {check}")
+            elif group.group == PLACEMENT and group.probability <= CONFIRMED and not self.contradicted:
                 text = f"The pours say little about the placement, which is that of {runs}: {check}"
-                said.append(f"{text} If so, repeat the campaign without 'prior'.")
-        return tuple(said)
+                texts.append(f"{text} If so, repeat the campaign without 'prior'.")
+        return tuple(texts)
 
 
 def verdicts(memory: CampaignMemory, shares: Mapping[str, float]) -> list[Decision]:
@@ -290,15 +290,15 @@ def verdicts(memory: CampaignMemory, shares: Mapping[str, float]) -> list[Decisi
     decisions = []
     for group, share in shares.items():
         parameters = memory.groups[group]
-        runs = ", ".join(dict.fromkeys(run for one in parameters for run in one.runs))
+        runs = ", ".join(dict.fromkeys(run for parameter in parameters for run in parameter.runs))
         if share < CONTRADICTED:
             text = (
                 f"the pours contradict the memory of the {group} ({runs}; {', '.join(map(str, parameters))}): its "
                 f"probability falls from {100 * RELIANCE:.0f} to {100 * share:.0f} %; no memory is used any more"
             )
         else:
-            found = "confirm" if share > CONFIRMED else "neither confirm nor contradict"
-            text = f"the pours {found} the memory of the {group} ({runs}): probability {100 * share:.0f} %"
+            verdict = "confirm" if share > CONFIRMED else "neither confirm nor contradict"
+            text = f"the pours {verdict} the memory of the {group} ({runs}): probability {100 * share:.0f} %"
         decisions.append(Decision(text, {"probability": share}, urgent=share < CONTRADICTED))
     return decisions
 
@@ -323,16 +323,16 @@ def memory_found(
     groups = tuple(
         MemoryGroup(
             group=group,
-            parameters={one.name: (one.mean, one.deviation) for one in parameters},
-            runs=tuple(dict.fromkeys(run for one in parameters for run in one.runs)),
+            parameters={p.name: (p.mean, p.deviation) for p in parameters},
+            runs=tuple(dict.fromkeys(run for parameter in parameters for run in parameter.runs)),
             probability=shares[group],
             contradicted=shares[group] < CONTRADICTED,
         )
         for group, parameters in memory.groups.items()
     )
     rows = [space.decode(point) for point in alone.points]
-    parts = [memory.text, *(one.text for one in verdicts(memory, {g: shares[g] for g in memory.groups}))]
-    if not any(one.contradicted for one in groups):
+    parts = [memory.text, *(verdict.text for verdict in verdicts(memory, {g: shares[g] for g in memory.groups}))]
+    if not any(group.contradicted for group in groups):
         parts.append("the uncalibrated parameters are those of this prior")
     text = "; ".join(parts)
     return MemoryFound(groups=groups, alone=estimates(rows), left_out=memory.left_out, text=text)
@@ -342,4 +342,4 @@ def estimates(rows: Sequence[Mapping[str, float]]) -> dict[str, EstimateAlone]:
     """Mean and standard deviation of each parameter over equally likely draws."""
     names = list(rows[0]) if rows else []
     values = {name: np.array([row[name] for row in rows]) for name in names}
-    return {name: EstimateAlone(mean=float(one.mean()), deviation=float(one.std())) for name, one in values.items()}
+    return {name: EstimateAlone(mean=float(x.mean()), deviation=float(x.std())) for name, x in values.items()}

@@ -202,16 +202,16 @@ def _open(points: Array, names: tuple[str, ...]) -> list[str]:
 
 
 def _ties(points: Array, names: tuple[str, ...]) -> list[str]:
-    correlation, found = _correlation(points), []
+    correlation, ties = _correlation(points), []
     for i in range(len(names)):
         for j in range(i + 1, len(names)):
             if abs(correlation[i, j]) > TIED:
                 way = "more" if correlation[i, j] > 0.0 else "less"
-                found.append(
+                ties.append(
                     f"{names[i]} and {names[j]} compensate each other: more of one, {way} of the other "
                     f"(correlation {correlation[i, j]:+.2f})"
                 )
-    return found
+    return ties
 
 
 def _correlation(points: Array) -> Any:

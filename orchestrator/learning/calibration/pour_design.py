@@ -230,11 +230,11 @@ class DesignedPours:
             strata = stratified(count, actions.dimension, self._seeds.rng)
         else:
             strata = [Stratum(point, point) for point in points]
-        kept = choose_holdout(strata, holdout, self._seeds.rng)
+        test_set = choose_holdout(strata, holdout, self._seeds.rng)
         turns, where = {"train": 0, "test": 0}, {"train": scenes, "test": tested or scenes}
         self._planned: list[_Planned] = []
         for i, stratum in enumerate(strata):
-            split = "test" if i in kept else "train"
+            split = "test" if i in test_set else "train"
             self._planned.append(_Planned(stratum, split, where[split][turns[split] % len(where[split])]))
             turns[split] += 1
         self._region = region_of(actions, constraints if points is None else ())

@@ -43,8 +43,8 @@ class RealOnly(Deployment[D2Settings]):
             return
         ledger = self._ledger
         if ledger.pours_left:
-            made = [p.point for p in ledger.pours if p.status != "refused"]
-            known = [*(point for point, _ in ledger.known), *made]
+            points = [p.point for p in ledger.pours if p.status != "refused"]
+            known = [*(point for point, _ in ledger.known), *points]
             if len(known) < min(self._settings.initial_samples, self._plan.pours):
                 # one Sobol sequence, point by point, each far from the points already poured
                 query = self._requests.space_filling(known=tuple(known))

@@ -82,9 +82,9 @@ class D3Settings(SearchSettings):
     @property
     def spending(self) -> str:
         """The budget per receiver, as text."""
-        more = f" (up to {MOST_PRIOR * self.prior_simulations} while none is good)" if self.adaptive else ""
+        most = f" (up to {MOST_PRIOR * self.prior_simulations} while none is good)" if self.adaptive else ""
         between = self.simulations_per_pour
-        return f"{self.prior_simulations} simulations{more}, then {self.pours} pours with {between} beside each"
+        return f"{self.prior_simulations} simulations{most}, then {self.pours} pours with {between} beside each"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
         """Check that each key belongs to the selected model."""

@@ -235,13 +235,13 @@ class Deployment(ABC, Generic[S]):
         self._report.final = suggestion
         self._finished = True
 
-    def _decide(self, what: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
-        text = f"{what}  {described(values)}"
+    def _decide(self, purpose: str, values: dict[str, float], suggestion: Suggestion, index: int) -> None:
+        text = f"{purpose}  {described(values)}"
         if not suggestion.means:
-            found = Decision(f"{text}  (no surrogate yet)")
+            decision = Decision(f"{text}  (no surrogate yet)")
         else:
-            found = expecting(text, Prediction(suggestion.means[index], suggestion.deviations[index]))
-        self.decisions.append(found)
+            decision = expecting(text, Prediction(suggestion.means[index], suggestion.deviations[index]))
+        self.decisions.append(decision)
 
     # -- results ---------------------------------------------------------------------------------------------------
 

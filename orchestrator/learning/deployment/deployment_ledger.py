@@ -209,7 +209,7 @@ class DeploymentRequests:
     def simulations_under(self, action: Action, purpose: str, draws: Sequence[Draw]) -> tuple[Simulate, ...]:
         """Simulations of one action, one under each draw of errors and θ."""
         scene, seeds = self.ledger.scene.name, self._seeds
-        return tuple(Simulate(scene, action, one.parameters, seeds.next(), purpose, one.error) for one in draws)
+        return tuple(Simulate(scene, action, draw.parameters, seeds.next(), purpose, draw.error) for draw in draws)
 
     def _next_theta(self) -> SimulationParameters:
         """The next of the plan's draws of θ, in an order of which any section covers them evenly; θ* without draws."""

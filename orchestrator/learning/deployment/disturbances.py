@@ -139,12 +139,12 @@ class Disturbances:
         from scipy.special import ndtri
 
         z = tuple(float(np.clip(ndtri(u), -FARTHEST, FARTHEST)) for u in row[: len(self.errors)])
-        drawn = {name: getattr(self._deviations, name) * value for name, value in zip(self.errors, z, strict=True)}
-        drawn["speed_factor"] = min(max(1.0 + drawn.get("speed_factor", 0.0), SLOWEST), FASTEST)
+        offsets = {name: getattr(self._deviations, name) * value for name, value in zip(self.errors, z, strict=True)}
+        offsets["speed_factor"] = min(max(1.0 + offsets.get("speed_factor", 0.0), SLOWEST), FASTEST)
         parameters = self._best
         if self._thetas:
             parameters = self._thetas[min(int(row[-1] * len(self._thetas)), len(self._thetas) - 1)]
-        return Draw(PoseError(**drawn) if self.errors else None, parameters, z)
+        return Draw(PoseError(**offsets) if self.errors else None, parameters, z)
 
     # -- representation in the surrogate ---------------------------------------------------------------------------
 
@@ -170,9 +170,9 @@ class Disturbances:
 
     def executed(self, point: Point, draw: Draw) -> Point:
         """Point of the surrogate for a simulation of an action (in its unit cube) under a draw."""
-        one = self.disturbance(draw)
-        moved = [s * u + t for u, s, t in zip(point, one.scales, one.shifts, strict=True)]
-        return (*moved, *one.context)
+        error = self.disturbance(draw)
+        moved = [s * u + t for u, s, t in zip(point, error.scales, error.shifts, strict=True)]
+        return (*moved, *error.context)
 
     def _coordinates(self, parameters: SimulationParameters) -> Point:
         return tuple(
@@ -182,12 +182,12 @@ class Disturbances:
     @cached_property
     def _varying(self) -> tuple[tuple[str, float, float], ...]:
         """Parameters that differ between the draws, with centre and standard deviation."""
-        found = []
+        axes = []
         for name in type(self._best).model_fields:
             values = [_number(theta, name) for theta in self._thetas]
             if len(set(values)) > 1:
-                found.append((name, float(np.mean(values)), float(np.std(values))))
-        return tuple(found)
+                axes.append((name, float(np.mean(values)), float(np.std(values))))
+        return tuple(axes)
 
 
 def _number(parameters: SimulationParameters, name: str) -> float:
@@ -206,15 +206,15 @@ def _folded(error: str, actions: Space) -> int | None:
     return index if placed else None
 
 
-def _moved(axis: Axis, error: str, drawn: PoseError) -> tuple[float, float]:
+def _moved(axis: Axis, error: str, draw: PoseError) -> tuple[float, float]:
     """Scale and shift of an axis' unit interval under an error."""
     width = axis.upper - axis.lower
     if error == "x":
-        return 1.0, drawn.x / width
+        return 1.0, draw.x / width
     if error == "y":  # the receiver moves, which shifts the pourer the other way
-        return 1.0, -drawn.y / width
+        return 1.0, -draw.y / width
     if error == "z":  # a higher receiver reduces the height of the lip above it
-        return 1.0, -drawn.z / width
+        return 1.0, -draw.z / width
     if axis.scale == "log":
-        return 1.0, math.log(drawn.speed_factor) / math.log(axis.upper / axis.lower)
-    return drawn.speed_factor, (drawn.speed_factor - 1.0) * axis.lower / width
+        return 1.0, math.log(draw.speed_factor) / math.log(axis.upper / axis.lower)
+    return draw.speed_factor, (draw.speed_factor - 1.0) * axis.lower / width

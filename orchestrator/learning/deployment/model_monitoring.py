@@ -146,20 +146,20 @@ class SimulatorMonitor:
 
     # -- what is logged --------------------------------------------------------------------------------------------
 
-    def record(self, found: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
+    def record(self, latest: DiscrepancyFound, pours: Sequence[PourTrial]) -> None:
         """Record the conclusions of an answer, and log those of the latest pour."""
         known = [pour for pour in pours if pour.cost is not None]
         number = known[-1].number if known else 0
-        self._latest, since = found, found.since_change
+        self._latest, since = latest, latest.since_change
         before, self._changed = self._changed, known[-since].number if since and since <= len(known) else None
         if self._changed is not None and (before is None or self._changed > before + 1):
             text = f"since pour {self._changed} the bench behaves differently: what was poured before no longer counts"
             self.decisions.append(Decision(text, {"changed_since": float(self._changed)}, urgent=True))
         if self._after and self._after[-1].pour == number:
             return
-        self._after.append(Belief(pour=number, ignorance=found.uninformative, gain=found.gain))
+        self._after.append(Belief(pour=number, ignorance=latest.uninformative, gain=latest.gain))
         if number:
-            values = {"ignorance": found.uninformative} | ({} if found.gain is None else {"gain": found.gain})
+            values = {"ignorance": latest.uninformative} | ({} if latest.gain is None else {"gain": latest.gain})
             self.decisions.append(Decision(f"after pour {number} {self.text}", values, urgent=True))
 
     @property
@@ -175,8 +175,8 @@ class SimulatorMonitor:
         if share >= WORDS[-2][0]:
             return text
         moved = [
-            _moved(axis, one) for axis, one in zip(self._actions.axes, self._shifts(), strict=True)
-            if abs(one.mean) > one.deviation
+            _moved(axis, offset) for axis, offset in zip(self._actions.axes, self._shifts(), strict=True)
+            if abs(offset.mean) > offset.deviation
         ]  # fmt: skip
         if moved:
             text += f"; the pours look as if {' and '.join(moved)} than commanded"
@@ -199,25 +199,25 @@ class SimulatorMonitor:
             pours: pours made so far.
             left: number of pours left in the budget.
         """
-        found, rules = suggestion.discrepancy, self._rules
-        if found is None:
+        discrepancy, rules = suggestion.discrepancy, self._rules
+        if discrepancy is None:
             return ""
         weighed = [pour.cost for pour in pours if pour.status == "weighed" and pour.cost is not None]
         if weighed and suggestion.best_mean is not None:
             best = max(suggestion.best_mean, 0.0)
             if rules.good_enough is not None and best <= rules.good_enough:
                 return self._saved(left, f"good enough: the best action is expected to lose {self._share(best)}")
-            if rules.min_gain is not None and found.gain is not None and found.gain < rules.min_gain:
-                why = f"no further pour is worthwhile: the next one is expected to save {self._share(found.gain)}"
+            if rules.min_gain is not None and discrepancy.gain is not None and discrepancy.gain < rules.min_gain:
+                why = f"no further pour is worthwhile: the next one is expected to save {self._share(discrepancy.gain)}"
                 return self._saved(left, f"{why}, the best action to lose {self._share(best)}")
-        if found.uninformative >= ALARM and not self._alarmed and weighed:
+        if discrepancy.uninformative >= ALARM and not self._alarmed and weighed:
             self._alarmed = True
             self.decisions.append(Decision(f"{self.text}; the simulator is weighted accordingly", urgent=True))
             return ""
         limit = rules.limit
-        if limit is None or not any(cost <= limit.loss for cost in weighed) or not found.exceedances:
+        if limit is None or not any(cost <= limit.loss for cost in weighed) or not discrepancy.exceedances:
             return ""
-        risk = found.exceedances[0]
+        risk = discrepancy.exceedances[0]
         if risk <= limit.probability * (1.0 + 1e-9):
             return ""
         why = (
@@ -259,11 +259,11 @@ class SimulatorMonitor:
         """Deviation of the bench for the next receiver; None if no query requested it."""
         if self._latest is None or not self._latest.drawn:
             return None
-        drawn = self._latest.drawn
+        draws = self._latest.drawn
         return BenchFound(
             axes=self._actions.names,
-            scales=tuple(one.scales for one in drawn),
-            shifts=tuple(one.shifts for one in drawn),
+            scales=tuple(draw.scales for draw in draws),
+            shifts=tuple(draw.shifts for draw in draws),
         )
 
 
@@ -276,12 +276,12 @@ def _in_si(axis: Axis, shift: float, deviation: float) -> Displaced:
     return Displaced(mean=shift * width, deviation=deviation * width)
 
 
-def _moved(axis: Axis, one: Displaced) -> str:
+def _moved(axis: Axis, offset: Displaced) -> str:
     """'x_offset were 6 ± 2 mm more'."""
     dimension = ACTION_DIMENSIONS.get(axis.name)
     factor, unit = (1.0, "") if dimension is None else (dimension.factor, f" {dimension.display_unit}")
-    more = "more" if one.mean > 0.0 else "less"
-    return f"{axis.name} were {abs(one.mean) / factor:.2g} ± {one.deviation / factor:.1g}{unit} {more}"
+    sense = "more" if offset.mean > 0.0 else "less"
+    return f"{axis.name} were {abs(offset.mean) / factor:.2g} ± {offset.deviation / factor:.1g}{unit} {sense}"
 
 
 def _percent(share: float) -> str:

@@ -180,7 +180,7 @@ class Objectives:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the objectives, in order."""
-        return tuple(part.name for part in self.parts)
+        return tuple(objective.name for objective in self.parts)
 
     def vector(self, fractions: Fractions, action: Action, scene: Scene, worst: Vector) -> Vector:
         """Values f_j of a pour.
@@ -194,20 +194,20 @@ class Objectives:
             missing = 1.0 - delivered / least
             return tuple((1.0 + missing) * value for value in worst)
         return tuple(
-            min(part.cost(fractions, action, scene), value) for part, value in zip(self.parts, worst, strict=True)
+            min(goal.cost(fractions, action, scene), value) for goal, value in zip(self.parts, worst, strict=True)
         )
 
     def worst(self, scene: Scene, actions: Space) -> Vector:
         """Largest f_j of a pour that delivers enough."""
-        return tuple(part.worst(scene, actions) for part in self.parts)
+        return tuple(objective.worst(scene, actions) for objective in self.parts)
 
     def total(self, vector: Vector) -> float:
         """Σ w_j f_j."""
-        return sum(part.weight * value for part, value in zip(self.parts, vector, strict=True))
+        return sum(objective.weight * value for objective, value in zip(self.parts, vector, strict=True))
 
     def wanted(self, scene: Scene) -> float:
         """Fraction of the load that should arrive."""
-        return min(part.wanted(scene) for part in self.parts)
+        return min(objective.wanted(scene) for objective in self.parts)
 
 
 def duration(action: Action) -> float:

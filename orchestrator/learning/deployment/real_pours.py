@@ -184,11 +184,11 @@ def prior_pours(
     data: ExistingPours, scene: Scene, actions: Space, costing: Costing
 ) -> tuple[tuple[Point, Vector], ...]:
     """Points and objectives of the pours from before the campaign in a scene."""
-    found = []
+    pours = []
     for pour in data.pours.get(scene.name, ()):
         measured = PourMeasurement(pour.poured + pour.retained, pour.spilled, pour.retained)
-        found.append((point_of(pour.action, actions), costing.poured(measured, pour.action)))
-    return tuple(found)
+        pours.append((point_of(pour.action, actions), costing.poured(measured, pour.action)))
+    return tuple(pours)
 
 
 def point_of(action: Action, actions: Space) -> Point:

@@ -209,8 +209,8 @@ class SafeWindow:
 
         Source: control variates: Glasserman, Monte Carlo methods in financial engineering, 2003, chapter 4.
         """
-        rest = (all_of_them - few for all_of_them, few in zip(expected, of_few, strict=True))
-        self._rest = dict(zip(self.places, rest, strict=True))
+        others = (all_of_them - few for all_of_them, few in zip(expected, of_few, strict=True))
+        self._rest = dict(zip(self.places, others, strict=True))
 
     def worst(self, check: WindowCheck) -> tuple[int, ...]:
         """Indices of the worst disturbances at the place; empty without a tail."""
@@ -222,10 +222,10 @@ class SafeWindow:
         centre = WindowCheck(self._centre)
         if self._round < ROUNDS and not self._fails(centre):
             first = self._round == 0
-            found = [centre] if first else []
+            checks = [centre] if first else []
             for (axis, way), side in self._sides.items():
-                found += [WindowCheck(self._at(axis, way, i), axis, way, i) for i in side.wanted(first=first)]
-            self.waiting = found
+                checks += [WindowCheck(self._at(axis, way, i), axis, way, i) for i in side.wanted(first=first)]
+            self.waiting = checks
         self._round += 1
         self.closed = not self.waiting
         return list(self.waiting)

@@ -322,7 +322,7 @@ def test_draws_of_the_posterior_are_scored_by_the_mean_of_their_simulations():
     wide = SimulationParameters(wall_distance=1.0)
     spilled = {TRUE_THETA.wall_distance: 0.3, 1.0: 0.6}
     card = CalibrationEvaluation(
-        TRUE_THETA, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, drawn=(TRUE_THETA, wide, TRUE_THETA)
+        TRUE_THETA, {}, pours, Contexts(CALIBRATION_ACTIONS, (SCENE,)), 3, sampled=(TRUE_THETA, wide, TRUE_THETA)
     )
     played = StrategyHarness(lambda a, theta, rng: spilled[theta.wall_distance]).run(card)
     assert len(played.simulations) == 2 + 3, "draws are simulated on pours that calibration did not see"
