@@ -172,14 +172,14 @@ class _Check:
                 sparse,
             ),
         )
-        said = f"{_g(scatter)} (standard deviation), {100 * share:.0f} % stable; right: {_g(self._tolerance)} or less"
+        text = f"{_g(scatter)} (standard deviation), {100 * share:.0f} % stable; right: {_g(self._tolerance)} or less"
         draught = "shield it from draught, put it on a firm table away from the arm's, or set a slower filter"
-        yield DeviceCheck("noise", *_state(scatter <= self._tolerance and share > 0.9, said, draught))
+        yield DeviceCheck("noise", *_state(scatter <= self._tolerance and share > 0.9, text, draught))
         minute = 60.0 * slope
         drifting = abs(slope) > 3.0 * error and abs(minute) > self._tolerance
-        said = f"{1e3 * minute:+.2f} ± {60e3 * error:.2f} g in a minute; right: at most {_g(self._tolerance)}"
+        text = f"{1e3 * minute:+.2f} ± {60e3 * error:.2f} g in a minute; right: at most {_g(self._tolerance)}"
         warm = "let it warm up for an hour, keep the sun and draught off, level it, adjust it; then check again"
-        yield DeviceCheck("drift", *_state(not drifting, said, warm))
+        yield DeviceCheck("drift", *_state(not drifting, text, warm))
 
     def _risen(self, lead: _Series, placed: _Series) -> DeviceCheck:
         """The resolution, and the share of repeated readings while the load rises slowly."""
@@ -189,58 +189,58 @@ class _Check:
         seen = self._observe(RISE_TIME + 2.0)
         changed = smallest_change([*lead.masses, *placed.masses, *seen.masses])
         step = max(self._step, changed)
-        found = repeated_readings(seen.times, seen.masses, step)
-        if found is None:
+        repeats = repeated_readings(seen.times, seen.masses, step)
+        if repeats is None:
             advice = f"repeat it, and pour at least {_g(wanted)} in {RISE_TIME:g} s, without a pause"
             return DeviceCheck(
                 "repeats", "warn", f"not measured: the load rose too slowly for steps of {_g(step)}", advice
             )
-        self._repeats, self._gaps = found.share, found.gaps or self._gaps
-        said = (
-            f"{100 * found.share:.0f} % of {found.count} readings repeat the one before while the load rises (95 %: "
-            f"{100 * found.low:.0f} to {100 * found.high:.0f} %), for at most {found.longest:.1f} s, in steps of "
-            f"{_g(step)}; right: {100 * REPEATED:.0f} % or less"
+        self._repeats, self._gaps = repeats.share, repeats.gaps or self._gaps
+        text = (
+            f"{100 * repeats.share:.0f} % of {repeats.count} readings repeat the one before while the load rises "
+            f"(95 %: {100 * repeats.low:.0f} to {100 * repeats.high:.0f} %), for at most {repeats.longest:.1f} s, "
+            f"in steps of {_g(step)}; right: {100 * REPEATED:.0f} % or less"
         )
-        return DeviceCheck("repeats", *_state(found.share <= REPEATED, said, "set a faster output or display rate"))
+        return DeviceCheck("repeats", *_state(repeats.share <= REPEATED, text, "set a faster output or display rate"))
 
-    def _lag(self, lead: _Series, rest: _Series) -> Iterator[DeviceCheck]:
-        times, masses = [*lead.times, *rest.times], [*lead.masses, *rest.masses]
+    def _lag(self, lead: _Series, risen: _Series) -> Iterator[DeviceCheck]:
+        times, masses = [*lead.times, *risen.times], [*lead.masses, *risen.masses]
         try:
             repeats = self._repeats if self._repeats > REPEATED else None
-            found = step_response(times, masses, resolution=self._step, repeats=repeats)
+            step = step_response(times, masses, resolution=self._step, repeats=repeats)
         except ValueError as error:
             yield DeviceCheck("lag", "warn", f"not measured: {error}", "repeat the check")
             return
-        said = (
-            f"{found.lag:.2f} ± {max(found.error, 0.01):.2f} s behind a load of {_g(found.step)} ({found.form}); "
+        text = (
+            f"{step.lag:.2f} ± {max(step.error, 0.01):.2f} s behind a load of {_g(step.step)} ({step.form}); "
             f"right: {SLOW:g} s or less"
         )
-        yield DeviceCheck("lag", *_state(found.lag <= SLOW, said, "set a faster filter in its menu, then check again"))
-        yield self._dose(found)
+        yield DeviceCheck("lag", *_state(step.lag <= SLOW, text, "set a faster filter in its menu, then check again"))
+        yield self._dose(step)
 
-    def _dose(self, found: StepResponse) -> DeviceCheck:
-        tolerance = dose_tolerance(FLOW, found.error, self._gaps, self._step, self._noise)
-        slowest = dose_tolerance(SLOWEST_FLOW, found.error, self._gaps, self._step, self._noise)
-        said = (
+    def _dose(self, step: StepResponse) -> DeviceCheck:
+        tolerance = dose_tolerance(FLOW, step.error, self._gaps, self._step, self._noise)
+        slowest = dose_tolerance(SLOWEST_FLOW, step.error, self._gaps, self._step, self._noise)
+        text = (
             f"±{_g(tolerance)} (95 %) can be met at {1e3 * FLOW:g} g/s at the end, ±{_g(slowest)} at "
             f"{1e3 * SLOWEST_FLOW:g} g/s; right: {_g(DOSE)} or less"
         )
         advice = "weigh doses on a finer or faster balance, or ask for a wider tolerance"
-        return DeviceCheck("dose", *_state(tolerance <= DOSE, said, advice))
+        return DeviceCheck("dose", *_state(tolerance <= DOSE, text, advice))
 
     def _reference(self, mass: float) -> DeviceCheck:
         weight = self._driver.weigh().mass
         deviation = weight - mass
-        said = f"{_g(mass)} weigh {_g(weight)}: {1e3 * deviation:+.3g} g; right: within {_g(self._tolerance)}"
+        text = f"{_g(mass)} weigh {_g(weight)}: {1e3 * deviation:+.3g} g; right: within {_g(self._tolerance)}"
         wrong = abs(deviation) > 0.1 * mass
         advice = "was another mass typed, or its unit?" if wrong else "level it and adjust it with its own weight"
-        return DeviceCheck("linearity", *_state(abs(deviation) <= self._tolerance, said, advice, bad="fail"))
+        return DeviceCheck("linearity", *_state(abs(deviation) <= self._tolerance, text, advice, bad="fail"))
 
     def _zero(self, when: str) -> DeviceCheck:
         weight = self._driver.weigh().mass
-        said = f"{1e3 * weight:+.3g} g {when}; right: within {_g(self._tolerance)}"
+        text = f"{1e3 * weight:+.3g} g {when}; right: within {_g(self._tolerance)}"
         return DeviceCheck(
-            "return to zero", *_state(abs(weight) <= self._tolerance, said, "does something touch the tray?")
+            "return to zero", *_state(abs(weight) <= self._tolerance, text, "does something touch the tray?")
         )
 
     def _vibration(self) -> DeviceCheck:
@@ -249,13 +249,13 @@ class _Check:
         seen = self._observe(REST_TIME)
         _, _, scatter = seen.trend(self._step)
         limit = max(self._tolerance, 3.0 * self._noise)
-        said = (
+        text = (
             f"{_g(scatter)} while the arm moves, {_g(self._noise)} at rest, {100 * float(seen.stable.mean()):.0f} % "
             f"stable; right: {_g(limit)} or less"
         )
         return DeviceCheck(
             "vibration",
-            *_state(scatter <= limit, said, "separate its table from the arm's, or put it on a stone plate"),
+            *_state(scatter <= limit, text, "separate its table from the arm's, or put it on a stone plate"),
         )
 
     def _observe(self, seconds: float) -> _Series:
@@ -352,8 +352,8 @@ class EmulatedHands:
         return True
 
 
-def _state(good: bool, found: str, advice: str, bad: State = "warn") -> tuple[State, str, str]:
-    return ("ok", found, "") if good else (bad, found, advice)
+def _state(good: bool, text: str, advice: str, bad: State = "warn") -> tuple[State, str, str]:
+    return ("ok", text, "") if good else (bad, text, advice)
 
 
 def _g(mass: float) -> str:

@@ -58,8 +58,8 @@ class DeviceBalance:
 
     async def connect(self) -> str:
         """See `BalanceDriver.connect`."""
-        said: str = await self.device.call("connect", deadline=self._deadline(PATIENCE))
-        return said
+        greeting: str = await self.device.call("connect", deadline=self._deadline(PATIENCE))
+        return greeting
 
     async def zero(self) -> None:
         """Set the zero of the empty balance; serial balances only."""

@@ -157,7 +157,7 @@ class BalanceEmulator(Protocol):
         """Set the mass on the balance from now on [kg]."""
         ...
 
-    def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
+    def order(self, kind: str, values: dict[str, Any]) -> dict[str, Any]:
         """Send another command to the emulator, for tests."""
         ...
 
@@ -287,8 +287,8 @@ class BalanceKind(ABC, Generic[B]):
                 driver.tare()
                 checks.append(DeviceCheck("balance tare", "ok", "it obeyed, and rests at zero"))
             else:
-                said = "not tried; --tare tries it (what is on it counts as nothing then)"
-                checks.append(DeviceCheck("balance tare", "ok", said))
+                text = "not tried; --tare tries it (what is on it counts as nothing then)"
+                checks.append(DeviceCheck("balance tare", "ok", text))
         except LaboratoryError as error:
             todo = "docs/reference/messages.md lists causes and remedies"
             checks.append(DeviceCheck("balance", "fail", str(error), todo))
@@ -316,8 +316,8 @@ def _doses(driver: BalanceDriver, step: float, time_scale: float) -> DeviceCheck
 
 def balance_kind(spec: BalanceSettings) -> BalanceKind[Any]:
     """The kind of a balance, for its settings."""
-    found: BalanceKind[Any] = drivers()[spec.kind](spec)
-    return found
+    kind: BalanceKind[Any] = drivers()[spec.kind](spec)
+    return kind
 
 
 def dialect_names() -> list[str]:

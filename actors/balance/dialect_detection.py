@@ -121,18 +121,18 @@ def detect(
     for line in candidates:
         quick.append(Attempt(line))
         last = line == candidates[-1]
-        found = _attempt(quick[-1], allowed, open_wire, interrupted, ANSWERING, late=timeout if last else 0.0)
-        if found is not None:
-            return found
+        match = _attempt(quick[-1], allowed, open_wire, interrupted, ANSWERING, late=timeout if last else 0.0)
+        if match is not None:
+            return match
         if timeout == ANSWERING or not quick[-1].moments:
             continue
         for earlier in quick:
             if earlier.line in patient or not earlier.may_be_late(quick, timeout):
                 continue
             patient[earlier.line] = Attempt(earlier.line)
-            found = _attempt(patient[earlier.line], allowed, open_wire, interrupted, timeout)
-            if found is not None:
-                return found
+            match = _attempt(patient[earlier.line], allowed, open_wire, interrupted, timeout)
+            if match is not None:
+                return match
     raise NoConnectionError(_failure(port, [patient.get(attempt.line, attempt) for attempt in quick], allowed))
 
 
@@ -154,15 +154,15 @@ def _attempt(
         attempt.possible = False
         return None
     try:
-        found = _try(wire, attempt, allowed, timeout)
+        match = _try(wire, attempt, allowed, timeout)
         attempt.ended = time.monotonic()
-        if found is None and late > timeout:
+        if match is None and late > timeout:
             _lines(wire, late, lambda line: True, attempt)
     except BaseException:
         wire.close()
         raise
-    if found is not None:
-        return found, wire
+    if match is not None:
+        return match, wire
     wire.close()
     return None
 
@@ -208,10 +208,10 @@ def _recognised(wire: Wire, alike: Sequence[Dialect], timeout: float, *, unasked
     if unasked and dialect.cancel is not None:
         wire.send(dialect.cancel)
         _lines(wire, ANSWERING)
-    said = {question: _identity(wire, question, timeout) for question in dialect.identity}
-    found = max(alike, key=lambda other: other.likeness(said))
-    identity = said[dialect.identity[-1]].replace('"', "")
-    return Detected(found, wire.line, identity, unasked, found.commands_in(said))
+    answers = {question: _identity(wire, question, timeout) for question in dialect.identity}
+    likeliest = max(alike, key=lambda other: other.likeness(answers))
+    identity = answers[dialect.identity[-1]].replace('"', "")
+    return Detected(likeliest, wire.line, identity, unasked, likeliest.commands_in(answers))
 
 
 def _identity(wire: Wire, question: str, timeout: float) -> str:
@@ -266,10 +266,10 @@ def _lines(
             attempt.moments.append(time.monotonic())
         if enough(line) or len(lines) > 50:
             return lines
-    rest = wire.take()
-    if rest and attempt is not None:
+    tail = wire.take()
+    if tail and attempt is not None:
         attempt.moments.append(time.monotonic())
-    return [*lines, rest] if rest else lines
+    return [*lines, tail] if tail else lines
 
 
 def _failure(port: str, attempts: Sequence[Attempt], allowed: Sequence[Dialect]) -> str:

@@ -11,16 +11,16 @@ from sim_engine.settings.plugin_registry import PluginRegistry
 
 
 def _balance(loaded: Any, name: str) -> Dialect | type[Any]:
-    found: Dialect | type[Any]
+    balance: Dialect | type[Any]
     if isinstance(loaded, Dialect):
-        found, called = loaded, loaded.name
+        balance, called = loaded, loaded.name
     elif isinstance(loaded, type) and callable(getattr(loaded, "driver", None)) and hasattr(loaded, "settings"):
-        found, called = loaded, loaded.settings.model_fields["kind"].default
+        balance, called = loaded, loaded.settings.model_fields["kind"].default
     else:
         raise TypeError("should be an instance of a Dialect, or a class derived from decant.plugins.BalanceKind")
     if called != name:
         raise ValueError(f"it calls itself '{called}', which should be the name that it is registered under")
-    return found
+    return balance
 
 
 BALANCES: PluginRegistry[Dialect | type[Any]] = PluginRegistry("decant.balances", "balance", _balance)
@@ -29,17 +29,17 @@ BALANCES: PluginRegistry[Dialect | type[Any]] = PluginRegistry("decant.balances"
 
 def dialects() -> dict[str, Dialect]:
     """Dialects by the names that files use."""
-    return {name: found for name, found in BALANCES.all.items() if isinstance(found, Dialect)}
+    return {name: dialect for name, dialect in BALANCES.all.items() if isinstance(dialect, Dialect)}
 
 
 def drivers() -> dict[str, type[Any]]:
     """Kinds of balances with drivers (`BalanceKind`) by the names that files use."""
-    return {name: found for name, found in BALANCES.all.items() if isinstance(found, type)}
+    return {name: driver for name, driver in BALANCES.all.items() if isinstance(driver, type)}
 
 
 def kinds() -> dict[str, type[Any]]:
     """Settings of these kinds by the names that files use."""
-    return {name: found.settings for name, found in drivers().items()}
+    return {name: driver.settings for name, driver in drivers().items()}
 
 
 def encoders() -> dict[str, Callable[[], ProtocolEncoder]]:

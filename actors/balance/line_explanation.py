@@ -65,8 +65,8 @@ def most_telling(lines: Iterable[bytes], allowed: Sequence[Dialect]) -> bytes | 
         lambda line: any(isinstance(_decoded(dialect, line), OtherQuantityError) for dialect in allowed),
         lambda line: re.search(rb"[0-9]", line) is not None,
     ):
-        if (found := next(filter(telling, lines), None)) is not None:
-            return found
+        if (telling_line := next(filter(telling, lines), None)) is not None:
+            return telling_line
     return None
 
 

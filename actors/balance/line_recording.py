@@ -90,7 +90,7 @@ class LineRecording:
 
     def weights(self, dialect: Dialect) -> list[str]:
         """The stable weights in it as a dialect reads them, each as long as it stays: ['0.0 g', '200.0 g']."""
-        found: list[str] = []
+        texts: list[str] = []
         for line in split_lines(self.received):
             try:
                 reading = dialect.decode(line)
@@ -98,9 +98,9 @@ class LineRecording:
                 continue
             if isinstance(reading, Reading) and reading.status is ReadingStatus.STABLE and reading.value is not None:
                 shown = f"{reading.value} {reading.unit}"
-                if found[-1:] != [shown]:
-                    found.append(shown)
-        return found
+                if texts[-1:] != [shown]:
+                    texts.append(shown)
+        return texts
 
     def save(self, path: Path) -> None:
         """Write a file."""

@@ -73,9 +73,9 @@ class OtherQuantityError(LineError):
         remedy: how to get the weight instead, if it is known.
     """
 
-    def __init__(self, what: str, remedy: str = "") -> None:
-        super().__init__(f"{what}, not a weight")
-        self.what, self.remedy = what, remedy
+    def __init__(self, problem: str, remedy: str = "") -> None:
+        super().__init__(f"{problem}, not a weight")
+        self.what, self.remedy = problem, remedy
 
 
 class ReadingStatus(StrEnum):
@@ -149,7 +149,7 @@ class Reading:
 
     def __str__(self) -> str:
         shown = "" if self.value is None else f"{self.value} {self.unit}".strip()
-        return ", ".join(part for part in (shown, self.mark or "", str(self.status), self.detail) if part)
+        return ", ".join(text for text in (shown, self.mark or "", str(self.status), self.detail) if text)
 
 
 class ReadingReply(StrEnum):

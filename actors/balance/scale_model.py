@@ -123,9 +123,9 @@ class EmulatedScale:
             before = self._true(self.time)
             ended = self.time >= self._loaded_at + self._load.times[-1]
             if self._lagging == before and ended and self._display.settled:
-                rest, self.time = end - self.time, end
-                self._resting += rest
-                self._display.advance(self._filtered, rest, self._zero + self._tare)
+                remaining, self.time = end - self.time, end
+                self._resting += remaining
+                self._display.advance(self._filtered, remaining, self._zero + self._tare)
                 return
             step = min(_STEP, end - self.time)
             self.time = min(self.time + step, end)

@@ -409,12 +409,12 @@ class SerialBalance:
 
     def describe(self) -> str:
         """Describe the connection: 'Kern KCP on /dev/…, 9600 baud 8N1', as far as it is known."""
-        found = self._conversation.found
-        if found is None:
+        match = self._conversation.found
+        if match is None:
             return f"{self._name} on {self._spec.port}, not yet connected"
-        said = f" ({found.identity})" if found.identity else ""
-        unasked = "; it sends without being asked: switch that off in its menu" if found.unasked else ""
-        return f"{found.dialect.title}{said} on {self._spec.port}, {found.line}{unasked}"
+        identity = f" ({match.identity})" if match.identity else ""
+        unasked = "; it sends without being asked: switch that off in its menu" if match.unasked else ""
+        return f"{match.dialect.title}{identity} on {self._spec.port}, {match.line}{unasked}"
 
     # Control.
 
@@ -439,30 +439,30 @@ class SerialBalance:
 
     def _set_reference(self, name: str, data: bytes) -> None:
         """Wait for a stable weight, send the command, and verify that the display is near zero."""
-        found, word = self._conversation.found, data.strip().decode("ascii", "replace")
-        if found is not None and found.commands and word not in found.commands:
+        match, word = self._conversation.found, data.strip().decode("ascii", "replace")
+        if match is not None and match.commands and word not in match.commands:
             text = f"it has no {name}: the commands that it lists (I0) leave '{word}' out. Use its key"
             raise self._error(CommandError, text)
-        said, end = "", time.monotonic() + 2.0 * self._rule.deadline
+        answer, end = "", time.monotonic() + 2.0 * self._rule.deadline
         for _ in range(COMMAND_ATTEMPTS):
             if time.monotonic() > end:
                 break
             self._settle()
-            said = self._send(name, data)
-            if said:
+            answer = self._send(name, data)
+            if answer:
                 self._interrupted.wait(_RETRY_INTERVAL / self._spec.time_scale)
                 continue
             settled = self._near_zero()
             if settled is None:
                 self._note_reference()
                 return
-            said = f"it still shows {self._display.in_grams(settled.mass)}, stable"
+            answer = f"it still shows {self._display.in_grams(settled.mass)}, stable"
             if self._seen_mark is WeightMark.GROSS:
-                said += (
+                answer += (
                     ", and that is the gross weight, which a tare does not change: set its print-out to net, or "
                     "'weight: gross' in the laboratory's file"
                 )
-        raise self._error(CommandError, WITHOUT_EFFECT.format(name=name, times=COMMAND_ATTEMPTS, said=said))
+        raise self._error(CommandError, WITHOUT_EFFECT.format(name=name, times=COMMAND_ATTEMPTS, said=answer))
 
     def _note_reference(self) -> None:
         """Record that the display's present mark and zero are those of the tare."""
@@ -620,9 +620,9 @@ class SerialBalance:
         self._strange_units = self._strange_units + 1 if strange else 0
         if self._strange_units >= STRANGE_UNITS:
             self._strange_units = 0
-            what = OTHER_UNITS.get(reading.unit.lower(), "not a mass that is understood")
+            meaning = OTHER_UNITS.get(reading.unit.lower(), "not a mass that is understood")
             wrong = (
-                f"it shows {reading.value} {reading.unit}, and that is {what}; switch it to g"
+                f"it shows {reading.value} {reading.unit}, and that is {meaning}; switch it to g"
                 if reading.unit
                 else f"it sends {reading.value} without a unit; switch on the unit in the print settings of its menu"
             )

@@ -152,9 +152,9 @@ class Wire:
 
     def take(self) -> bytes:
         """Remove and return the received bytes that have no line end yet."""
-        rest = bytes(self._buffer)
+        chunk = bytes(self._buffer)
         self._buffer.clear()
-        return rest
+        return chunk
 
     def close(self) -> None:
         """Close the port; never fails."""
@@ -292,9 +292,9 @@ def _reason(port: str, error: OSError) -> str:
     """Return why a port cannot be opened, and a remedy."""
     number = error.errno
     if number == 2 or not Path(port).exists():
-        found = ports()
-        there = f"there are {', '.join(found)}" if found else "no serial port of a balance is there"
-        return f"there is no such port; {there}. Is the cable plugged in and the balance switched on?"
+        known = ports()
+        listed = f"there are {', '.join(known)}" if known else "no serial port of a balance is there"
+        return f"there is no such port; {listed}. Is the cable plugged in and the balance switched on?"
     if number == 13:
         return "this user may not open it; add the user to the group that owns it (often 'dialout') and log in anew"
     if number in (11, 16) or "exclusively" in str(error):
@@ -338,8 +338,8 @@ def look_at_port(name: str) -> DeviceCheck:
     port = Path(name)
     if not port.exists():
         known = ports()
-        there = f"there are {', '.join(known)}" if known else "no serial port is there"
-        return DeviceCheck("balance port", "fail", f"{port} isn't there", f"plug the cable in, switch it on; {there}")
+        listed = f"there are {', '.join(known)}" if known else "no serial port is there"
+        return DeviceCheck("balance port", "fail", f"{port} isn't there", f"plug the cable in, switch it on; {listed}")
     if (other := _other_than_a_port(port)) is not None:
         return DeviceCheck("balance port", "fail", f"{port} is {other}", "name the serial port that the balance is on")
     if not os.access(port, os.R_OK | os.W_OK):

@@ -96,8 +96,8 @@ def step_response(
             f"the display changed by {1e3 * step:g} g only; put on at least {SMALLEST * 1e3 * resolution:g} g"
         )
     risen = (m - start) / step
-    rest = np.concatenate((np.diff(risen[:4]), np.diff(risen[-4:])))
-    noise = float(np.median(np.abs(rest)))
+    settled = np.concatenate((np.diff(risen[:4]), np.diff(risen[-4:])))
+    noise = float(np.median(np.abs(settled)))
     first = float(t[np.argmax(risen > max(0.01, 4.0 * noise))])
     held = np.concatenate(([False], m[1:] == m[:-1]))
     if repeats is None:
@@ -115,7 +115,7 @@ def step_response(
     for (_, response), lag in itertools.product(FILTERS.values(), LAGS):
         for duration in PLACING:
             place = (t[None, :] - moments[:, None]) / lag
-            smooth = np.mean([response(place - part * duration / lag) for part in (0.1, 0.3, 0.5, 0.7, 0.9)], axis=0)
+            smooth = np.mean([response(place - share * duration / lag) for share in (0.1, 0.3, 0.5, 0.7, 0.9)], axis=0)
             squares = ((smooth - risen) / sigma) ** 2
             misfits.append(np.sum(squares[:, ~held] if held.any() else squares, axis=1))
             fits.append(_log_likelihood(misfits[-1], squares[:, held], chances, int(np.sum(~held))))
@@ -184,8 +184,8 @@ def _poles(roots: Sequence[complex]) -> Callable[[Floats], Floats]:
         scaled = np.array(roots) * float(np.real(np.sum(-1.0 / np.array(roots))))
         weights = [1.0 / np.prod([1.0 - root / other for other in scaled if other != root]) for root in scaled]
         times = np.linspace(0.0, 50.0, 50_001)
-        rest = np.sum([w * np.exp(root * times) for w, root in zip(weights, scaled, strict=True)], axis=0)
-        return times, 1.0 - np.real(rest)
+        transient = np.sum([w * np.exp(root * times) for w, root in zip(weights, scaled, strict=True)], axis=0)
+        return times, 1.0 - np.real(transient)
 
     return lambda time: np.interp(time, *table())
 

@@ -79,19 +79,19 @@ class Weighings:
         """All weighings so far, including valid ones of earlier pours."""
         return self._known | self._weighed
 
-    async def before(self, given: Mapping[str, PourMasses] | None = None) -> None:
+    async def before(self, masses: Mapping[str, PourMasses] | None = None) -> None:
         """Carry out all steps before the pour.
 
         Args:
-            given: weighings made otherwise; the steps up to the last of them are left out.
+            masses: weighings made otherwise; the steps up to the last of them are left out.
 
         Raises:
             BalanceError: an error that the operator could not fix, e.g. no connection.
             LaboratoryError: any error of `ask`.
         """
-        for key, weighed in (given or {}).items():
+        for key, weighed in (masses or {}).items():
             self._note(key, weighed)
-        first = max((i + 1 for i, step in enumerate(self._steps) if given and step.key in given), default=0)
+        first = max((i + 1 for i, step in enumerate(self._steps) if masses and step.key in masses), default=0)
         for step in self._steps[first : self._pour]:
             await self._do(step)
 
@@ -184,10 +184,10 @@ class Weighings:
         slack = SURE * math.hypot(before.uncertainty, typed.uncertainty)
         if -slack <= typed.mass - before.mass <= loaded + slack:
             return ""
-        what, when = ("tray", "before the pour") if step.key == "tray_after" else ("pourer", "when it was empty")
+        load, when = ("tray", "before the pour") if step.key == "tray_after" else ("pourer", "when it was empty")
         least, most = 1e3 * before.mass, 1e3 * (before.mass + loaded)
         return (
-            f"'{answer}' is {1e3 * typed.mass:g} g. The {what} was {least:g} g {when}, and {most - least:g} g were "
+            f"'{answer}' is {1e3 * typed.mass:g} g. The {load} was {least:g} g {when}, and {most - least:g} g were "
             f"loaded: {least:g} to {most:g} g are possible. Read it again; type the same text to keep it"
         )
 

@@ -310,17 +310,17 @@ def _sigma(row: Mapping[str, float], weighed: Mapping[str, PourMasses]) -> float
 
 
 def _check_complete(placement: Placement, weighed: Mapping[str, PourMasses]) -> None:
-    asked = {step.key: step.put for step in PLANS[placement].steps if step.key}
-    missing = [key for key in asked if key not in weighed]
+    prompts = {step.key: step.put for step in PLANS[placement].steps if step.key}
+    missing = [key for key in prompts if key not in weighed]
     if missing:
-        what = "; ".join(f"{key} ('{asked[key]}')" for key in missing)
+        steps = "; ".join(f"{key} ('{prompts[key]}')" for key in missing)
         raise BalanceError(
-            f"not weighed: {what}. Without it the pour can't be counted; nothing is assumed in its place"
+            f"not weighed: {steps}. Without it the pour can't be counted; nothing is assumed in its place"
         )
-    for key in asked:
-        one = weighed[key]
-        if not (math.isfinite(one.mass) and math.isfinite(one.uncertainty) and one.uncertainty >= 0.0):
-            raise BalanceError(f"{key} is not a weight: {one.mass} kg ± {one.uncertainty} kg")
+    for key in prompts:
+        reading = weighed[key]
+        if not (math.isfinite(reading.mass) and math.isfinite(reading.uncertainty) and reading.uncertainty >= 0.0):
+            raise BalanceError(f"{key} is not a weight: {reading.mass} kg ± {reading.uncertainty} kg")
 
 
 def _check_sense(mass: dict[str, float], sigma: dict[str, float], nominal: float | None, tolerance: float) -> None:

@@ -337,9 +337,9 @@ async def _open_devices(
     gripper_spec = None if spec.gripper is None else spec.gripper.beside(arm_spec)
     if spec.mode == "virtual":
         emulators = DeviceEmulators(opening("emulators", BenchEmulators, arm_spec, balance_spec, gripper_spec))
-        found = await emulators.found()
-        arm_spec, true_arm = found.arm, found.true_arm
-        balance_spec, gripper_spec = found.balance or balance_spec, found.gripper or gripper_spec
+        addresses = await emulators.found()
+        arm_spec, true_arm = addresses.arm, addresses.true_arm
+        balance_spec, gripper_spec = addresses.balance or balance_spec, addresses.gripper or gripper_spec
     balance = None if balance_spec.typed else opening.balance(balance_spec, spec.name)
     held = opening.held(gripper_spec, arm_spec, balance, balance_spec, tell)
     arm = opening.arm(arm_spec, None if spec.mode == "virtual" else spec.accepted_checksum, held)

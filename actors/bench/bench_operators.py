@@ -93,9 +93,7 @@ class OperatorQuestions:
     def take_log(self) -> list[dict[str, Any]]:
         """Return the questions and answers since the last call, JSON-ready."""
         log, self.log = self.log, []
-        return [
-            {k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(one).items() if v != ""} for one in log
-        ]
+        return [{k: round(v, 3) if isinstance(v, float) else v for k, v in asdict(e).items() if v != ""} for e in log]
 
     async def _await(self, answering: asyncio.Future[str], question: OperatorQuestion, begun: float) -> str:
         while True:

@@ -184,8 +184,8 @@ class DoseProcedure(BenchProcedure):
                 f"{grams(LIGHTEST_RECEIVER)}"
             )
         begin = before[0].time - 1.0
-        self._placed = tuple(one for one in self._readings.all if one.time >= begin)
-        placed = tuple(DoseReading(one.time - begin, one.mass, one.stable) for one in self._placed)
+        self._placed = tuple(reading for reading in self._readings.all if reading.time >= begin)
+        placed = tuple(DoseReading(reading.time - begin, reading.mass, reading.stable) for reading in self._placed)
         rng = np.random.default_rng((self._seed, 41))
         step = self._readings.step or 1e-4
         self._series = series_of(self._scene, dose, self._settings, placed, rng, step=step)
@@ -296,7 +296,7 @@ class DoseProcedure(BenchProcedure):
         assert result.amount is not None
         source = source_of(self._scene, self._dose)
         every = max(len(self._tilts) // SIGNALS, 1)
-        during = [one for one in self._readings.all if one.time >= self._at]
+        during = [r for r in self._readings.all if r.time >= self._at]
         about = {
             **after_dose(self._series, result),
             "wanted": self._dose.amount,
@@ -304,10 +304,10 @@ class DoseProcedure(BenchProcedure):
             "duration": self._duration,
             "times": [round(t, 3) for t, _ in self._tilts[::every]],
             "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in self._tilts[::every]],
-            "read_at": [round(one.time - self._at, 3) for one in during],
-            "readings_g": [round(1e3 * (one.mass - self._zero), 3) for one in during],
-            "placed_at": [round(one.time - self._at, 3) for one in self._placed],
-            "placed_g": [round(1e3 * (one.mass - self._zero), 3) for one in self._placed],
+            "read_at": [round(r.time - self._at, 3) for r in during],
+            "readings_g": [round(1e3 * (r.mass - self._zero), 3) for r in during],
+            "placed_at": [round(r.time - self._at, 3) for r in self._placed],
+            "placed_g": [round(1e3 * (r.mass - self._zero), 3) for r in self._placed],
             "step_g": 1e3 * self._readings.step,
             **truth,
         }

@@ -164,8 +164,8 @@ class FlowingLiquid:
         """Pour along the motion since the last call."""
         from actors.arm.planning.kinematics import pourer_transforms
 
-        found = self._history(self._since)
-        fresh = [(t, q) for t, q in zip(found.times, found.joints, strict=True) if self._since < t <= found.now]
+        changes = self._history(self._since)
+        fresh = [(t, q) for t, q in zip(changes.times, changes.joints, strict=True) if self._since < t <= changes.now]
         if not fresh:
             return
         times = np.array([t for t, _ in fresh])

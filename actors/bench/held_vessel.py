@@ -82,14 +82,14 @@ def grip_limits(vessel: Vessel, spec: GripperSettings, arm: ArmSettings) -> Grip
             f"the fingers are {1e3 * height:.0f} mm above the underside of '{name}', which is "
             f"{1e3 * vessel.rim_height:.0f} mm high: see 'grip' of the arm, or 'height' of the gripper"
         )
-    given = vessel.spec.grip
-    width = vessel.width_at(height) if given is None or given.width is None else given.width
+    limits = vessel.spec.grip
+    width = vessel.width_at(height) if limits is None or limits.width is None else limits.width
     if width + SMALLEST_GAP > spec.widest:
         raise LaboratoryError(
             f"'{name}' is {1e3 * width:.1f} mm wide where it is gripped, {1e3 * height:.0f} mm above its underside; "
             f"the gripper opens to {1e3 * spec.widest:.1f} mm"
         )
-    return GripLimits(name, width, (2e-3 if given is None else given.tolerance) + spec.accuracy)
+    return GripLimits(name, width, (2e-3 if limits is None else limits.tolerance) + spec.accuracy)
 
 
 class HeldVessel:
@@ -296,20 +296,20 @@ class HeldVessel:
         """
         if not self.holds or self._limits is None:
             return self.lost
-        found = ""
+        fault = ""
         while True:
             try:
                 state = await self.state()
             except LaboratoryError as error:  # a driver that died counts, too
                 self._blind += 1
-                found = str(error) if self._blind >= BLIND else ""
-                if not found and sure:
+                fault = str(error) if self._blind >= BLIND else ""
+                if not fault and sure:
                     continue
             else:
-                self._blind, found = 0, self._limits.problem(state)
+                self._blind, fault = 0, self._limits.problem(state)
             break
-        if found:
-            self.lost, self.holds = found, False
+        if fault:
+            self.lost, self.holds = fault, False
         return self.lost
 
 

@@ -177,8 +177,8 @@ class BalanceReadings:
 
     def fresh(self) -> list[DoseReading]:
         """Readings since the last call."""
-        found, self._taken = self._kept[self._taken :], len(self._kept)
-        return found
+        new, self._taken = self._kept[self._taken :], len(self._kept)
+        return new
 
     @property
     def all(self) -> tuple[DoseReading, ...]:
@@ -347,10 +347,10 @@ class PourProcedure(BenchProcedure):
         await self._ready()
         show = self._report.pour if self._report.watched else None
         await setup.ground_truth.prepare(PourAsk(self._scene, self._action, self._path, self._seed, show))
-        given: dict[str, PourMasses] = {}
+        known: dict[str, PourMasses] = {}
         if setup.handling is not None:
-            given = await setup.handling.prepare(self._consent, self._weighings.weighed.get("pourer_empty"), self._seed)
-        await self._weighings.before(given)
+            known = await setup.handling.prepare(self._consent, self._weighings.weighed.get("pourer_empty"), self._seed)
+        await self._weighings.before(known)
 
     async def _move(self) -> None:
         """Approach, pour and return home after one consent, unless a stop interrupts the motion."""
@@ -482,7 +482,7 @@ class PourProcedure(BenchProcedure):
         if self._setup.mode != "hardware" or not below or min(len(self._tilts), len(self._readings.all)) < 2:
             return {}
         begin = self._tilts[0][0]
-        during = [(one.time - begin, one.mass) for one in self._readings.all if one.time >= begin - BEFORE_TILT]
+        during = [(r.time - begin, r.mass) for r in self._readings.all if r.time >= begin - BEFORE_TILT]
         signals = {
             "times": [round(t - begin, 3) for t, _ in self._tilts],
             "tilt_deg": [round(math.degrees(tilt), 2) for _, tilt in self._tilts],

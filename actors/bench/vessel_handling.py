@@ -350,7 +350,7 @@ class VesselHandling:
         """Fill the pourer up, by the refill device or the operator, until it holds what is asked for."""
         assert self._scene is not None
         liquid, now, problem, tries = self._scene.liquid, back, "", 0
-        rest = self._layout.rest["pourer"]
+        stand = self._layout.rest["pourer"]
         while True:
             missing = liquid.mass - (now.mass - empty.mass)
             if abs(missing) <= 0.5 * self._weighing.load_tolerance:
@@ -359,7 +359,7 @@ class VesselHandling:
                 tries += 1
                 reserve = await self._reserve(missing, consent)
                 async with self._driving(consent, self._fill, SET_UP):
-                    await self._move("pourer", rest.name, consent)
+                    await self._move("pourer", stand.name, consent)
                     filled = await self._supply.top_up(missing, liquid.density, seed)
                     self._mass["pourer"] = liquid.mass
                     await self._move("pourer", self._layout.balance.name, consent)
@@ -414,28 +414,28 @@ class VesselHandling:
             await self._held.let_go(consent.asked)
         await self._held.activated(consent.asked)
         unknown = [f"where the {name} stands" for name, place in self._record.stands().items() if place is None]
-        rest = self._layout.rest["receiver"].name
+        stand = self._layout.rest["receiver"].name
         question = OperatorQuestion(
-            f"Put the empty, dry receiver on the place '{rest}'. Leave the gripper and all other places empty. Keep "
+            f"Put the empty, dry receiver on the place '{stand}'. Leave the gripper and all other places empty. Keep "
             "the pourer: you weigh and fill it next.",
             "done",
             f"it is unknown {' and '.join(unknown)}" if unknown else "",
             about="laid_out",
-            details={"receiver": rest},
+            details={"receiver": stand},
         )
         await self._ask(question, consent)
-        self._at, self._mass, self._dry, self._gross = {"receiver": rest}, {}, None, None
+        self._at, self._mass, self._dry, self._gross = {"receiver": stand}, {}, None, None
         self._poured = self._pending = None
         for name in self._record.stands():  # frees the places before they are filled
             self._record.put(name, None, "laid out again")
-        self._record.put("receiver", rest, "laid out by the operator")
+        self._record.put("receiver", stand, "laid out by the operator")
         self._record.put("pourer", None, "with the operator")
         self._enter("receiver", 0.0, 0.0)
         self._enter("pourer", None, 0.0)
 
     async def around(self, question: OperatorQuestion, consent: MotionConsent) -> str:
         """Carry out the step of a weighing with the arm; other questions go to the operator."""
-        balance, rest = self._layout.balance.name, self._layout.rest
+        balance, stands = self._layout.balance.name, self._layout.rest
         about = question.about
         if not question.problem and self._at.get("pourer") is not None:
             if about == "set_up":
@@ -443,8 +443,8 @@ class VesselHandling:
                 return "done"
             if about == "cleared_after":
                 async with self._driving(consent, CLEAR, WEIGH):
-                    await self._put("pourer", rest["pourer"].name)
-                    await self._move("receiver", rest["receiver"].name, consent)
+                    await self._put("pourer", stands["pourer"].name)
+                    await self._move("receiver", stands["receiver"].name, consent)
                 return "done"
             if about == "pourer_after":
                 async with self._driving(consent, WEIGH):
@@ -461,9 +461,9 @@ class VesselHandling:
 
     async def _set_up(self, consent: MotionConsent) -> None:
         """Receiver on the balance, weighed with what stuck to it; pourer in the gripper."""
-        balance, rest = self._layout.balance.name, self._layout.rest
+        balance, stands = self._layout.balance.name, self._layout.rest
         async with self._driving(consent, SET_UP):
-            await self._move("pourer", rest["pourer"].name, consent)
+            await self._move("pourer", stands["pourer"].name, consent)
             await self._move("receiver", balance, consent)
             gross = await self._weigh()
             await self._account(gross, consent)
@@ -483,7 +483,7 @@ class VesselHandling:
         left = before.mass + poured.received.mass - gross.mass
         gained = back.mass - poured.pourer_after.mass
         parts = (before, poured.received, gross, back, poured.pourer_after)
-        sigma = math.sqrt(sum(part.uncertainty**2 for part in parts))
+        sigma = math.sqrt(sum(amount.uncertainty**2 for amount in parts))
         missing = left - gained
         self._spilled(missing, sigma)
         self._cycle |= {"poured_back_g": 1e3 * gained, "missing_g": 1e3 * missing, "uncertainty_g": 1e3 * sigma}
@@ -541,8 +541,8 @@ class VesselHandling:
         left = film[0].mass - film[1].mass if film else 0.0
         self._mass = {"pourer": after.mass - empty.mass, "receiver": received.mass + left}
         for role, parts in (("pourer", (after, empty)), ("receiver", (received, *film))):
-            self._enter(role, self._mass[role], math.hypot(*(part.uncertainty for part in parts)))  # type: ignore[index]
-        spread = math.hypot(*(part.uncertainty for part in (full, received, after)))
+            self._enter(role, self._mass[role], math.hypot(*(amount.uncertainty for amount in parts)))  # type: ignore[index]
+        spread = math.hypot(*(amount.uncertainty for amount in (full, received, after)))
         self._spilled(full.mass - after.mass - received.mass, spread)
         if self._layout.balance.tray is not None:
             self._enter(TRAY, *self._in_tray)

@@ -179,11 +179,11 @@ class BenchEmulators:
             raise LaboratoryError("nothing stands in for the arm here")
         return self._arm
 
-    def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
+    def order(self, kind: str, values: dict[str, Any]) -> dict[str, Any]:
         """Send a command to the balance emulator: 'unplug', 'plug', 'faults' …; see its `order`."""
         if self._balance is None:
             raise LaboratoryError("there is no virtual balance here")
-        return self._balance.order(what, values)
+        return self._balance.order(kind, values)
 
     def close(self) -> None:
         """End both emulators. May be called again."""
@@ -246,9 +246,9 @@ class DeviceEmulators:
         answer: dict[str, Any] = await self.device.call("fault", name, arguments, deadline=DEADLINE, urgent=True)
         return answer
 
-    async def order(self, what: str, **values: Any) -> dict[str, Any]:
+    async def order(self, kind: str, **values: Any) -> dict[str, Any]:
         """Send a command to the balance emulator."""
-        answer: dict[str, Any] = await self.device.call("order", what, values, deadline=DEADLINE, urgent=True)
+        answer: dict[str, Any] = await self.device.call("order", kind, values, deadline=DEADLINE, urgent=True)
         return answer
 
     async def flow(self, order: FlowOrder) -> None:
@@ -308,14 +308,14 @@ def _without_long_rests(
     gaps: FloatArray, moved: NDArray[np.bool_], joints: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return times from 0 and joints; only the first `LONGEST_REST` seconds of each rest are kept."""
-    kept, now, rest = [(0.0, 0)], 0.0, 0.0
+    steps, now, still = [(0.0, 0)], 0.0, 0.0
     for i, (gap, moves) in enumerate(zip(gaps, moved, strict=True), start=1):
-        allowed = float(gap) if moves else min(float(gap), LONGEST_REST - rest)
-        rest = 0.0 if moves else rest + allowed
+        allowed = float(gap) if moves else min(float(gap), LONGEST_REST - still)
+        still = 0.0 if moves else still + allowed
         if allowed > 0.0:
             now += allowed
-            kept.append((now, i))
-    return np.array([t for t, _ in kept]), joints[[i for _, i in kept]]
+            steps.append((now, i))
+    return np.array([t for t, _ in steps]), joints[[i for _, i in steps]]
 
 
 class VirtualBench(GroundTruth):

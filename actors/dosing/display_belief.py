@@ -82,7 +82,7 @@ class DisplayBelief:
         repeats = Repeats(cls().repeats)
         if len(masses) < 2:
             return cls(step=step)
-        low, high = (float(np.median(part)) for part in (masses[:3], masses[-3:]))
+        low, high = (float(np.median(readings)) for readings in (masses[:3], masses[-3:]))
         for before, after in itertools.pairwise(masses):
             if low + RISING[0] * (high - low) < before < low + RISING[1] * (high - low):
                 repeats.see(after == before, 0.0)

@@ -450,7 +450,7 @@ class DoseController:
             begin = self._since + 0.4 * RUN_OFF + EARLIEST_WEIGHING * lag
             final, deviation, rise = self._approached([r for r in self._recent if r.time > begin] or last, lag)
             half = needed // 2
-            early, late = (math.fsum(r.mass for r in part) / half for part in (last[:half], last[-half:]))
+            early, late = (math.fsum(r.mass for r in readings) / half for readings in (last[:half], last[-half:]))
             spread = max(r.mass for r in last) - min(r.mass for r in last)
             flat = spread <= max(2.0 * self._step_size, 1.5e-4) and abs(late - early) <= max(
                 0.6 * self._step_size, 5e-5
@@ -488,7 +488,7 @@ class DoseController:
         """Whether the particles agree about the mass that a reading at this time still lags behind."""
         e = self._estimator
         expected = max(3.0 * e.deviation(), 1.5e-4)
-        if self._doubt_since is not None or any(abs(one) >= expected for one in self._innovations):
+        if self._doubt_since is not None or any(abs(innovation) >= expected for innovation in self._innovations):
             return False
         rise = e.mass - e.predicted(time)
         largest, deviation = LARGEST_REMAINDER

@@ -351,13 +351,13 @@ class DoseEstimator:
             late = np.where(self._ended > 0.0, np.exp(-self._ended / LATE[1]), 0.0) / LATE[1]
             self.mass += late * (self._belief.aim * TIME_STEP + LATE[0] * math.sqrt(LATE[1]) * noise[0])
         self._steps += 1
-        here = self._steps % len(self._mass_history)
-        self._mass_history[here], self._flow_history[here] = self.mass, self.flow
+        slot = self._steps % len(self._mass_history)
+        self._mass_history[slot], self._flow_history[slot] = self.mass, self.flow
         back = self._fall / TIME_STEP
-        whole, part = int(back), back - int(back)
-        first, second = (here - whole) % len(self._mass_history), (here - whole - 1) % len(self._mass_history)
-        landed = (1.0 - part) * self._mass_history[first] + part * self._mass_history[second]
-        impact = (1.0 - part) * self._flow_history[first] + part * self._flow_history[second]
+        steps, fraction = int(back), back - int(back)
+        first, second = (slot - steps) % len(self._mass_history), (slot - steps - 1) % len(self._mass_history)
+        landed = (1.0 - fraction) * self._mass_history[first] + fraction * self._mass_history[second]
+        impact = (1.0 - fraction) * self._flow_history[first] + fraction * self._flow_history[second]
         load = landed + cup.density * self._fall * impact
         self._before = self._lags[3].copy()
         slow, fast = self.lag_shape * self.lag, (1.0 - self.lag_shape) * self.lag / 3.0
@@ -370,8 +370,8 @@ class DoseEstimator:
 
     def predicted(self, time: float) -> Floats:
         """Predicted reading at a time within the last step or after it (N,) [kg]."""
-        part = min(max((self.time - time) / TIME_STEP, 0.0), 1.0)
-        predicted: Floats = (1.0 - part) * self._lags[3] + part * self._before
+        share = min(max((self.time - time) / TIME_STEP, 0.0), 1.0)
+        predicted: Floats = (1.0 - share) * self._lags[3] + share * self._before
         return predicted
 
     @property
@@ -475,7 +475,7 @@ class DoseEstimator:
         if 1.0 / float(weight @ weight) > share * count:
             return
         places = (np.arange(count) + self._rng.random()) / count
-        drawn = np.minimum(np.searchsorted(np.cumsum(weight), places), count - 1)
+        chosen = np.minimum(np.searchsorted(np.cumsum(weight), places), count - 1)
         self._log_weight = np.zeros(count)
         for name in (
             "onset_bias",
@@ -489,10 +489,10 @@ class DoseEstimator:
             "_ended",
             "_flowed",
         ):
-            setattr(self, name, getattr(self, name)[drawn])
+            setattr(self, name, getattr(self, name)[chosen])
         for name in ("_lags", "_mass_history", "_flow_history"):
-            setattr(self, name, getattr(self, name)[:, drawn])
-        self._before = self._before[drawn]
+            setattr(self, name, getattr(self, name)[:, chosen])
+        self._before = self._before[chosen]
         # copies of one particle must not stay the same
         self.onset_bias = self.onset_bias + 0.2 * float(self.onset_bias.std()) * _even_normal(count, self._rng)
         spread = 0.2 * float(np.log(self.flow_factor).std())
@@ -597,16 +597,16 @@ def draw_lags(
     """
     delay = np.clip(TRANSPORT_DELAY[0] + TRANSPORT_DELAY[1] * _even_normal(count, rng), 0.0, None)
     try:
-        found = step_response([one.time for one in placed], [one.mass for one in placed], resolution=step)
+        response = step_response([r.time for r in placed], [r.mass for r in placed], resolution=step)
     except ValueError:
         lag = np.exp(math.log(0.33) + math.log(1.65) * _even_normal(count, rng))
         return np.clip(lag + delay, *LAG_RANGE), rng.permutation(np.linspace(0.25, 1.0, count))
-    drawn = rng.choice(found.probability.size, size=count, p=found.probability.ravel())
+    cells = rng.choice(response.probability.size, size=count, p=response.probability.ravel())
     shapes = np.array([shape for shape, _ in FILTERS.values()])
     jitter = 1.0 + 0.05 * _even_normal(count, rng)
     return (
-        np.clip(LAGS[drawn % len(LAGS)] * jitter + delay, *LAG_RANGE),
-        np.clip(shapes[drawn // len(LAGS)] + 0.03 * _even_normal(count, rng), *SHAPE_RANGE),
+        np.clip(LAGS[cells % len(LAGS)] * jitter + delay, *LAG_RANGE),
+        np.clip(shapes[cells // len(LAGS)] + 0.03 * _even_normal(count, rng), *SHAPE_RANGE),
     )
 
 

@@ -139,7 +139,7 @@ class DoseSeries:
         belief = (
             DoseBelief.prior(volumes, lag, rng) if knowledge is None else DoseBelief.known(knowledge, volumes, lag, rng)
         )
-        shown = DisplayBelief.placed([one.time for one in placed], [one.mass for one in placed], step)
+        shown = DisplayBelief.placed([reading.time for reading in placed], [reading.mass for reading in placed], step)
         self.belief = replace(belief, display=display or belief.display.joined(shown))
 
     @property
@@ -176,10 +176,10 @@ class DoseSeries:
         rng = np.random.default_rng((seed, 23))
         widened = self.belief.widened(rng)
         amounts, durations, ends = [], [], Counter[DoseEnd]()
-        for k, drawn in enumerate(rng.permutation(len(widened.volume))[:count]):
+        for k, chosen in enumerate(rng.permutation(len(widened.volume))[:count]):
             truth = DoseEstimator(
                 self._cup,
-                _single(widened, int(drawn)),
+                _single(widened, int(chosen)),
                 fall_time=self._fall_time,
                 step=self._step,
                 noise=0.0,
@@ -348,13 +348,13 @@ def after_dose(series: DoseSeries, result: DoseResult) -> dict[str, Any]:
 
 def _single(belief: DoseBelief, particle: int) -> DoseBelief:
     """The belief with one of its particles only."""
-    one = slice(particle, particle + 1)
+    only = slice(particle, particle + 1)
     return DoseBelief(
-        belief.onset_bias[one],
-        belief.flow_factor[one],
-        belief.lag[one],
-        belief.lag_shape[one],
-        belief.volume[one],
+        belief.onset_bias[only],
+        belief.flow_factor[only],
+        belief.lag[only],
+        belief.lag_shape[only],
+        belief.volume[only],
         belief.aim,
         belief.doses,
         belief.display,

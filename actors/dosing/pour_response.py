@@ -114,11 +114,11 @@ def displayed(
     load = np.interp(before, times, mass)
     if fall_time > 0.0:
         load = load + fall_time * np.gradient(load, TIME_STEP)
-    for part in (lag_shape * lag, *3 * ((1.0 - lag_shape) * lag / 3.0,)):
-        gain = TIME_STEP / (part + TIME_STEP)  # delays by exactly `part`
+    for delay in (lag_shape * lag, *3 * ((1.0 - lag_shape) * lag / 3.0,)):
+        gain = TIME_STEP / (delay + TIME_STEP)  # delays by exactly `delay`
         load, _ = lfilter([gain], [1.0, gain - 1.0], load, zi=[(1.0 - gain) * load[0]])
-    found: Floats = np.interp(at, grid, load)
-    return found
+    shown: Floats = np.interp(at, grid, load)
+    return shown
 
 
 def fall_time(height: float, speed: float = 0.1) -> float:

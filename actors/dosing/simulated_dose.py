@@ -110,13 +110,13 @@ def _set_up(
 ) -> tuple[DoseSeries, VirtualDosingBench, tuple[DoseReading, ...]]:
     source = source_of(scene, dose)
     constants = seed if dose.source is None else source.constants
-    drawn = np.random.default_rng((constants, 31))
+    seeded = np.random.default_rng((constants, 31))
     scale = TrueScale(
-        FILTERS[int(drawn.integers(len(FILTERS)))],
-        lag=float(drawn.uniform(0.15, 0.45)),
+        FILTERS[int(seeded.integers(len(FILTERS)))],
+        lag=float(seeded.uniform(0.15, 0.45)),
         step=1e-4,
     )
-    rng = drawn if dose.source is None else np.random.default_rng((seed, 31))
+    rng = seeded if dose.source is None else np.random.default_rng((seed, 31))
     pourer = build_vessel(scene.pourer)
     true = source.mass if dose.source is None else source.mass + source.deviation * float(rng.standard_normal())
     liquid = scene.liquid.model_copy(

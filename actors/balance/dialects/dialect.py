@@ -102,20 +102,20 @@ class Dialect(ABC):
             ValueError: the dialect has no line for it.
         """
 
-    def likeness(self, said: Mapping[str, str]) -> int:
+    def likeness(self, answers: Mapping[str, str]) -> int:
         """Score how well a balance that answered the query fits this dialect; among dialects with the same query the
         largest wins.
 
         Args:
-            said: its replies to the queries of `identity`, '' for none.
+            answers: its replies to the queries of `identity`, '' for none.
         """
         return 0
 
-    def commands_in(self, said: Mapping[str, str]) -> frozenset[str]:
+    def commands_in(self, answers: Mapping[str, str]) -> frozenset[str]:
         """The commands that the balance lists, without line ends; empty if it lists none.
 
         Args:
-            said: as in `likeness`.
+            answers: as in `likeness`.
         """
         return frozenset()
 

@@ -22,9 +22,9 @@ class Kcp(status_lines.StatusLines):
     name: str = "kcp"
     title: str = "Kern KCP"
 
-    def likeness(self, said: Mapping[str, str]) -> int:
+    def likeness(self, answers: Mapping[str, str]) -> int:
         """See `Dialect.likeness`."""
-        return 3 if status_lines.is_kern(said) else 1  # default of the two: its query interval suits both dialects
+        return 3 if status_lines.is_kern(answers) else 1  # default of the two: its query interval suits both dialects
 
     def encoders(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """See `Dialect.encoders`."""

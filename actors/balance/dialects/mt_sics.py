@@ -40,9 +40,9 @@ class MtSics(status_lines.StatusLines):
     title: str = "Mettler-Toledo MT-SICS"
     gap: float = 0.05
 
-    def likeness(self, said: Mapping[str, str]) -> int:
+    def likeness(self, answers: Mapping[str, str]) -> int:
         """See `Dialect.likeness`."""
-        return 2 if self.commands_in(said) else 0
+        return 2 if self.commands_in(answers) else 0
 
     def encoders(self) -> Mapping[str, Callable[[], ProtocolEncoder]]:
         """See `Dialect.encoders`."""

@@ -119,8 +119,8 @@ class Ohaus(Dialect):
         if _TIME.fullmatch(legend):
             raise OtherQuantityError("a line of interval printing", "Switch interval printing off")
         if legend not in _MARKS:
-            what = _LEGENDS.get(legend, "an unknown quantity")
-            raise OtherQuantityError(f"{what} ('{legend}')", "Reduce its print-out to the weight in its menu")
+            meaning = _LEGENDS.get(legend, "an unknown quantity")
+            raise OtherQuantityError(f"{meaning} ('{legend}')", "Reduce its print-out to the weight in its menu")
         status = ReadingStatus.UNSTABLE if match["moving"] else ReadingStatus.STABLE
         return Reading(status, value, match["unit"], mark=_MARKS[legend])
 

@@ -135,9 +135,9 @@ def weight_line(dialect: Lines, reading: Reading) -> bytes:
     """Return the line for a reading. If the dialect has none, return its fault line, or nothing if it has no fault
     line.
     """
-    for said in (reading, Reading(ReadingStatus.ERROR)):
+    for state in (reading, Reading(ReadingStatus.ERROR)):
         with contextlib.suppress(ValueError):
-            return dialect.encode(said)
+            return dialect.encode(state)
     return b""
 
 
@@ -156,17 +156,17 @@ class PlainEncoder:
 
     def commands(self, heard: bytearray) -> list[bytes]:
         """See `ProtocolEncoder.commands`."""
-        found: list[bytes] = []
+        complete: list[bytes] = []
         while heard:
             command = next((c for c in self._known if heard.startswith(c)), None)
             if command is not None:
-                found.append(command)
+                complete.append(command)
                 del heard[: len(command)]
             elif any(c.startswith(heard) for c in self._known):
                 break  # incomplete command
             else:
                 del heard[0]
-        return found
+        return complete
 
     def answer(self, command: bytes, display: EncoderDisplay) -> Said:
         """See `ProtocolEncoder.answer`."""
@@ -204,9 +204,9 @@ class CommandEncoder:
 
 def complete_lines(heard: bytearray) -> list[bytes]:
     """Remove complete lines from the receive buffer and return them, without their ends."""
-    *whole, rest = re.split(rb"\r\n|\n", bytes(heard))
-    heard[:] = rest
-    return whole
+    *lines, unfinished = re.split(rb"\r\n|\n", bytes(heard))
+    heard[:] = unfinished
+    return lines
 
 
 def silently(act: Callable[[], ReadingStatus]) -> bytes:

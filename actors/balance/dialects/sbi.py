@@ -189,13 +189,13 @@ def _weight(text: str) -> Reading:
 
 def _other(name: str, text: str) -> LineError:
     """Return the error for a line with another identification."""
-    what = IDENTIFICATIONS.get(name) or next((what for form, what in _NUMBERED.items() if form.fullmatch(name)), "")
-    if not what:
+    word = IDENTIFICATIONS.get(name) or next((word for form, word in _NUMBERED.items() if form.fullmatch(name)), "")
+    if not word:
         try:
             _weight(text)
         except LineError as error:
             return error
-    return OtherQuantityError(f"{what or 'an unknown quantity'} ('{name}')", _REMEDY)
+    return OtherQuantityError(f"{word or 'an unknown quantity'} ('{name}')", _REMEDY)
 
 
 class SbiEncoder:
@@ -212,11 +212,11 @@ class SbiEncoder:
 
     def commands(self, heard: bytearray) -> list[bytes]:
         """See `ProtocolEncoder.commands`."""
-        found = re.findall(rb"\x1b([A-Z]|[a-z][A-Za-z0-9]*_)", bytes(heard))
+        letters = re.findall(rb"\x1b([A-Z]|[a-z][A-Za-z0-9]*_)", bytes(heard))
         tail = bytes(heard).rpartition(b"\x1b")
         begun = tail[1] and re.fullmatch(rb"(?:[a-z][A-Za-z0-9]*)?", tail[2])
         heard[:] = b"\x1b" + tail[2] if begun else b""
-        return found
+        return letters
 
     def answer(self, command: bytes, display: EncoderDisplay) -> Said:
         """See `ProtocolEncoder.answer`."""

@@ -171,9 +171,9 @@ class StatusLines(Dialect):
         """See `Dialect.encode`."""
         return encode(reading)
 
-    def commands_in(self, said: Mapping[str, str]) -> frozenset[str]:
+    def commands_in(self, answers: Mapping[str, str]) -> frozenset[str]:
         """See `Dialect.commands_in`."""
-        return frozenset(re.findall(r'[0-9]+ "([^"]+)"', said.get("I0", "")))
+        return frozenset(re.findall(r'[0-9]+ "([^"]+)"', answers.get("I0", "")))
 
 
 class StatusLineEncoder:
@@ -305,6 +305,6 @@ class StatusLineEncoder:
         )
 
 
-def is_kern(said: Mapping[str, str]) -> bool:
+def is_kern(answers: Mapping[str, str]) -> bool:
     """Whether the balance identifies itself as one of Kern's."""
-    return any("KERN" in text.upper() for text in said.values())
+    return any("KERN" in text.upper() for text in answers.values())
