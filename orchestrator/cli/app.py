@@ -293,8 +293,8 @@ def main() -> None:
         os.execve(sys.executable, command, {**os.environ, "PYTHONUTF8": "1"})
     # Typer builds the parameters of all commands before it reads the first word
     word = sys.argv[1] if len(sys.argv) > 1 else ""
-    commands = [one for one in app.registered_commands if one.name == word]
-    groups = [one for one in app.registered_groups if one.typer_instance and one.typer_instance.info.name == word]
+    commands = [c for c in app.registered_commands if c.name == word]
+    groups = [g for g in app.registered_groups if g.typer_instance and g.typer_instance.info.name == word]
     named = copy.copy(app)
     if commands or groups:
         named.registered_commands, named.registered_groups = commands, groups

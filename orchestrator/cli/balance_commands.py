@@ -50,7 +50,7 @@ Given = Annotated[
 
 def check(
     balance: Balance,
-    given: Given = None,
+    options: Given = None,
     record: Annotated[
         Path | None, typer.Option(help="Also record the raw traffic into this file, as 'decant balance record' does.")
     ] = None,
@@ -66,33 +66,33 @@ def check(
     from orchestrator.cli.robot_commands import print_table
 
     checks: list[DeviceCheck] = []
-    with _settings(balance, given) as (spec, emulator), _tap(record, balance, emulator is not None) as tap:
+    with _settings(balance, options) as (spec, emulator), _tap(record, balance, emulator is not None) as tap:
         if emulator is None and not sys.stdin.isatty():
             raise RefusalError("the check asks for loads at a terminal, with nothing piped into it")
         hands: CheckOperator = CheckingPerson() if emulator is None else EmulatedHands(partial(_put, emulator))
         driver = _driver(spec, tap)
         try:
-            for found in check_balance(
+            for finding in check_balance(
                 driver,
                 hands,
                 repeatability=spec.deviation,
                 step=spec.step,
                 time_scale=spec.time_scale,
             ):
-                checks.append(found)
+                checks.append(finding)
                 if not as_json:
-                    print_table([found])
+                    print_table([finding])
             _finish(tap, record, driver)
         finally:
             driver.close()
-    failed = [one for one in checks if one.state == "fail"]
+    failed = [c for c in checks if c.state == "fail"]
     if as_json:
         from orchestrator.cli.command_results import CheckOutput
 
         print_json(CheckOutput(laboratory=balance, mode="", ready=not failed, checks=checks))
     if failed:
         raise RefusalError(f"{len(failed)} of {len(checks)} checks fail", FAILED)
-    print_message("ready" if all(one.state == "ok" for one in checks) else "ready, with warnings")
+    print_message("ready" if all(c.state == "ok" for c in checks) else "ready, with warnings")
 
 
 def record(
@@ -111,7 +111,7 @@ def record(
     seconds: Annotated[float, typer.Option(min=0.1, help="Duration [s].")] = 60.0,
     listen: Annotated[bool, typer.Option("--listen", help="Request nothing after connecting, only listen.")] = False,
     remarks: Annotated[str, typer.Option(help="Make and model, and what is put on it and when.")] = "",
-    given: Given = None,
+    options: Given = None,
     virtual: Annotated[bool, typer.Option("--virtual", help="Say in the file that the balance is emulated.")] = False,
 ) -> None:
     """Record the raw traffic of a balance: every byte with its time. A test can replay the file through the driver.
@@ -131,7 +131,7 @@ def record(
     if balance is None or to is None:
         raise RefusalError("give the balance and a file to write: BALANCE --to FILE; or a file to explain: --from FILE")
     with (
-        _settings(balance, given) as (spec, emulator),
+        _settings(balance, options) as (spec, emulator),
         _tap(to, balance, virtual or emulator is not None, remarks) as tap,
     ):
         assert tap is not None, "a file is given"
@@ -233,15 +233,15 @@ def _ask(prompt: str) -> str:
 
 
 @contextlib.contextmanager
-def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBalanceSettings, BalanceEmulator | None]]:
+def _settings(target: str, options: list[str] | None) -> Iterator[tuple[SerialBalanceSettings, BalanceEmulator | None]]:
     """The balance's settings, and its emulator in a virtual laboratory."""
     from actors.balance.balance_settings import SerialBalanceSettings, balance_kind
     from orchestrator.cli.robot_commands import read_laboratory
 
     if not target.endswith((".yaml", ".yml")):
-        yield _port_settings(target, given), None
+        yield _port_settings(target, options), None
         return
-    if given:
+    if options:
         raise RefusalError("--set belongs to a port; a laboratory file has the settings")
     spec = read_laboratory(Path(target)).balance
     if not isinstance(spec, SerialBalanceSettings) or spec.typed:
@@ -259,7 +259,7 @@ def _settings(target: str, given: list[str] | None) -> Iterator[tuple[SerialBala
         emulator.close()
 
 
-def _port_settings(port: str, given: list[str] | None) -> SerialBalanceSettings:
+def _port_settings(port: str, options: list[str] | None) -> SerialBalanceSettings:
     """The settings of a balance at a port, checked as those of a file are.
 
     Raises:
@@ -270,7 +270,7 @@ def _port_settings(port: str, given: list[str] | None) -> SerialBalanceSettings:
     from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 
     lines = [f"port: {json.dumps(port)}"]
-    for text in given or ():
+    for text in options or ():
         key, equals, value = text.partition("=")
         if not equals:
             raise RefusalError(f"--set {text}: should be a key and a value, as dialect=kcp")
@@ -310,7 +310,7 @@ def _finish(tap: Recorder | None, to: Path | None, driver: Any) -> None:
     """Add to the recording what was detected and the weights as they are understood today."""
     from actors.balance.line_recording import LineRecording
 
-    found = driver.found
-    if tap is not None and to is not None and found is not None:
-        weights = LineRecording.load(to).weights(found.dialect)
-        tap.add(dialect=found.dialect.name, line=str(found.line), balance=found.identity, weights=weights)
+    match = driver.found
+    if tap is not None and to is not None and match is not None:
+        weights = LineRecording.load(to).weights(match.dialect)
+        tap.add(dialect=match.dialect.name, line=str(match.line), balance=match.identity, weights=weights)

@@ -197,7 +197,7 @@ def plan(
         not_resumed="this planning is not resumed; what was simulated",
     )
     answers = []
-    for stage in (one for one in request.stages if one.name.startswith(DEPLOYMENT)):
+    for stage in (deployed for deployed in request.stages if deployed.name.startswith(DEPLOYMENT)):
         result = result_of(run_result.results, stage.name, Deployed)
         recommended = result.recommended
         if recommended is None:
@@ -246,5 +246,5 @@ def planning_request(
     from orchestrator.campaigns.file_loading import load_vessel
     from orchestrator.runs.run_tasks import plan_task, read_theta
 
-    given = None if parameters is None else read_theta(parameters, plan)
-    return plan_task(plan, given, None if receiver is None else load_vessel(receiver), iterations, **prediction)
+    theta = None if parameters is None else read_theta(parameters, plan)
+    return plan_task(plan, theta, None if receiver is None else load_vessel(receiver), iterations, **prediction)

@@ -148,24 +148,26 @@ def call(work: Callable[..., None], /, *args: Any, **kwargs: Any) -> None:
 
 def grouped(work: Callable[..., None]) -> Callable[..., None]:
     """Replace each parameter whose type is a dataclass by its fields: options that several commands share."""
-    own = inspect.signature(work, eval_str=True)
-    groups: dict[str, Any] = {
-        one.name: one.annotation for one in own.parameters.values() if is_dataclass(one.annotation)
-    }
+    declared = inspect.signature(work, eval_str=True)
+    groups: dict[str, Any] = {p.name: p.annotation for p in declared.parameters.values() if is_dataclass(p.annotation)}
     fields = {name: inspect.signature(group, eval_str=True).parameters for name, group in groups.items()}
-    flat = [one for each in own.parameters.values() for one in fields.get(each.name, {each.name: each}).values()]
-    signature = own.replace(parameters=[each.replace(kind=inspect.Parameter.POSITIONAL_OR_KEYWORD) for each in flat])
+    flat = [p for each in declared.parameters.values() for p in fields.get(each.name, {each.name: each}).values()]
+    signature = declared.replace(
+        parameters=[each.replace(kind=inspect.Parameter.POSITIONAL_OR_KEYWORD) for each in flat]
+    )
 
     @functools.wraps(work)
     def run(*args: Any, **kwargs: Any) -> None:
         bound = signature.bind(*args, **kwargs)
         bound.apply_defaults()
-        given = bound.arguments
-        made = {name: group(**{field: given.pop(field) for field in fields[name]}) for name, group in groups.items()}
-        work(**given, **made)
+        arguments = bound.arguments
+        values = {
+            name: group(**{field: arguments.pop(field) for field in fields[name]}) for name, group in groups.items()
+        }
+        work(**arguments, **values)
 
     run.__signature__ = signature  # type: ignore[attr-defined]
-    run.__annotations__ = {one.name: one.annotation for one in flat}
+    run.__annotations__ = {p.name: p.annotation for p in flat}
     return run
 
 
@@ -186,10 +188,10 @@ def command(work: Callable[..., None], *, quiet: bool = False) -> Callable[..., 
         call(work, *args, **kwargs)
 
     if quiet:
-        own = inspect.signature(work, eval_str=True)
-        parameters = [*own.parameters.values(), _QUIET]
-        run.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {one.name: one.annotation for one in parameters}
+        signature = inspect.signature(work, eval_str=True)
+        parameters = [*signature.parameters.values(), _QUIET]
+        run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run
 
 

@@ -127,7 +127,7 @@ class CommissioningArchive:
         """
         added: list[ArchivedRecording] = []
         for path in paths:
-            if path.name in {one.name for one in (*self.recordings, *added)}:
+            if path.name in {r.name for r in (*self.recordings, *added)}:
                 raise ArchiveError(f"{path.name} is in the archive already; give the new recording another name")
             kind, source, read = read_recording(path)
             added.append(ArchivedRecording(path.name, kind, source, read))
@@ -143,7 +143,7 @@ class CommissioningArchive:
                     if file.exists():
                         archive.write(file, file.relative_to(path.parent).as_posix())
             self.recordings += added
-            entries = [dataclasses.asdict(one) for one in self.recordings]
+            entries = [dataclasses.asdict(r) for r in self.recordings]
             archive.writestr(INDEX, json.dumps({"decant_archive": FORMAT, "recordings": entries}, indent=1))
         fresh.replace(self.path)
         return added
@@ -153,18 +153,18 @@ class CommissioningArchive:
         with tempfile.TemporaryDirectory() as folder:
             with zipfile.ZipFile(self.path) as archive:
                 archive.extractall(folder)
-            for one in self.recordings:
+            for r in self.recordings:
                 try:
-                    _, _, read = read_recording(Path(folder) / one.name)
+                    _, _, read = read_recording(Path(folder) / r.name)
                 except ArchiveError as error:
-                    yield DeviceCheck(one.name, "fail", str(error), "this version does not read it any more")
+                    yield DeviceCheck(r.name, "fail", str(error), "this version does not read it any more")
                     continue
-                different = list(_differences(one.read, read))
-                found = f"{one.kind}, {one.source}: {_summary(one)}"
+                different = list(_differences(r.read, read))
+                text = f"{r.kind}, {r.source}: {_summary(r)}"
                 if different:
-                    yield DeviceCheck(one.name, "fail", f"{found}; {different[0]}", "this version reads it differently")
+                    yield DeviceCheck(r.name, "fail", f"{text}; {different[0]}", "this version reads it differently")
                 else:
-                    yield DeviceCheck(one.name, "ok", f"{found}; read as on the day")
+                    yield DeviceCheck(r.name, "ok", f"{text}; read as on the day")
 
 
 def read_recording(path: Path) -> tuple[str, str, Any]:
@@ -199,8 +199,8 @@ def _read_balance(path: Path) -> tuple[str, str, Any]:
 def _read_run(path: Path) -> tuple[str, str, Any]:
     if not (path / JOURNAL_NAME).exists():
         record = json.loads((path / EMPTY_POUR).read_text(encoding="utf-8"))
-        kept = {name: record[name] for name in ("action", "slow", "tracking")}
-        return "empty pour", "virtual" if record["mode"] == "virtual" else "hardware", kept
+        fields = {name: record[name] for name in ("action", "slow", "tracking")}
+        return "empty pour", "virtual" if record["mode"] == "virtual" else "hardware", fields
     run = read_former_run(path)
     pours = [
         {
@@ -240,9 +240,9 @@ def _read_robot_check(path: Path) -> tuple[str, str, Any]:
     return "robot check", data["source"], {"checks": [dataclasses.asdict(check) for check in checks]}
 
 
-def _summary(one: ArchivedRecording) -> str:
-    read = one.read
-    match one.kind:
+def _summary(recording: ArchivedRecording) -> str:
+    read = recording.read
+    match recording.kind:
         case "robot check":
             failed = sum(check["state"] == "fail" for check in read["checks"])
             return f"{len(read['checks'])} checks, {failed} fail"

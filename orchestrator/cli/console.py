@@ -115,14 +115,14 @@ def stdout_for_results() -> Iterator[None]:
     The file descriptor itself is redirected, since some libraries print from C++ and from child processes.
     """
     sys.stdout.flush()
-    kept = os.dup(1)
+    saved = os.dup(1)
     os.dup2(2, 1)
     try:
         with contextlib.redirect_stdout(sys.stderr):
             yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(saved, 1)
+        os.close(saved)
 
 
 def fail(error: DecantError) -> NoReturn:
@@ -162,11 +162,11 @@ def check_output(path: Path | None, option: str, suffix: str) -> None:
 
 def _why_not_opened(path: Path) -> str | None:
     """Found out by opening it: permissions don't tell of full disks, names too long, and folders of the system."""
-    there = why_unreadable(path) != "no such file"
+    exists = why_unreadable(path) != "no such file"
     try:
         with path.open("ab"):
             pass
-        if not there:
+        if not exists:
             path.unlink()
     except (OSError, ValueError) as error:
         return getattr(error, "strerror", None) or str(error)

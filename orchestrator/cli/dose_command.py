@@ -142,14 +142,14 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
         source = strategy.next_source(planned)
         scene = series.scene(source.name, planned.receiver)
         target = DoseTarget(planned.amount, planned.limit, planned.position, source)
-        found = predicted_dose(plan.laboratory, scene, target, seeds.next() % 2**32, count)
-        left = max(source.mass - found.amount, 0.0)
+        forecast = predicted_dose(plan.laboratory, scene, target, seeds.next() % 2**32, count)
+        left = max(source.mass - forecast.amount, 0.0)
         deviation = max(source.deviation, FILL_DEVIATION) + WEIGHED_DEVIATION
         strategy.assume(source.name, KnownSource(mass=left, deviation=deviation))
-        total, filled = total + found.duration, filled + source.fill
-        rows.append(_row(number, planned, source, found, left))
+        total, filled = total + forecast.duration, filled + source.fill
+        rows.append(_row(number, planned, source, forecast, left))
         if not as_json:
-            print(forecast_text(planned, source, found))
+            print(forecast_text(planned, source, forecast))
     if as_json:
         from orchestrator.cli.command_results import DosePredictionOutput
 
@@ -160,23 +160,23 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
     print_message("nothing was poured")
 
 
-def _row(number: int, planned: PlannedDose, source: DoseSource, found: DoseForecast, left: float) -> dict[str, Any]:
+def _row(number: int, planned: PlannedDose, source: DoseSource, forecast: DoseForecast, left: float) -> dict[str, Any]:
     return {
         "number": number,
         "wanted_g": 1e3 * planned.amount,
         "position": planned.position,
         "source": source.name,
         "filled": source.fill,
-        "expected_g": 1e3 * found.amount,
-        "interval_g": [1e3 * value for value in found.interval],
-        "duration_s": found.duration,
-        "longest_s": found.longest,
-        "enough": found.enough,
-        "fine_flow_g_s": 1e3 * found.fine_flow,
-        "clean_flow_g_s": 1e3 * found.clean_flow,
+        "expected_g": 1e3 * forecast.amount,
+        "interval_g": [1e3 * value for value in forecast.interval],
+        "duration_s": forecast.duration,
+        "longest_s": forecast.longest,
+        "enough": forecast.enough,
+        "fine_flow_g_s": 1e3 * forecast.fine_flow,
+        "clean_flow_g_s": 1e3 * forecast.clean_flow,
         "left_g": 1e3 * left,
-        "reachable_tolerance_g": 1e3 * found.reachable,
-        "ends": {str(end): count for end, count in found.ends.items()},
+        "reachable_tolerance_g": 1e3 * forecast.reachable,
+        "ends": {str(end): count for end, count in forecast.ends.items()},
     }
 
 
@@ -246,13 +246,13 @@ def pour_doses(request: RunRequest, *, in_process: bool, as_json: bool, again: s
     if as_json:
         from orchestrator.cli.json_output import DoseOutput
 
-        doses = [one.model_dump(exclude={"signals"}) for one in result.doses]
+        doses = [dose.model_dump(exclude={"signals"}) for dose in result.doses]
         print_json(DoseOutput(run=str(directory), doses=doses))
     else:
-        for one in result.doses:
-            print(dose_text(one))
+        for dose in result.doses:
+            print(dose_text(dose))
     print_note(f"run: {directory}")
-    if any(one.received_g is None for one in result.doses):
+    if any(dose.received_g is None for dose in result.doses):
         raise RefusalError("not every dose was poured", FAILED)
     return directory
 

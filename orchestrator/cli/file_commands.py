@@ -122,16 +122,16 @@ def plugins(as_json: Json = False) -> None:
     """
     from orchestrator.campaigns.installed_plugins import broken, installed
 
-    found, unusable = installed(), broken()
+    usable, unusable = installed(), broken()
     if as_json:
         from orchestrator.cli.command_results import PluginsOutput
 
         print_json(
-            PluginsOutput(plugins=[*map(dataclasses.asdict, found)], broken=[*map(dataclasses.asdict, unusable)])
+            PluginsOutput(plugins=[*map(dataclasses.asdict, usable)], broken=[*map(dataclasses.asdict, unusable)])
         )
     else:
-        width = [max(len(row) for row in column) for column in zip(*((p.group, p.name) for p in found), strict=True)]
-        for plugin in found:
+        width = [max(len(row) for row in column) for column in zip(*((p.group, p.name) for p in usable), strict=True)]
+        for plugin in usable:
             print(f"{plugin.group:<{width[0]}}  {plugin.name:<{width[1]}}  {plugin.package}")
     if unusable:
         raise RefusalError("\n".join(map(str, unusable)), FAILED)

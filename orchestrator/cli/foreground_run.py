@@ -277,12 +277,12 @@ async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, res
     """Run; a first SIGINT, SIGTERM or SIGHUP pauses at the next safe point, a second gives up what is under way."""
     begun = "a pour that has begun"
     task = asyncio.ensure_future(work())
-    asked = 0
+    signals = 0
 
     def stop() -> None:
-        nonlocal asked
-        asked += 1
-        if asked == 1:
+        nonlocal signals
+        signals += 1
+        if signals == 1:
             doing = "pausing" if resumable else "ending"
             print_message(f"\n{doing}: {begun} is finished and weighed first; once more to give it up")
         else:
@@ -298,7 +298,7 @@ async def _until_signalled(work: Callable[[], Awaitable[CampaignResult]], *, res
         loop.add_signal_handler(number, stop)
     try:
         result = await task
-        if asked:
+        if signals:
             print_message("the campaign had ended before: its results are written")
         return result
     finally:
@@ -317,7 +317,7 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
     pours = given_up_pours(directory)
     if not pours:
         return f"; nothing is lost. Continue with: {again}"
-    what = " and ".join(pours)
+    lost = " and ".join(pours)
     if plan.laboratory.mode != "virtual":
         rescue = (
             "What it poured is lost unless you weigh it now: wait until the arm stands still, move nothing else, and "
@@ -329,7 +329,7 @@ def interruption(directory: Path, plan: CampaignPlan, again: str) -> str:
     else:
         rescue = "Resuming asks for its outcome: on a virtual bench 'repeat' pours it again with the same chance"
     return (
-        f" while {what} was under way: it was abandoned, and its outcome is unknown. {rescue}. Everything "
+        f" while {lost} was under way: it was abandoned, and its outcome is unknown. {rescue}. Everything "
         f"before it is kept. Continue with: {again}"
     )
 
@@ -348,7 +348,7 @@ def finished_without_report(directory: Path) -> str:
 def given_up_pours(directory: Path) -> list[str]:
     """Pours of a run that had begun and have no outcome: 'pour 3 of stage deployment:narrow'."""
     with contextlib.suppress(JournalError):
-        return [f"pour {one.request.number} of stage {one.stage}" for one in read_record(directory).unknown_pours]
+        return [f"pour {pour.request.number} of stage {pour.stage}" for pour in read_record(directory).unknown_pours]
     return []
 
 

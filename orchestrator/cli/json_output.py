@@ -65,12 +65,12 @@ class _PlannedParts(CommandOutput):
 
 def _part(model: type[BaseModel], names: Any) -> dict[str, Any]:
     """Fields of another model, for `create_model`."""
-    found = {}
+    fields = {}
     for name in names:
         field = copy(model.model_fields[name])
         field.description = meanings(model)[name] or None
-        found[name] = (field.annotation, field)
-    return found
+        fields[name] = (field.annotation, field)
+    return fields
 
 
 PlannedOutput = create_model(
@@ -220,4 +220,4 @@ def output_schema() -> dict[str, Any]:
     fields: dict[str, Any] = {name: (model, ...) for name, model in OUTPUTS.items()}
     model = create_model("Output", __doc__="Output of commands with --json, by command.", **fields)
     schema = model.model_json_schema(mode="serialization", schema_generator=DescribedSchema)
-    return {**{name: part for name, part in schema.items() if name != "required"}, "title": "Output"}
+    return {**{name: entry for name, entry in schema.items() if name != "required"}, "title": "Output"}

@@ -114,30 +114,30 @@ def list_vessels(
     rows: list[dict[str, Any]]
     with _opened(url, state) as where:
         if not isinstance(where, VesselAccount):
-            found = where.get("/materials")
-            rows = [{"id": one["id"], "position": one["position"], **one["content"]} for one in found["vessels"]]
-            rows += [{"id": one["id"], "position": one["position"], **one["content"]} for one in found["sources"]]
+            materials = where.get("/materials")
+            rows = [{"id": row["id"], "position": row["position"], **row["content"]} for row in materials["vessels"]]
+            rows += [{"id": row["id"], "position": row["position"], **row["content"]} for row in materials["sources"]]
         else:
             places = where.places()
             rows = [
-                {"id": one.vessel, "position": places[one.vessel].text if one.vessel in places else ""}
-                | one.json_content()
-                for one in where.all()
+                {"id": content.vessel, "position": places[content.vessel].text if content.vessel in places else ""}
+                | content.json_content()
+                for content in where.all()
             ]
     if as_json:
         print_json({"vessels": rows})
         return
     if not rows:
         print_message("no vessel has content; 'decant materials weigh' enters one, see docs/laboratory/station.md")
-    for one in rows:
-        text = f"{one['id']:24s} {one['liquid'] or '-':12s} {_content(one):24s} {one['position']}"
+    for row in rows:
+        text = f"{row['id']:24s} {row['liquid'] or '-':12s} {_content(row):24s} {row['position']}"
         print(text.rstrip())
 
 
-def _content(one: dict[str, Any]) -> str:
-    if one["mass_g"] is None:
+def _content(row: dict[str, Any]) -> str:
+    if row["mass_g"] is None:
         return "unknown: weigh it"
-    return f"{one['mass_g']:.1f} ± {one['deviation_g']:.1f} g"
+    return f"{row['mass_g']:.1f} ± {row['deviation_g']:.1f} g"
 
 
 def _show_entries(vessel: str, limit: int, url: str | None, state: Path | None, as_json: bool) -> None:
@@ -147,16 +147,16 @@ def _show_entries(vessel: str, limit: int, url: str | None, state: Path | None, 
         if not isinstance(where, VesselAccount):
             rows = where.get("/materials/account", vessel=vessel, limit=limit)
         else:
-            rows = [one.json_entry() for one in reversed(where.history(vessel, limit))]
+            rows = [entry.json_entry() for entry in reversed(where.history(vessel, limit))]
     if as_json:
         print_json({"entries": rows})
         return
     if not rows:
         print_message(f"{vessel}: has no entry; 'decant materials list' lists the vessels")
-    for one in rows:
-        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(one["t"]))
-        about = "  ".join(part for part in (one["pour"], one["by"], one["note"]) if part)
-        print(f"{when}  {one['kind']:8s} {_content(one):24s} {about}".rstrip())
+    for row in rows:
+        when = time.strftime("%Y-%m-%d %H:%M", time.localtime(row["t"]))
+        about = "  ".join(text for text in (row["pour"], row["by"], row["note"]) if text)
+        print(f"{when}  {row['kind']:8s} {_content(row):24s} {about}".rstrip())
 
 
 def weigh(

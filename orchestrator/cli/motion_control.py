@@ -95,12 +95,12 @@ def consent_to_motion(request: RunRequest, count: str = "", path: PathReport | N
         confirm(laboratory, [*lines, *report_lines(path)])
         return checksum
     print_note(f"planning paths from all over the actions of {plan.name} …")
-    found = envelope(laboratory.arm, campaign_pours(plan, request.stages))
-    if not found.reports:
+    paths = envelope(laboratory.arm, campaign_pours(plan, request.stages))
+    if not paths.reports:
         raise RefusalError(
-            f"none of {len(found.refused)} actions could be poured by this arm; the first: {found.refused[0]}"
+            f"none of {len(paths.refused)} actions could be poured by this arm; the first: {paths.refused[0]}"
         )
-    confirm(laboratory, [*lines, *envelope_lines(found)])
+    confirm(laboratory, [*lines, *envelope_lines(paths)])
     return checksum
 
 
@@ -326,11 +326,11 @@ class Jogging:
 
     def where(self) -> None:
         """Print the positions of joints and tool."""
-        here = self._arm.where()
-        if here.joints:
-            joints = "  ".join(f"{i}: {math.degrees(q):7.2f}" for i, q in enumerate(here.joints, start=1))
+        position = self._arm.where()
+        if position.joints:
+            joints = "  ".join(f"{i}: {math.degrees(q):7.2f}" for i, q in enumerate(position.joints, start=1))
             self._print(f"joints  {joints} deg")
-        numbers = here.tool.as_list
+        numbers = position.tool.as_list
         place = "  ".join(f"{name} {1e3 * value:7.1f}" for name, value in zip("xyz", numbers[:3], strict=True))
         turn = "  ".join(f"r{name} {value:6.3f}" for name, value in zip("xyz", numbers[3:], strict=True))
         self._print(f"tool    {place} mm   {turn} rad")
@@ -356,10 +356,10 @@ class Jogging:
             JogError: the arm does not report its joints or its home position.
             LaboratoryError: the motion is refused or stopped.
         """
-        here = self._arm.where()
-        if len(here.home) != len(here.joints) or not here.home:
+        position = self._arm.where()
+        if len(position.home) != len(position.joints) or not position.home:
             raise JogError("this arm does not report its joints or its home configuration; bring it home by steps")
-        steps = steps_home(here.joints, here.home)
+        steps = steps_home(position.joints, position.home)
         if not steps:
             self._print("at home")
             return True

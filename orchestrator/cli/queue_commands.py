@@ -141,14 +141,14 @@ def submit(
         raise RefusalError(f"{error.filename}: {error.strerror}") from None
     with connected_client(url, state) as client:
         body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority, "id": caller_id}
-        found = client.post("/campaigns", {**body, "not_before": not_before})
+        queued = client.post("/campaigns", {**body, "not_before": not_before})
     if as_json:
-        print_json(found)
+        print_json(queued)
         return
-    print(found["id"])
-    print_note(f"queued for {found['rig']}; follow it with: decant queue logs -f {found['id']}")
-    if found["waits_for"]:
-        print_message(f"it waits for: {found['waits_for']}")
+    print(queued["id"])
+    print_note(f"queued for {queued['rig']}; follow it with: decant queue logs -f {queued['id']}")
+    if queued["waits_for"]:
+        print_message(f"it waits for: {queued['waits_for']}")
 
 
 def list_campaigns(key: CampaignOrAll = None, url: Url = None, state: State = None, as_json: Json = False) -> None:
@@ -179,8 +179,8 @@ def list_campaigns(key: CampaignOrAll = None, url: Url = None, state: State = No
     if status["queue_paused"]:
         print_message("the queue is paused: decant queue resume")
     rows = [("CAMPAIGN", "STATE", "RIG", "SUBMITTED", "")]
-    for one in campaigns:
-        rows.append((one["id"], one["state"], one["rig"], _clock(one["created"]), _standing(one)))
+    for item in campaigns:
+        rows.append((item["id"], item["state"], item["rig"], _clock(item["created"]), _standing(item)))
     widths = [max(len(row[i]) for row in rows) for i in range(4)]
     for row in rows:
         print("  ".join([*(text.ljust(width) for text, width in zip(row[:4], widths, strict=True)), row[4]]).rstrip())
@@ -188,11 +188,11 @@ def list_campaigns(key: CampaignOrAll = None, url: Url = None, state: State = No
         _print_question(question)
 
 
-def _standing(one: dict[str, Any]) -> str:
-    progress = one["progress"]
+def _standing(item: dict[str, Any]) -> str:
+    progress = item["progress"]
     if progress is None:
-        reason = str(one["reason"]).split("\n", maxsplit=1)[0][:100]
-        return " · ".join(filter(None, (reason, one["waits_for"] and f"waits for: {one['waits_for']}")))
+        reason = str(item["reason"]).split("\n", maxsplit=1)[0][:100]
+        return " · ".join(filter(None, (reason, item["waits_for"] and f"waits for: {item['waits_for']}")))
     parts = [f"{progress['stage']} ({progress['stage_index']}/{progress['stage_count']})"] if progress["stage"] else []
     if progress["of_pours"]:
         parts.append(f"{progress['pours']}/{progress['of_pours']} pours")
@@ -204,24 +204,24 @@ def _standing(one: dict[str, Any]) -> str:
 
 def _show(key: str, url: str | None, state: Path | None, as_json: bool) -> None:
     with connected_client(url, state) as client:
-        found = client.get(f"/campaigns/{key}")
+        item = client.get(f"/campaigns/{key}")
     if as_json:
-        print_json(found)
+        print_json(item)
         return
-    print(f"{found['id']}: {found['state']}  ({found['task']} on {found['rig']}, {found['mode']})")
+    print(f"{item['id']}: {item['state']}  ({item['task']} on {item['rig']}, {item['mode']})")
     for name in ("reason", "waits_for", "run", "live"):
-        if found[name]:
-            print(f"  {name.replace('_', ' '):10s} {found[name]}")
-    print(f"  submitted  {_clock(found['created'])} by {found['by']}")
-    if found["progress"] is not None:
-        print(f"  now        {_standing(found)}")
-        print(f"             {found['progress']['line']}")
-    for pour in found["pours_made"]:
+        if item[name]:
+            print(f"  {name.replace('_', ' '):10s} {item[name]}")
+    print(f"  submitted  {_clock(item['created'])} by {item['by']}")
+    if item["progress"] is not None:
+        print(f"  now        {_standing(item)}")
+        print(f"             {item['progress']['line']}")
+    for pour in item["pours_made"]:
         told = pour["measured"] or {"unknown": "UNKNOWN"}.get(pour["state"], pour["state"])
         told += f" ({pour['loss']})" if pour["state"] == "weighed" else ""
         predicted = f"  predicted {pour['predicted']}" if pour["predicted"] else ""
         print(f"  pour {pour['number']:<3d} into {pour['receiver']}  {pour['action']}{predicted}  → {told}")
-    for entry in found["audit"]:
+    for entry in item["audit"]:
         print(f"  {_clock(entry['t'])}  {entry['by']}: {entry['what']} {entry['detail']}".rstrip())
 
 
@@ -274,8 +274,8 @@ def _line(event: dict[str, Any]) -> str | None:
             text = event["decision"]["text"]
         case "QuestionAsked" | "QuestionAnswered" | "QuestionClosed":
             question = event["question"]
-            said = f" → {question['answer']} ({question['by']})" if question["answer"] else ""
-            text = f"question {question['id']}: {question['text']}{said}"
+            answered = f" → {question['answer']} ({question['by']})" if question["answer"] else ""
+            text = f"question {question['id']}: {question['text']}{answered}"
         case "AuditEntry":
             text = f"{event['by']}: {event['what']} {event['detail']}".rstrip()
         case _:
@@ -285,16 +285,16 @@ def _line(event: dict[str, Any]) -> str | None:
 
 def _finished(event: dict[str, Any]) -> str:
     request, outcome = event["request"], event["outcome"]
-    what = f"pour {request['number']}" if request["type"] == "Pour" else request["type"].lower()
+    request_name = f"pour {request['number']}" if request["type"] == "Pour" else request["type"].lower()
     match outcome["type"]:
         case "Poured":
             masses = outcome["measurement"]
-            return f"{what}: {1e3 * masses['spilled']:.1f} g spilled of {1e3 * masses['loaded']:.1f} g"
+            return f"{request_name}: {1e3 * masses['spilled']:.1f} g spilled of {1e3 * masses['loaded']:.1f} g"
         case "Simulated":
-            return f"{what}: {100 * outcome['outcome']['spilled']:.2f} % spilled"
+            return f"{request_name}: {100 * outcome['outcome']['spilled']:.2f} % spilled"
         case "Failed":
-            return f"{what}: failed: {outcome['reason']}"
-    return f"{what}: {outcome['type'].lower()}"
+            return f"{request_name}: failed: {outcome['reason']}"
+    return f"{request_name}: {outcome['type'].lower()}"
 
 
 def pause(
@@ -326,14 +326,14 @@ def stop(key: CampaignId, url: Url = None, state: State = None) -> None:
     _change(key, "stop", url, state)
 
 
-def _change(key: str | None, what: str, url: str | None, state: Path | None) -> None:
+def _change(key: str | None, change: str, url: str | None, state: Path | None) -> None:
     """Pause, resume, stop or abort a campaign, or pause or resume the queue if none is given."""
     with connected_client(url, state) as client:
-        found = client.post(f"/queue/{what}" if key is None else f"/campaigns/{key}/{what}")
+        changed = client.post(f"/queue/{change}" if key is None else f"/campaigns/{key}/{change}")
     if key is None:
-        print("queue paused" if found["queue_paused"] else "queue resumed")
+        print("queue paused" if changed["queue_paused"] else "queue resumed")
     else:
-        print(f"{found['id']}: {found['state']}, wanted: {found['desired_state']}")
+        print(f"{changed['id']}: {changed['state']}, wanted: {changed['desired_state']}")
 
 
 def estop(
@@ -361,11 +361,11 @@ def estop(
                 f"emergency stop{f' of {rig}' if rig else ''} cleared: abandoned campaigns wait until they are resumed"
             )
             return
-        found = client.emergency_stop(reason, rig)
-    one = any(known["name"] == rig and known["mode"] != "none" for known in found.get("rigs", ()))
-    of, option = (f" of {rig}", f" --rig {rig}") if one else ("", "")
+        stopped = client.emergency_stop(reason, rig)
+    known_rig = any(known["name"] == rig and known["mode"] != "none" for known in stopped.get("rigs", ()))
+    of, option = (f" of {rig}", f" --rig {rig}") if known_rig else ("", "")
     print(f"EMERGENCY STOP{of}: the work is abandoned; nothing starts there before 'decant estop --clear{option}'")
-    for note in found["notes"]:
+    for note in stopped["notes"]:
         print_message(f"note: {note}")
 
 
@@ -381,13 +381,11 @@ def answer(
     with connected_client(url, state) as client:
         if question is None:
             questions = client.get("/questions")
-            for one in questions:
-                _print_question(one)
+            for q in questions:
+                _print_question(q)
             if not questions:
                 asking = [
-                    one["id"]
-                    for one in client.get("/campaigns", limit=50)
-                    if one["state"] == State.WAITING_FOR_OPERATOR
+                    c["id"] for c in client.get("/campaigns", limit=50) if c["state"] == State.WAITING_FOR_OPERATOR
                 ]
                 print_message(
                     f"the question of {asking[0]} is being prepared: the arm and the balance are read. Try again in a "
@@ -398,8 +396,8 @@ def answer(
             return
         if not text:
             raise RefusalError(f"question {question}: what is the answer? 'decant queue answer' lists the questions")
-        found = client.post(f"/questions/{question}/answer", {"answer": " ".join(text)})
-    print(f"question {found['id']}: {found['answer']}")
+        closed = client.post(f"/questions/{question}/answer", {"answer": " ".join(text)})
+    print(f"question {closed['id']}: {closed['answer']}")
 
 
 def _print_question(question: dict[str, Any]) -> None:
@@ -429,8 +427,8 @@ def enable(key: CampaignId, url: Url = None, state: State = None) -> None:
         moves = client.get(f"/campaigns/{key}/motion")
         announce(moves["laboratory"], moves["arm"], moves["lines"])
         print("> ", end="", file=sys.stderr, flush=True)
-        found = client.post(f"/campaigns/{key}/enable", {"laboratory": sys.stdin.readline().strip()})
-    print_message(f"motion is enabled for the coming part of the run: {found['id']}")
+        enabled = client.post(f"/campaigns/{key}/enable", {"laboratory": sys.stdin.readline().strip()})
+    print_message(f"motion is enabled for the coming part of the run: {enabled['id']}")
 
 
 def shutdown(url: Url = None, state: State = None) -> None:

@@ -13,7 +13,7 @@ from orchestrator.cli.shell_completion import RUNS, local_runs
 
 
 def report(
-    what: Annotated[
+    run: Annotated[
         Path,
         typer.Argument(
             help="Folder of a run, or its name in runs/.",
@@ -36,7 +36,7 @@ def report(
     from orchestrator.records.journal import JOURNAL_NAME
 
     check_output(output, "--output", ".html")
-    folder = what if what.exists() or len(what.parts) > 1 else RUNS / what
+    folder = run if run.exists() or len(run.parts) > 1 else RUNS / run
     if (folder / JOURNAL_NAME).is_file():
         page, figures = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
     elif folder.suffix in (".yaml", ".yml"):

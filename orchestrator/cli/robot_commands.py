@@ -89,11 +89,11 @@ def check(
         check_bench_packages(spec)
 
     def read(look: ArmDiagnostics) -> SafetyRecord | None:
-        found = _accept(laboratory, look) if accept_safety and not virtual else record
+        accepted = _accept(laboratory, look) if accept_safety and not virtual else record
         if record_to is not None:
             with Refused(OSError, ArchiveError, at=f"--record {record_to}: "):
-                write_robot_check(record_to, laboratory, look, found, virtual=virtual)
-        return found
+                write_robot_check(record_to, laboratory, look, accepted, virtual=virtual)
+        return accepted
 
     report = check_bench(spec, laboratory, record, tare=tare, read=read)
     if as_json:
@@ -123,13 +123,13 @@ def archive(
     from orchestrator.cli.commissioning_archive import CommissioningArchive
 
     with Refused(OSError):
-        kept = CommissioningArchive(archive)
+        stored = CommissioningArchive(archive)
         if recordings:
-            kept.add(recordings)
+            stored.add(recordings)
         elif not archive.exists():
             raise RefusalError(f"{archive}: there is no such archive, and no recording to begin one with")
-    checks = list(kept.replay())
-    failed = [one for one in checks if one.state == "fail"]
+    checks = list(stored.replay())
+    failed = [c for c in checks if c.state == "fail"]
     if as_json:
         print_json(CheckOutput(laboratory=str(archive), mode="", ready=not failed, checks=checks))
     else:
@@ -139,15 +139,15 @@ def archive(
     print_message(f"{archive}: {len(checks)} recordings, read as on the day")
 
 
-def without_arm(path: Path, spec: LaboratorySettings, asked: str) -> RefusalError:
+def without_arm(path: Path, spec: LaboratorySettings, purpose: str) -> RefusalError:
     """Return the refusal for a laboratory without an arm, with a suggestion.
 
     Args:
-        asked: the command's purpose, as part of the message.
+        purpose: the command's purpose, as part of the message.
     """
     has = "its bench is simulated" if spec.bench is not None else "it has no bench"
     return RefusalError(
-        f"{path}: laboratory {spec.name} has no 'arm', {has}: {asked}. Name a laboratory that has one, for example "
+        f"{path}: laboratory {spec.name} has no 'arm', {has}: {purpose}. Name a laboratory that has one, for example "
         "laboratories/virtual.yaml"
     )
 
@@ -172,10 +172,10 @@ def print_table(checks: Sequence[DeviceCheck]) -> None:
     table = Table(box=None, pad_edge=False, show_header=False, padding=(0, 2, 0, 0))
     for check in checks:
         mark, style = _MARKS[check.state]
-        said = Text(check.found)
+        text = Text(check.found)
         if check.advice:
-            said.append(f"\n→ {check.advice}", style="bold" if check.state == "fail" else "")
-        table.add_row(Text(mark, style=style), Text(check.name), said)
+            text.append(f"\n→ {check.advice}", style="bold" if check.state == "fail" else "")
+        table.add_row(Text(mark, style=style), Text(check.name), text)
     console = Console(highlight=False)
     (console if console.is_terminal else Console(highlight=False, width=1000)).print(table)
 
@@ -302,9 +302,9 @@ def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMoti
     from orchestrator.cli.motion_control import stoppable, typed_line
 
     spec = read_laboratory(laboratory)
-    place = next((one for one in spec.places if one.name == name), None)
+    place = next((p for p in spec.places if p.name == name), None)
     if place is None:
-        known = ", ".join(f"'{one.name}'" for one in spec.places) or "none"
+        known = ", ".join(f"'{p.name}'" for p in spec.places) or "none"
         raise RefusalError(f"{laboratory}: there is no place '{name}'; there are {known}")
     lines = f"from home to the place '{name}' and back, at a quarter of the usual speed"
     with _session(laboratory, "try", lines, enable_motion) as (driver, arm):

@@ -122,19 +122,19 @@ def _command(
 
     def register(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)
-        def call_it(**given: Any) -> None:
+        def call_it(**arguments: Any) -> None:
             if names:
-                given["conditions"] = {option: given.pop(key) for key, option in names.items()}
-            call(command, **given)
+                arguments["conditions"] = {option: arguments.pop(key) for key, option in names.items()}
+            call(command, **arguments)
 
         if names:
-            own = inspect.signature(command, eval_str=True).parameters.values()
+            signature = inspect.signature(command, eval_str=True).parameters.values()
             parameters = [
                 *(inspect.Parameter(key, KEYWORD, default=None, annotation=options[o]) for key, o in names.items()),
-                *(one.replace(kind=KEYWORD) for one in own if one.name != "conditions"),
+                *(p.replace(kind=KEYWORD) for p in signature if p.name != "conditions"),
             ]
             call_it.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-            call_it.__annotations__ = {one.name: one.annotation for one in parameters}
+            call_it.__annotations__ = {p.name: p.annotation for p in parameters}
         runs.command(name, epilog=examples(*lines))(call_it)
         return command
 
@@ -160,11 +160,11 @@ def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = 
     from orchestrator.reports.console_view import print_table
 
     with _client(daemon) as client:
-        found = client.runs(conditions)
+        listed = client.runs(conditions)
     if as_json:
-        print_json({"runs": found})
+        print_json({"runs": listed})
         return
-    if not found:
+    if not listed:
         print_note("no run; `decant runs add FOLDER` enters runs that the catalogue doesn't know")
         return
     rows = [
@@ -179,10 +179,10 @@ def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = 
             "into": ", ".join(run["receiver"]),
             "pours": _count_of_pours(run),
             "best loss": "  ".join(
-                f"{name} {_loss(one['best_loss'], one['loss'])}" for name, one in run["recommended"].items()
+                f"{name} {_loss(best['best_loss'], best['loss'])}" for name, best in run["recommended"].items()
             ),
         }
-        for run in found
+        for run in listed
     ]
     print_table(rows, right=("pours",))
 
@@ -195,11 +195,11 @@ def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = 
 def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """List pours with their actions, weighed spillage and predictions."""
     with _client(daemon) as client:
-        found = client.pours(conditions)
+        listed = client.pours(conditions)
     if as_json:
-        print_json({"pours": found})
-    elif found:
-        _print_pours(found)
+        print_json({"pours": listed})
+    elif listed:
+        _print_pours(listed)
     else:
         print_note("no pour that this holds for")
 
@@ -208,37 +208,37 @@ def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = Fals
 def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
     """Show one run: state, θ*, recommendations, pours, notes, and files."""
     with _client(daemon) as client:
-        found = client.run(run)
+        entry = client.run(run)
     if as_json:
-        print_json(found)
+        print_json(entry)
         return
     lines = {
-        "run": f"{found['run']}  {_mode(found['mode'])}",
-        "state": f"{found['state']}{': ' + found['reason'] if found['reason'] else ''}",
-        "begun": f"{_date(found['begun'])}, ended {_date(found['ended'])}",
-        "campaign": f"{found['campaign']}, seed {found['seed']}, laboratory {found['laboratory']}",
-        "strategies": ", ".join(found["strategy"]),
-        "liquid": "{}, from {} into {}".format(*(", ".join(found[key]) for key in ("liquid", "pourer", "receiver"))),
-        "work": f"{found['simulations']} simulations, {_count_of_pours(found)} pours, "
-        f"{found['spilled_g'] or 0:.1f} g spilled",
-        "θ*": ", ".join(f"{key} {value:.4g}" for key, value in found["theta"].items()),
-        "test |Δ|": _percent(found["test_discrepancy"]),
+        "run": f"{entry['run']}  {_mode(entry['mode'])}",
+        "state": f"{entry['state']}{': ' + entry['reason'] if entry['reason'] else ''}",
+        "begun": f"{_date(entry['begun'])}, ended {_date(entry['ended'])}",
+        "campaign": f"{entry['campaign']}, seed {entry['seed']}, laboratory {entry['laboratory']}",
+        "strategies": ", ".join(entry["strategy"]),
+        "liquid": "{}, from {} into {}".format(*(", ".join(entry[key]) for key in ("liquid", "pourer", "receiver"))),
+        "work": f"{entry['simulations']} simulations, {_count_of_pours(entry)} pours, "
+        f"{entry['spilled_g'] or 0:.1f} g spilled",
+        "θ*": ", ".join(f"{key} {value:.4g}" for key, value in entry["theta"].items()),
+        "test |Δ|": _percent(entry["test_discrepancy"]),
         **{
-            f"best for {receiver}": f"{_action(one['action'])}: {_loss(one['predicted_loss'], one['loss'])} expected, "
-            f"{_loss(one['best_loss'], one['loss'])} the best poured"
-            for receiver, one in found["recommended"].items()
+            f"best for {receiver}": f"{_action(b['action'])}: {_loss(b['predicted_loss'], b['loss'])} expected, "
+            f"{_loss(b['best_loss'], b['loss'])} the best poured"
+            for receiver, b in entry["recommended"].items()
         },
-        "folder": found["path"],
+        "folder": entry["path"],
     }
     width = max(map(len, lines))
     for key, text in lines.items():
         if text:
             print(f"{key:<{width}}  {text}")
-    for note in found["notes"]:
+    for note in entry["notes"]:
         print(f"{'note':<{width}}  {_date(note['time'])} {note['by']}: {note['text']}")
-    if found["list_of_pours"]:
+    if entry["list_of_pours"]:
         print()
-        _print_pours(found["list_of_pours"], of_one_run=True)
+        _print_pours(entry["list_of_pours"], of_one_run=True)
 
 
 @_command("decant runs known", "decant runs known beaker")
@@ -253,25 +253,25 @@ def known(
     from orchestrator.reports.console_view import print_table
 
     with _catalogue() as catalogue, _refusing():
-        found = [one for one in catalogue.posteriors() if cup in (None, one.pourer, *one.receivers)]
+        posteriors = [p for p in catalogue.posteriors() if cup in (None, p.pourer, *p.receivers)]
     if as_json:
-        print_json({"posteriors": [posterior_table(one) for one in found]})
+        print_json({"posteriors": [posterior_table(p) for p in posteriors]})
         return
-    if not found:
+    if not posteriors:
         print_note(f"no posterior{'' if cup is None else f' about {cup}'}; a finished calibration with C4 has one")
         return
     rows = [
         {
-            "run": one.posterior,
-            "laboratory": f"{one.laboratory}, arm {one.arm}",
-            "mode": _mode(one.mode),
-            "liquid": one.liquid.name,
-            "from": one.pourer,
-            "into": ", ".join(one.receivers),
-            "pours": str(one.pours),
-            "known": "; ".join(str(RememberedParameter(name, *told, ())) for name, told in one.estimates.items()),
+            "run": p.posterior,
+            "laboratory": f"{p.laboratory}, arm {p.arm}",
+            "mode": _mode(p.mode),
+            "liquid": p.liquid.name,
+            "from": p.pourer,
+            "into": ", ".join(p.receivers),
+            "pours": str(p.pours),
+            "known": "; ".join(str(RememberedParameter(name, *told, ())) for name, told in p.estimates.items()),
         }
-        for one in found
+        for p in posteriors
     ]
     print_table(rows, right=["pours"])
 
@@ -296,15 +296,15 @@ def check(run: Which, state: State = None, as_json: Json = False) -> None:
 
     folder = _folder(run)
     with _refusing():
-        found = check_journal(folder / JOURNAL_NAME)
+        report = check_journal(folder / JOURNAL_NAME)
     if as_json:
-        print_json(asdict(found))
+        print_json(asdict(report))
     else:
-        print(f"{folder}: {found.verdict}")
-        for pour in found.pours:
+        print(f"{folder}: {report.verdict}")
+        for pour in report.pours:
             print(f"  {pour}")
-    if found.problems:
-        raise RefusalError(f"{folder}: {len(found.problems)} problem(s) found", FAILED)
+    if report.problems:
+        raise RefusalError(f"{folder}: {len(report.problems)} problem(s) found", FAILED)
 
 
 def _folder(run: str) -> Path:
@@ -354,8 +354,8 @@ def note(
 ) -> None:
     """Add a note to a run, with date and author. It is in the run's folder; `decant runs list` finds its words."""
     with _client(daemon) as client:
-        found = client.note(run, text)
-    print(f"{found['run']}: {len(found['notes'])} note{'s' * (len(found['notes']) > 1)}")
+        entry = client.note(run, text)
+    print(f"{entry['run']}: {len(entry['notes'])} note{'s' * (len(entry['notes']) > 1)}")
 
 
 @_command(
@@ -379,14 +379,14 @@ def export(
         raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(FORMATS)}")
     try:
         with _client(daemon) as client:
-            found = client.export(folder, conditions, formats or FORMATS)
+            exported = client.export(folder, conditions, formats or FORMATS)
     except MissingExtraError as error:
         raise RefusalError(f"{error}; or --format csv") from None
     if as_json:
-        print_json(found)
+        print_json(exported)
         return
-    print_note(f"{found['runs']} runs, {found['pours']} pours")
-    print("\n".join(found["files"]))
+    print_note(f"{exported['runs']} runs, {exported['pours']} pours")
+    print("\n".join(exported["files"]))
 
 
 @_command(
@@ -403,7 +403,7 @@ def add(
     """Register runs that the catalogue lacks: from another machine, or moved. Files add their posteriors only."""
     from orchestrator.records.run_registry import enter, runs_below
 
-    found: list[Path] = []
+    runs_found: list[Path] = []
     posteriors = [path for path in folders if path.suffix.lower() in (".yaml", ".yml", ".json")]
     if posteriors:
         _import_posteriors(posteriors)
@@ -416,12 +416,12 @@ def add(
         below = list(runs_below(folder.absolute()))
         if not below:
             raise RefusalError(f"{folder}: there is no run in it (no journal.sqlite, at any depth)")
-        found += below
+        runs_found += below
     with _refusing():
-        enter(found)
+        enter(runs_found)
     with _catalogue():
         pass
-    print(f"{len(found)} run{'s' * (len(found) > 1)} entered, or known already")
+    print(f"{len(runs_found)} run{'s' * (len(runs_found) > 1)} entered, or known already")
 
 
 def _import_posteriors(paths: Sequence[Path]) -> None:
@@ -430,9 +430,9 @@ def _import_posteriors(paths: Sequence[Path]) -> None:
 
     read = [load_posterior_file(path) for path in paths]
     with _refusing():
-        for one in read:
-            import_posterior(one)
-    print(f"{len(read)} posterior{'s' * (len(read) > 1)} entered: {', '.join(one.posterior for one in read)}")
+        for p in read:
+            import_posterior(p)
+    print(f"{len(read)} posterior{'s' * (len(read) > 1)} entered: {', '.join(p.posterior for p in read)}")
 
 
 # -- formatting ------------------------------------------------------------------------------------------------------
@@ -479,9 +479,9 @@ def _print_pours(pours: Sequence[Row], *, of_one_run: bool = False) -> None:
     if weighed:
         mean = sum(pour["spillage"] for pour in weighed) / len(weighed)
         least = min(weighed, key=lambda pour: float(pour["spillage"]))
-        made = f"{len(pours)} pour{'s' * (len(pours) != 1)}, {len(weighed)} weighed"
+        total = f"{len(pours)} pour{'s' * (len(pours) != 1)}, {len(weighed)} weighed"
         print(
-            f"{made}: {_percent(mean)} spilled in the mean, at least {_percent(least['spillage'])} "
+            f"{total}: {_percent(mean)} spilled in the mean, at least {_percent(least['spillage'])} "
             f"(pour {least['number']} of {least['stage']}, {least['run']})"
         )
 

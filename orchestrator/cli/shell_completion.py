@@ -33,15 +33,15 @@ def files_of(kind: str) -> Callable[[str], list[str]]:
     def complete(incomplete: str) -> list[str]:
         from orchestrator.campaigns.yaml.yaml_source import kind_of
 
-        found = []
+        matching = []
         for path in _yaml_files(incomplete):
             try:
                 keys = _TOP_LEVEL_KEY.findall(path.read_text(encoding="utf-8", errors="replace"))
             except OSError:
                 continue
             if kind_of(dict.fromkeys(keys)) == kind:
-                found.append(str(path))
-        return found
+                matching.append(str(path))
+        return matching
 
     return complete
 
@@ -51,19 +51,21 @@ def _yaml_files(incomplete: str) -> list[Path]:
     from orchestrator.records.journal import JOURNAL_NAME
 
     start, beginning = os.path.split(incomplete)
-    found: list[Path] = []
+    files: list[Path] = []
     for folder, folders, names in os.walk(start or "."):
-        here = Path(folder)
-        depth = len(here.relative_to(start or ".").parts)
+        parent = Path(folder)
+        depth = len(parent.relative_to(start or ".").parts)
         first = beginning if depth == 0 else ""
-        if JOURNAL_NAME in names or len(found) > FILE_LIMIT:
+        if JOURNAL_NAME in names or len(files) > FILE_LIMIT:
             folders.clear()
             continue
         folders[:] = sorted(name for name in folders if name.startswith(first) and not name.startswith("."))
         if depth == DEPTH:
             folders.clear()
-        found += [here / name for name in sorted(names) if name.startswith(first) and name.endswith((".yaml", ".yml"))]
-    return found
+        files += [
+            parent / name for name in sorted(names) if name.startswith(first) and name.endswith((".yaml", ".yml"))
+        ]
+    return files
 
 
 def catalogued_runs(incomplete: str) -> list[str]:
@@ -125,6 +127,6 @@ def queued_campaigns(incomplete: str) -> list[str]:
         from orchestrator.daemon.api.daemon_client import Client
 
         with Client() as client:
-            return [one["id"] for one in client.get("/campaigns", limit=50) if one["id"].startswith(incomplete)]
+            return [c["id"] for c in client.get("/campaigns", limit=50) if c["id"].startswith(incomplete)]
     except (ImportError, OSError, RunError):
         return []

@@ -159,7 +159,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
                 delivered_ml=None if delivered is None else scene.liquid.millilitres(delivered),
                 prediction=PredictionOutput.model_validate({"band": where, "seeds": seeds, **over_seeds}),
                 regimes=None if regime is None else regime.as_json(),
-                not_covered=[] if regime is None else [one.as_json() for one in regime.not_covered],
+                not_covered=[] if regime is None else [gap.as_json() for gap in regime.not_covered],
             )
         )
     else:
@@ -237,14 +237,14 @@ def _regimes(task: PourTask) -> ModelValidity | None:
     from orchestrator.reports.validity_warnings import numbers_line, regimes_of
 
     try:
-        found = regimes_of(task.scene, task.action, task.parameters.particles, task.parameters.lip_adhesion)
+        validity = regimes_of(task.scene, task.action, task.parameters.particles, task.parameters.lip_adhesion)
     except (ValueError, OSError) as error:
         print_note(f"note: whether something is not simulated could not be worked out: {error}")
         return None
-    print_note(f"{numbers_line(found)} (Reynolds, Weber and Bond numbers)")
-    for one in found.not_covered:
-        print_note(f"not simulated, {one.kind}: {one.text}")
-    return found
+    print_note(f"{numbers_line(validity)} (Reynolds, Weber and Bond numbers)")
+    for gap in validity.not_covered:
+        print_note(f"not simulated, {gap.kind}: {gap.text}")
+    return validity
 
 
 def scene_to_simulate(plan: CampaignPlan, name: str | None = None) -> tuple[Scene, Space]:
@@ -295,14 +295,14 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     simulator = PourSimulator()
     tasks = [known.tasks(scene, pour.action, options.seed, options.seeds) for pour in pours]
     _check(simulator, table, source, [some if scene.uncertain else some[:1] for some in tasks])
-    said = known.said(scene)
-    print_note(f"{scene.name}: {len(pours)} pours, {len(tasks[0])} simulations each, {said}")
+    text = known.said(scene)
+    print_note(f"{scene.name}: {len(pours)} pours, {len(tasks[0])} simulations each, {text}")
     outcomes = _simulated(simulator, tasks)
     rows = [
         _row(row.line, pour, some, known.residual) for row, pour, some in zip(table.rows, pours, outcomes, strict=True)
     ]
     dimensions = [name for name in table.dimensions if name in table.varying()] or list(table.dimensions)
-    found = scores(rows)
+    by_split = scores(rows)
     if options.csv is not None:
         from orchestrator.reports.prediction_scores import write_scored
 
@@ -312,31 +312,31 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
         from orchestrator.reports.prediction_scores import draw_scored
 
         title = f"{scene.pourer.name} into {scene.receiver.name}, {len(rows)} weighed pours"
-        print_note(f"picture: {figure_style.save(draw_scored(rows, title=title, note=said), options.png)}")
+        print_note(f"picture: {figure_style.save(draw_scored(rows, title=title, note=text), options.png)}")
     if options.as_json:
         from orchestrator.cli.command_results import SimulateTableOutput
         from sim_engine.prediction_band import resolution_shift
 
         left, shift = known.residual, resolution_shift(known.theta.particles)
-        own = left is not None and left.here
+        measured = left is not None and left.here
         left_shift = None if left is None else left.shift
         print_json(
             SimulateTableOutput(
                 scene=scene.name,
                 from_=source,
-                scores=found,
+                scores=by_split,
                 level=LEVEL,
                 theta=known.theta,
                 thetas=len(known.thetas),
                 simulations=sum(map(len, outcomes)),
                 cpu_s=sum(outcome.cpu_s for some in outcomes for outcome in some),
-                bands={"discrepancy_shift": left_shift, "resolution_shift": 0.0 if own else shift},
+                bands={"discrepancy_shift": left_shift, "resolution_shift": 0.0 if measured else shift},
                 pours=rows,
             )
         )
     else:
-        for split, one in found.items():
-            print(f"{split}: {one.text()}")
+        for split, score in by_split.items():
+            print(f"{split}: {score.text()}")
     lost = sum(row.lost for row in rows)
     if lost:
         print_note(f"{lost} of {sum(map(len, outcomes))} simulations could not be used, and are left out")
@@ -356,8 +356,8 @@ def _scene(plan: CampaignPlan, options: SimulateOptions, source: Path) -> tuple[
     sets = {} if calibration is None else {"calibration": calibration.records, "transfer": calibration.transfer}
     name, same = options.scene, source.absolute().resolve()
     if name is None:
-        own = [key for key, records in sets.items() if records is not None and records.path.resolve() == same]
-        name = own[0] if own else ("calibration" if calibration is not None else None)
+        names = [key for key, records in sets.items() if records is not None and records.path.resolve() == same]
+        name = names[0] if names else ("calibration" if calibration is not None else None)
     scene, _ = scene_to_simulate(plan, name)
     if options.receiver is not None:
         vessel = load_vessel(options.receiver)
@@ -430,7 +430,7 @@ def _check(simulator: PourSimulator, table: RecordTable, source: Path, tasks: Se
 def _simulated(simulator: PourSimulator, tasks: Sequence[Sequence[PourTask]]) -> list[list[PourOutcome]]:
     """Run the simulations of all pours, then close the simulator."""
     begin, total, done = time.monotonic(), sum(map(len, tasks)), 0
-    found: list[list[PourOutcome]] = []
+    by_pour: list[list[PourOutcome]] = []
 
     def doing() -> str:
         spent = time.monotonic() - begin
@@ -444,10 +444,10 @@ def _simulated(simulator: PourSimulator, tasks: Sequence[Sequence[PourTask]]) ->
                 for task in some:
                     outcomes.append(simulator.simulate(task).outcome)
                     done += 1
-                found.append(outcomes)
+                by_pour.append(outcomes)
         finally:
             simulator.close()
-    return found
+    return by_pour
 
 
 def _row(
@@ -512,8 +512,8 @@ class PredictionInputs:
     def said(self, scene: Scene) -> str:
         """Describe the sources of uncertainty in the prediction intervals of a scene's pours."""
         among = f"{len(self.drawn)} θ of the posterior" if self.drawn else "one θ"
-        own = self.residual is not None and self.residual.here
-        parts = ["seeds", among, *([] if own else [f"{self.theta.particles} particles' resolution"])]
+        measured = self.residual is not None and self.residual.here
+        parts = ["seeds", among, *([] if measured else [f"{self.theta.particles} particles' resolution"])]
         if scene.uncertain:
             parts.insert(1, "shapes that the vessels may have")
         if self.residual is not None:
@@ -549,5 +549,5 @@ def prediction_inputs(plan: CampaignPlan, parameters: Path | None, thetas: int |
     theta = load_parameters(parameters, plan.parameters)
     if thetas is None:
         thetas = seeds if predicts_with_posterior(parameters) else 0
-    drawn = load_posterior(parameters, thetas, plan.parameters) if thetas else ()
-    return PredictionInputs(theta, drawn, load_discrepancy(parameters))
+    draws = load_posterior(parameters, thetas, plan.parameters) if thetas else ()
+    return PredictionInputs(theta, draws, load_discrepancy(parameters))

@@ -30,7 +30,7 @@ def order(
     """Order one pour: an amount, or an action."""
     action = {}
     for text in assignments or []:
-        name, equals, value = (part.strip() for part in text.partition("="))
+        name, equals, value = (word.strip() for word in text.partition("="))
         if not equals:
             raise RefusalError(f"--set: {text!r} should be name=value, for example angular_velocity='60 deg/s'")
         action[name] = value
@@ -43,11 +43,11 @@ def order(
                 dry_run=dry_run,
             )
         )  # fmt: skip
-        found = client.post(f"/pours?wait={wait:g}", body)
+        poured = client.post(f"/pours?wait={wait:g}", body)
     if as_json:
-        print_json(found)
+        print_json(poured)
         return
-    print(pour_text(found))
+    print(pour_text(poured))
 
 
 def pour_text(pour: dict[str, Any]) -> str:
@@ -75,8 +75,8 @@ def backup(file: Annotated[Path, typer.Argument(help="Archive to write (.zip).")
     from orchestrator.records.run_registry import state_directory
 
     with Refused(RunError), Refused(OSError):
-        found = back_up(state or state_directory(), file)
-    print(f"{file}: {found['campaigns']} campaigns, {found['runs']} runs, {found['bytes'] / 1e6:.1f} MB")
+        written = back_up(state or state_directory(), file)
+    print(f"{file}: {written['campaigns']} campaigns, {written['runs']} runs, {written['bytes'] / 1e6:.1f} MB")
     print_message("recordings are left out; the archive contains access tokens")
 
 
@@ -90,9 +90,9 @@ def restore(
     from orchestrator.records.run_registry import state_directory
 
     with Refused(RunError), Refused(OSError):
-        found = state_backup.restore(file, state or state_directory())
-    then = time.strftime("%Y-%m-%d %H:%M", time.localtime(found["time"]))
-    print(f"restored the state of {then}: {found['campaigns']:.0f} campaigns, {found['runs']:.0f} runs")
+        restored = state_backup.restore(file, state or state_directory())
+    then = time.strftime("%Y-%m-%d %H:%M", time.localtime(restored["time"]))
+    print(f"restored the state of {then}: {restored['campaigns']:.0f} campaigns, {restored['runs']:.0f} runs")
     print_message(
         "the queue is paused. Pours made since then are not in it: weigh the vessels, then decant queue resume"
     )

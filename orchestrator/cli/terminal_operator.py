@@ -117,8 +117,8 @@ class TerminalOperator:
             except EOFError:
                 ends += 1
                 if ends >= _ENDS_OF_INPUT:
-                    what = question.text.rstrip(".")
-                    raise LaboratoryError(f"the terminal was closed; no answer is possible: {what}") from None
+                    question_text = question.text.rstrip(".")
+                    raise LaboratoryError(f"the terminal was closed; no answer is possible: {question_text}") from None
                 self._write(f"\nThe question is still open: {self._expected(question)}\n> ")
                 continue
             ends = 0
@@ -130,8 +130,8 @@ class TerminalOperator:
 
     def _understood(self, question: OperatorQuestion, line: str) -> str | None:
         """Return the answer in a line, or print the valid answers and return None."""
-        said = " ".join(line.lower().split())
-        if said == GIVE_UP:
+        words = " ".join(line.lower().split())
+        if words == GIVE_UP:
             raise LaboratoryError(f"abandoned by the operator at: {question.text.rstrip('.')}")
         if question.wants == "weight":
             try:
@@ -142,9 +142,9 @@ class TerminalOperator:
             digits = max(0, round(-math.log10(1e3 * weight.step)))
             self._write(f"  {1e3 * weight.mass:.{digits}f} g\n")
             return line.strip()
-        answer = _WORDS[question.wants].get(said)
+        answer = _WORDS[question.wants].get(words)
         if answer is None:
-            unknown = f"'{line.strip()}' is not an answer; " if said else ""
+            unknown = f"'{line.strip()}' is not an answer; " if words else ""
             self._write(f"{unknown}{_EXPECTED[question.wants]}\n> ")
         return answer
 

@@ -99,32 +99,32 @@ def _serve(shown: Path, at: str | None) -> None:
             signal.signal(number, handler)
 
 
-def _again(what: Path, number: int, particles: int | None, stage: str | None, path: Path) -> Path:
+def _again(source: Path, number: int, particles: int | None, stage: str | None, path: Path) -> Path:
     from orchestrator.cli.console import waiting_for
     from orchestrator.live_view.simulation_view import find_pour, simulation_rrd, task_of
     from sim_engine.simulator import PourSimulator
 
-    run = _run_of(what)
+    run = _run_of(source)
     plan = _plan_of(run)
     pour = find_pour(run, number, stage)
     task = task_of(plan, run, pour, particles)
     simulator, begin = PourSimulator(), time.monotonic()
     with contextlib.closing(simulator), waiting_for(lambda: f"simulating, {time.monotonic() - begin:.0f} s so far"):
         result = simulator.simulate(task)
-    said = f"{1e3 * task.scene.liquid.mass * result.outcome.spilled:.1f} g spilled in this simulation"
+    spilled = f"{1e3 * task.scene.liquid.mass * result.outcome.spilled:.1f} g spilled in this simulation"
     assert pour.measured is not None
     weighed = f"{1e3 * pour.measured.spilled:.1f} g spilled when it was poured"
     title = f"pour {pour.request.number} of {pour.stage}, simulated again ({weighed})"
-    print_note(f"{title}; {said}, {result.outcome.particles} particles")
+    print_note(f"{title}; {spilled}, {result.outcome.particles} particles")
     return simulation_rrd(path, task, result, title)
 
 
-def _beside(what: list[Path], path: Path) -> Path:
+def _beside(sources: list[Path], path: Path) -> Path:
     from orchestrator.live_view.blueprints import put_beside
     from orchestrator.reports.figure_style import safe_name
 
     named: dict[str, Path] = {}
-    for each in what:
+    for each in sources:
         file = _recording_of(each)
         name = safe_name(file.parent.name if file.name == "campaign.rrd" else file.stem)
         while name in named:
@@ -133,26 +133,26 @@ def _beside(what: list[Path], path: Path) -> Path:
     return put_beside(named, path)
 
 
-def _recording_of(what: Path) -> Path:
+def _recording_of(source: Path) -> Path:
     """Return the recording of a run, or the file itself.
 
     Raises:
         RefusalError: there is none (exit code 2).
     """
-    if what.suffix == ".rrd" and what.is_file():
-        return what
-    run = _run_of(what)
-    found = sorted(run.glob("campaign*.rrd"), key=lambda path: path.stat().st_mtime)
-    found = [path for path in found if "optimising" not in path.name]
-    if not found:
+    if source.suffix == ".rrd" and source.is_file():
+        return source
+    run = _run_of(source)
+    recordings = sorted(run.glob("campaign*.rrd"), key=lambda path: path.stat().st_mtime)
+    recordings = [path for path in recordings if "optimising" not in path.name]
+    if not recordings:
         raise RefusalError(f"{run}: has no recording; was it run with 'outputs: {{recording: false}}'?")
-    return found[-1]
+    return recordings[-1]
 
 
-def _run_of(what: Path) -> Path:
+def _run_of(source: Path) -> Path:
     from orchestrator.records.journal import JOURNAL_NAME
 
-    run = what if what.exists() or len(what.parts) > 1 else Path("runs") / what
+    run = source if source.exists() or len(source.parts) > 1 else Path("runs") / source
     if not (run / JOURNAL_NAME).is_file():
         raise RefusalError(f"{run}: is not the folder of a run: it has no {JOURNAL_NAME}")
     return run
@@ -205,8 +205,8 @@ def parsed(at: str) -> tuple[str, int | None]:
     Raises:
         RefusalError: the text is invalid.
     """
-    found = re.fullmatch(r"(?P<address>[A-Za-z0-9.-]+|\[[0-9a-fA-F:]+\])(:(?P<port>\d+))?", at)
-    port = None if found is None or found["port"] is None else int(found["port"])
-    if found is None or (port is not None and not 0 < port < 65536):
+    match = re.fullmatch(r"(?P<address>[A-Za-z0-9.-]+|\[[0-9a-fA-F:]+\])(:(?P<port>\d+))?", at)
+    port = None if match is None or match["port"] is None else int(match["port"])
+    if match is None or (port is not None and not 0 < port < 65536):
         raise RefusalError(f"--live-at {at!r}: write ADDRESS or ADDRESS:PORT, as 127.0.0.1:9090")
-    return found["address"].strip("[]"), port
+    return match["address"].strip("[]"), port

@@ -70,7 +70,7 @@ class DaemonRestart:
         number, times = os.environ.pop(LISTENING, None), os.environ.pop(RENEWED, "")
         self._environment = dict(os.environ)  # a copy, since Ray changes it
         now = time.time()
-        self._times = [float(one) for one in times.split() if now - float(one) < WITHIN]
+        self._times = [float(word) for word in times.split() if now - float(word) < WITHIN]
         self._kept: int | None = None
         self.listening: socket.socket | None = None
         if number is not None:
@@ -89,16 +89,16 @@ class DaemonRestart:
 
     def drop(self) -> None:
         """Close the kept socket; no program follows."""
-        kept, self._kept = self._kept, None
-        if kept is not None:
-            os.close(kept)
+        sockets, self._kept = self._kept, None
+        if sockets is not None:
+            os.close(sockets)
 
     def begin_anew(self) -> NoReturn:
         """Execute this process's command line again.
 
         Locks, pipes and files close, so Ray's cleanup process treats this program as ended.
         """
-        times = " ".join(str(one) for one in (*self._times, time.time()))
+        times = " ".join(str(moment) for moment in (*self._times, time.time()))
         environment = {**self._environment, RENEWED: times}
         if self._kept is not None:
             os.set_inheritable(self._kept, True)

@@ -428,11 +428,11 @@ def _criteria(case: str, record: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _comparable(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+def _comparable(row: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Whether two measurements share a row: the same criterion and unit, and at most one word of the names differs."""
-    if any(one[key] != other[key] for key in ("criterion", "unit")):
+    if any(row[key] != other[key] for key in ("criterion", "unit")):
         return False
-    words, others = one["name"].split(), other["name"].split()
+    words, others = row["name"].split(), other["name"].split()
     return len(words) == len(others) and sum(a != b for a, b in zip(words, others, strict=True)) <= 1
 
 

@@ -226,9 +226,9 @@ def depth(
                 "a depth image needs its camera's focal length in pixels: --focal 615; the camera's software tells it "
                 "(fx)"
             )
-        found = points_on_table(read_depth(image, _unit(unit)), focal, _centre(centre))
-        pixel = float(found[:, 1].min()) / focal
-        return _scanned(out, sizes, vessel, notes, scan_of(found, "outer", underside=0.0), pixel)
+        points = points_on_table(read_depth(image, _unit(unit)), focal, _centre(centre))
+        pixel = float(points[:, 1].min()) / focal
+        return _scanned(out, sizes, vessel, notes, scan_of(points, "outer", underside=0.0), pixel)
 
     _make(out, vessel, work)
 

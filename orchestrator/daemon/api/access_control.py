@@ -188,19 +188,19 @@ def needs(role: Role) -> Callable[..., Awaitable[Person]]:
     ) -> Person:
         tokens: Tokens = request.app.state.tokens
         address = request.client.host if request.client is not None else ""
-        found = stopping_person(request.scope, tokens) if is_stop(request.scope) else None
-        if found is None and shown is None:
+        holder = stopping_person(request.scope, tokens) if is_stop(request.scope) else None
+        if holder is None and shown is None:
             text = "a token is needed: 'Authorization: Bearer TOKEN'"
             raise HTTPException(401, text, {"WWW-Authenticate": "Bearer"})
         try:
-            found = found or tokens.person(shown.credentials.strip() if shown else "", address)
+            holder = holder or tokens.person(shown.credentials.strip() if shown else "", address)
         except TooManyFailuresError as error:
             raise HTTPException(429, str(error), {"Retry-After": str(int(error.wait) + 1)}) from None
-        if found is None:
+        if holder is None:
             raise HTTPException(401, "this token is not known", {"WWW-Authenticate": "Bearer"})
-        if found.role < role:
-            raise HTTPException(403, f"{found.name} is a {found.role.name.lower()}; this takes {role.name.lower()}")
-        return found
+        if holder.role < role:
+            raise HTTPException(403, f"{holder.name} is a {holder.role.name.lower()}; this takes {role.name.lower()}")
+        return holder
 
     return person
 

@@ -39,7 +39,7 @@ def _several(model: Any) -> Any:
     return list[model]
 
 
-def _filters(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
+def _filters(name: str, **others: Any) -> Callable[..., dict[str, Any]]:
     """Make a dependency that returns the filters in a request's query."""
     text = Annotated[str | None, Field(max_length=200)]
     fields: dict[str, Any] = {
@@ -50,11 +50,11 @@ def _filters(name: str, **more: Any) -> Callable[..., dict[str, Any]]:
         Field(default=[], max_length=20, description="Words that must all occur in a run's names or notes."),
     )
     fields["limit"] = (int, Field(default=200, ge=1, le=1000, description="Return at most this many, the newest."))
-    model = create_model(name, __config__=ConfigDict(extra="forbid"), **fields, **more)
+    model = create_model(name, __config__=ConfigDict(extra="forbid"), **fields, **others)
 
     def asked(query: Any) -> dict[str, Any]:
-        found: dict[str, Any] = query.model_dump()
-        return found
+        conditions: dict[str, Any] = query.model_dump()
+        return conditions
 
     asked.__annotations__["query"] = Annotated[model, Query()]
     return asked
@@ -104,19 +104,19 @@ async def _in_catalogue(daemon: SharedServices, query: Callable[[Catalogue], T])
 
 
 @router.get("/runs", operation_id="runs", response_model=_several(PreviousRun))
-async def runs(daemon: Daemon, person: Viewer, asked: RunsAsked) -> Any:
+async def runs(daemon: Daemon, person: Viewer, conditions: RunsAsked) -> Any:
     """List the runs of this machine, newest first.
 
     The list includes runs of the command line if it uses the same state directory. All given conditions must hold;
     names may contain the wildcards * and ?.
     """
-    return await _in_catalogue(daemon, lambda catalogue: catalogue.runs(asked))
+    return await _in_catalogue(daemon, lambda catalogue: catalogue.runs(conditions))
 
 
 @router.get("/runs/pours", operation_id="run_pours", response_model=_several(PreviousPour))
-async def pours(daemon: Daemon, person: Viewer, asked: PoursAsked) -> Any:
+async def pours(daemon: Daemon, person: Viewer, conditions: PoursAsked) -> Any:
     """List the pours of all runs, oldest first: the action, the measured spillage and the prediction."""
-    return await _in_catalogue(daemon, lambda catalogue: catalogue.pours(asked))
+    return await _in_catalogue(daemon, lambda catalogue: catalogue.pours(conditions))
 
 
 @router.get(
@@ -125,23 +125,23 @@ async def pours(daemon: Daemon, person: Viewer, asked: PoursAsked) -> Any:
     response_class=Response,
     responses={200: {"content": {"application/zip": {}}, "description": "runs.*, pours.*, dictionary.csv."}},
 )
-async def export(daemon: Daemon, person: Viewer, asked: ExportAsked) -> Response:
+async def export(daemon: Daemon, person: Viewer, conditions: ExportAsked) -> Response:
     """Export runs and pours as files with a data dictionary, in one zip archive.
 
     If vessels are registered, `account.csv` is the account of the materials, with the run of each ordered pour.
     """
-    formats = dict.fromkeys(asked.pop("format"))
+    formats = dict.fromkeys(conditions.pop("format"))
     account = Materials(daemon.store).table()
 
     def written(catalogue: Catalogue) -> bytes:
         archive = BytesIO()
         with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
-            found = catalogue.export(Path(folder), asked, list(formats))
-            for path in map(Path, found.pop("files")):
+            report = catalogue.export(Path(folder), conditions, list(formats))
+            for path in map(Path, report.pop("files")):
                 packed.write(path, path.name)
             if account:
                 packed.writestr("account.csv", account)
-            packed.comment = json.dumps(found).encode()
+            packed.comment = json.dumps(report).encode()
         return archive.getvalue()
 
     content = await _in_catalogue(daemon, written)
@@ -172,6 +172,6 @@ async def run_report(daemon: Daemon, person: Viewer, run: str) -> FileResponse:
 @router.post("/runs/{run}/notes", operation_id="note_run")
 async def note(daemon: Daemon, person: Operator, run: str, body: NoteIn) -> NotesOut:
     """Add a note to a run, with date and author. It is stored in the run's folder."""
-    found = await _in_catalogue(daemon, lambda catalogue: catalogue.note(run, body.text, person.name))
-    daemon.note(person.name, "note", detail=f"{found['run']}: {body.text}")
-    return NotesOut.model_validate(found)
+    entry = await _in_catalogue(daemon, lambda catalogue: catalogue.note(run, body.text, person.name))
+    daemon.note(person.name, "note", detail=f"{entry['run']}: {body.text}")
+    return NotesOut.model_validate(entry)

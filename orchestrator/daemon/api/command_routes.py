@@ -61,14 +61,14 @@ def what_moves(daemon: SharedServices, item: QueueItem) -> WhatMovesOut:
         arm = work.campaign.laboratory.arm
         assert arm is not None, "a laboratory of hardware has an arm"
         required_checksum(work.campaign)
-        found = envelope(arm, campaign_pours(work.campaign, work.stages))
+        paths = envelope(arm, campaign_pours(work.campaign, work.stages))
     except (ConfigError, RunError, KeyError) as error:
         raise MotionNotEnabledError(str(error)) from None
-    if not found.reports:
+    if not paths.reports:
         raise MotionNotEnabledError(
-            f"none of {len(found.refused)} actions could be poured by this arm: {found.refused[0]}"
+            f"none of {len(paths.refused)} actions could be poured by this arm: {paths.refused[0]}"
         )
-    lines = [f"pours          up to {pour_count(work.campaign, work.stages)}", *envelope_lines(found)]
+    lines = [f"pours          up to {pour_count(work.campaign, work.stages)}", *envelope_lines(paths)]
     return WhatMovesOut(laboratory=work.campaign.laboratory.name, arm=arm.title, lines=lines)
 
 
@@ -191,13 +191,13 @@ async def answer(
 ) -> QuestionOut:
     """Answer a question. The first answer counts."""
     try:
-        found = daemon.asking.answer(number, body.answer, person.name)
+        question = daemon.asking.answer(number, body.answer, person.name)
     except KeyError:
         raise HTTPException(404, f"question {number} is not open") from None
     except AnswerError as error:
         raise HTTPException(422, str(error)) from None
-    daemon.note(person.name, "answer", found.campaign, f"{found.text} → {found.answer}")
-    return found
+    daemon.note(person.name, "answer", question.campaign, f"{question.text} → {question.answer}")
+    return question
 
 
 @router.post("/queue/pause", operation_id="pause_queue")
@@ -233,13 +233,13 @@ async def emergency_stop(
         person.name, "; ".join(filter(None, reasons)), rigs[0] if len(rigs) == 1 else rigs, notes=notes
     )
     try:
-        found: dict[str, Any] = (await status(daemon, stops, person)).model_dump(mode="json")
+        state: dict[str, Any] = (await status(daemon, stops, person)).model_dump(mode="json")
     except UNSTORED as error:
         _log.error("the state can't be read after an emergency stop: %s", error)
-        found = {}
+        state = {}
         notes.append("the state of the daemon can't be read: see its log")
     response = EarlyResponse if body else JSONResponse
-    return response({**found, "notes": notes})
+    return response({**state, "notes": notes})
 
 
 @router.post("/emergency-stop/clear", operation_id="clear")
@@ -257,6 +257,6 @@ async def clear(daemon: Daemon, stops: Stops, person: Admin, body: ClearIn | Non
 async def shutdown(request: Request, daemon: Daemon, stops: Stops, person: Admin) -> StatusOut:
     """Shut the daemon down at the next safe point; a second request does so at once."""
     daemon.note(person.name, "shutdown")
-    found = await status(daemon, stops, person)
+    state = await status(daemon, stops, person)
     request.app.state.shutdown()
-    return found
+    return state

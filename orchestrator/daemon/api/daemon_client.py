@@ -130,12 +130,12 @@ class Client:
         texts = {"rig": rig[:LONGEST_SENT], "reason": reason[:LONGEST_SENT]}
         query = {name: re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text) for name, text in texts.items()}
         try:
-            found = self._call("POST", "/emergency-stop", params=query, timeout=STOP_TIMEOUT)
+            state = self._call("POST", "/emergency-stop", params=query, timeout=STOP_TIMEOUT)
         except DaemonError as error:
             refusal = str(error).startswith("NOT STOPPED")
             text = str(error) if refusal else f"THE STOP WAS NOT CONFIRMED: {PHYSICAL}. {error}"
             raise DaemonError(text, error.exit_code, unreachable=error.unreachable) from None
-        return found.json()
+        return state.json()
 
     def _call(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         try:
@@ -248,16 +248,16 @@ def _stored_url(state: Path) -> str | None:
 def _token(state: Path) -> str:
     path = state / "tokens"
     try:
-        found = token_of(path, Role.ADMIN) or token_of(path, Role.VIEWER) if path.exists() else None
+        token = token_of(path, Role.ADMIN) or token_of(path, Role.VIEWER) if path.exists() else None
     except PermissionError:  # the daemon of another user, such as a service
-        found = None
-    if found is None:
+        token = None
+    if token is None:
         raise DaemonError(
             f"no token: {path} does not exist or belongs to another user. Set $DECANT_TOKEN to a token that the "
             "daemon's administrator gives you, or name the state directory of your own daemon (--state, $DECANT_STATE)",
             2,
         )
-    return found
+    return token
 
 
 class RemoteCatalogueClient:
@@ -288,10 +288,10 @@ class RemoteCatalogueClient:
 
     def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
         """See `Catalogue`."""
-        found = self._client.fetch("/runs/export", format=list(formats), **conditions)
+        packed = self._client.fetch("/runs/export", format=list(formats), **conditions)
         folder.mkdir(parents=True, exist_ok=True)
         files = []
-        with zipfile.ZipFile(BytesIO(found)) as archive:
+        with zipfile.ZipFile(BytesIO(packed)) as archive:
             counts: Row = json.loads(archive.comment)
             for name in archive.namelist():
                 path = folder / Path(name).name

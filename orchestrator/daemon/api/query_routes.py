@@ -77,7 +77,7 @@ async def rigs(daemon: Daemon, stops: Stops, person: Viewer) -> list[RigOut]:
 
 def rigs_out(daemon: SharedServices, stops: EmergencyStops) -> list[RigOut]:
     """Convert the rigs to their response models."""
-    found = []
+    rigs = []
     for name, worker in daemon.workers.items():
         campaign, checkpoint, arm, told = None, "", worker.arm, None
         if worker.running is not None:
@@ -86,8 +86,8 @@ def rigs_out(daemon: SharedServices, stops: EmergencyStops) -> list[RigOut]:
         if arm is not None:
             check = arm.check
             told = {"state": check.state, "text": check.found, "advice": check.advice, "time": arm.time}
-        found.append(RigOut.model_validate({**rig, "emergency": stops.of_rigs.get(name), "arm": told}))
-    return found
+        rigs.append(RigOut.model_validate({**rig, "emergency": stops.of_rigs.get(name), "arm": told}))
+    return rigs
 
 
 @router.get("/campaigns", operation_id="campaigns")

@@ -78,8 +78,8 @@ async def order_pour(
     with _answering():
         if body.dry_run or orders.book.find(body.id) is not None:
             response.status_code = 200
-        found = await orders.pour(body, person.name)
-        return await orders.wait(body.id, wait) if wait and not body.dry_run else found
+        pour = await orders.pour(body, person.name)
+        return await orders.wait(body.id, wait) if wait and not body.dry_run else pour
 
 
 @router.get("/pours", operation_id="pours", response_model=list[PourOut])
@@ -145,7 +145,7 @@ async def account(
     """Return the last entries of the account of one vessel or of all, oldest first."""
     with _answering():
         name = vessel if not vessel or "/" in vessel else orders.materials.vessel(vessel).id
-        return [one.json_entry() for one in reversed(orders.materials.account.history(name, limit))]
+        return [entry.json_entry() for entry in reversed(orders.materials.account.history(name, limit))]
 
 
 @router.post("/materials/liquids", status_code=201, operation_id="add_liquid", response_model=MaterialsOut)
@@ -202,6 +202,6 @@ async def place_vessel(daemon: Daemon, orders: Orders, person: Operator, key: st
     return _changed(daemon, orders, person.name, "place vessel", f"{key}: {body.position or 'nowhere'}")
 
 
-def _changed(daemon: SharedServices, orders: Ordering, by: str, what: str, detail: str) -> Any:
-    daemon.note(by, what, detail=detail)
+def _changed(daemon: SharedServices, orders: Ordering, by: str, change: str, detail: str) -> Any:
+    daemon.note(by, change, detail=detail)
     return orders.materials.everything(daemon.running_laboratories)

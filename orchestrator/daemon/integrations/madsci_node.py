@@ -153,9 +153,9 @@ class MadsciNode:
         daemon, flags = self._daemon, self._flags()
         rigs = [daemon.workers[rig.name] for rig in daemon.settings.rigs]
         running = [
-            one.id
-            for one in self.actions()
-            if one.campaign is not None and any(worker.holds(one.campaign) for worker in rigs)
+            action.id
+            for action in self.actions()
+            if action.campaign is not None and any(worker.holds(action.campaign) for worker in rigs)
         ]
         waiting = [
             f"{item.id}: {text}"
@@ -246,17 +246,17 @@ class MadsciNode:
                 return
             dry = action.name == "predict_pour"
             request = PourIn.model_validate({**action.args, "id": action.id, "dry_run": dry})
-            found = await self._ordering.pour(request, PERSON)
-            predicted = found if dry else None
+            pour = await self._ordering.pour(request, PERSON)
+            predicted = pour if dry else None
         except ValidationError as problem:
             error = f"args: {problems_text(problem.errors())}"
         except RunError as problem:
             error = str(problem)
-        kept = None if predicted is None else json.dumps(predicted)
-        if error is not None or kept is not None:
+        forecast = None if predicted is None else json.dumps(predicted)
+        if error is not None or forecast is not None:
             self._store.write(
                 "update node_action set started = ?, error = ?, json_result = ? where id = ?",
-                *(time.time(), error, kept, action.id),
+                *(time.time(), error, forecast, action.id),
             )
 
     async def result(self, key: str) -> dict[str, Any]:
@@ -374,7 +374,7 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
 
     @app.get("/action")
     async def history(action_id: str | None = None) -> Any:
-        keys = [one.id for one in node.actions() if action_id in (None, "", one.id)]
+        keys = [action.id for action in node.actions() if action_id in (None, "", action.id)]
         return {key: [await node.result(key)] for key in keys}
 
     @app.post("/action/{name}")
@@ -438,5 +438,5 @@ def _action(row: dict[str, Any]) -> NodeAction:
 
 def _semantic(version: str) -> str:
     """Return the version with three numbers, as MADSci requires."""
-    parts = [part for part in version.split(".") if part.isdigit()]
+    parts = [number for number in version.split(".") if number.isdigit()]
     return ".".join((*parts, "0", "0")[:3])

@@ -137,10 +137,10 @@ class _StopCommand(sila.UnobservableCommand):  # type: ignore[misc]
 
             async def executed(request: bytes = b"", metadata: dict[str, bytes] | None = None) -> bytes:
                 try:
-                    found: bytes = await execute(request, metadata)
+                    answer: bytes = await execute(request, metadata)
                 except (ValidationError, UndefinedExecutionError):  # the latter if the call is no protobuf at all
-                    found = await execute(_EMPTY_TEXT, metadata)
-                return found
+                    answer = await execute(_EMPTY_TEXT, metadata)
+                return answer
 
             handler.execute = executed
         return attached
@@ -207,10 +207,10 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
         """
         order = _order(order_id, source, receiver, amount, tolerance, action, liquid, rig)
         await self._ordered("/pours", order)
-        found = await self._ended(f"/pours/{_part(order_id)}", status, intermediate)
-        result = found["result"]
+        poured = await self._ended(f"/pours/{_part(order_id)}", status, intermediate)
+        result = poured["result"]
         masses = (_number(result[name]) for name in ("received_g", "spilled_g", "duration_s"))
-        return (*masses, json.dumps(found))  # type: ignore[return-value]
+        return (*masses, json.dumps(poured))  # type: ignore[return-value]
 
     @sila.UnobservableCommand(errors=CALL)
     async def predict_pour(
@@ -242,10 +242,10 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
           Details: Everything that the daemon returns about the prediction, as JSON.
         """
         order = _order("prediction", source, receiver, amount, tolerance, action, liquid, rig)
-        found = await self._ordered("/pours", order | {"dry_run": True})
-        predicted = found["predicted"] or {}
+        pour = await self._ordered("/pours", order | {"dry_run": True})
+        predicted = pour["predicted"] or {}
         low, high = predicted.get("interval_g") or (None, None)
-        return _number(low), _number(high), _number(predicted.get("duration_s")), json.dumps(found)
+        return _number(low), _number(high), _number(predicted.get("duration_s")), json.dumps(pour)
 
     @sila.UnobservableCommand(errors=CALL)
     async def weigh(self, vessel: str, mass: Grams, deviation: Grams, liquid: str, note: str) -> None:
@@ -290,8 +290,8 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
           Details: Everything that the daemon returns about the campaign, as JSON.
         """
         key = (await self._ordered("/campaigns", {"id": order_id, "path": path, "rig": rig}))["id"]
-        found = await self._ended(f"/campaigns/{_part(key)}", status, intermediate)
-        return key, found["run"] or "", json.dumps(found)
+        ended = await self._ended(f"/campaigns/{_part(key)}", status, intermediate)
+        return key, ended["run"] or "", json.dumps(ended)
 
     @sila.UnobservableCommand(errors=CALL)
     async def cancel(self, order_id: str) -> None:
@@ -361,7 +361,7 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
         """Open questions that an operator answers on the daemon's page, oldest first."""
 
         def read() -> list[str]:
-            return [f"{one['id']}: {one['text']}" for one in self._client.get("/questions")]
+            return [f"{question['id']}: {question['text']}" for question in self._client.get("/questions")]
 
         async for value in self._changes(read):
             yield value
@@ -371,7 +371,7 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
         """Registered vessels with their contents."""
 
         def read() -> list[VesselContent]:
-            return [_content(one) for one in self._client.get("/materials")["vessels"]]
+            return [_content(vessel) for vessel in self._client.get("/materials")["vessels"]]
 
         async for value in self._changes(read):
             yield value
@@ -422,14 +422,14 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
         shown: tuple[str, str] | None = None
         began = time.monotonic()
         while True:
-            found: dict[str, Any] = await self._repeated(self._client.get, path)
-            if _has_ended(found):
-                return found
-            reason = found["reason"] or found.get("waits_for", "")
-            if (found["state"], reason) != shown:
-                shown = (found["state"], reason)
+            state: dict[str, Any] = await self._repeated(self._client.get, path)
+            if _has_ended(state):
+                return state
+            reason = state["reason"] or state.get("waits_for", "")
+            if (state["state"], reason) != shown:
+                shown = (state["state"], reason)
                 intermediate.send(*shown)
-            left = _seconds_left(found)
+            left = _seconds_left(state)
             since = time.monotonic() - began
             status.update(
                 progress=None if left is None else since / max(since + left, 1e-3),
@@ -473,7 +473,7 @@ def _order(
 ) -> dict[str, Any]:
     """The body of `POST /pours`. Equal arguments give an equal body, which makes a repeated order the same order."""
     wanted = f"{amount!r} g" if amount else None
-    motion = {one.dimension: one.value for one in action}
+    motion = {setting.dimension: setting.value for setting in action}
     try:
         return order_body(
             lambda: PourIn(
@@ -495,23 +495,23 @@ def _refuse(error: DaemonError) -> NoReturn:
     raise kind(str(error)) from None
 
 
-def _has_ended(found: dict[str, Any]) -> bool:
+def _has_ended(state: dict[str, Any]) -> bool:
     """Whether a pour or a campaign has ended well; another end is an error."""
-    match found["state"]:
+    match state["state"]:
         case "weighed" | "finished":
             return True
         case "failed":
-            raise OrderFailedError(found["reason"] or f"{found['id']} has failed")
+            raise OrderFailedError(state["reason"] or f"{state['id']} has failed")
         case "cancelled":
-            raise OrderCancelledError(found["reason"] or f"{found['id']} was cancelled")
+            raise OrderCancelledError(state["reason"] or f"{state['id']} was cancelled")
         case "stopped" | "withdrawn":
-            raise OrderCancelledError(found["reason"] or f"{found['id']} was stopped")
+            raise OrderCancelledError(state["reason"] or f"{state['id']} was stopped")
     return False
 
 
-def _seconds_left(found: dict[str, Any]) -> float | None:
+def _seconds_left(state: dict[str, Any]) -> float | None:
     """Expected time until a pour or a campaign ends [s]."""
-    left = found.get("seconds_left", (found.get("progress") or {}).get("seconds_left"))
+    left = state.get("seconds_left", (state.get("progress") or {}).get("seconds_left"))
     return None if left is None else float(left)
 
 

@@ -73,18 +73,18 @@ class CampaignQueue:
 
     def item(self, key: str) -> QueueItem:
         """Return a campaign by its id, its caller's id or a unique prefix of three letters or more. Raises KeyError."""
-        found = self._store.item(key) or self._store.by_caller_id(key)
-        if found is None and len(key) >= 3:
-            similar = [one for one in self._store.items() if one.id.startswith(key)]
-            found = similar[0] if len(similar) == 1 else None
-        if found is None:
+        entry = self._store.item(key) or self._store.by_caller_id(key)
+        if entry is None and len(key) >= 3:
+            similar = [known for known in self._store.items() if known.id.startswith(key)]
+            entry = similar[0] if len(similar) == 1 else None
+        if entry is None:
             raise KeyError(key)
-        return found
+        return entry
 
-    def _queued(self, key: str, what: str) -> QueueItem:
+    def _queued(self, key: str, change: str) -> QueueItem:
         item = self.item(key)
         if item.state != "queued":
-            raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign {what}")
+            raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign {change}")
         return item
 
     def move(
@@ -108,8 +108,8 @@ class CampaignQueue:
         if not_before is not None:
             self._store.change(item.id, not_before=not_before or None)
         if before is not None:
-            queue = [one for one in self._store.items(["queued"]) if one.id != item.id]
-            at = 0 if before == "" else next((i for i, one in enumerate(queue) if one.id == self.item(before).id), None)
+            queue = [e for e in self._store.items(["queued"]) if e.id != item.id]
+            at = 0 if before == "" else next((i for i, e in enumerate(queue) if e.id == self.item(before).id), None)
             if at is None:
                 raise RequestRefusedError(f"{before} is not in the queue")
             level = queue[at].priority if queue else item.priority

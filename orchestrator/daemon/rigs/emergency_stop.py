@@ -134,7 +134,7 @@ class StopProtocol(H11Protocol):
         """Pass data on, with the request line corrected."""
         if self.conn.their_state is h11.IDLE and not self.conn.trailing_data[0]:
             self._line = (self._line + data).lstrip(b"\r\n")
-            line, end, rest = self._line.partition(b"\n")
+            line, end, remainder = self._line.partition(b"\n")
             if not end and len(line) <= LONGEST_LINE:
                 return
             self._line = b""
@@ -142,7 +142,7 @@ class StopProtocol(H11Protocol):
             target, _, version = target.rpartition(b" ")
             encoded = quote_from_bytes(target, _VISIBLE).encode()
             self._malformed_stop = stop_path(target.partition(b"?")[0].decode("latin-1")) is not None
-            data = b" ".join((method, encoded, version)) + b"\r\n" + rest if end else line
+            data = b" ".join((method, encoded, version)) + b"\r\n" + remainder if end else line
         super().data_received(data)
 
     _malformed_stop = False
@@ -209,8 +209,8 @@ class EmergencyStops:
     @property
     def of_all(self) -> dict[str, Any] | None:
         """The active emergency stop of all rigs, with its fields by, time and reason; None if there is none."""
-        found: dict[str, Any] | None = self._store.flag(EMERGENCY)
-        return found
+        latch: dict[str, Any] | None = self._store.flag(EMERGENCY)
+        return latch
 
     @property
     def of_rigs(self) -> dict[str, dict[str, Any]]:
@@ -258,7 +258,7 @@ class EmergencyStops:
         for _ in range(LEAVING_STEPS):
             await asyncio.sleep(0)
         text, changes = recorded_reason(reason)
-        found = [*notes, *unknown, *changes]
+        texts = [*notes, *unknown, *changes]
         with contextlib.suppress(*UNSTORED):  # it holds after a restart; authors and reasons of several are kept
             self._store.set_flag(flag, later_stop(self._store.flag(flag), by, text, time.time()))
             for worker in workers:
@@ -267,10 +267,10 @@ class EmergencyStops:
         with contextlib.suppress(*UNSTORED):
             detail = ": ".join(filter(None, (f"rig {affected}" if affected else "", text)))
             self._shared.note(
-                by, "emergency stop", detail=f"{detail} ({'; '.join(found)})".lstrip() if found else detail
+                by, "emergency stop", detail=f"{detail} ({'; '.join(texts)})".lstrip() if texts else detail
             )
         await asyncio.gather(*arms, return_exceptions=True)
-        return found
+        return texts
 
     def scope(self, rig: object) -> tuple[str, list[str]]:
         """Return the rig that a stop is for, '' for all, and a note if the wanted rig does not exist."""

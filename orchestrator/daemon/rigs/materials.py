@@ -107,7 +107,7 @@ class Materials:
         try:
             capacity = build_vessel(vessel_from(Document.parse(text, Path("vessel.json")))).capacity
         except ConfigError as error:
-            raise MaterialError("; ".join(f"{one.where or 'shape'}: {one.message}" for one in error.problems)) from None
+            raise MaterialError("; ".join(f"{p.where or 'shape'}: {p.message}" for p in error.problems)) from None
         except (VesselError, ValueError) as error:
             raise MaterialError(f"shape: {error}") from None
         self._require_free(position, key)
@@ -116,9 +116,9 @@ class Materials:
 
     def _add(self, table: str, key: str, code: str, **values: Any) -> None:
         """Insert a row; an identical row may be registered again."""
-        found = self._store.rows(f"select * from {table} where id = ?", key)
-        if found:
-            if any(found[0][name] != value for name, value in {"code": code or None, **values}.items()):
+        rows = self._store.rows(f"select * from {table} where id = ?", key)
+        if rows:
+            if any(rows[0][name] != value for name, value in {"code": code or None, **values}.items()):
                 raise MaterialError(f"{table} '{key}' is registered already, with other properties")
             return
         if code and any(self._store.rows(f"select id from {t} where code = ?", code) for t in _TABLES):
@@ -131,9 +131,9 @@ class Materials:
         if not position:
             return
         self._row("position", position)
-        there = self._store.rows("select id from vessel where position = ? and id != ?", position, vessel)
-        if there:
-            raise MaterialError(f"position {position} is taken by vessel {there[0]['id']}; move that one first")
+        standing = self._store.rows("select id from vessel where position = ? and id != ?", position, vessel)
+        if standing:
+            raise MaterialError(f"position {position} is taken by vessel {standing[0]['id']}; move that one first")
 
     def place(self, vessel: str, position: str, by: str) -> None:
         """Record that a vessel was moved to a position; '' for none. Raises MaterialError.
@@ -146,10 +146,10 @@ class Materials:
             except InvalidArgumentError as error:
                 raise MaterialError(str(error)) from None
             return
-        found = self.vessel(vessel)
+        registered = self.vessel(vessel)
         position = str(self._row("position", position)["id"]) if position else ""
-        self._require_free(position, found.id)
-        self._store.write("update vessel set position = ? where id = ?", position or None, found.id)
+        self._require_free(position, registered.id)
+        self._store.write("update vessel set position = ? where id = ?", position or None, registered.id)
 
     # ---- contents
 
@@ -169,12 +169,12 @@ class Materials:
             OSError: the account can't be written.
         """
         if "/" not in vessel:
-            found = self.vessel(vessel)
-            vessel, liquid = found.id, self.liquid_id(liquid) if liquid else self.content(found.id).liquid
+            registered = self.vessel(vessel)
+            vessel, liquid = registered.id, self.liquid_id(liquid) if liquid else self.content(registered.id).liquid
             volume = 0.0 if not liquid or liquid == MIXTURE else mass / self.liquid(liquid).density
-            if volume > found.capacity:
+            if volume > registered.capacity:
                 raise MaterialError(
-                    f"{found.id}: holds {1e6 * found.capacity:.0f} ml, and {1e6 * volume:.0f} ml are stated"
+                    f"{registered.id}: holds {1e6 * registered.capacity:.0f} ml, and {1e6 * volume:.0f} ml are stated"
                 )
         try:
             self.account.weigh(vessel, mass, deviation, liquid=liquid, by=by, note=note)
@@ -238,7 +238,7 @@ class Materials:
         columns = ("t", "vessel", "kind", "mass_g", "deviation_g", "liquid", "pour", "run", "by", "note")
         writer = csv.DictWriter(text, columns)
         writer.writeheader()
-        writer.writerows({**one.json_entry(), "run": runs.get(one.pour, "")} for one in reversed(entries))
+        writer.writerows({**entry.json_entry(), "run": runs.get(entry.pour, "")} for entry in reversed(entries))
         return text.getvalue()
 
     # ---- look-up
@@ -256,8 +256,8 @@ class Materials:
 
     def properties(self, key: str) -> dict[str, Any]:
         """Return the properties of a liquid, as in a campaign. Raises MaterialError."""
-        found: dict[str, Any] = json.loads(self._row("liquid", key)["properties"])
-        return found
+        stored: dict[str, Any] = json.loads(self._row("liquid", key)["properties"])
+        return stored
 
     def liquid_id(self, key: str) -> str:
         """Return the id of a liquid given by its id or code. Raises MaterialError."""
@@ -269,11 +269,11 @@ class Materials:
         return str(self._row("position", position)["rig"]) if position else ""
 
     def _row(self, table: str, key: str) -> dict[str, Any]:
-        found = self._store.rows(f"select * from {table} where id = ? or code = ?", key, key)
-        if not found:
+        rows = self._store.rows(f"select * from {table} where id = ? or code = ?", key, key)
+        if not rows:
             known = [row["id"] for row in self._store.rows(f"select id from {table} order by created desc limit 20")]
             raise MaterialError(f"there is no {table} '{key[:80]}'; there are {', '.join(known) or 'none'}")
-        return found[0]
+        return rows[0]
 
     def everything(self, running: Collection[str] = ()) -> dict[str, list[dict[str, Any]]]:
         """Return all materials, with the contents of the vessels; ready for JSON, masses in g and volumes in ml.
@@ -281,7 +281,7 @@ class Materials:
         Args:
             running: names of the laboratories in which a campaign runs.
         """
-        contents = {one.vessel: one for one in self.account.all()}
+        contents = {content.vessel: content for content in self.account.all()}
         vessels = []
         for row in self._store.rows("select * from vessel order by id"):
             held = contents.pop(row["id"], None) or VesselContent(row["id"], 0.0, "weighed", 0.0, 0.0)
@@ -322,7 +322,7 @@ class Materials:
         return float(rows[0]["total"])
 
     def refusal(
-        self, source: str, receiver: str, liquid: str, amount: float | None, more: float = 0.0, *, pour: str = ""
+        self, source: str, receiver: str, liquid: str, amount: float | None, margin: float = 0.0, *, pour: str = ""
     ) -> str:
         """Return the reason why the vessels can't serve a pour; '' if they can.
 
@@ -330,16 +330,16 @@ class Materials:
             source, receiver: ids or codes.
             liquid: id or code that the source has to hold; '' for any.
             amount: wanted [kg]; None for an action, which may pour anything up to the whole content.
-            more: possible excess [kg].
+            margin: possible excess [kg].
             pour: caller's id of the pour.
         """
         try:
-            return self._refusal(self.vessel(source), self.vessel(receiver), liquid, amount, more, pour)
+            return self._refusal(self.vessel(source), self.vessel(receiver), liquid, amount, margin, pour)
         except MaterialError as error:
             return str(error)
 
     def _refusal(
-        self, source: RegisteredVessel, receiver: RegisteredVessel, liquid: str, amount: float | None, more: float,
+        self, source: RegisteredVessel, receiver: RegisteredVessel, liquid: str, amount: float | None, margin: float,
         pour: str,
     ) -> str:  # fmt: skip
         if source.id == receiver.id:
@@ -349,12 +349,12 @@ class Materials:
                 return (
                     f"{vessel.id}: pour {other} has begun and has no outcome; answer its question, resume or cancel it"
                 )
-        held, there = self.content(source.id), self.content(receiver.id)
-        for vessel, content in ((source, held), (receiver, there)):
+        held, target = self.content(source.id), self.content(receiver.id)
+        for vessel, content in ((source, held), (receiver, target)):
             if content.mass is None:
                 return f"{vessel.id}: pour {content.pour} left it with an unknown content; weigh the vessel"
         assert held.mass is not None
-        assert there.mass is not None
+        assert target.mass is not None
         if not held.liquid or held.mass <= 0.0:
             return f"{source.id}: is empty; fill and weigh it"
         if held.liquid == MIXTURE:
@@ -364,14 +364,14 @@ class Materials:
         promised = self.promised(source.id, pour)
         sure = held.mass - SURE * held.deviation - promised
         wanted = 0.0 if amount is None else amount
-        if sure <= (0.0 if amount is None else amount + more):
+        if sure <= (0.0 if amount is None else amount + margin):
             spoken = f", {1e3 * promised:.4g} g of it are promised to other pours" if promised else ""
             return (
                 f"{source.id}: holds {1e3 * held.mass:.4g} ± {1e3 * SURE * held.deviation:.2g} g{spoken}, and "
                 f"{1e3 * wanted:.4g} g are wanted; fill and weigh it"
             )
         density = self.liquid(held.liquid).density
-        most = (held.mass if amount is None else amount + more) + there.mass + SURE * there.deviation
+        most = (held.mass if amount is None else amount + margin) + target.mass + SURE * target.deviation
         if most / density > receiver.capacity:
             return (
                 f"{receiver.id}: holds {1e6 * receiver.capacity:.0f} ml up to the brim, and there could be "
@@ -408,7 +408,7 @@ def liquid_of(key: str, properties: Mapping[str, Any], mass: float) -> Liquid:
     try:
         return liquid_from(Document.parse(text, Path("liquid.json")))
     except ConfigError as error:
-        told = "; ".join(f"{one.where or 'liquid'}: {one.message}" for one in error.problems)
+        told = "; ".join(f"{problem.where or 'liquid'}: {problem.message}" for problem in error.problems)
         raise MaterialError(f"liquid {key}: {told}") from None
 
 
@@ -419,9 +419,9 @@ def mass_of(text: str, name: str) -> float:
         MaterialError: it is none, or negative; the message names the field.
     """
     try:
-        found = parse_quantity(text, "kg", "30 g")
+        mass = parse_quantity(text, "kg", "30 g")
     except QuantityError as error:
         raise MaterialError(f"{name}: {error}") from None
-    if found < 0.0:
+    if mass < 0.0:
         raise MaterialError(f"{name}: {text} is negative; a mass should be 0 g or more")
-    return found
+    return mass

@@ -152,8 +152,8 @@ class Ordering:
         return item, order, predicted
 
     def _refusal(self, order: PourOrder) -> str:
-        more = order.tolerance
-        return self.materials.refusal(order.source, order.receiver, order.liquid, order.amount, more, pour=order.id)
+        margin = order.tolerance
+        return self.materials.refusal(order.source, order.receiver, order.liquid, order.amount, margin, pour=order.id)
 
     def _rig(self, order: PourOrder, wanted: str) -> str:
         """The rig of a pour: the given one, that of the vessels, or the only one."""
@@ -162,10 +162,10 @@ class Ordering:
             told = ", ".join(f"{vessel} stands at {rig}" for vessel, rig in standing.items())
             raise OrderError(f"rig: {told}" + (f", and {wanted} is wanted" if wanted else "") + "; move a vessel")
         names = [rig.name for rig in self._daemon.settings.rigs]
-        found = wanted or next(iter(standing.values()), names[0] if len(names) == 1 else "")
-        if found not in names:
+        name = wanted or next(iter(standing.values()), names[0] if len(names) == 1 else "")
+        if name not in names:
             raise OrderError(f"rig: name one of {', '.join(names)}, or register the positions of the vessels")
-        return found
+        return name
 
     async def _predicted(self, item: QueueItem) -> dict[str, Any]:
         settings, warm = self._daemon.settings, self._daemon.warm
@@ -180,10 +180,10 @@ class Ordering:
     async def _dry_run(self, request: PourIn, by: str) -> dict[str, Any]:
         item, order, predicted = await self._prepared(request, by)
         await self._forget(item)
-        held, there = self.materials.content(order.source), self.materials.content(order.receiver)
+        held, target = self.materials.content(order.source), self.materials.content(order.receiver)
         density = self.materials.liquid(order.liquid).density
         sure = (held.mass or 0.0) - SURE * held.deviation - self.materials.promised(order.source)
-        room = self.materials.vessel(order.receiver).capacity - (there.mass or 0.0) / density
+        room = self.materials.vessel(order.receiver).capacity - (target.mass or 0.0) / density
         return {
             **{"id": order.id, "campaign": "", "state": "dry run", "reason": "nothing was poured"},
             **{"needs_enabling": False, "source": order.source, "receiver": order.receiver},
@@ -225,7 +225,7 @@ class Ordering:
         if item.state in ("unknown", "waiting for operator") or (
             item.state in ("paused", "failed") and await self._begun(item)
         ):
-            open_question = [one for one in self._daemon.store.questions(campaign=item.id) if one.kind == "bench"]
+            open_question = [q for q in self._daemon.store.questions(campaign=item.id) if q.kind == "bench"]
             return "waiting for operator" if open_question else "unknown", item.reason
         if item.state in ("paused", "failed"):
             return item.state, item.reason
@@ -238,18 +238,18 @@ class Ordering:
         settings = self._daemon.settings
         try:
             rig = settings.rig(item.rig)
-            found = await asyncio.to_thread(settled_pour, settings.runs / item.run, settings.snapshots / item.id, rig)
+            settled = await asyncio.to_thread(settled_pour, settings.runs / item.run, settings.snapshots / item.id, rig)
         except (RunError, OSError, KeyError, ValueError):
             return True  # unreadable: it may have begun
-        return found is not None and found.pour.state in ("under way", "unknown")
+        return settled is not None and settled.pour.state in ("under way", "unknown")
 
     async def wait(self, key: str, seconds: float) -> dict[str, Any]:
         """Return a pour as soon as it rests, or after a time [s]. Raises KeyError."""
         end = time.monotonic() + seconds
         while True:
-            found = await self.pour_out(key)
-            if found["state"] in RESTING or time.monotonic() >= end or self._daemon.stopping:
-                return found
+            pour = await self.pour_out(key)
+            if pour["state"] in RESTING or time.monotonic() >= end or self._daemon.stopping:
+                return pour
             await asyncio.sleep(WAIT)
 
     def campaign_of(self, key: str) -> str:

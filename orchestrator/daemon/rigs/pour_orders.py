@@ -217,8 +217,8 @@ class PlannedOrder:
             OrderError: there is no place for the pourer.
             ConfigError: the laboratory's file is invalid.
         """
-        pourer, receiver = (vessel_from(Document.parse(json.dumps(one), Path("vessel.json")))
-                            for one in (order.pourer, order.vessel))  # fmt: skip
+        pourer, receiver = (vessel_from(Document.parse(json.dumps(vessel), Path("vessel.json")))
+                            for vessel in (order.pourer, order.vessel))  # fmt: skip
         liquid = liquid_of(order.liquid, order.properties, round(order.load, 9))
         scene = Scene(f"deployment-{receiver.name}", pourer, receiver, liquid, fixed=_USUAL)
         action = _action(order.action, _USUAL) if "x_offset" in order.action else _placed(scene, order)
@@ -248,8 +248,8 @@ class PlannedOrder:
 
     def request(self) -> RunRequest:
         """The run of the order."""
-        made = single_task(self.plan, POUR, self.strategy, pours=True)
-        return replace(made, problems=self.problems, as_written=False)
+        task = single_task(self.plan, POUR, self.strategy, pours=True)
+        return replace(task, problems=self.problems, as_written=False)
 
     @property
     def target(self) -> DoseTarget | None:
@@ -274,8 +274,8 @@ class PlannedOrder:
         target, laboratory = self.target, self.plan.laboratory
         if not laboratory.pours:
             return [f"laboratory {laboratory.name} has no bench"]
-        if found := check_vessels(self.scene, self.plan.source, None if target is None else 0.0):
-            return [one.message for one in found]
+        if misfits := check_vessels(self.scene, self.plan.source, None if target is None else 0.0):
+            return [problem.message for problem in misfits]
         try:
             if target is not None:
                 check_dose(self.scene, target)
@@ -321,33 +321,33 @@ class PlannedOrder:
 
     def _forecast(self) -> dict[str, Any]:
         assert self.target is not None
-        found = predicted_dose(self.plan.laboratory, self.scene, self.target, self.order.seed)
+        forecast = predicted_dose(self.plan.laboratory, self.scene, self.target, self.order.seed)
         wanted = self.target.amount
         bench = self.plan.laboratory.bench
-        low, high = (1e3 * value for value in found.interval)
+        low, high = (1e3 * value for value in forecast.interval)
         return {
-            "amount_g": 1e3 * found.amount,
+            "amount_g": 1e3 * forecast.amount,
             "interval_g": [low, high],
-            "error_g": 1e3 * (found.amount - wanted),
+            "error_g": 1e3 * (forecast.amount - wanted),
             "error_interval_g": [low - 1e3 * wanted, high - 1e3 * wanted],
-            "duration_s": found.duration + (0.0 if bench is None else bench.operator_time),
-            "reachable_tolerance_g": 1e3 * found.reachable,
-            "enough": found.enough,
-            "ends": {str(end): count for end, count in found.ends.items()},
+            "duration_s": forecast.duration + (0.0 if bench is None else bench.operator_time),
+            "reachable_tolerance_g": 1e3 * forecast.reachable,
+            "enough": forecast.enough,
+            "ends": {str(end): count for end, count in forecast.ends.items()},
         }
 
     async def _simulated(self, pool: SimulatorPool) -> dict[str, Any]:
         assert self.plan.deployment is not None
         costing = Costing.of(self.plan.deployment, self.scene, self.plan.parameters)
         strategy = RepeatedSimulation(costing, self.action, SEEDS, self.order.seed)
-        asked = strategy.ask(Slots(SEEDS, 0))
-        tasks = [PourTask(self.scene, one.action, one.parameters, one.seed) for one in asked]  # type: ignore[union-attr]
+        requests = strategy.ask(Slots(SEEDS, 0))
+        tasks = [PourTask(self.scene, r.action, r.parameters, r.seed) for r in requests]  # type: ignore[union-attr]
         done = await asyncio.gather(*map(pool.simulate, tasks), return_exceptions=True)
-        for request, found in zip(asked, done, strict=True):
-            if isinstance(found, BaseException):
-                strategy.tell(request, Failed("simulation", str(found)))
+        for request, outcome in zip(requests, done, strict=True):
+            if isinstance(outcome, BaseException):
+                strategy.tell(request, Failed("simulation", str(outcome)))
             else:
-                strategy.tell(request, Simulated(found.outcome))
+                strategy.tell(request, Simulated(outcome.outcome))
         result = strategy.result()
         load = 1e3 * self.scene.liquid.mass
         poured, spilled = result.over_seeds.get("poured"), result.over_seeds.get("spilled")
@@ -430,7 +430,7 @@ def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float
     masses = weighed_masses(measured)
     received = masses.delivered_g or 0.0
     half = INTERVAL * 1e3 * float(about.get("deviation", math.sqrt(2.0) * deviation))
-    found: dict[str, Any] = {
+    result: dict[str, Any] = {
         "received_g": received,
         "received_interval_g": [received - half, received + half],
         "spilled_g": masses.spilled_g,
@@ -440,9 +440,9 @@ def weighed_result(order: PourOrder, measured: PourMeasurement, deviation: float
     }
     if order.amount is not None:
         error = received - 1e3 * order.amount
-        found["error_g"], found["error_interval_g"] = error, [error - half, error + half]
-        found["within_tolerance"] = abs(error) <= 1e3 * order.tolerance
-    return found
+        result["error_g"], result["error_interval_g"] = error, [error - half, error + half]
+        result["within_tolerance"] = abs(error) <= 1e3 * order.tolerance
+    return result
 
 
 @dataclass(frozen=True)
@@ -536,8 +536,8 @@ class OrderBook:
         if pour.measured is not None:
             result = {"state": "weighed", **weighed_result(order, pour.measured, deviation)}
             received = 1e-3 * result["received_g"]
-            one = math.sqrt(2.0) * deviation
-            moved: Transfer | None = Transfer((received + pour.measured.spilled, one), (received, one))
+            spread = math.sqrt(2.0) * deviation
+            moved: Transfer | None = Transfer((received + pour.measured.spilled, spread), (received, spread))
         elif isinstance(pour.outcome, Failed):
             result = {"state": "failed", "end": pour.reason}
             # an invalid action was refused before anything moved

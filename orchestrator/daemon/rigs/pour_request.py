@@ -168,7 +168,7 @@ class SubmissionIn(RequestModel):
 
 def problems_text(errors: Iterable[Mapping[str, Any]], begin: int = 0) -> str:
     """Errors of validation in one line, each with its place from a part of it on."""
-    return "; ".join(f"{'.'.join(map(str, one['loc'][begin:]))}: {one['msg']}" for one in errors)
+    return "; ".join(f"{'.'.join(map(str, error['loc'][begin:]))}: {error['msg']}" for error in errors)
 
 
 def described(name: str) -> str:

@@ -64,9 +64,9 @@ class Asking:
         finally:
             del self._waiting[question.id]
             self._store.close_question(question.id, "withdrawn")
-            found = self._store.question(question.id)
-            if found is not None and found.answer is None:
-                self._publish("QuestionClosed", {"question": found.model_dump(mode="json")}, question.campaign)
+            stored = self._store.question(question.id)
+            if stored is not None and stored.answer is None:
+                self._publish("QuestionClosed", {"question": stored.model_dump(mode="json")}, question.campaign)
 
     def answer(self, key: int, answer: str, by: str) -> QuestionOut:
         """Answer a question.
@@ -87,10 +87,10 @@ class Asking:
         meant = understood(question, answer)
         self._store.answer(key, meant, by)
         waiting.set_result(meant)
-        found = self._store.question(key)
-        assert found is not None
-        self._publish("QuestionAnswered", {"question": found.model_dump(mode="json")}, question.campaign)
-        return found
+        open_question = self._store.question(key)
+        assert open_question is not None
+        self._publish("QuestionAnswered", {"question": open_question.model_dump(mode="json")}, question.campaign)
+        return open_question
 
 
 def understood(question: QuestionOut, answer: str) -> str:
@@ -99,30 +99,30 @@ def understood(question: QuestionOut, answer: str) -> str:
     Raises:
         AnswerError: the answer is not valid for the question.
     """
-    said = " ".join(answer.split())
+    words = " ".join(answer.split())
     if question.kind != "bench":
-        meant = next((o for o in question.options if o.lower() == said.lower()), None)
+        meant = next((o for o in question.options if o.lower() == words.lower()), None)
         if meant is not None:
             return meant
         if question.kind == "unknown":
             try:
-                parse_answer(said, question.options, 1e-3 * float(question.details[LOAD]))
-                return said
+                parse_answer(words, question.options, 1e-3 * float(question.details[LOAD]))
+                return words
             except ValueError as error:
                 raise AnswerError(str(error)) from None
-        raise AnswerError(f"'{said}' is not an answer; answer with one of: {'; '.join(question.options)}")
-    if said.lower() == GIVE_UP:
+        raise AnswerError(f"'{words}' is not an answer; answer with one of: {'; '.join(question.options)}")
+    if words.lower() == GIVE_UP:
         return GIVE_UP
     if question.wants == "weight":
         try:
-            typed_weight(said)
+            typed_weight(words)
         except ValueError as error:
             raise AnswerError(str(error)) from None
-        return said
-    found = _WORDS[question.wants].get(said.lower())
-    if found is None:
-        raise AnswerError(f"'{said}' is not an answer; answer with {_WANTED[question.wants]}")
-    return found
+        return words
+    meaning = _WORDS[question.wants].get(words.lower())
+    if meaning is None:
+        raise AnswerError(f"'{words}' is not an answer; answer with {_WANTED[question.wants]}")
+    return meaning
 
 
 class RemoteOperator:

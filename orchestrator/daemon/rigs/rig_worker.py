@@ -186,8 +186,8 @@ class Running:
         if self.item.task == POUR and self.item.run is None:
             await self._renew_order()
         vessels = Materials(self._shared.store).on_rig(self._rig.name)
-        found = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig, vessels)
-        request, warned = await asyncio.to_thread(_prepared, found)
+        prepared = await asyncio.to_thread(run_request, self._shared.settings, self.item, self._rig, vessels)
+        request, warned = await asyncio.to_thread(_prepared, prepared)
         assert request.folder is not None
         self.laboratory = request.campaign.laboratory.name
         for text in warned:
@@ -215,8 +215,8 @@ class Running:
         folder = self._shared.settings.snapshots / self.item.id
         order = await asyncio.to_thread(PourOrder.read, folder)
         materials = Materials(self._shared.store)
-        more = order.tolerance
-        if reason := materials.refusal(order.source, order.receiver, order.liquid, order.amount, more, pour=order.id):
+        margin = order.tolerance
+        if reason := materials.refusal(order.source, order.receiver, order.liquid, order.amount, margin, pour=order.id):
             raise OrderError(f"{reason}. Nothing was poured")
         content = materials.content(order.source)
         await asyncio.to_thread(renew_load, folder, content.mass or 0.0, content.deviation)
@@ -461,8 +461,8 @@ class RigWorker:
         settings = self._shared.settings
         try:
             run, snapshot = settings.runs / item.run, settings.snapshots / item.id
-            found = await asyncio.to_thread(settled_pour, run, snapshot, self.rig)
-            OrderBook(self._shared.store).settle(item, found, ended=ended)
+            settled = await asyncio.to_thread(settled_pour, run, snapshot, self.rig)
+            OrderBook(self._shared.store).settle(item, settled, ended=ended)
         except (RunError, OSError, ValueError) as error:
             _log.error("pour of %s is not in the account: %s", item.id, error)
             text = f"its outcome could not be entered in the account of the materials: {error}"
@@ -473,13 +473,13 @@ class RigWorker:
             return None
         store = self._shared.store
         mine = store.wanted(self.rig.name)
-        begun = sorted((one for one in mine if one.run is not None), key=lambda one: one.begun or 0.0)
+        begun = sorted((c for c in mine if c.run is not None), key=lambda c: c.begun or 0.0)
         now = time.time()
-        queued = [one for one in mine if one.state == "queued" and (one.not_before is None or one.not_before <= now)]
+        queued = [c for c in mine if c.state == "queued" and (c.not_before is None or c.not_before <= now)]
         if self._shared.queue_paused:
             queued = []
-        found = next((one for one in (*begun, *queued) if one.mode != "hardware" or one.motion_enabled), None)
-        return found if found is not None and self._has_room() else None
+        following = next((c for c in (*begun, *queued) if c.mode != "hardware" or c.motion_enabled), None)
+        return following if following is not None and self._has_room() else None
 
     def _pause(self) -> float:
         """Time until the queue is read again at the latest [s]: sooner if a campaign may start by its time."""
@@ -501,7 +501,7 @@ class RigWorker:
         self._show_arm(None)
         store.change(item.id, state="preparing", reason="", begun=item.begun or time.time(), motion_enabled=False)
         feed.publish("CampaignLeased", {"rig": self.rig.name}, item.id)
-        if self._shared.suspect and not any(one.running for one in self._shared.workers.values() if one is not self):
+        if self._shared.suspect and not any(w.running for w in self._shared.workers.values() if w is not self):
             self._shared.suspect = False
             await self._shared.warm.close()
         state, reason, desired = "failed", "", DesiredState.PAUSE
@@ -541,14 +541,14 @@ class RigWorker:
 
     def _kept_desired_state(self, item: QueueItem) -> DesiredState:
         """Somebody has to answer before it goes on: it goes on to ask, unless people want something else of it."""
-        found = self._shared.store.item(item.id)
-        return DesiredState.RUN if found is None else DesiredState(found.desired_state)
+        stored = self._shared.store.item(item.id)
+        return DesiredState.RUN if stored is None else DesiredState(stored.desired_state)
 
     def _ended_by_people(self, item: QueueItem) -> tuple[str, str, DesiredState]:
-        found = self._shared.store.item(item.id)
-        desired = DesiredState.PAUSE if found is None else DesiredState(found.desired_state)
-        state = "unknown" if found is not None and found.state == "unknown" else "paused"
-        reason = found.reason if found is not None else ""
+        stored = self._shared.store.item(item.id)
+        desired = DesiredState.PAUSE if stored is None else DesiredState(stored.desired_state)
+        state = "unknown" if stored is not None and stored.state == "unknown" else "paused"
+        reason = stored.reason if stored is not None else ""
         return state, reason, desired
 
     async def _leave(self, running: Running, state: str, reason: str, desired: DesiredState) -> None:
@@ -567,6 +567,6 @@ class RigWorker:
         self.running = None  # whoever hears that it rests may have it go on
         self._shared.feed.publish("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
         with contextlib.suppress(OSError):
-            busy = {one.running.item.run for one in self._shared.workers.values() if one.running is not None}
+            busy = {worker.running.item.run for worker in self._shared.workers.values() if worker.running is not None}
             await asyncio.to_thread(prune_recordings, self._shared.settings, {name for name in busy if name})
             await self._shared.warm.tidy()

@@ -73,9 +73,9 @@ def pack(plan: CampaignPlan, theta: Path | None = None) -> tuple[str, Files]:
 
 def _packed(value: Any, files: Files) -> Any:
     if isinstance(value, Mapping):
-        return {key: _packed(one, files) for key, one in value.items()}
+        return {key: _packed(entry, files) for key, entry in value.items()}
     if isinstance(value, list):
-        return [_packed(one, files) for one in value]
+        return [_packed(entry, files) for entry in value]
     if isinstance(value, str) and value.startswith("/"):  # only absolute paths begin with '/' in a record
         return _taken(Path(value), files)
     return value
@@ -187,8 +187,8 @@ def run_request(
 def planned_order(settings: DaemonSettings, item: QueueItem, rig: Rig) -> PlannedOrder:
     """Plan an order from its snapshot; see `run_request`."""
     folder = settings.snapshots / item.id
-    found = PlannedOrder.of(PourOrder.read(folder), rig, folder)
-    return replace(found, plan=_of_daemon(found.plan, settings))
+    planned = PlannedOrder.of(PourOrder.read(folder), rig, folder)
+    return replace(planned, plan=_of_daemon(planned.plan, settings))
 
 
 def _of_daemon(plan: CampaignPlan, settings: DaemonSettings) -> CampaignPlan:
@@ -311,9 +311,9 @@ def _from_path(settings: DaemonSettings, text: str) -> tuple[str, Files]:
     """Pack a campaign on this machine from one of the allowed folders."""
     if not settings.roots:
         raise SubmissionError("no campaign may be submitted by its path: the daemon's settings name no 'roots'")
-    found = [resolved(root / text) for root in settings.roots]
+    candidates = [resolved(root / text) for root in settings.roots]
     with confined(settings.roots):
-        path = next((one for one in found if one.is_file() and _inside(one, settings)), None)
+        path = next((file for file in candidates if file.is_file() and _inside(file, settings)), None)
         if path is None:
             raise SubmissionError(f"{text}: there is no such campaign in the folders that may be read (roots)")
         return pack(load_confined(path, settings.roots))

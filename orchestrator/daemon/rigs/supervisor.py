@@ -50,10 +50,10 @@ class Supervisor:
         known = {row["id"] for row in shared.store.rows("select id from campaign")}
         await asyncio.to_thread(self._remove_unacknowledged, known)
         for item in shared.store.active():
-            found = f"found {item.state} after the daemon had ended without a word"
+            reason = f"found {item.state} after the daemon had ended without a word"
             # without a run nothing has begun: it is in the queue again
-            shared.store.change(item.id, state="paused" if item.run is not None else "queued", reason=found)
-            shared.feed.publish("CampaignFound", {"state": item.state, "text": found}, item.id)
+            shared.store.change(item.id, state="paused" if item.run is not None else "queued", reason=reason)
+            shared.feed.publish("CampaignFound", {"state": item.state, "text": reason}, item.id)
         for key in OrderBook(shared.store).begun():
             item = self.queue.item(key)
             if (worker := shared.workers.get(item.rig)) is not None:

@@ -99,19 +99,19 @@ class Tokens:
         Raises:
             TooManyFailuresError: the token is wrong, and this address has sent too many wrong tokens before.
         """
-        found = self.find(token)
-        if found is None:
+        holder = self.find(token)
+        if holder is None:
             self._check(address)
             self._note_failure(address)
-        return found
+        return holder
 
     def find(self, token: str) -> Person | None:
         """Return the holder of a token, or None; a wrong token is not counted."""
-        shown, found = _digest(token), None
+        shown, holder = _digest(token), None
         for known, person in self._known:  # compare all of them, so that the time taken reveals nothing
             if hmac.compare_digest(known, shown):
-                found = person
-        return found
+                holder = person
+        return holder
 
     def _check(self, address: str) -> None:
         failures = self._failures.get(address)
@@ -137,8 +137,8 @@ def token_of(path: Path, role: Role) -> str | None:
     Raises:
         TokenFileError: the file can't be read.
     """
-    found = [(Role[line[0].upper()], line[2]) for line in _lines(path)]
-    return next((token for known, token in sorted(found) if known >= role), None)
+    tokens = [(Role[line[0].upper()], line[2]) for line in _lines(path)]
+    return next((token for known, token in sorted(tokens) if known >= role), None)
 
 
 def _make(path: Path) -> None:
@@ -164,7 +164,7 @@ def _lines(path: Path) -> list[tuple[str, str, str]]:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise TokenFileError(f"{path}: can't be read: {error}") from None
-    found = []
+    entries = []
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
@@ -174,8 +174,8 @@ def _lines(path: Path) -> list[tuple[str, str, str]]:
             raise TokenFileError(
                 f"{path}:{number}: should be ROLE NAME TOKEN: a role ({roles}), a name, 20 characters or more"
             )
-        found.append((words[0], words[1], words[2]))
-    return found
+        entries.append((words[0], words[1], words[2]))
+    return entries
 
 
 def _digest(token: str) -> bytes:

@@ -228,28 +228,28 @@ def networks(allow: Sequence[str]) -> list[ipaddress.IPv4Network | ipaddress.IPv
     return [ipaddress.ip_network(text, strict=False) for text in allow]
 
 
-def load_settings(path: Path | None, **given: Any) -> DaemonSettings:
+def load_settings(path: Path | None, **options: Any) -> DaemonSettings:
     """Load the settings from a file; options of the command line override them.
 
     Args:
         path: settings file; None: defaults.
-        given: fields of `DaemonSettings`; None for options that are not given.
+        options: fields of `DaemonSettings`; None for options that are not given.
 
     Raises:
         ConfigError: the file or a rig's file is invalid.
     """
-    given = {name: value for name, value in given.items() if value is not None}
+    options = {name: value for name, value in options.items() if value is not None}
     if path is None:
-        return replace(DaemonSettings(resolved(given.pop("state", state_directory()))), **given)
+        return replace(DaemonSettings(resolved(options.pop("state", state_directory()))), **options)
     report = Report()
     place = Place(Document.read(resolved(path)))
     file = validate(DaemonFile, place, report)
     settings = None if file is None else _resolve(file, place, report)
     report.raise_if_any()
     assert settings is not None, "settings without problems"
-    if "state" in given:
-        given["state"] = resolved(given["state"])
-    return replace(settings, **given)
+    if "state" in options:
+        options["state"] = resolved(options["state"])
+    return replace(settings, **options)
 
 
 def _rig(name: str, source: Path, at: Place, report: Report) -> list[Rig]:
@@ -270,8 +270,8 @@ def _check_tls(certificate: Path | None, key: Path | None, at: Place, report: Re
     try:
         ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key)
     except OSError as error:  # includes SSLError
-        said = error.reason or "they can't be read" if isinstance(error, ssl.SSLError) else error.strerror
-        report.add(at, f"{certificate.name} and {key and key.name} are not a certificate and its key in PEM ({said})")
+        reason = error.reason or "they can't be read" if isinstance(error, ssl.SSLError) else error.strerror
+        report.add(at, f"{certificate.name} and {key and key.name} are not a certificate and its key in PEM ({reason})")
 
 
 def _check_receivers(section: NotifySettings, at: Place, report: Report) -> None:
@@ -304,8 +304,8 @@ def _resolve(file: DaemonFile, place: Place, report: Report) -> DaemonSettings:
     tls = file.listen.tls
     files = (None, None) if tls is None else (path(tls.certificate, listen), path(tls.key, listen))
     if tls is not None:
-        for key, found in zip(("certificate", "key"), files, strict=True):
-            if found is not None and (missing := missing_file(found)) is not None:
+        for key, pem in zip(("certificate", "key"), files, strict=True):
+            if pem is not None and (missing := missing_file(pem)) is not None:
                 report.add(listen.at("tls", key), missing)
         if not any(report.is_broken(listen.at("tls", key)) for key in ("certificate", "key")) and None not in files:
             _check_tls(*files, listen.at("tls"), report)

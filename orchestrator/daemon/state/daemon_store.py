@@ -340,9 +340,9 @@ class Store:
         names = ", ".join(values)
         written = [_written(n, v) for n, v in values.items()]
         key = self.write(f"insert into question ({names}) values ({', '.join('?' * len(values))})", *written)
-        found = self.question(key)
-        assert found is not None
-        return found
+        question = self.question(key)
+        assert question is not None
+        return question
 
     def answer(self, key: int, answer: str, by: str) -> None:
         """Store an answer, before anything acts on it."""

@@ -71,9 +71,9 @@ def plain(value: Any) -> Any:
         table = {f.name: plain(v) for f, v in values.items() if v is not None or f.metadata != WRITTEN_IF_SET}
         return {"type": type(value).__name__, **table}
     if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
+        return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [plain(one) for one in value]
+        return [plain(entry) for entry in value]
     if hasattr(value, "tolist"):
         return plain(value.tolist())
     return str(value)
@@ -222,12 +222,12 @@ class Feed:
         try:
             while self._db is not None:
                 news = self._news
-                found = self._after(seen)
-                for sent in found:
+                batch = self._after(seen)
+                for sent in batch:
                     seen = sent.id
                     if campaign is None or sent.campaign == campaign:
                         yield sent
-                if not found:
+                if not batch:
                     try:
                         async with asyncio.timeout(beat):
                             await news.wait()
@@ -248,5 +248,5 @@ class Feed:
         rows = self._db.execute(
             "select id, t, campaign, type, data from event where id > ? order by id limit ?", [seen, _BATCH]
         )
-        found = [SentEvent(*row) for row in rows]
-        return found or ([self._ring[0]] if self._ring else [])
+        events = [SentEvent(*row) for row in rows]
+        return events or ([self._ring[0]] if self._ring else [])

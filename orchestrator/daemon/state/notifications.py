@@ -133,9 +133,7 @@ class Notifier:
         self._news: dict[str, _CampaignNews] = {}
         self._lock = threading.Lock()
         self._ended = threading.Event()
-        self._threads = [
-            threading.Thread(target=one.work, name=f"word to {one}", daemon=True) for one in self._receivers
-        ]
+        self._threads = [threading.Thread(target=r.work, name=f"word to {r}", daemon=True) for r in self._receivers]
         self._threads.append(threading.Thread(target=self._watch_for_silence, name="silence", daemon=True))
         for thread in self._threads:
             thread.start()
@@ -143,7 +141,7 @@ class Notifier:
     @property
     def counts(self) -> dict[str, Counts]:
         """Numbers of messages by receiver; receivers' names contain no secrets."""
-        return {str(one): one.counts for one in self._receivers}
+        return {str(receiver): receiver.counts for receiver in self._receivers}
 
     def note(self, kind: str, data: Mapping[str, Any], campaign: str = "") -> None:
         """Process an event: its type in the daemon's feed, and its data."""
@@ -158,8 +156,8 @@ class Notifier:
     def close(self, timeout: float = 5.0) -> None:
         """Send waiting messages for at most this long [s], and end."""
         self._ended.set()
-        for one in self._receivers:
-            one.end()
+        for receiver in self._receivers:
+            receiver.end()
         deadline = time.monotonic() + timeout
         for thread in self._threads:
             thread.join(max(deadline - time.monotonic(), 0.0))
@@ -221,13 +219,13 @@ class Notifier:
                 return None if reason in _BY_PEOPLE else self._made("failed", campaign, "can't go on", [reason])
         return self._made("ended", campaign, f"is {state}", [reason])
 
-    def _made(self, occasion: Occasion, campaign: str, what: str, lines: Sequence[str]) -> Notification | None:
+    def _made(self, occasion: Occasion, campaign: str, headline: str, lines: Sequence[str]) -> Notification | None:
         news = self._news.get(campaign)
         if occasion not in self._about or (occasion in _FOR_PERSON and not self._first(news)):
             return None
         mode = f"{MODE_LABELS[news.mode]} " if news is not None and news.mode in MODE_LABELS else ""
         rig = "" if news is None or not news.rig else f" at {news.rig}"
-        title = f"Decant: {what}" if not campaign else f"Decant, {mode}{campaign}{rig}: {what}"
+        title = f"Decant: {headline}" if not campaign else f"Decant, {mode}{campaign}{rig}: {headline}"
         return Notification(occasion, title, "\n".join(filter(None, (*lines, self._page))) or title)
 
     def _watch_for_silence(self) -> None:
@@ -255,8 +253,8 @@ class Notifier:
             self._send(message)
 
     def _send(self, message: Notification) -> None:
-        for one in self._receivers:
-            one.put(message)
+        for receiver in self._receivers:
+            receiver.put(message)
 
 
 async def pass_on(events: AsyncIterator[SentEvent | None], notifier: Notifier) -> None:
@@ -296,11 +294,11 @@ class _Receiver:
 
         url = os.environ.get(self.url.removeprefix(ENVIRONMENT), "") if self.url.startswith(ENVIRONMENT) else self.url
         self._scheme = url.partition(":")[0]
-        found = Apprise()
-        if not url or not found.add(url):
+        service = Apprise()
+        if not url or not service.add(url):
             where = self.url if self.url.startswith(ENVIRONMENT) else f"the {self.number}. one ({self._scheme}:…)"
             raise NotifyError(f"{where}: is not a URL that apprise knows; see https://appriseit.com/services/")
-        self._apprise = found
+        self._apprise = service
         self._messages: queue.Queue[Notification | None] = queue.Queue(QUEUE)
         self._ending = threading.Event()
 

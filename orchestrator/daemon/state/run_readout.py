@@ -60,15 +60,15 @@ class Pours:
         """
         with self._guard:
             before = self._read.pop(directory, None)
-            made, known = (plan(), None) if before is None else before
+            planned, known = (plan(), None) if before is None else before
             try:
                 record = read_record(directory, known=known)
             except (JournalError, CodecError, OSError):
                 return [], []  # being created, or of another version: read from its start at the next call
-            self._read[directory] = made, record
+            self._read[directory] = planned, record
             if len(self._read) > self._keep:
                 self._read.popitem(last=False)
-            pours = pour_summaries(made, record, live=live)
+            pours = pour_summaries(planned, record, live=live)
             return pours, night(record, pours)
 
 
@@ -87,26 +87,26 @@ def night(record: RunState, pours: Sequence[PourSummary]) -> list[dict[str, Any]
         Time [s since 1970], kind and text of each, in order; empty without a consent.
     """
     begun = next((t for t, _, about in record.notes if about == "consent"), math.inf)
-    found = [
+    timeline = [
         (t, about if about in _OF_NIGHT else "answer", text)
         for t, text, about in record.notes
         if t >= begun and about not in (None, "unattended", *MOTIONS)
     ]
     for pour in pours:
         if pour.time is not None and pour.time >= begun and pour.state not in ("asked", "under way"):
-            found.append(
+            timeline.append(
                 (pour.time, "pour", pour.line if pour.state == "weighed" else f"pour {pour.number}: {pour.state}")
             )
-    return [{"time": t, "kind": kind, "text": text} for t, kind, text in sorted(found)]
+    return [{"time": t, "kind": kind, "text": text} for t, kind, text in sorted(timeline)]
 
 
 def summary_of(directory: Path) -> dict[str, Any] | None:
     """Return a run's `summary.json`, or None before it is published."""
     try:
-        found: dict[str, Any] = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+        summary: dict[str, Any] = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    return found
+    return summary
 
 
 def found_at(spec: LaboratorySettings) -> dict[str, str]:
@@ -120,7 +120,7 @@ def found_at(spec: LaboratorySettings) -> dict[str, str]:
     """
     if spec.arm is None:
         return {"bench": "simulated: it has no arm and no balance that could be read"}
-    found: dict[str, str] = {}
+    findings: dict[str, str] = {}
     try:
         with reached(spec) as ready:
             assert ready.arm is not None
@@ -131,10 +131,10 @@ def found_at(spec: LaboratorySettings) -> dict[str, str]:
         return {"bench": f"can't be read: {error}"}
     for check in checks:
         if check.name != "balance tare":  # a question must not change what the balance shows
-            found[check.name] = check.found
+            findings[check.name] = check.found
     if spec.mode == "virtual":
-        found["note"] = "arm and balance are virtual and were restarted: they show nothing of the pour"
-    return found
+        findings["note"] = "arm and balance are virtual and were restarted: they show nothing of the pour"
+    return findings
 
 
 def prune_recordings(settings: DaemonSettings, busy: Collection[str] = ()) -> list[Path]:

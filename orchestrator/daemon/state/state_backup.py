@@ -54,13 +54,13 @@ def back_up(state: Path, target: Path) -> dict[str, int]:
         raise BackupError(f"{state}: has no {STORE}; --state names the daemon's state directory")
     if target.exists():
         raise BackupError(f"{target}: exists already; name another file")
-    part = target.with_name(target.name + ".part")
+    unfinished = target.with_name(target.name + ".part")
     runs = sorted(path for path in (state / "runs").glob("*") if path.is_dir())
     campaigns = sorted(path for path in (state / "campaigns").glob("*") if path.is_dir())
     try:
         # The content includes tokens.
         with (
-            os.fdopen(os.open(part, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file,
+            os.fdopen(os.open(unfinished, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "wb") as file,
             zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive,
         ):
             # The store is first: a run that is further than the store continues from its journal.
@@ -76,9 +76,9 @@ def back_up(state: Path, target: Path) -> dict[str, int]:
                 _add_run(archive, folder, state)
             about = {"format": FORMAT, "time": time.time(), "campaigns": len(campaigns), "runs": len(runs)}
             archive.writestr(CONTENT, json.dumps(about))
-        part.replace(target)
+        unfinished.replace(target)
     finally:
-        part.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
     return {"campaigns": len(campaigns), "runs": len(runs), "bytes": target.stat().st_size}
 
 
@@ -144,10 +144,10 @@ def restore(source: Path, state: Path) -> dict[str, float]:
     store = Store(state / STORE)
     try:
         store.set_flag(PAUSED, {"by": "restore", "time": time.time()})
-        rest = (*ENDED, "queued")
+        resting = (*ENDED, "queued")
         store.write(
-            f"update campaign set desired_state = ? where state not in ({', '.join('?' * len(rest))})",
-            *(str(DesiredState.PAUSE), *rest),
+            f"update campaign set desired_state = ? where state not in ({', '.join('?' * len(resting))})",
+            *(str(DesiredState.PAUSE), *resting),
         )
         store.note(
             "restore", "restore backup", detail=time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(about["time"]))
