@@ -136,9 +136,6 @@ def test_what_pours_say_of_the_simulator_is_known_where_it_is_borne_out_and_open
         after=(Belief(pour=1, ignorance=ignorance, gain=None),),
         displaced={},
         factor=1.0,
-        limit=0.9,
-        policy="go on",
-        followed=None,
         alarm=False,
         text="the simulator is as it is",
     )
