@@ -58,7 +58,7 @@ LIVES = 4
 LEAVING = 20.0
 """Within so long nothing is left of a program that was killed [s]."""
 
-_POUR = re.compile(r"pour (\d+) of stage (\S+)")
+POUR_ASKED_ABOUT = re.compile(r"pour (\d+) of stage (\S+)")
 
 
 @dataclass
@@ -148,6 +148,10 @@ class Rig:
         """Where the disk is, that is filled up."""
         return life.place / "disk"
 
+    def questions(self, life: Life) -> int:
+        """Number of questions about pours that had begun."""
+        return len(life.noted("asked"))
+
     def check(self, life: Life) -> Iterator[str]:
         """What else should not be."""
         yield from ()
@@ -236,13 +240,17 @@ class Rig:
             life.note("asked", question)
             return self.answer(question)
 
-        moments = Moments(life, self._strike(life), self.pids)
+        moments = self.moments(life)
         async with self.laboratory(life) as laboratory:
             with self.subscribers(life, plan) as subscribers, moments.noted():
                 everybody = [*subscribers, self._tilting(moments)]
                 await run_campaign(
                     plan, laboratory, life.directory, resume=resume, ask_operator=answer, subscribers=everybody
                 )
+
+    def moments(self, life: Life) -> Moments:
+        """What happens in a life, which is struck at."""
+        return Moments(life, self._strike(life), self.pids)
 
     def _tilting(self, moments: Moments) -> Subscriber:
         """The middle of a pour is a moment like a write."""
@@ -255,7 +263,7 @@ class Rig:
 
     def answer(self, question: str) -> str:
         """The operator has weighed what the undisturbed pour weighed."""
-        found = _POUR.search(question)
+        found = POUR_ASKED_ABOUT.search(question)
         assert found is not None, question
         return self.weights[f"{found[2]} {found[1]}"]
 
@@ -316,7 +324,7 @@ class Rig:
         weighed = set(weights(life.directory))
         if weighed != set(self.weights) or len(poured) > len(weighed):
             yield f"{len(poured)} pours were made, {len(weighed)} weights are in the journal"
-        if (asked := len(life.noted("asked"))) != len(unknown):
+        if (asked := self.questions(life)) != len(unknown):
             yield f"{len(unknown)} pours had begun and had no outcome, and a person was asked {asked} times"
         yield from self.check(life)
 

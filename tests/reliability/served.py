@@ -37,7 +37,7 @@ from tests.reliability.case import (
     first_of_kind,
 )
 from tests.reliability.formula import LOG, Formula
-from tests.reliability.rig import PATIENCE, Life, Moments, Rig
+from tests.reliability.rig import PATIENCE, Life, Rig
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 
 TEXT = CAMPAIGN.replace("recorded_simulations: 1", "figures: false, recording: false").replace(
@@ -45,6 +45,9 @@ TEXT = CAMPAIGN.replace("recorded_simulations: 1", "figures: false, recording: f
 )
 
 WAITING = 0.1
+
+SUBMITTED = "struck"
+"""Id of the submission, which is sent again after a kill."""
 
 
 @dataclass
@@ -110,7 +113,7 @@ class DaemonRig(Rig):
 
         PouringBench.pour = logged  # type: ignore[method-assign]
         settings = replace(load_settings(None, state=life.state, port=0, in_process=True), keep_free=0)
-        with Moments(life, self._strike(life), self.pids).noted():
+        with self.moments(life).noted():
             serve(settings)
 
     def _live(self, life: Life) -> str:
@@ -185,7 +188,7 @@ class _People:
         items = client.get("/campaigns")
         if not items:
             text, files = pack(load_campaign(self._rig.folder / "small.yaml"))
-            client.post("/campaigns", {"text": text, "files": files})
+            client.post("/campaigns", {"text": text, "files": files, "id": SUBMITTED})
             return False
         (item,) = items
         for question in client.get("/questions"):
