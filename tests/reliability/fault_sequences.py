@@ -32,8 +32,8 @@ from typing import Any
 
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.daemon.daemon_client import Client, DaemonError
-from orchestrator.daemon.submissions import pack
+from orchestrator.daemon.api.daemon_client import Client, DaemonError
+from orchestrator.daemon.rigs.submissions import pack
 from orchestrator.records.journal import Kind
 from orchestrator.records.states import State
 from tests.reliability import strikes
