@@ -330,8 +330,8 @@ def plan(
         if value < 1:
             raise InvalidArgumentError(f"{name}={value!r}: should be 1 or more")
     vessel = load_vessel(Path(receiver).expanduser()) if isinstance(receiver, str | Path) else receiver
-    theta_ = _given(theta, campaign)
-    request = plan_task(campaign, theta_, vessel, iterations, seeds)
+    chosen = _given(theta, campaign)
+    request = plan_task(campaign, chosen, vessel, iterations, seeds)
     return _run(request, checked(request, RunResources(in_process=in_process, subscribers=watch)))
 
 
@@ -399,10 +399,10 @@ def _rows(table: Any) -> list[dict[str, Any]]:
         raise InvalidArgumentError(
             f"pours: should be a pandas.DataFrame or a list of dicts, not {type(table).__name__}"
         )
-    rows_ = list(rows)
-    if wrong := [row for row in rows_ if not isinstance(row, Mapping)]:
+    listed = list(rows)
+    if wrong := [row for row in listed if not isinstance(row, Mapping)]:
         raise InvalidArgumentError(f"pours: every row should be a dict from column to value, not {wrong[0]!r}")
-    return [dict(row) for row in rows_]
+    return [dict(row) for row in listed]
 
 
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

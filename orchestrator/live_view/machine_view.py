@@ -174,7 +174,7 @@ def status_page(progress: ProgressState, trust: str = "") -> str:
             lines.append("The next step is being chosen")
     elif run.reason:
         lines.append(_plain(run.reason))
-    lines += [f"{_plain(known.name)}: {text_}" for known in run.stages.values() if (text_ := str(known.progress))]
+    lines += [f"{_plain(known.name)}: {shown}" for known in run.stages.values() if (shown := str(known.progress))]
     for scene, best in progress.best.items():
         lines.append(f"**Best into {_plain(receiver_name(plan, scene))}: {best.unit.text(best.loss)}**")
     if trust:

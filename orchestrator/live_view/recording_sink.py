@@ -134,8 +134,8 @@ class RecordingSink:
                 end.take(entity, moments, columns, size)
             return
         half = len(moments) // 2
-        for half_ in (slice(half), slice(half, None)):
-            self.rows(entity, moments[half_], [(name, array[half_]) for name, array in columns])
+        for side in (slice(half), slice(half, None)):
+            self.rows(entity, moments[side], [(name, array[side]) for name, array in columns])
 
     def clear(self, entity: str, *, recursive: bool = False) -> None:
         """Hide the previous content of an entity from now on.

@@ -93,11 +93,11 @@ def campaign_warnings(plan: CampaignPlan) -> dict[str, list[NotSimulated]]:
         spaces += [(scene, plan.calibration.actions) for scene in plan.calibration.scenes]
     if plan.deployment is not None:
         spaces += [(scene, plan.deployment.actions) for scene in plan.deployment.scenes]
-    warnings_ = {
+    by_scene = {
         scene.name: space_warnings(scene, actions, particles, adhesion, names.get(scene.name, scene.name))
         for scene, actions in spaces
     }
-    return {name: warnings for name, warnings in warnings_.items() if warnings}
+    return {name: warnings for name, warnings in by_scene.items() if warnings}
 
 
 def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list[NotCovered]]:
@@ -108,12 +108,12 @@ def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list
     """
     theta = recommended_theta_of(results) or plan.parameters
     scenes = {} if plan.deployment is None else {scene.name: scene for scene in plan.deployment.scenes}
-    warnings_ = {}
+    by_scene = {}
     for name, result in deployments_of(results).items():
         if name in scenes and result.recommended is not None:
             action = scenes[name].action(dict(result.recommended.action_si))
-            warnings_[name] = list(regimes_of(scenes[name], action, theta.particles, theta.lip_adhesion).not_covered)
-    return warnings_
+            by_scene[name] = list(regimes_of(scenes[name], action, theta.particles, theta.lip_adhesion).not_covered)
+    return by_scene
 
 
 def lines(warnings: Mapping[str, Sequence[NotSimulated]]) -> list[str]:

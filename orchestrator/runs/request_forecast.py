@@ -109,20 +109,20 @@ class RequestForecast:
 
     async def _until_a_pour(self, strategy: Strategy) -> None:
         """Queue all simulations before the first pour; outcomes are delivered in logical order, as in the stage."""
-        open_: list[Request] = []
+        pending: list[Request] = []
         while not strategy.finished:
-            simulations = sum(isinstance(request, Simulate) for request in open_)
+            simulations = sum(isinstance(request, Simulate) for request in pending)
             requests = strategy.ask(Slots(max(self.capacity - simulations, 0), 1))
             if any(isinstance(request, Pour) for request in requests):
                 return
-            open_ += requests
+            pending += requests
             for request in requests:
                 if isinstance(request, Simulate):
                     self.speculation.predict(request)
-            if not open_:
+            if not pending:
                 return
-            request = min(open_, key=lambda request: isinstance(request, Simulate))
-            open_.remove(request)
+            request = min(pending, key=lambda request: isinstance(request, Simulate))
+            pending.remove(request)
             if isinstance(request, Suggest):
                 strategy.tell(request, await self.suggest(request))
             elif isinstance(request, Simulate):

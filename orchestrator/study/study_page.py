@@ -101,20 +101,20 @@ class StudyTable:
 
 def tables(study: StudyPlan, pooled: Gathered) -> list[StudyTable]:
     """All tables for which there is data."""
-    tables_ = []
+    shown = []
     if pooled.calibrated:
-        tables_.append(_calibrations(study, pooled))
+        shown.append(_calibrations(study, pooled))
     if rows := [*_calibration_effects(study, pooled), *_deployment_effects(study, pooled)]:
-        tables_.append(StudyTable("table-effects", "Who gains how much", _PAIRED, _EFFECT_COLUMNS, rows))
+        shown.append(StudyTable("table-effects", "Who gains how much", _PAIRED, _EFFECT_COLUMNS, rows))
     if pooled.finals:
-        tables_.append(_finals(pooled, Losses(study, pooled, final=True)))
+        shown.append(_finals(pooled, Losses(study, pooled, final=True)))
     if pooled.losses:
         losses = Losses(study, pooled)
-        tables_.append(_deployments(pooled, losses))
+        shown.append(_deployments(pooled, losses))
         if rows := _needed(pooled, losses):
             header = ("mismatch", "receiver", "loss", "D2", "D3")
-            tables_.append(StudyTable("table-pours", "Pours to the same loss", _NEEDED, header, rows))
-    return tables_
+            shown.append(StudyTable("table-pours", "Pours to the same loss", _NEEDED, header, rows))
+    return shown
 
 
 def _calibrations(study: StudyPlan, pooled: Gathered) -> StudyTable:

@@ -68,7 +68,7 @@ class FarProcess:
         """Plug the line in again: another device under the same path."""
         self.order("plug")
 
-    def order(self, what: str, **values: Any) -> dict[str, Any]:
+    def order(self, kind: str, **values: Any) -> dict[str, Any]:
         """Send a command and wait until it is executed.
 
         Raises:
@@ -76,7 +76,7 @@ class FarProcess:
         """
         with self._lock:
             try:
-                self._process.write(json.dumps({"do": what, **values}).encode("ascii") + b"\n")
+                self._process.write(json.dumps({"do": kind, **values}).encode("ascii") + b"\n")
             except (OSError, ValueError) as error:
                 raise LaboratoryError(f"virtual balance at {self.port}: its process is gone{self._end()}") from error
             return self._answer()
@@ -233,9 +233,9 @@ class SerialBalanceEmulator:
         """See `BalanceEmulator.put`."""
         self._balance.put(mass)
 
-    def order(self, what: str, values: dict[str, Any]) -> dict[str, Any]:
+    def order(self, kind: str, values: dict[str, Any]) -> dict[str, Any]:
         """Send a command: 'unplug', 'plug', 'faults' …; see `VirtualSerialBalance`."""
-        return self._balance.order(what, **values)
+        return self._balance.order(kind, **values)
 
     def close(self) -> None:
         """See `BalanceEmulator.close`."""
