@@ -28,7 +28,7 @@ from sim_engine.vessel.mesh import (
     wall_thickness,
 )
 from sim_engine.vessel.mesh_shape import Axis, MeshShape
-from sim_engine.vessel.mesh_surface import components
+from sim_engine.vessel.mesh_surface import components, normals_and_areas
 from sim_engine.vessel.shapes import LengthUnit, VesselError
 from sim_engine.vessel_acquisition.surface_repair import (
     boundary_loops,
@@ -57,6 +57,9 @@ HOLE = 0.6
 
 LARGE_HOLE = 0.01
 """Share of the surface from which a closed hole, or an open surface that is dropped, is a warning."""
+
+BESIDE = 1e-4
+"""Largest height above the underside of a bowl of an open surface that is its stem or foot [m]."""
 
 CHANGED = 0.01
 """Relative change of the cavity from which a repair is a warning."""
@@ -229,21 +232,33 @@ def _closed(mesh: Any, wall: float | None, log: _Log) -> Any:
     faces, removed = without_redundant(upright, faces)
     if removed.within:
         log.notes.append(f"{removed.within} inner face(s), which bound no solid, were removed")
-    corners = vertices[faces]
-    whole = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
-    small = [sheet for sheet in removed.sheets if sheet[2] < LARGE_HOLE * whole]
-    if small:
-        area = 1e4 * sum(sheet[2] for sheet in small)
+    floor = float(upright[faces.ravel(), 2].min())
+    beneath = [bool(upright[sheet, 2].max() <= floor + BESIDE) for sheet in removed.sheets]
+    sheets = [sheet for sheet, below in zip(removed.sheets, beneath, strict=True) if not below]
+    base = [sheet for sheet, below in zip(removed.sheets, beneath, strict=True) if below]
+    least = LARGE_HOLE * float(normals_and_areas(vertices, faces)[1].sum())
+    areas = [float(normals_and_areas(vertices, sheet)[1].sum()) for sheet in sheets]
+    if small := [area for area in areas if area < least]:
+        area = 1e4 * sum(small)
         log.notes.append(f"{len(small)} small open surface(s), which bound no solid, of {area:.2g} cm² were dropped")
-    for low, high, area in removed.sheets:
-        if area < LARGE_HOLE * whole:
-            continue
-        log.warnings.append(
-            f"an open surface of {1e4 * area:.3g} cm², {1e3 * (low - bottom):.3g} to {1e3 * (high - bottom):.3g} mm "
-            "above the underside, was dropped: it bounds no solid (the surface of a liquid?)"
+    for sheet, area in zip(sheets, areas, strict=True):
+        low, high = (1e3 * (limit(upright[sheet, 2]) - bottom) for limit in (np.min, np.max))
+        if area >= least:
+            log.warnings.append(
+                f"an open surface of {1e4 * area:.3g} cm², {low:.3g} to {high:.3g} mm above the underside, was "
+                "dropped: it bounds no solid (the surface of a liquid?)"
+            )
+    closed, faces = _without_holes(vertices, faces, wall, log)
+    faces = outwards(closed, faces)
+    if base:
+        foot = np.concatenate(base)
+        vertices, foot, _ = holes_filled(vertices, foot, boundary_loops(foot))
+        faces = np.vstack([faces, outwards(vertices, foot) + len(closed)])
+        closed = np.vstack([closed, vertices])
+        log.notes.append(
+            f"its stem or foot, {1e3 * (floor - bottom):.0f} mm high and open, was closed and counts as solid"
         )
-    vertices, faces = _without_holes(vertices, faces, wall, log)
-    return _mesh(vertices, outwards(vertices, faces))
+    return _mesh(closed, faces)
 
 
 def _mesh(vertices: Floats, faces: Integers) -> Any:

@@ -151,11 +151,11 @@ class RemovedFaces:
 
     Attributes:
         within: number of faces within a wall.
-        sheets: height range (low, high) [m] and area [m²] of each open surface in the air.
+        sheets: faces of each open surface in the air, shapes (F, 3).
     """
 
     within: int
-    sheets: tuple[tuple[float, float, float], ...]
+    sheets: tuple[Integers, ...]
 
 
 def without_redundant(vertices: Floats, faces: Integers) -> tuple[Integers, RemovedFaces]:
@@ -179,11 +179,7 @@ def without_redundant(vertices: Floats, faces: Integers) -> tuple[Integers, Remo
             if mean > 0.5:
                 within += int(chosen.sum())
             else:
-                corners = vertices[faces[chosen]]
-                area = 0.5 * np.linalg.norm(
-                    np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-                )
-                sheets.append((float(corners[..., 2].min()), float(corners[..., 2].max()), float(area.sum())))
+                sheets.append(faces[chosen])
         if not drop.any() or drop.all():
             break
         faces = faces[~drop]

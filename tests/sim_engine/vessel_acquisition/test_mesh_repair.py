@@ -205,6 +205,23 @@ def test_edges_of_several_faces_and_mixed_orientations_are_read(
 
 
 @pytest.mark.slow
+def test_stem_and_foot_of_a_glass_without_thickness_are_kept(tmp_path: Path) -> None:
+    """One sheet for the bowl, and below it an open one, as Blender's glasses are built (carosto/pouring_env)."""
+    bowl, stem = [(0, 56), (5, 56), (28, 85), (34, 115), (30, 180)], [(5, 56), (5, 16), (31, 2), (31, 0)]
+    sheets = [trimesh.creation.revolve(np.array(points, float), sections=48) for points in (bowl, stem)]
+    trimesh.util.concatenate(sheets).export(tmp_path / "glass.stl")
+    repaired = mended(tmp_path / "glass.stl", unit="mm", wall=2e-3)
+    assert np.ptp(repaired.vertices[:, 2]) == pytest.approx(0.180, abs=5e-4)
+    assert not repaired.warnings
+    assert any("stem or foot, 56 mm high" in note for note in repaired.notes)
+    (r0, z0), *others = np.array(bowl[1:], float)
+    frustums = 0.0
+    for r1, z1 in others:
+        frustums += np.pi * (z1 - z0) * (r0**2 + r0 * r1 + r1**2) / 3.0
+        r0, z0 = r1, z1
+    assert capacity(repaired) == pytest.approx(1e-3 * frustums, rel=0.01)
+
+
 def test_triangles_that_stand_on_the_surface_do_not_change_the_cavity(tmp_path: Path) -> None:
     fins().export(tmp_path / "cup.obj")
     assert capacity(mended(tmp_path / "cup.obj", unit="mm", wall=None)) == pytest.approx(CUP, rel=0.01)
