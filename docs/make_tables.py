@@ -436,8 +436,11 @@ MACHINE = "AMD EPYC, 2 shared cores, Linux x86_64, Python 3.11"
 """The machine of tables that name no other one, as docs/evidence/results.md says."""
 
 
-MEANS_ONLY = ("recorded", "quickstart-fits", "memory")
-"""Tables of which a page shows the means alone; the figures of each seed stay in docs/data/results.json."""
+MEANS_ONLY, HIDDEN = (
+    ("recorded", "quickstart-fits", "memory", "cliffs", "milder", "learning"),
+    ("seed", "seeds", "best of 15"),
+)
+"""Tables of which a page shows the means alone, and columns that it leaves out: docs/data/results.json has all."""
 
 
 def measured(name: str) -> str:
@@ -445,8 +448,8 @@ def measured(name: str) -> str:
     found = json.loads((FOLDER / "data" / "results.json").read_text(encoding="utf-8"))[name]
     head, rows = found["head"], found["rows"]
     if name in MEANS_ONLY:
-        columns = [i for i, title in enumerate(head) if not (title == "seed" or title.isdecimal())]
-        rows = [[row[i] for i in columns] for row in rows if "mean" in row or "mean" in head]
+        columns = [i for i, title in enumerate(head) if not (title in HIDDEN or title.isdecimal())]
+        rows = [[row[i] for i in columns] for row in rows if "mean" in row or "seed" not in head]
         head = [head[i] for i in columns]
     machine = "" if found["machine"] == MACHINE else f"{found['machine']}; "
     how = f"<sub>`{found['command']}`; {found['settings']}. {machine}{found['date']}, version {found['version']}.</sub>"
@@ -589,8 +592,6 @@ def dosing_particles() -> str:
     head = (
         "wanted",
         "doses",
-        "bench g",
-        "particles g",
         "difference g",
         "smallest … largest g",
         "as a shift of the onset",
@@ -601,8 +602,6 @@ def dosing_particles() -> str:
             for text in (
                 name,
                 str(row["doses"]),
-                f"{row['bench']:.1f}",
-                f"{row['particles']:.1f}",
                 f"{row['difference']:+.1f} ± {row['deviation']:.1f}",
                 f"{row['smallest']:+.1f} … {row['largest']:+.1f}",
                 f"{row['onset']:+.2f}° ± {row['onset_deviation']:.2f}°",
