@@ -35,6 +35,7 @@ def weigh_pairs(f: ti.template(), s, inv_h):
     Roots and polynomials of pairs that are adjacent in the lists are computed eight at a time, apart from reading
     scattered positions."""
     measure_pairs(f, s)
+    # u = 1 − r/h; share = W h³/σ, pair = slope, so that ∇W = −(σ/h⁵) pair (x_i − x_j).
     for k in range(f.list_begin[s], f.list_end[s]):
         u = ti.max(1.0 - ti.sqrt(f.pair[k]) * inv_h, 0.0)
         f.share[k] = weight(u)
@@ -46,11 +47,13 @@ def measure_first(f: ti.template(), s):
     """Density of all particles and, for the whole step, the norms of their constraints' gradients."""
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
+    # Volume V = d³ / PACKING of a particle: scale = V σ/h⁵ [1/m²], the common factor of V ∇W.
     scale = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING * inv_h * inv_h
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.density[i] = 1.0  # W(0) of the particle itself
         f.sums[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
     weigh_pairs(f, s, inv_h)
+    # ρ_i = Σ_j W_ij and (Σ_j ∇W, Σ_j |∇W|²), without their factors; a pair adds to both of its particles.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x[i]
         rho = ti.cast(0.0, ti.f32)
@@ -66,6 +69,8 @@ def measure_first(f: ti.template(), s):
             f.sums[j] = f.sums[j] + ti.Vector([-lean[0], -lean[1], -lean[2], lean[3]])
         f.density[i] = f.density[i] + rho
         f.sums[i] = f.sums[i] + sums
+    # squares_i = Σ_k |∇_k C_i|² + ε (Macklin & Müller 2013, equations 8 and 11; ε = 0.05/h² is their relaxation):
+    # |∇_i C_i|² with ∇_i C_i = Σ_j V ∇W − Σ_walls wall_slope/h n, plus Σ_j |V ∇W|² for the neighbours k = j.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         total = -scale * ti.Vector([f.sums[i][0], f.sums[i][1], f.sums[i][2]])
         for b in ti.static(range(VESSELS)):
@@ -79,6 +84,7 @@ def measure_first(f: ti.template(), s):
 @ti.func
 def measure(f: ti.template(), s):
     """Density of all particles."""
+    # Σ_j W_ij h³/σ, including W(0); `compression` multiplies it by V σ/h³ and adds the walls.
     inv_h = 1.0 / (SUPPORT * f.spacing[s])
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.density[i] = 1.0
@@ -96,6 +102,7 @@ def measure(f: ti.template(), s):
 @ti.func
 def compression(f: ti.template(), s, i, volume, inv_h):
     """ρ/ρ₀ of a particle, including the walls' contribution, from the sum over its neighbours."""
+    # ρ/ρ₀ = V Σ_j W_ij + Σ_walls ∫ W over the half-space beyond the wall's plane, q = φ/h − wall_shift away.
     rho = f.density[i] * volume
     for b in ti.static(range(VESSELS)):
         q = f.phi[i][b] * inv_h - f.wall_shift[s]
@@ -125,6 +132,7 @@ def multiply_first(f: ti.template(), s, rate, thick: ti.template()):
         if rho > 0.95:
             inside += 1.0
             compressed += ti.max(excess, 0.0)
+        # λ ← max(λ + rate C / Σ|∇C|², 0), C = ρ/ρ₀ − 1 (− `allowed`): λ ≥ 0 because liquid pushes but does not pull.
         # C is dimensionless, its gradients 1/m: multipliers are m².
         after = ti.max(f.pressure[i] + rate * excess / f.squares[i], 0.0)
         f.pressure[i] = after
@@ -153,6 +161,7 @@ def multiply(f: ti.template(), s, rate, momentum, thick: ti.template()):
         if rho > 0.95:
             inside += 1.0
             compressed += ti.max(excess, 0.0)
+        # Chebyshev: λ ← max(λ + rate C / Σ|∇C|² + momentum Δλ, 0); rate and momentum are those of `Stepper.iterate`.
         before = f.pressure[i]
         after = ti.max(before + rate * excess / f.squares[i] + momentum * f.dp[i], 0.0)
         f.pressure[i] = after
@@ -168,6 +177,7 @@ def measure_before(f: ti.template(), s):
     volume = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.density[i] = 1.0
+    # The same sums at the positions x0; the lists' skin covers the displacement since then.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x0[i]
         rho = ti.cast(0.0, ti.f32)
@@ -180,6 +190,7 @@ def measure_before(f: ti.template(), s):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         rho = f.density[i] * volume
         for b in ti.static(range(VESSELS)):
+            # φ(x0) ≈ φ(x) + n · back; with a vessel in motion, x0 is first carried along to its pose at the end.
             n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
             back = f.x0[i] - f.x[i]
             if f.swing[s, b] > 0.0:
@@ -212,6 +223,7 @@ def displace(f: ti.template(), s):
                 f.push[i][b] = f.push[i][b] + push
         f.move[i] = ti.Vector([move[0], move[1], move[2], 0.0])
         f.place[i] = ti.Vector([f.x[i][0], f.x[i][1], f.x[i][2], scale * pi])
+    # Δx_i = −Σ_j (Δλ_i + Δλ_j) V ∇W_ij (Macklin & Müller 2013, equation 12, with λ ≥ 0 for compression).
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.place[i]
         move = ti.Vector([0.0, 0.0, 0.0, 0.0])

@@ -21,13 +21,13 @@ SIGMA = 21.0 / (2.0 * math.pi)
 def weight(u: ti.f32) -> ti.f32:
     """W h³ / σ from u = max(1 − q, 0). Branch-free: otherwise each listed pair beyond h costs a misprediction."""
     u2 = u * u
-    return u2 * u2 * (5.0 - 4.0 * u)
+    return u2 * u2 * (5.0 - 4.0 * u)  # (1 − q)⁴ (1 + 4q), Wendland 1995: φ_{3,1}
 
 
 @ti.func
 def slope(u: ti.f32) -> ti.f32:
     """∇W = −(σ / h⁵) · slope · (x_i − x_j), from u = max(1 − q, 0)."""
-    return 20.0 * u * u * u
+    return 20.0 * u * u * u  # −W'(q) / q = 20 (1 − q)³
 
 
 @ti.func
@@ -47,6 +47,7 @@ def decayed(x: ti.f32) -> ti.f32:
 @ti.func
 def wall_density(q: ti.f32) -> ti.f32:
     """∫ W over the half-space beyond a plane at distance q·h: 1 up to q = −1, ½ at q = 0, 0 from q = 1 on."""
+    # ∫_q^1 2π t W (t − q) dt by parts; the half-space and its complement add up to 1.
     u = ti.max(1.0 - ti.abs(q), 0.0)
     u6 = u * u * u
     u6 = u6 * u6

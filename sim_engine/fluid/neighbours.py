@@ -39,6 +39,7 @@ def cover(f: ti.template(), s, reach):
             high = ti.max(high, f.x[i])
     # The domain follows the liquid; if it spreads too far for the table, cells become larger. Without particles it is
     # one cell.
+    # The number of cells is Π (⌊(high − low) / edge⌋ + 1) ≤ f.cells.
     low = ti.min(low, high)
     edge = ti.Vector([reach, reach, reach / LAYERS])
     size = ti.cast((high - low) / edge, ti.i32) + 1
@@ -49,13 +50,21 @@ def cover(f: ti.template(), s, reach):
 
 
 @ti.func
+def cell_at(table, x, low, edge, size):
+    """Index of the cell of a position, in cells that begin at `table`; z varies fastest, so columns are adjacent."""
+    q = ti.cast((x - low) / edge, ti.i32)
+    return table + (q[0] * size[1] + q[1]) * size[2] + q[2]
+
+
+@ti.func
 def begin_cells(f: ti.template(), table, cells, begin):
     """Convert counts per cell to start indices, with `begin` as the first; there is one more entry than cells."""
-    run = begin
+    # Exclusive prefix sum: start_c = begin + Σ_{c' < c} count_c'.
+    start = begin
     for c in range(table, table + cells + 1):
         count = f.cell_start[c]
-        f.cell_start[c] = run
-        run += count
+        f.cell_start[c] = start
+        start += count
 
 
 @ti.func
@@ -80,34 +89,25 @@ def sort(f: ti.template(), s, reach):
     cells = size[0] * size[1] * size[2]
     for c in range(table, table + cells + 1):
         f.cell_start[c] = 0
+    # Histogram: cell_start[c] = number of particles in cell c. One more cell holds those that do not move any more.
     for i in range(begin, end):
         c = table + cells
         if f.home[i] < SPILLED:
-            q = ti.cast((f.x[i] - low) / edge, ti.i32)
-            c = table + (q[0] * size[1] + q[1]) * size[2] + q[2]
+            c = cell_at(table, f.x[i], low, edge, size)
         f.cell[i] = c
         f.cell_start[c] = f.cell_start[c] + 1
-        f.x_copy[i] = f.x[i]
-        f.v_copy[i] = f.v[i]
-        f.dx[i] = f.x0[i]
-        f.pressure_copy[i] = f.pressure[i]
-        f.home_copy[i] = f.home[i]
-        f.sag_copy[i] = f.sag[i]
-        f.name_copy[i] = f.name[i]
+        for values, copy in ti.static(f.carried):
+            copy[i] = values[i]
     begin_cells(f, table, cells, begin)
     f.moving[s] = f.cell_start[table + cells] - begin
+    # Scatter: in the order of their old indices, so that the sort is stable and a pour is repeatable.
     for i in range(begin, end):
         c = f.cell[i]
         k = f.cell_start[c]
         f.cell_start[c] = k + 1
-        f.x[k] = f.x_copy[i]
+        for values, copy in ti.static(f.carried):
+            values[k] = copy[i]
         f.x_listed[k] = f.x_copy[i]
-        f.v[k] = f.v_copy[i]
-        f.x0[k] = f.dx[i]
-        f.pressure[k] = f.pressure_copy[i]
-        f.home[k] = f.home_copy[i]
-        f.sag[k] = f.sag_copy[i]
-        f.name[k] = f.name_copy[i]
     return low, edge, size
 
 
@@ -155,6 +155,7 @@ def list_pairs(f: ti.template(), s, reach, low, edge, size):
 @ti.func
 def measure_pairs(f: ti.template(), s):
     """Distances of all listed pairs, squared, to `pair`."""
+    # r² = |x_i − x_j|² [m²]; the pair's index k runs through the rows of all i, which are adjacent.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x[i]
         for k in range(f.first[i], f.first[i] + f.count[i]):
@@ -176,9 +177,9 @@ def take_seats(f: ti.template(), s, reach):
     cells = size[0] * size[1] * size[2]
     for c in range(table, table + cells + 1):
         f.cell_start[c] = 0
+    # Counting sort as in `sort`, of seats only: particles keep their indices.
     for i in range(begin, end):
-        q = ti.cast((f.x[i] - low) / edge, ti.i32)
-        c = table + (q[0] * size[1] + q[1]) * size[2] + q[2]
+        c = cell_at(table, f.x[i], low, edge, size)
         f.cell[i] = c
         f.cell_start[c] = f.cell_start[c] + 1
     begin_cells(f, table, cells, seats)
@@ -194,6 +195,8 @@ def take_seats(f: ti.template(), s, reach):
         f.lean[k] = ti.Vector([0.0, 0.0, 0.0])  # a diverged pour may have left NaN there, and NaN times 0 is NaN
         f.missing[k] = 0.0
     # cell_start[c] is now the end of cell c, so that the cell begins at cell_start[c − 1].
+    # Half of the neighbourhood: the own column from the next seat on, and the columns (0, +1), (+1, −1), (+1, 0),
+    # (+1, +1) relative to it, each from the layer c0 at z − reach to the layer c1 at z + reach.
     for k in range(seats, behind):
         x = f.x[f.seated[k]]
         q = ti.cast((x - low) / edge, ti.i32)

@@ -31,31 +31,20 @@ class SceneTable:
 
     def __init__(self, fields: Mapping[str, ti.Field]) -> None:
         self._begin: dict[str, tuple[int, int]] = {}
-        # Fields with their place in them and their column in the table.
-        self.scalars: list[tuple[ti.Field, int]] = []
-        self.vectors: list[tuple[ti.Field, int, int]] = []
-        self.of_vessels: list[tuple[ti.Field, int, int]] = []
-        self.vectors_of_vessels: list[tuple[ti.Field, int, int, int]] = []
-        self.matrices_of_vessels: list[tuple[ti.Field, int, int, int, int]] = []
-        k = 0
+        self.of_scenes: list[tuple[ti.Field, int]] = []  # with their columns
+        self.of_vessels: list[tuple[ti.Field, int, int]] = []  # with their vessels and columns
+        column = 0
         for name, field in fields.items():
-            first = k
-            n, m = (field.n, field.m) if isinstance(field, ti.MatrixField) else (0, 0)
+            begin = column
             for vessel in range(field.shape[1]) if len(field.shape) == 2 else [None]:
-                if vessel is None and n == 0:
-                    self.scalars.append((field, k))
-                elif vessel is None:
-                    self.vectors += [(field, i, k + i) for i in range(n)]
-                elif n == 0:
-                    self.of_vessels.append((field, vessel, k))
-                elif field.ndim == 1:
-                    self.vectors_of_vessels += [(field, vessel, i, k + i) for i in range(n)]
-                else:
-                    places = [(i, j) for i in range(n) for j in range(m)]
-                    self.matrices_of_vessels += [(field, vessel, i, j, k + i * m + j) for i, j in places]
-                k += max(n, 1) * max(m, 1)
-            self._begin[name] = first, k
-        self._columns = k
+                for component in _components(field):
+                    if vessel is None:
+                        self.of_scenes.append((component, column))
+                    else:
+                        self.of_vessels.append((component, vessel, column))
+                    column += 1
+            self._begin[name] = begin, column
+        self._columns = column
 
     def rows(self, scenes: Sequence[Mapping[str, ArrayLike]]) -> NDArray[np.float64]:
         """The table of some scenes, (scenes, columns); fields that are not named are 0.
@@ -77,16 +66,17 @@ class SceneTable:
     @ti.func
     def write(self, s, rows: ti.template()):
         """Set a scene's fields from its row of the table."""
-        for field, k in ti.static(self.scalars):
-            field[s] = rows[s, k]
-        for field, i, k in ti.static(self.vectors):
-            field[s][i] = rows[s, k]
-        for field, b, k in ti.static(self.of_vessels):
-            field[s, b] = rows[s, k]
-        for field, b, i, k in ti.static(self.vectors_of_vessels):
-            field[s, b][i] = rows[s, k]
-        for field, b, i, j, k in ti.static(self.matrices_of_vessels):
-            field[s, b][i, j] = rows[s, k]
+        for component, column in ti.static(self.of_scenes):
+            component[s] = rows[s, column]
+        for component, vessel, column in ti.static(self.of_vessels):
+            component[s, vessel] = rows[s, column]
+
+
+def _components(field: ti.Field) -> list[ti.Field]:
+    """Fields of numbers that share the memory of a field of vectors or matrices, row by row."""
+    if not isinstance(field, ti.MatrixField):
+        return [field]
+    return [field.get_scalar_field(i, j) for i in range(field.n) for j in range(field.m)]
 
 
 SUPPORT = 2.2
@@ -178,6 +168,16 @@ class FluidState:
         self.seat, self.lean, self.pulled = (ti.Vector.field(3, ti.f32, shape=seats, layout=apart) for _ in range(3))
         self.bonds, self.missing = (ti.field(ti.f32, shape=seats) for _ in range(2))
         self.cell_start = ti.field(ti.i32, shape=pool * CELLS + scenes * (LEAST_CELLS + 2))
+        # Values that stay with a particle when `neighbours.sort` gives it another index, each with room for a copy.
+        self.carried = (
+            (self.x, self.x_copy),
+            (self.v, self.v_copy),
+            (self.x0, self.dx),
+            (self.pressure, self.pressure_copy),
+            (self.home, self.home_copy),
+            (self.sag, self.sag_copy),
+            (self.name, self.name_copy),
+        )
 
         arrays = set(vars(self))
         # Per scene: its range in the pools …

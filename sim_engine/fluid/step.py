@@ -102,6 +102,7 @@ class Stepper:
     def place_pourer(self, s, time, poses: ti.template()):
         """Pose of the pourer from the table, whose rows are `table_step` apart."""
         f = self.state
+        # Linear between rows k and k + 1 at the weight w: p = p_k + w (p_{k+1} − p_k); a quaternion is then normalised.
         u = ti.cast(ti.max(time, f.start[s]) / f.table_step[s], ti.f32)
         k = ti.min(ti.cast(u, ti.i32), f.table_length[s] - 2)
         w = ti.min(u - k, 1.0)
@@ -120,6 +121,7 @@ class Stepper:
         clear = CONTACT * f.spacing[s]
         limit = 0.45 * SKIN * f.spacing[s]
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            # x* = x0 + dt (v − dt g), Macklin & Müller 2013, algorithm 1. In thick liquids `flow` has added gravity.
             x0 = f.x[i]
             f.x0[i] = x0
             v = f.v[i]
@@ -137,6 +139,7 @@ class Stepper:
                         x = to_world(f, s, b, y)
             f.x[i] = x
             f.push[i] = ti.Vector([0.0, 0.0])
+            # Lists reach SKIN · d beyond h: while each particle has moved by less than half of it, no pair is missing.
             if square(x - f.x_listed[i]) > limit * limit:
                 f.stale[s] = 1
 
@@ -148,9 +151,9 @@ class Stepper:
             turn, origin = f.turn[s, b], f.origin[s, b]
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 y = turned_back(turn, f.x[i] - origin)
-                look = distance_and_gradient(f, planes, f.plane_offset[s, b], s, b, y, f.sag[i][b])
-                f.phi[i][b] = look[3]
-                n = turned(turn, look)
+                wall = distance_and_gradient(f, planes, f.plane_offset[s, b], s, b, y, f.sag[i][b])
+                f.phi[i][b] = wall[3]
+                n = turned(turn, wall)
                 for c in ti.static(range(3)):
                     f.normal[i][b, c] = n[c]
 
@@ -168,6 +171,7 @@ class Stepper:
             for b in ti.static(range(VESSELS)):
                 phi = f.phi[i][b]
                 if phi < 4.0 * f.spacing[s]:
+                    # φ(x + Δx) ≈ φ(x) + n · Δx; a penetration −φ is undone along n, and counts as the wall's push.
                     n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                     phi += dot(n, move)
                     if phi < 0.0:
@@ -192,7 +196,10 @@ class Stepper:
         tolerance = ti.cast(TOLERANCE, ti.f32)
         if ti.static(thick and warm):
             tolerance = STRAIN
-        # Three-term recurrence of the Chebyshev iteration on [SMOOTHEST, ROUGHEST] (Golub & Varga 1961).
+        # Three-term recurrence of the Chebyshev iteration on eigenvalues in [SMOOTHEST, ROUGHEST] = centre ± half
+        # (Golub & Varga 1961): with σ_0 = half / centre, σ_{k+1} = 1 / (2 / σ_0 − σ_k),
+        #     Δλ_{k+1} = σ_{k+1} σ_k Δλ_k + (2 σ_{k+1} / half) C / Σ|∇C|²,    Δλ_0 = (1 / centre) C / Σ|∇C|²
+        # The factors of the two terms are momentum and rate; `multiply` applies them.
         centre = ti.cast(0.5 * (ROUGHEST + SMOOTHEST), ti.f32)
         half = ti.cast(0.5 * (ROUGHEST - SMOOTHEST), ti.f32)
         sigma = half / centre
@@ -230,6 +237,7 @@ class Stepper:
         """
         f = self.state
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            # λ ~ pressure · dt²: the same pressure has a multiplier that grows with the square of the step.
             f.pressure[i] = f.pressure[i] * WARM * ratio
         self.iterate(s, True, thick)
 
@@ -251,8 +259,78 @@ class Stepper:
             f.dv[i] = f.x[i] - f.dv[i]
 
     @ti.func
+    def find_contact(self, s, b, y0, y1, clear, sag, grids: ti.template()):
+        """Where a particle's step from y0 to y1 in a vessel's frame ends, and the wall there.
+
+        Returns:
+            The end, as a position in the vessel's frame; (n, φ), normal and distance of the wall as a 4-vector; and
+            whether the wall was within reach of the step.
+        """
+        f = self.state
+        y = y1
+        wall = ti.Vector([0.0, 0.0, 0.0, FAR])
+        within_reach = False
+        # At most two passes through one look-up, which compiles to half as much code as two of them.
+        passes = 1
+        while passes > 0:
+            wall = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, sag)
+            passes -= 1
+            # |∇φ| ≤ STRETCH: with φ(y1) ≥ STRETCH |y1 − y0| there is no solid on the path. Otherwise it is swept.
+            if not within_reach and wall[3] < STRETCH * length(y1 - y0):
+                within_reach = True
+                passes = 1
+                y = swept(f, grids, s, b, y0, y1, 0.5 * clear, sag)
+        return y, wall, within_reach
+
+    @ti.func
+    def push_off(self, s, b, i, y0, y, wall, clear):
+        """Enforce the distance `CONTACT`, and Coulomb's friction.
+
+        Returns:
+            The new position in the vessel's frame, and its distance from the wall [m].
+        """
+        f = self.state
+        n = ti.Vector([wall[0], wall[1], wall[2]])
+        phi = wall[3]
+        push = f.push[i][b]  # the wall's normal displacement in this step [m], in the place of its normal force
+        moved = y
+        if phi < clear and phi > 0.0:
+            moved += (clear - phi) * n
+            push += clear - phi
+            phi = clear
+        if push > 0.0 and phi < 1.5 * f.spacing[s]:
+            # Coulomb: the wall, at rest in the vessel's frame, holds back at most μ times its normal displacement:
+            # Δx_t ← Δx_t (1 − min(μ push / |Δx_t|, 1)), as Macklin, Müller, Chentanez & Kim 2014 do, with one μ.
+            step = moved - y0
+            tangential = step - dot(step, n) * n
+            slid = length(tangential)
+            if slid > 1e-9:
+                moved -= tangential * ti.min(f.friction[s] * push / slid, 1.0)
+        return moved, phi
+
+    @ti.func
+    def note_crossing(self, s, b, i, y0, y, grids: ti.template()):
+        """Take a particle out of play whose step leads through a wall."""
+        f = self.state
+        if crossed(f, grids, s, b, y0, y, f.sag[i][b]) == 1:
+            f.home[i] = ESCAPED
+            f.stale[s] = 1
+
+    @ti.func
+    def set_velocity(self, s, i, x0, x, dt, thick: ti.template()):
+        """Velocity of a particle from its positions; a fault if it is not finite."""
+        f = self.state
+        # v = (x − x0) / dt (Macklin & Müller 2013, algorithm 1), without the displacements of `decompress`.
+        v = (x - x0) / dt
+        if ti.static(thick):
+            v -= f.dv[i] / dt
+        f.v[i] = v
+        if not (ti.abs(v[0]) + ti.abs(v[1]) + ti.abs(v[2]) < 1e3):  # true for NaN, too
+            f.fault[s] = 2
+
+    @ti.func
     def finish(self, s, dt, grids: ti.template(), thick: ti.template()):
-        """Final look-up of the walls, friction, velocities."""
+        """Contact of all moving particles with the walls at the step's end, and their velocities."""
         f = self.state
         d = f.spacing[s]
         clear = CONTACT * d
@@ -264,46 +342,15 @@ class Stepper:
                 if f.phi[i][b] < reach + STRETCH * f.swing[s, b]:
                     y0 = to_vessel(f, s, b, x0, True)
                     y1 = to_vessel(f, s, b, x, False)
-                    y = y1
-                    look = ti.Vector([0.0, 0.0, 0.0, FAR])
-                    risky = False
-                    looks = 1
-                    while looks > 0:
-                        look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, y, f.sag[i][b])
-                        looks -= 1
-                        if not risky and look[3] < STRETCH * length(y1 - y0):
-                            risky = True
-                            looks = 1
-                            y = swept(f, grids, s, b, y0, y1, 0.5 * clear, f.sag[i][b])
-                    n = ti.Vector([look[0], look[1], look[2]])
-                    phi = look[3]
-                    push = f.push[i][b]
-                    if phi < clear and phi > 0.0:
-                        y += (clear - phi) * n
-                        push += clear - phi
-                        phi = clear
-                    if push > 0.0 and phi < 1.5 * d:
-                        # Coulomb: the wall, which moves with the vessel's frame, holds back at most μ times its normal
-                        # displacement.
-                        way = y - y0
-                        along = way - dot(way, n) * n
-                        slid = length(along)
-                        if slid > 1e-9:
-                            y -= along * ti.min(f.friction[s] * push / slid, 1.0)
+                    contact, wall, within_reach = self.find_contact(s, b, y0, y1, clear, f.sag[i][b], grids)
+                    y, phi = self.push_off(s, b, i, y0, contact, wall, clear)
                     if square(y - y1) > 0.0:
                         x = to_world(f, s, b, y)
                     f.phi[i][b] = phi
-                    if risky:
-                        if crossed(f, grids, s, b, y0, y, f.sag[i][b]) == 1:
-                            f.home[i] = ESCAPED
-                            f.stale[s] = 1
+                    if within_reach:
+                        self.note_crossing(s, b, i, y0, y, grids)
             f.x[i] = x
-            v = (x - x0) / dt
-            if ti.static(thick):
-                v -= f.dv[i] / dt
-            f.v[i] = v
-            if not (ti.abs(v[0]) + ti.abs(v[1]) + ti.abs(v[2]) < 1e3):
-                f.fault[s] = 2
+            self.set_velocity(s, i, x0, x, dt, thick)
 
     @ti.func
     def classify(self, s, cavities: ti.template()):
@@ -328,6 +375,7 @@ class Stepper:
                     home = SPILLED
                     f.stale[s] = 1
                 f.home[i] = home
+                # Mean of max(ρ/ρ₀ − 1, 0) over interior particles; a surface has a lower density than 0.95.
                 if f.density[i] > 0.95:
                     inside += 1
                     compressed += ti.max(f.density[i] - 1.0, 0.0)
@@ -339,6 +387,7 @@ class Stepper:
     def let_fall(self, s, dt):
         """Particles out of play fall to the table, for display only."""
         f = self.state
+        # Symplectic Euler without any contact but the table's plane z = 0: v_z ← v_z − g dt, x ← x + dt v.
         for i in range(f.begin[s] + f.moving[s], f.begin[s] + f.particles[s]):
             if f.x[i][2] > 0.0:
                 f.v[i][2] = f.v[i][2] - f.gravity[s] * dt
@@ -358,8 +407,10 @@ class Stepper:
     ):
         """One time step of one scene, up to cohesion, which has a separate kernel; `conclude` completes the step."""
         f = self.state
+        # CFL condition on displacements: dt = CFL d / max|v|, between SHORTEST_STEP and min(longest_step, PACE √(d/g)).
         longest = ti.min(f.longest_step[s], PACE * ti.sqrt(f.spacing[s] / ti.max(f.gravity[s], 1e-3)))
         dt = ti.min(ti.max(CFL * f.spacing[s] / (f.fastest[s] + 1e-6), SHORTEST_STEP), longest)
+        # Viscosity: dt ν / d² ≤ STIFFEST, for accuracy; it is implicit and stable at any step.
         if ti.static(thick):
             dt = ti.max(ti.min(dt, STIFFEST * f.spacing[s] ** 2 / f.kinematic[s]), SHORTEST_STEP)
         ratio = ti.min((dt / f.dt[s]) ** 2, 4.0)
@@ -399,6 +450,7 @@ class Stepper:
         """Complete a time step."""
         f = self.state
         dt = f.dt[s]
+        # While the lattice settles, velocities decay by TREACLE per step; all liquid begins to drift at the start.
         if f.time[s] < f.start[s]:
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 if ti.static(thick):

@@ -59,6 +59,7 @@ def look_at_surface(f: ti.template(), s, seats, behind, inv_h):
     Stores the energy's derivatives by the two sums: by the sum over attractions in `lean`; by the sum over bonds, which
     is negative, with reversed sign in `missing`.
     """
+    # Walls count as liquid: half-spaces, u = 1 − φ / (RANGE d), at most touching the particle.
     for k in range(seats, behind):
         i = f.seated[k]
         bonds = ti.cast(0.0, ti.f32)
@@ -71,6 +72,7 @@ def look_at_surface(f: ti.template(), s, seats, behind, inv_h):
                 lean += RANGE**3 * wall_attraction(u) * n
         f.bonds[k] = bonds
         f.lean[k] = lean
+    # bonds_i = Σ_j bond(r_ij), lean_i = Σ_j attraction(r_ij) r_ij, r = x_i − x_j in units of RANGE d.
     for k in range(seats, behind):
         x = f.seat[k]
         bonds = ti.cast(0.0, ti.f32)
@@ -88,6 +90,8 @@ def look_at_surface(f: ti.template(), s, seats, behind, inv_h):
                 f.lean[j] = f.lean[j] - g
         f.bonds[k] = f.bonds[k] + bonds
         f.lean[k] = f.lean[k] + lean
+    # With g⃗ = lean / PLANE, δ = BONDED − bonds / WHOLE, G = max(|g⃗| − CALM, 0) and the root
+    # e = √(G² + (ALONE δ)² + BLUNT²): ∂e/∂lean = G g⃗ / (|g⃗| PLANE e), −∂e/∂bonds = ALONE² δ / (WHOLE e).
     for k in range(seats, behind):
         lean = f.lean[k] / PLANE
         size = length(lean) + 1e-9
@@ -105,6 +109,8 @@ def pull(f: ti.template(), s, dt):
     inv_h = 1.0 / (RANGE * f.spacing[s])
     seats, behind = take_seats(f, s, RANGE * f.spacing[s])
     look_at_surface(f, s, seats, behind, inv_h)
+    # Gradient of Σ e by r of a pair, with g = ∂e_i/∂lean − ∂e_j/∂lean, a(r) = attraction, a'(r)/r = attraction_turn:
+    # a g + (a'/r (g · r) + a (missing_i + missing_j)) r, because d bond/dr⃗ = −a r⃗. The force is its negative.
     for k in range(seats, behind):
         x = f.seat[k]
         lean = f.lean[k]
@@ -122,6 +128,7 @@ def pull(f: ti.template(), s, dt):
                 force += pair
                 f.pulled[j] = f.pulled[j] + pair
         f.pulled[k] = f.pulled[k] - force
+    # Young: energy −adhesion · wall_bond(u) of the particle, so the force is −adhesion · wall_attraction(u) n.
     if f.adhesion[s] != 0.0:
         for k in range(seats, behind):
             i = f.seated[k]
@@ -130,6 +137,7 @@ def pull(f: ti.template(), s, dt):
                 if u > 0.0:
                     n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                     f.pulled[k] = f.pulled[k] - f.adhesion[s] * wall_attraction(u) * n
+    # Δv = cohesion [m/s²] · dt · pulled, at most LARGEST_PULL · d / dt in size.
     strength = f.cohesion[s] * dt
     bound = LARGEST_PULL * f.spacing[s] / dt
     for k in range(seats, behind):

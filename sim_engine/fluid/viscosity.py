@@ -125,6 +125,8 @@ def drag(distance, film, cover, above):
         cover: particles of the layer next to the wall per d² of wall.
         above: thickness of the liquid above that layer, in spacings, up to 1.
     """
+    # beside · (above / (cover s) + (1 − above) 1.5 / (s film²)): Newton's shear in a layer at the distance s, and the
+    # friction of a film (Nusselt 1916), which is 3 / film² at s = ½, the middle of a layer.
     s = ti.max(distance, NEAREST)
     return beside(s) / s * (above / cover + (1.0 - above) * 1.5 / (film * film))
 
@@ -147,6 +149,8 @@ def survey(f: ti.template(), s, dt):
         f.dx[i] = ti.Vector([0.0, 0.0, 0.0])
         for b in ti.static(range(VESSELS)):
             f.push[i][b] = 0.0
+    # Sums over neighbours: squares = Σ W, dp = Σ W e² with the rate e = v_ij · r / r² at which a pair separates [1/s],
+    # dx = −Σ W r, push = Σ W(distance along the wall) · membership of the partner in the layer next to it.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         total = ti.cast(0.0, ti.f32)
         strain = ti.cast(0.0, ti.f32)
@@ -157,13 +161,13 @@ def survey(f: ti.template(), s, dt):
             r2 = square(r)
             w = weight(ti.max(1.0 - ti.sqrt(r2) * inv_h, 0.0))
             parting = dot(f.v[i] - f.v[j], r) / (r2 + closest)
-            part = w * parting * parting * r2 / (r2 + closest)
+            strained = w * parting * parting * r2 / (r2 + closest)
             total += w
-            strain += part
+            strain += strained
             lean += w * r
             f.dx[j] = f.dx[j] + w * r
             f.squares[j] = f.squares[j] + w
-            f.dp[j] = f.dp[j] + part
+            f.dp[j] = f.dp[j] + strained
             for b in ti.static(range(VESSELS)):
                 of_i, of_j = beside(f.phi[i][b] / d), beside(f.phi[j][b] / d)
                 if of_i * of_j > 0.0:
@@ -177,15 +181,19 @@ def survey(f: ti.template(), s, dt):
         f.dx[i] = f.dx[i] - lean
     nu = f.kinematic[s]
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        # A relaxation at the rate k corresponds to a viscosity of k d²/5.
+        # Smagorinsky: e² = |S|²/15 on average, and a relaxation at the rate k corresponds to a viscosity of k d²/5:
+        # ν_i = max(ν, eddies √⟨e²⟩ d²/5) [m²/s], eddies = 5 C² √15.
         strain = ti.sqrt(f.dp[i] / (f.squares[i] + 1e-9))
         f.dp[i] = ti.max(nu, 0.2 * f.eddies[s] * d * d * strain)
         for b in ti.static(range(VESSELS)):
+            # Shape of the liquid at the wall, from the kernel sums of a layer (BESIDE) and of one on top of it (ABOVE):
+            # height above the layer and film thickness in spacings, cover in particles per d².
             n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
             above = ti.min(ti.max(ALONE * dot(f.dx[i], n) / (d * ABOVE), 0.0), 1.0)
             q = f.phi[i][b] / d
             cover = ALONE * (beside(q) + f.push[i][b]) / (ALONE + BESIDE)
             film = ti.min(ti.max(ALONE * f.squares[i] / BESIDE, THINNEST), 1.0)
+            # The wall's part of dt L, dimensionless: push = dt ν/d² drag.
             f.push[i][b] = f.no_slip[s] * dt * nu / (d * d) * drag(q, film, ti.max(cover, SPARSEST), above)
 
 
@@ -194,6 +202,7 @@ def rub(f: ti.template(), s, dt, v: ti.template(), out: ti.template()):
     """out = dt L v, walls at rest."""
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
+    # (dt L v)_i = push_i v_i + Σ_j dt PAIRS/d² ½ (ν_i + ν_j) u³ (v_i − v_j), u = 1 − r/h; without the rotation ω.
     scale = dt * PAIRS / (d * d) * 0.5
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         vi = v[i]
@@ -232,6 +241,9 @@ def turn_along(f: ti.template(), s, dt):
         f.sums[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
         f.place[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
         f.move[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    # Least squares: the rotation ω of Δv = v − v_copy minimises Σ_j u³ |Δv_ij − ω × r_ij|², hence
+    #     ω = J⁻¹ Σ_j u³ r × Δv_ij,    J = Σ_j u³ (|r|² 1 − r ⊗ r), an inertia, r in units of h.
+    # Second moments Σ u³ r ⊗ r go to sums (xx, xy, xz, yy), move[3] (yz) and place[0] (zz), the moment to move[0 … 2].
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         change = f.v[i] - f.v_copy[i]
         for k in range(f.first[i], f.first[i] + f.count[i]):
@@ -255,6 +267,7 @@ def turn_along(f: ti.template(), s, dt):
         low = LEAST_INERTIA * (xx + yy + zz) + 1e-9
         inertia = ti.Matrix([[yy + zz + low, -xy, -xz], [-xy, xx + zz + low, -yz], [-xz, -yz, xx + yy + low]])
         f.gradient[i] = inv_h * (inertia.inverse() @ ti.Vector([f.move[i][0], f.move[i][1], f.move[i][2]]))
+    # dv_i += Σ_j dt PAIRS/d² ½ (ν_i + ν_j) u³ ½ (ω_i + ω_j) × r_ij: the residual of the solution that turns along.
     scale = dt * PAIRS / (d * d) * 0.25
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         nu = f.dp[i]
@@ -272,6 +285,7 @@ def diagonal(f: ti.template(), s, dt):
     """Mean of the diagonal of 1 + dt L at every particle (squares), by which conjugate gradients divide."""
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
+    # D_i = 1 + Σ_walls push_i + Σ_j dt PAIRS/d² ½ (ν_i + ν_j) u³
     scale = dt * PAIRS / (d * d) * 0.5
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.squares[i] = 1.0 + f.push[i][0] + f.push[i][1]
@@ -300,53 +314,58 @@ def flow(f: ti.template(), s, dt):
         f.v[i] = v
         f.v_copy[i] = ti.Vector([0.0, 0.0, 0.0])
         size += square(v)
-    # The residual of the equation, as a velocity, without the part of the rotation.
+    # The residual of (1 + dt L) v = v* + dt g at the start v = v* + dt g: −dt L v, plus the drag of walls that move,
+    # push · (velocity of the wall). Without the part of the rotation.
     rub(f, s, dt, f.v, f.dx)
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-        rest = -f.dx[i]
+        residual = -f.dx[i]
         for b in ti.static(range(VESSELS)):
             k = f.push[i][b]
             if k > 0.0:
                 y = to_vessel(f, s, b, f.x[i], True)
                 carried = (turned(f.turn[s, b], y) + f.origin[s, b] - f.x[i]) / dt
-                rest += k * carried
-        f.dv[i] = rest
+                residual += k * carried
+        f.dv[i] = residual
+    # Ends at Σ |residual|² ≤ N (ACCURACY g dt)², or COARSELY² Σ |v|² without gravity; at least 1e-7 m/s per particle.
     count = ti.cast(f.moving[s], ti.f32)
     limit = count * (ACCURACY * fall) ** 2
     if f.gravity[s] < 1e-3:
         limit = COARSELY**2 * size
     limit = ti.max(limit, count * 1e-14)
+    # Conjugate gradients with the diagonal D as preconditioner (Hestenes & Stiefel 1952; Saad 2003, algorithm 9.1):
+    #     α = rᵀD⁻¹r / pᵀAp,  v += α p,  r −= α A p,  β = r'ᵀD⁻¹r' / rᵀD⁻¹r,  p = D⁻¹r' + β p,    A = 1 + dt L
+    # r: dv, p: gradient, A p: gradient + dx, D: squares, rᵀD⁻¹r: weighted_residual, pᵀAp: curvature.
     for _ in range(ROUNDS):
         turn_along(f, s, dt)
-        lasting = ti.cast(0.0, ti.f32)
-        left = ti.cast(0.0, ti.f32)
+        weighted_residual = ti.cast(0.0, ti.f32)
+        squared_residual = ti.cast(0.0, ti.f32)
         for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            rest = f.dv[i]
+            residual = f.dv[i]
             f.v_copy[i] = f.v[i]
-            f.gradient[i] = rest / f.squares[i]
-            left += square(rest)
-            lasting += square(rest) / f.squares[i]
+            f.gradient[i] = residual / f.squares[i]
+            squared_residual += square(residual)
+            weighted_residual += square(residual) / f.squares[i]
         n = 0
-        while left > limit and n < MOST_PASSES:
+        while squared_residual > limit and n < MOST_PASSES:
             rub(f, s, dt, f.gradient, f.dx)
-            along = ti.cast(0.0, ti.f32)
+            curvature = ti.cast(0.0, ti.f32)
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 p = f.gradient[i]
-                along += dot(p, p + f.dx[i])
-            stride = lasting / ti.max(along, 1e-20)
-            left = 0.0
-            before = lasting
-            lasting = 0.0
+                curvature += dot(p, p + f.dx[i])
+            alpha = weighted_residual / ti.max(curvature, 1e-20)
+            squared_residual = 0.0
+            previous = weighted_residual
+            weighted_residual = 0.0
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
                 p = f.gradient[i]
-                f.v[i] = f.v[i] + stride * p
-                rest = f.dv[i] - stride * (p + f.dx[i])
-                f.dv[i] = rest
-                left += square(rest)
-                lasting += square(rest) / f.squares[i]
-            turn = lasting / ti.max(before, 1e-20)
+                f.v[i] = f.v[i] + alpha * p
+                residual = f.dv[i] - alpha * (p + f.dx[i])
+                f.dv[i] = residual
+                squared_residual += square(residual)
+                weighted_residual += square(residual) / f.squares[i]
+            beta = weighted_residual / ti.max(previous, 1e-20)
             for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-                f.gradient[i] = f.dv[i] / f.squares[i] + turn * f.gradient[i]
+                f.gradient[i] = f.dv[i] / f.squares[i] + beta * f.gradient[i]
             n += 1
         f.passes[s] = f.passes[s] + n
 
@@ -359,6 +378,8 @@ def relax(f: ti.template(), s, dt):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.dx[i] = ti.Vector([0.0, 0.0, 0.0])  # drift towards the neighbours' velocities
         f.squares[i] = 0.0
+    # r² and |v_ij · r| of all pairs, then their weights, eight at a time:
+    # W (1 − exp(−(xsph_rate + eddies |e|) dt)), e = v_ij · r / r² [1/s].
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi, vi = f.x[i], f.v[i]
         for k in range(f.first[i], f.first[i] + f.count[i]):
@@ -371,6 +392,7 @@ def relax(f: ti.template(), s, dt):
         parting = f.share[k] / (r2 + closest)
         f.share[k] = w
         f.pair[k] = w * decayed((f.viscosity[s] + f.eddies[s] * parting) * dt)
+    # XSPH (Schechter & Bridson 2012): v_i += Σ_j W c_ij (v_j − v_i) / max(Σ_j W, 1), c_ij = 1 − exp(…) of the pair.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         vi = f.v[i]
         drift = ti.Vector([0.0, 0.0, 0.0])
@@ -411,6 +433,7 @@ def yield_to_shear(f: ti.template(), s, dt):
         f.sums[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
         f.squares[i] = 0.0
         f.dp[i] = 0.0
+        # dx collects the constraint's displacement, that by walls first: λ wall_slope/h n.
         f.gradient[i] = ti.Vector([0.0, 0.0, 0.0])
         push = ti.Vector([0.0, 0.0, 0.0])
         for b in ti.static(range(VESSELS)):
@@ -419,6 +442,8 @@ def yield_to_shear(f: ti.template(), s, dt):
                 n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                 push += f.pressure[i] * wall_slope(q) * inv_h * n
         f.dx[i] = push
+    # With g = −V ∇W = V (σ/h⁵) slope r, r = x_i − x_j: M = Σ g ⊗ r, gradient = Σ (λ_j − λ_i) g = −Σ (λ_j − λ_i) V ∇W,
+    # dx = Σ (λ_i + λ_j) g, as in `density.displace`.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x[i]
         pi = f.pressure[i]
@@ -441,6 +466,7 @@ def yield_to_shear(f: ti.template(), s, dt):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         m = f.sums[i]
         matrix = ti.Matrix([[m[0], m[1], m[2]], [m[1], m[3], f.squares[i]], [m[2], f.squares[i], f.dp[i]]])
+        # Exact minus actual displacement, over dt: Δv = share / dt (M⁻¹ gradient − dx) [m/s], along walls next to them.
         determinant = matrix.determinant()
         even = (determinant - NEIGHBOURHOOD) / (INSIDE - NEIGHBOURHOOD)
         covered = ti.min((f.density[i] - COVERED) / (SURROUNDED - COVERED), 1.0)
@@ -455,6 +481,7 @@ def yield_to_shear(f: ti.template(), s, dt):
         f.gradient[i] = change
         f.dx[i] = change
         f.squares[i] = 1.0
+    # v_i += (Δv_i + Σ_j W Δv_j) / (1 + Σ_j W): Shepard's average (Shepard 1968), W(0) = 1.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         for k in range(f.first[i], f.first[i] + f.count[i]):
             j = f.neighbour[k]

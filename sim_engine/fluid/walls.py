@@ -47,6 +47,7 @@ STRETCH = 1.0 + LARGEST_RIM_CORRECTION / LIP_BLEND
 @ti.func
 def look_up(f: ti.template(), s, b, y, sag):
     """Where the grid is read for a point of the vessel frame: near the rim `sag` [m] higher in the world."""
+    # y + sag min(over / blend, 1) up: full at the lowered rim, zero from LIP_BLEND d below it; `up` is the world's.
     place = y
     blend = LIP_BLEND * f.spacing[s]
     over = y[2] - f.rim[s, b] + sag + blend
@@ -92,6 +93,7 @@ def distance(f: ti.template(), grids: ti.template(), s, b, y, sag):
         row = size[2]
         slab = size[1] * size[2]
         k = f.grid_offset[s, b] + i[0] * slab + i[1] * row + i[2]
+        # Interpolated along z in four rows, then along y, then along x.
         c00 = grids[k] + w[2] * (grids[k + 1] - grids[k])
         c01 = grids[k + row] + w[2] * (grids[k + row + 1] - grids[k + row])
         c10 = grids[k + slab] + w[2] * (grids[k + slab + 1] - grids[k + slab])
@@ -121,6 +123,7 @@ def distance_and_gradient(f: ti.template(), grids: ti.template(), offset, s, b, 
         row = size[2]
         slab = size[1] * size[2]
         k = offset + i[0] * slab + i[1] * row + i[2]
+        # Derivatives of the trilinear interpolation: gx = ∂φ/∂u_x and so on, in grid spacings; d: differences along z.
         d00 = grids[k + 1] - grids[k]
         d01 = grids[k + row + 1] - grids[k + row]
         d10 = grids[k + slab + 1] - grids[k + slab]
@@ -164,67 +167,74 @@ def swept(f: ti.template(), grids: ti.template(), s, b, y0, y1, skin, sag):
     Args:
         skin: distance kept from solid [m]; less if the particle is already closer.
     """
+    # Sphere tracing (Hart 1996) with the Lipschitz constant STRETCH: a ball of the radius φ/STRETCH is free of solid.
     y = y0
-    way = y1 - y0
-    left = length(way)
+    path = y1 - y0
+    remaining = length(path)
     clear = skin
-    begun = ti.cast(0.0, ti.f32)
-    place = y0
-    looks = 0
+    first_phi = ti.cast(0.0, ti.f32)
+    query = y0
+    lookups = 0
     leg = 0
     while leg < 2:
-        look = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, place, sag)
-        n = ti.Vector([look[0], look[1], look[2]])
-        phi = look[3]
-        if looks == 0:
-            begun = phi
+        wall = distance_and_gradient(f, grids, f.grid_offset[s, b], s, b, query, sag)
+        n = ti.Vector([wall[0], wall[1], wall[2]])
+        phi = wall[3]
+        # Look-up 0 at y0, 1 at y1: without solid in between the trace is not needed. From 2 on: tracing at y.
+        if lookups == 0:
+            first_phi = phi
             clear = ti.min(clear, 0.9 / STRETCH * ti.max(phi, 0.0))
-            place = y1
-            if left <= phi / STRETCH - clear or left < 1e-9:
+            query = y1
+            if remaining <= phi / STRETCH - clear or remaining < 1e-9:
                 y = y1
                 leg = 2
-        elif looks == 1:
-            place = y0
-            if phi > 0.0 and begun + phi >= STRETCH * left:
+        elif lookups == 1:
+            query = y0
+            if phi > 0.0 and first_phi + phi >= STRETCH * remaining:
                 y = y1 + ti.max(clear - phi, 0.0) * n
                 leg = 2
         else:
             free = phi / STRETCH - clear
-            if left <= free or left < 1e-9:
-                y += way
+            if remaining <= free or remaining < 1e-9:
+                y += path
                 leg = 2
-            elif free < 1e-5 or looks > TRACE_STEPS:
+            elif free < 1e-5 or lookups > TRACE_STEPS:
+                # At solid: the remaining path loses its part into the wall, min(path · n, 0) n, once.
                 if leg == 0:
-                    way -= ti.min(dot(way, n), 0.0) * n
+                    path -= ti.min(dot(path, n), 0.0) * n
                 clear *= 0.5
-                looks = 1
+                lookups = 1
                 leg += 1
             else:
-                y += way * (free / left)
-                way *= 1.0 - free / left
-            left = length(way)
-            place = y
-        looks += 1
+                y += path * (free / remaining)
+                path *= 1.0 - free / remaining
+            remaining = length(path)
+            query = y
+        lookups += 1
     return y
 
 
 @ti.func
 def crossed(f: ti.template(), grids: ti.template(), s, b, y0, y1, sag):
     """1 if a straight step in the vessel frame passes the middle of a wall; sampled, independent of the sweep."""
-    way = y1 - y0
-    far = length(way)
-    gone = ti.cast(0.0, ti.f32)
+    # φ is −t/2 in the middle of a wall of thickness t; a sample below −0.35 t counts as there.
+    path = y1 - y0
+    path_length = length(path)
+    travelled = ti.cast(0.0, ti.f32)
     hit = 0
-    looks = 0
-    while looks < 64:
-        phi = distance(f, grids, s, b, y0 + way * (gone / (far + 1e-12)), sag)
-        looks += 1
+    lookups = 0
+    while lookups < 64:
+        phi = distance(f, grids, s, b, y0 + path * (travelled / (path_length + 1e-12)), sag)
+        lookups += 1
         if phi < -0.35 * f.wall[s, b]:
             hit = 1
-            looks = 64
-        if gone >= far:
-            looks = 64
-        gone = ti.min(gone + ti.max(phi / STRETCH, ti.max(0.25 * f.wall[s, b], far / 48.0)), far)
+            lookups = 64
+        if travelled >= path_length:
+            lookups = 64
+        # steps of the free ball's radius, but at least a quarter of the wall and a 48th of the path
+        travelled = ti.min(
+            travelled + ti.max(phi / STRETCH, ti.max(0.25 * f.wall[s, b], path_length / 48.0)), path_length
+        )
     return hit
 
 
@@ -239,6 +249,7 @@ SLOWLY = 0.05
 def lower_rims(f: ti.template(), s, dt, thick: ti.template()):
     """Change the lowering of each vessel's rim for each particle, over dt."""
     d = f.spacing[s]
+    # Relaxation with the time constant √(d/g): share = 1 − exp(−dt √(g/d)).
     gravity = ti.max(f.gravity[s], 1e-3)
     share = 1.0 - ti.exp(-dt * ti.sqrt(gravity / d))
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -248,6 +259,7 @@ def lower_rims(f: ti.template(), s, dt, thick: ti.template()):
                 if f.swing[s, b] > 0.0:
                     y = to_vessel(f, s, b, f.x[i], False)
                     u -= (turned(f.turn[s, b], y) + f.origin[s, b] - turned(f.turn0[s, b], y) - f.origin0[s, b]) / dt
+                # Film e = u²/g (Froude number 1), in thick liquids at least √(3νu/g) (Nusselt 1916) [m].
                 film = square(u) / gravity
                 if ti.static(thick):
                     film = ti.max(film, ti.sqrt(3.0 * f.kinematic[s] * length(u) / gravity))
