@@ -80,6 +80,8 @@ def penalised(
     """
     if len(busy) == 0 and feasibility is None:
         return score
+    # González et al. 2016 maximise g Π_j φ_j with a positive reward g = log(1 + e^(−(score − centre)/spread)); here
+    # −log of the product is minimised.
     base = score(candidates)
     centre, spread = float(np.median(base)), max(float(np.std(base)), 1e-12)
     outside = _outside(surrogate, busy, candidates) if len(busy) else None
@@ -98,6 +100,8 @@ def penalised(
 
 def _outside(surrogate: Surrogate, busy: Array, candidates: Array) -> Score:
     """Logarithm of the probability of being outside all balls."""
+    # The minimum is at least r_j = (f(x_j) − M) / L from x_j, if L bounds |∇f| and M is its value. With
+    # f(x_j) ~ N(m, s²), P(|x − x_j| > r_j) = Φ((L |x − x_j| − (m − M)) / s) (González et al. 2016, for a maximum).
     mean, deviation = surrogate.predict(busy)
     all_means = surrogate.predict(candidates)[0]
     lowest = min(float(all_means.min()), float(mean.min()))
@@ -125,6 +129,7 @@ def spread_out(
         return region.draw(count, rng, even=True)
     candidates = region.draw(max(64, 4 * count), rng, even=True)
     weight = 1.0 if feasibility is None else np.exp(feasibility.log_probability(candidates))
+    # Greedy maximin design: argmax_x P(x) min_j |x − x_j|, one point after the other (Johnson, Moore & Ylvisaker 1990).
     chosen: list[Array] = []
     distance = _round_the_cube(candidates, taken).min(axis=1)
     for _ in range(count):
@@ -145,6 +150,8 @@ def between(
     """
     candidates = region.draw(PLACES, rng, even=True)
     weight = 1.0 if feasibility is None else np.exp(feasibility.log_probability(candidates))
+    # A point x decreases the quantisation error Σ_z min_j |z − x_j|² over all places z by
+    # Σ_z max(nearest(z) − |z − x|², 0).
     apart = cdist(candidates, candidates, "sqeuclidean")
     nearest = cdist(candidates, taken, "sqeuclidean").min(axis=1)
     chosen = []
@@ -192,6 +199,7 @@ def _cloud(region: Region, point: Array, spread: float, count: int, rng: np.rand
 
 def _steepest_slope(surrogate: Surrogate, points: Array, step: float = 1e-3) -> float:
     """Largest slope of the posterior mean at some points [cost per unit of the cube], by forward differences."""
+    # ∂m/∂x_i ≈ (m(x + step e_i) − m(x)) / step at every point
     m, dimension = points.shape
     moved = (points[:, None, :] + step * np.eye(dimension)[None, :, :]).reshape(-1, dimension)
     means = surrogate.predict(np.concatenate([points, moved]))[0]

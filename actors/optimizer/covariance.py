@@ -82,6 +82,7 @@ def matern(first: Array, second: Array, lengths: Array) -> tuple[Array, Array]:
 
     Source: Rasmussen & Williams, Gaussian Processes for Machine Learning, equation 4.17.
     """
+    # k(r) = (1 + s + s²/3) e^(−s), s = √5 r; with t = r²/2: −dk/dt = −k'(r) / r = 5/3 (1 + s) e^(−s).
     s, falling = _distances(first, second, lengths)
     return (1.0 + s + s**2 / 3.0) * falling, (5.0 / 3.0) * (1.0 + s) * falling
 
@@ -92,6 +93,7 @@ BLOCK = 256
 
 def matern_correlation(first: Array, second: Array, lengths: Array) -> Array:
     """The correlation of `matern` alone."""
+    # (1 + s + s²/3) e^(−s), in the memory of s: arrays of this size cost more to allocate than to compute.
     first, second = first / lengths, second / lengths
     correlation = np.empty((len(first), len(second)))
     for begin in range(0, len(first), BLOCK):  # whose temporaries stay in the processor's cache
@@ -183,6 +185,7 @@ class Covariance:
 
     def observed(self, theta: Array) -> tuple[Array, Pullback]:
         """Covariance of the observations (n, n), and its pullback: symmetric W (n, n) → Σ W_ij ∂K_ij/∂θ (p,)."""
+        # K = σ² M_ℓ(T x, T x′) + k + (n² + 1e-8) 1; the last term keeps K positive definite with repeated points.
         lengths = self.lengths(theta)
         points = self.sheared(theta, self.points)
         correlation, slope = matern(points, points, lengths)
@@ -195,6 +198,8 @@ class Covariance:
         K[np.diag_indices_from(K)] += noise + 1e-8
 
         def pullback(W: Array) -> Array:
+            # In logarithms: ∂K/∂log σ = 2 σ² M, ∂K/∂log n = 2 n² 1, and with slope = −∂M/∂(r²/2): ∂K_ij/∂log ℓ_a = σ²
+            # slope_ij z_ija² / ℓ_a², z = T x. Shears: ∂K_ij/∂T_ab = −σ² slope_ij z_ija x_ijb / ℓ_a².
             diagonal = 2.0 * np.diagonal(W) * noise
             gradient = [2.0 * float(np.vdot(W, base))]
             gradient += list(variance * _by_length(points, W * slope) / lengths**2)
@@ -227,6 +232,7 @@ def _by_length(points: Array, G: Array) -> Array:
     """Σ_ik G_ik (x_ij − x_kj)² for every axis j, G symmetric: (dimension,)."""
     if len(points) == 0:
         return np.zeros(points.shape[1])
+    # Σ_ik G_ik (x_i − x_k)² = 2 Σ_i x_i² Σ_k G_ik − 2 Σ_ik G_ik x_i x_k; centred, because the two terms nearly cancel.
     centred = points - points.mean(axis=0)
     return np.asarray(2.0 * (centred**2).T @ G.sum(axis=1) - 2.0 * np.einsum("ij,ij->j", centred, G @ centred))
 

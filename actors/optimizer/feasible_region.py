@@ -58,6 +58,7 @@ class Region:
         """Which points (m, dimension) satisfy all constraints: (m,)."""
         allowed = np.ones(len(points), dtype=np.bool_)
         for weights, upper in self._rows:
+            # Σ weight · value ≤ upper + slack, of decoded values; the slack is for their rounding
             parts = [weight * self._decoded(i, points[:, i]) for i, weight in weights]
             slack = _SLACK * (abs(upper) + sum(abs(weight) for _, weight in weights))
             allowed &= np.sum(parts, axis=0) <= upper + slack
@@ -85,11 +86,12 @@ class Region:
                 raise ValueError(
                     f"of {attempts} points of the space {len(accepted)} meet all constraints; {count} are needed"
                 )
-            some = 2 ** max(0, math.ceil(math.log2(max(count, attempts, 1))))
-            fresh = rng.random((some, d)) if sequence is None else np.asarray(sequence.random(some))
-            attempts += some
-            fresh = self.snap(fresh if law is None else law(fresh))
-            accepted = np.concatenate([accepted, fresh[self.allows(fresh)]])
+            # A power of two, as Sobol sequences need, and at least as many as so far: attempts double.
+            batch = 2 ** max(0, math.ceil(math.log2(max(count, attempts, 1))))
+            points = rng.random((batch, d)) if sequence is None else np.asarray(sequence.random(batch))
+            attempts += batch
+            points = self.snap(points if law is None else law(points))
+            accepted = np.concatenate([accepted, points[self.allows(points)]])
         return accepted[:count]
 
     def _decoded(self, index: int, units: Array) -> Array:
@@ -150,6 +152,7 @@ class Feasibility:
 
 def _log_positive(processes: Sequence[GaussianProcess], points: Array) -> Array:
     """Logarithms (m,) of the probability that all labels at points (m, dimension) are positive."""
+    # P = Π_k Φ(m_k / √(s_k² + n_k²)): Rasmussen & Williams, section 6.5, with the label's noise as the width of Φ.
     total = np.zeros(len(points))
     for process in processes:
         mean, deviation = process.predict(points)

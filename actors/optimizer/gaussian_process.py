@@ -57,6 +57,7 @@ def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Seque
     """
     bounds: Any = covariance.bounds
 
+    # −log p(θ | y) = −log p(y | θ) + ½ |z|² + const, z = (θ − centre) / deviation: normal priors of the logarithms.
     def loss(theta: Array) -> tuple[float, Array]:
         z = (theta - covariance.centre) / covariance.deviation
         value, gradient = negative_log_likelihood(covariance, residuals, theta)
@@ -84,6 +85,8 @@ def maximum_a_posteriori(covariance: Covariance, residuals: Array, starts: Seque
 
 def negative_log_likelihood(covariance: Covariance, residuals: Array, theta: Array) -> tuple[float, Array]:
     """−log p of residuals (n,) at hyperparameters θ (p,), and its gradient (p,)."""
+    # K = L Lᵀ, α = K⁻¹ r (Rasmussen & Williams, algorithm 2.1), and by their equation 5.9
+    #     −∂ log p/∂θ = ½ tr((K⁻¹ − α αᵀ) ∂K/∂θ), the pullback of ½ (K⁻¹ − α αᵀ)
     K, pullback = covariance.observed(theta)
     L, trouble = lapack.dpotrf(K, lower=1)
     if trouble:
@@ -98,6 +101,7 @@ def negative_log_likelihood(covariance: Covariance, residuals: Array, theta: Arr
 
 
 def _value(L: Array, alpha: Array, residuals: Array) -> float:
+    # −log p = ½ rᵀ K⁻¹ r + ½ log |K| + n/2 log 2π (Rasmussen & Williams, equation 2.30), ½ log |K| = Σ log L_ii
     return 0.5 * float(residuals @ alpha) + float(np.log(np.diagonal(L)).sum()) + 0.5 * len(L) * math.log(2 * math.pi)
 
 
@@ -183,6 +187,8 @@ class GaussianProcess:
 
     def predict(self, points: Array) -> tuple[Array, Array]:
         """See `Surrogate.predict`. The deviation excludes the observations' noise."""
+        # m(x) = m₀(x) + k(x)ᵀ K⁻¹ r and s²(x) = k(x, x) − |V|², V = L⁻¹ k(x): Rasmussen & Williams, equations 2.38
+        # and 2.26; r and k are in units of `scale` and its square.
         K = self.covariance_terms.cross(self._fitted.theta, points)
         V = solve_triangular(self._fitted.L, K.T, lower=True, check_finite=False)
         prior = self.covariance_terms.variance(self._fitted.theta, points)
@@ -221,6 +227,7 @@ class GaussianProcess:
 
     def covariance(self, first: Array, second: Array) -> Array:
         """Posterior covariance of the noise-free cost between points (m, d) and (k, d): (m, k), in its unit squared."""
+        # cov(f, f′) = k(x, x′) − k(x)ᵀ K⁻¹ k(x′) = k − Vᵀ W (Rasmussen & Williams, equation 2.24)
         theta, L = self._fitted.theta, self._fitted.L
         V = solve_triangular(L, self.covariance_terms.cross(theta, first).T, lower=True, check_finite=False)
         W = V
@@ -269,6 +276,7 @@ def simulated_mean_process(
 
 def _of_noise_alone(residuals: Array) -> float:
     """Log-likelihood of residuals (n,) as independent normal noise with the best-fitting deviation."""
+    # max over v of Σ log N(r_i; 0, v) = −n/2 (log 2πv + 1) at v = mean r²
     variance = max(float(np.mean(residuals**2)), 1e-12)
     return -0.5 * len(residuals) * (math.log(2 * math.pi * variance) + 1.0)
 

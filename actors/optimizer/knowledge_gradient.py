@@ -81,7 +81,7 @@ def looked_ahead(
     pour: Array,
     candidates: Array,
     known: Array,
-    left: int,
+    pours_left: int,
     allowed: Callable[[Array, Array], Array],
     feasibility: Feasibility | None,
 ) -> Array:
@@ -92,14 +92,15 @@ def looked_ahead(
         pour: (dimension,), the best by its own loss and savings.
         candidates: (m, dimension), the first of them all over the region.
         known: (k, dimension), poured actions that may be poured again; k ≥ 0.
-        left: H.
+        pours_left: H.
         allowed: applies limits and refusals to values (p,) of pours at places (p, dimension).
         feasibility: of requests; None if no request was refused.
     """
-    if left == 0:
+    if pours_left == 0:
         return pour
     means, deviations, noises = process.components(candidates)
     costs = clipped_mean(means, deviations)
+    # Disputed: variance of the means between hypotheses, Var_j m_j(x), over a pour's noise.
     between = process.mixture @ means**2 - (process.mixture @ means) ** 2
     disputed = np.sqrt(np.maximum(between, 0.0)) / (process.mixture @ noises)
     heavy = np.argsort(-process.mixture, kind="stable")[:HEAVIEST]
@@ -114,25 +115,31 @@ def looked_ahead(
     targets = np.unique(np.concatenate([places, known, candidates[others]]), axis=0)
     if feasibility is not None and (likely := feasibility.likely(targets)).any():
         targets = targets[likely]
+    # E c(x) − H (min_x′ E c(x′) − E_y min_x′ E[c(x′) | y at x]): less H knowledge gradients (Frazier et al. 2009)
     now = float(process.predict(targets)[0].min())
-    value = process.predict(places)[0] - left * (now - process.worst * predicted_minimum(process, places, targets))
+    value = process.predict(places)[0] - pours_left * (
+        now - process.worst * predicted_minimum(process, places, targets)
+    )
     return np.asarray(places[int(np.argmin(allowed(value / process.worst, places)))])
 
 
 def predicted_minimum(process: ModelAveragedProcess, places: Array, targets: Array) -> Array:
     """Least expected cost (p,) over targets (m, dimension), in units of the worst, after a pour at places (p, ·)."""
     means, deviations, _ = process.components(targets)
-    at, its, noises = process.components(places)
-    spreads = np.hypot(its, noises)
+    place_means, place_deviations, noises = process.components(places)
+    spreads = np.hypot(place_deviations, noises)
     covariances = process.covariances(places, targets)
     edges = np.concatenate([[-np.inf], 0.5 * (SHOWN[1:] + SHOWN[:-1]), [np.inf]])
     minima = []
+    # After y at place i, hypothesis j has (Rasmussen & Williams, equations 2.25 and 2.26 with one observation more)
+    #     m_j(x′) + slope (y − m_j(x_i)),  s_j²(x′) − slope cov_j,    slope = cov_j(x_i, x′) / (s_j²(x_i) + n_j²)
+    # and y = SHOWN[k] with the probability chances[k, j]; Σ_k min_x′ Σ_j w_j chances[k, j] E clip(f_j(x′)) is E_y min.
     for i in range(len(places)):
-        chances = np.diff(ndtr((edges[:, None] - at[:, i]) / spreads[:, i]), axis=0)  # (shown, components)
+        chances = np.diff(ndtr((edges[:, None] - place_means[:, i]) / spreads[:, i]), axis=0)  # (shown, components)
         slope = covariances[:, i] / spreads[:, i, None] ** 2
-        left = np.sqrt(np.maximum(deviations**2 - slope * covariances[:, i], 1e-10))
-        moved = means + slope * (SHOWN[:, None] - at[:, i])[:, :, None]  # (shown, components, targets)
-        costs = clipped_mean(moved, np.broadcast_to(left, moved.shape))
+        posterior_deviations = np.sqrt(np.maximum(deviations**2 - slope * covariances[:, i], 1e-10))
+        moved = means + slope * (SHOWN[:, None] - place_means[:, i])[:, :, None]  # (shown, components, targets)
+        costs = clipped_mean(moved, np.broadcast_to(posterior_deviations, moved.shape))
         minima.append(float(np.einsum("kc,c,kcm->km", chances, process.mixture, costs).min(axis=1).sum()))
     return np.array(minima)
 
@@ -167,13 +174,14 @@ def least_loss(
         feasibility: of requests; None if no request was refused. An infeasible pour counts as the worst cost.
     """
     best = float(process.predict(known)[0].min()) / process.worst if len(known) else 0.0
-    left = min(discrepancy.pours_left, FORESIGHT) if len(known) else 0
+    pours_left = min(discrepancy.pours_left, FORESIGHT) if len(known) else 0
     allowed = _allowed(process, discrepancy, feasibility)
 
+    # E clip(f, 0, 1) − H E (b − f⁺)⁺ by hypothesis, averaged; (b − f⁺)⁺ = (b − f)⁺ − (0 − f)⁺ for b ≥ 0.
     def score(points: Array) -> Array:
         means, deviations, _ = process.components(points)
         saved = shortfall(best, means, deviations) - shortfall(0.0, means, deviations)
-        return allowed(process.mixture @ (clipped_mean(means, deviations) - left * saved), points)
+        return allowed(process.mixture @ (clipped_mean(means, deviations) - pours_left * saved), points)
 
     return score
 
@@ -184,6 +192,7 @@ def _allowed(
     """Return a function that applies the limit and the feasibility to values (m,) of pours at points (m, dimension)."""
 
     def changed(value: Array, points: Array) -> Array:
+        # Penalty FORBIDDEN (P(y > loss) − p)⁺, then P value + (1 − P) · 1: a refused pour counts as the worst.
         if discrepancy.limit is not None:
             over = process.exceedance(points, discrepancy.limit.loss) - discrepancy.limit.probability
             value = value + FORBIDDEN * np.maximum(over, 0.0)
@@ -201,9 +210,11 @@ def pour_gains(process: ModelAveragedProcess, points: Array, known: Array) -> Ar
     means, deviations, noises = process.components(points)
     at_best, its_deviation, _ = (component[:, 0] for component in process.components(place[None, :]))
     best = shortfall(0.0, -at_best, its_deviation)[:, None]  # E f⁺ of each component
+    # s̃ = s² / √(s² + n²): deviation of the change that a pour makes in the expected difference (Frazier et al. 2009)
     doubt = process.differences(points, place)
     doubt = doubt**2 / np.hypot(doubt, noises)
     expected = shortfall(0.0, -means, deviations)
+    # E d⁺ = E (E b⁺ − N(E f⁺, s̃²))⁺, at most E (b_j − f_j⁺)⁺, the gain of perfect knowledge
     gains = np.minimum(
         shortfall(best, expected, np.maximum(doubt, 1e-9)),
         shortfall(best, means, deviations) - shortfall(0.0, means, deviations),
@@ -235,6 +246,7 @@ def instructive(
         return np.empty((0, len(pour)))
     to_come = candidates[np.argsort(score(candidates), kind="stable")[:LATEST]]
     targets = np.concatenate([process.points[-LATEST:], pour[None, :], to_come])
+    # Variance of e^{g_j} f̂_s at the places that hypothesis j assigns to the targets: its weight is w_j e^{2 g_j}.
     hypotheses, weights = process.heaviest
     seen = hypotheses.moved(targets)
     gains = weights * np.exp(2.0 * hypotheses.gains)
@@ -248,6 +260,7 @@ def instructive(
     noise = simulated.noise**2 + 1e-12
     G = simulated.covariance(everything, np.concatenate([everything, seen]))
 
+    # One more simulation at a: G(x, x′) −= G(x, a) G(a, x′) / (G(a, a) + n²), the posterior covariance
     def observe(index: int) -> None:
         G[:] -= np.outer(G[:, index], G[index]) / (max(float(G[index, index]), 0.0) + noise)
 
@@ -255,6 +268,7 @@ def instructive(
         observe(index)
     chosen = []
     for _ in range(count):
+        # Reduction by a: Σ_t importance_t G(a, t)² / (G(a, a) + n²) (Cohn 1996), the largest one is taken
         variances = np.maximum(np.diagonal(G[:, : len(everything)])[: len(places)], 0.0) + noise
         removed = (G[: len(places), len(everything) :] ** 2 @ importance) / variances
         best = int(np.argmax(removed))
@@ -279,9 +293,10 @@ def proposals(
     score = least_loss(process, query.discrepancy, known, feasibility)
     candidates = np.concatenate([candidates, known])
     pour = acquisition.minimise(score, candidates, arrays.region, rng)
-    left, allowed = min(query.discrepancy.pours_left, FORESIGHT), _allowed(process, query.discrepancy, feasibility)
+    pours_left = min(query.discrepancy.pours_left, FORESIGHT)
+    allowed = _allowed(process, query.discrepancy, feasibility)
     if query.discrepancy.lookahead and len(known):
-        pour = looked_ahead(process, pour, candidates, known, left, allowed, feasibility)
+        pour = looked_ahead(process, pour, candidates, known, pours_left, allowed, feasibility)
     if found_good(arrays.simulated_costs) or found_good(arrays.costs):
         simulations = instructive(process, query.count - 1, candidates, score, pour, arrays.busy, arrays.region)
     else:

@@ -144,6 +144,8 @@ class Hypotheses:
     def of(cls, discrepancy: ModelDiscrepancy, centre: Array, latent: Array, contrary: NDArray[np.bool_]) -> Hypotheses:
         """Return the hypotheses of latent variables (J, `latent_size`), a priori standard normal."""
         dimension = len(discrepancy.offset_priors)
+        # Columns: z of shifts and of factors, then h and g (all normal); σ, ℓ, s, the earlier offset, n and m as
+        # uniform numbers Φ(z).
         z, rows = latent[:, : 2 * dimension], np.asarray(ndtr(latent[:, 2 * dimension :]))
         width, gain = latent[:, 2 * dimension : 2 * dimension + 2].T
         residual, length, far, known, noise, growth = rows[:, 2:].T
@@ -162,6 +164,8 @@ class Hypotheses:
             np.array([getattr(prior, name) for prior in discrepancy.offset_priors])
             for name in ("shift", "factor", "origin")
         )
+        # u ↦ f u + s shift z + (f − 1) origin, f = e^{s factor z}: a factor on the axis' value also moves its origin.
+        # After an earlier offset (scales, shifts), the two maps are composed.
         factors = np.exp(spread[:, None] * factor * z[:, dimension:])
         moved = spread[:, None] * shift * z[:, :dimension] + (factors - 1.0) * origin
         return cls(
@@ -282,6 +286,8 @@ class ModelAveragedProcess:
         mean, deviation = (
             moments.reshape(J, m) for moments in self.simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
         )
+        # μ_j = clip(e^{g_j} f̂_s(z_j(x)), 0, 1), contrary: 1 − f̂_s; v_j = √(σ_j² + e^{2 g_j} s_s²); noise n_j + m_j
+        # μ_j
         gain = np.exp(hypotheses.gains)[:, None] / self.worst
         means = np.clip(gain * np.where(hypotheses.contrary[:, None], self.worst - mean, mean), 0.0, 1.0)
         spreads = np.hypot(hypotheses.rests[:, None], gain * deviation)
@@ -314,13 +320,14 @@ class ModelAveragedProcess:
         """
         rng = np.random.default_rng(1)
         likelihood = self._likelihood(sample, counting)
+        # z′ = √(1 − β²) z + β ξ keeps N(0, 1), so the acceptance is the likelihoods' ratio alone (Cotter et al. 2013).
         for step in STEPS:
             proposed = np.sqrt(1.0 - step**2) * latent + step * rng.standard_normal(latent.shape)
             candidates = make(proposed)
-            theirs = self._likelihood(candidates, counting)
-            accepted = np.log(rng.random(len(latent))) < theirs - likelihood
+            proposed_likelihood = self._likelihood(candidates, counting)
+            accepted = np.log(rng.random(len(latent))) < proposed_likelihood - likelihood
             latent = np.where(accepted[:, None], proposed, latent)
-            likelihood = np.where(accepted, theirs, likelihood)
+            likelihood = np.where(accepted, proposed_likelihood, likelihood)
         return make(latent)
 
     def _likelihood(self, hypotheses: Hypotheses, counting: NDArray[np.bool_]) -> Array:
@@ -357,14 +364,18 @@ class ModelAveragedProcess:
             np.append(np.where(self._all.near, NEAR_CHANGED, 1.0), np.ones(len(UNINFORMATIVE_LENGTHS)))
         )
         changed -= _log_sum(changed)
+        # before[j, t] = log w_j + Σ_{i<t} log p_j(y_i | y_<i): joint with the observations before t (chain rule)
         first = changed if begin else prior
         before = first[:, None] + np.concatenate([np.zeros((len(prior), 1)), np.cumsum(chances, axis=1)], axis=1)
         so_far = np.exp(before[:, :-1] - before[:, :-1].max(axis=0, initial=-np.inf))
+        # Probability integral transform: P(y_i < observed | y_<i) = Σ_j w_j(t) Φ(residual_j)
         below = (so_far * ndtr(residuals)).sum(axis=0) / so_far.sum(axis=0)  # of each observation, given those before
         surprising = np.abs(below - 0.5) > 0.5 * SURPRISE
         counting, logs = [np.arange(n) >= begin], [before[:, m]]
         if surprising.any():
             after = np.cumsum(self._sequential(at_data, lengths, order[::-1])[0], axis=1)[:, ::-1]
+            # Change before `start`: Σ_j of the old bench's evidence, times CHANGE, times w_j p_j(y_start … y_n) of the
+            # new (Adams & MacKay 2007, with one change).
             for start in range(1, m):
                 counting.append(np.arange(n) >= begin + start)
                 logs.append(changed + after[:, start] + _log_sum(before[:, start]) + np.log(CHANGE))
@@ -387,6 +398,9 @@ class ModelAveragedProcess:
         prior = _Prior(*(getattr(prior, name)[:, order] for name in ("means", "spreads", "noises")))
         L = self._factorised(prior, lengths, self.points[order])
         costs = self._costs[order]
+        # Residuals L⁻¹ (y − μ): the i-th is (y_i − E[y_i | y_<i]) / L_ii, L_ii its conditional deviation. The
+        # probability of an interval [low, high] of it is Φ(high) − Φ(low), from the side on which it is not a
+        # difference of numbers near 1.
         residuals = np.linalg.solve(L, (costs - prior.means)[:, :, None])[:, :, 0]
         deviations = np.diagonal(L, axis1=1, axis2=2)
         high = np.where(costs > TOTAL, np.inf, residuals + 0.5 * RESOLUTION / deviations)
@@ -404,12 +418,14 @@ class ModelAveragedProcess:
         n = len(points)
         if n == 0:
             return np.zeros((len(lengths), 0, 0))
+        # K_j = v_j(x) v_j(x′) M_{ℓ_j}(x, x′) + n_j(x)² 1
         K = _correlation(points, points, lengths) * prior.spreads[:, :, None] * prior.spreads[:, None, :]
         K[:, np.arange(n), np.arange(n)] += prior.noises**2
         return np.asarray(np.linalg.cholesky(K))
 
     def components(self, points: Array) -> tuple[Array, Array, Array]:
         """Posterior means, deviations and noises (components, m) at points (m, dimension), in units of the worst."""
+        # Rasmussen & Williams, equations 2.25 and 2.26, for every hypothesis: μ_j + Vᵀ L⁻¹ (y − μ_j), v_j² − |V|²
         prior, V = self._projected(points)
         means = prior.means + np.einsum("jim,ji->jm", V, self._residuals)
         variances = prior.spreads**2 - np.einsum("jim,jim->jm", V, V)
@@ -449,6 +465,7 @@ class ModelAveragedProcess:
 
     def predict(self, points: Array) -> tuple[Array, Array]:
         """See `Surrogate.predict`: moments of the cost, which is between 0 and the worst."""
+        # Moments of a mixture: E = Σ w_j E_j, Var = Σ w_j E_j[c²] − E²
         means, deviations, _ = self.components(points)
         first, second = clipped_moments(means, deviations)
         mean = self.mixture @ first
@@ -511,6 +528,8 @@ def latent_size(dimension: int) -> int:
 
 def clipped_moments(means: Array, deviations: Array) -> tuple[Array, Array]:
     """E clip(f, 0, 1) and E clip(f, 0, 1)² of normal f."""
+    # With l = −m/s, u = (1 − m)/s: E c = m (Φ(u) − Φ(l)) + s (φ(l) − φ(u)) + 1 − Φ(u) and
+    # E c² = (m² + s²) (Φ(u) − Φ(l)) + s (m φ(l) − (m + 1) φ(u)) + 1 − Φ(u), moments of a censored normal.
     low, high = -means / deviations, (1.0 - means) / deviations
     below, under = ndtr(low), ndtr(high)
     p, q, above = _density(low), _density(high), 1.0 - under
@@ -529,6 +548,7 @@ def clipped_mean(means: Array, deviations: Array) -> Array:
 
 def shortfall(level: Array | float, means: Array, deviations: Array) -> Array:
     """E (level − f)⁺ of normal f."""
+    # Expected improvement (Jones, Schonlau & Welch 1998, equation 15): (l − m) Φ(u) + s φ(u), u = (l − m) / s
     u = (level - means) / deviations
     return np.asarray((level - means) * ndtr(u) + deviations * _density(u))
 

@@ -70,6 +70,8 @@ def observation_intervals(process: GaussianProcess, points: Array, level: float)
         covariance = covariance.with_uncertain_mean(MEAN_DEVIATION)
     prior_mean = process.mean(points)
     log_weights, means, deviations = [], [], []
+    # p(y | data) ≈ Σ_k w_k N(m_k, s_k² + n_k²), w_k ∝ p(data | θ_k) p(θ_k) / q(θ_k): importance sampling of the
+    # integral over θ (Rasmussen & Williams, section 5.2); moments as in `GaussianProcess.predict`.
     for theta, log_ratio in zip(*_proposed(covariance, process.residuals, process.theta), strict=True):
         K, _ = covariance.observed(theta)
         L, trouble = lapack.dpotrf(K, lower=1)
@@ -98,6 +100,7 @@ def _proposed(covariance: Covariance, residuals: Array, best: Array) -> tuple[Ar
     Source: Laplace approximation with heavy tails and a defensive mixture (Owen & Zhou, Safe and effective importance
     sampling, JASA 2000).
     """
+    # In prior deviations z; H = axes diag(values) axesᵀ is the posterior's curvature, whose widths are 1/√values.
     p = len(covariance.names)
     z_best = (best - covariance.centre) / covariance.deviation
     values, axes = np.linalg.eigh(_curvature(covariance, residuals, best))
@@ -106,9 +109,11 @@ def _proposed(covariance: Covariance, residuals: Array, best: Array) -> tuple[Ar
     rows = np.clip(rows, 1e-6, 1.0 - 1e-6)
     rows[FROM_PRIOR, :p] = 0.5  # the most likely ones themselves, whose covariance can be factorised
     z = ndtri(rows[:, :p])
+    # Student t with ν = TAILS: z_best + √(ν/χ²_ν) N(0, H⁻¹), χ²_ν = 2 P⁻¹(ν/2, u)
     chi_squared = 2.0 * gammaincinv(0.5 * TAILS, rows[FROM_PRIOR:, p])
     z[FROM_PRIOR:] = z_best + np.sqrt(TAILS / chi_squared)[:, None] * (z[FROM_PRIOR:] * widths) @ axes.T
     prior = -0.5 * (z**2).sum(axis=1) - 0.5 * p * math.log(2.0 * math.pi)
+    # Mixture q = share N(0, 1) + (1 − share) t_ν(z_best, H⁻¹); `prior` and `around` are the logarithms of the two.
     distance = (((z - z_best) @ axes / widths) ** 2).sum(axis=1)
     around = -0.5 * (TAILS + p) * np.log1p(distance / TAILS) - float(np.log(widths).sum())
     around += gammaln(0.5 * (TAILS + p)) - gammaln(0.5 * TAILS) - 0.5 * p * math.log(TAILS * math.pi)
@@ -124,6 +129,7 @@ def _curvature(covariance: Covariance, residuals: Array, theta: Array) -> Array:
     """Hessian (p, p) of −log posterior, in prior standard deviations, by differences of the gradient."""
     deviation, p = covariance.deviation, len(theta)
     hessian = np.eye(p)
+    # H = 1 (the prior) + ∂g/∂z, g the gradient of −log likelihood by z, by central differences
     for i, step in enumerate(np.diag(STEP * deviation)):
         above, below = (negative_log_likelihood(covariance, residuals, theta + sign * step)[1] for sign in (1.0, -1.0))
         hessian[i] += (above - below) / (2.0 * STEP) * deviation
@@ -150,6 +156,8 @@ def highest_density_intervals(
         level: probability, between 0 and 1.
         largest: possible value; may be infinite.
     """
+    # Intervals [F⁻¹(p), F⁻¹(p + level)] for p = 0 … 1 − level: the narrowest one is the highest-density interval of a
+    # density with one mode (Box & Tiao 1973, section 2.8; Chen & Shao 1999).
     below = np.linspace(0.0, 1.0 - level, ENDS)
     if math.isinf(largest):
         largest = max(float((means + WIDEST * deviations).max()), 0.0)
@@ -163,6 +171,7 @@ def highest_density_intervals(
 def _quantiles(weights: Array, means: Array, deviations: Array, shares: Array, largest: float) -> Array:
     """Quantiles (k, m) for probabilities (k,), by bisection."""
     low, high = np.zeros((len(shares), means.shape[1])), np.full((len(shares), means.shape[1]), largest)
+    # Bisection of F(z) = Σ_j w_j Φ((z − m_j) / s_j) = share, to largest / 2^HALVINGS; 0 and `largest` have atoms.
     none = weights @ ndtr(-means / deviations) >= shares[:, None]
     all_of_it = weights @ ndtr((largest - means) / deviations) <= shares[:, None]
     for _ in range(HALVINGS):

@@ -184,6 +184,7 @@ class RememberedGroup:
         from scipy.special import ndtr  # slow import
 
         centres, deviations = np.array(self.centres), np.array(self.deviations)
+        # Π_a N(u_a; c_a, s_a²) / (Φ((1 − c_a)/s_a) − Φ(−c_a/s_a)): normals that are truncated to [0, 1]
         z = (points[:, list(self.axes)] - centres) / deviations
         inside = ndtr((1.0 - centres) / deviations) - ndtr(-centres / deviations)
         norms = np.log(deviations * np.maximum(inside, 1e-9)) + 0.5 * math.log(2.0 * math.pi)
@@ -207,6 +208,7 @@ def truncated_quantiles(uniform: Array, mean: float, deviation: float, lower: fl
     """
     from scipy.special import ndtr, ndtri  # slow import
 
+    # Inverse distribution function: m + s Φ⁻¹(Φ(l) + u (Φ(h) − Φ(l))), l and h the bounds in deviations from m
     below, above = np.asarray(ndtr((np.array([lower, upper]) - mean) / deviation))
     return np.asarray(np.clip(mean + deviation * ndtri(below + uniform * (above - below)), lower, upper))
 

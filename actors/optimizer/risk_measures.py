@@ -38,6 +38,7 @@ def tail_weights(losses: Array, level: float) -> Array:
     atoms: the same, Conditional value-at-risk for general loss distributions, 2002.
     """
     count = losses.shape[1]
+    # Rockafellar & Uryasev 2002: losses in descending order have the weights 1/mass, …, then the fraction that is left.
     mass = max((1.0 - level) * count, 1e-12)
     by_rank = np.clip(mass - np.arange(count), 0.0, 1.0) / mass
     by_rank /= by_rank.sum()  # below the fraction of one loss, only the worst counts
@@ -104,6 +105,7 @@ class RiskProcess:
     def _moments(self, points: Array) -> tuple[Array, Array]:
         losses, cross = self._losses(points)
         weights = tail_weights(losses, self.level)
+        # M = Σ_j w_j f_j: E M = Σ w_j m_j, Var M = wᵀ K w − |L⁻¹ Σ_j w_j k_j|² (K: prior, k_j: with the observations)
         mean = (weights * losses).sum(axis=1)
         # The weights are applied before solving: one right-hand side per point instead of J.
         known = self.process.explained(np.einsum("mj,mjn->mn", weights, cross))

@@ -76,6 +76,7 @@ def describe(
     at_known, known_deviations = model.surrogate.predict(known)
     expected = at_known
     if not risky and feasibility is not None and len(arrays.costs):
+        # E = P m(x) + (1 − P) · (largest observed cost), P that the pour does not fail
         probability = feasibility.made(known)
         expected = probability * at_known + (1.0 - probability) * arrays.costs.max()
     best = int(np.argmin(expected))
@@ -130,9 +131,9 @@ def posterior_of(
     if not len(contexts):
         prior, memory = array(question.prior, 2), question.memory or ()
         draws = drawn_beforehand(question.count, query.space.dimension, prior, rng, memory)
-        lack = (DISCREPANCY_PRIOR[0],) * question.count
+        discrepancies = (DISCREPANCY_PRIOR[0],) * question.count
         held = None if question.memory is None else tuple(group.weight for group in memory)
-        return Posterior(tuples(region.snap(draws)), lack, float(question.count), held)
+        return Posterior(tuples(region.snap(draws)), discrepancies, float(question.count), held)
     sampled = sample_posterior(
         model.process,
         contexts,
@@ -149,7 +150,7 @@ def posterior_of(
 
 
 def design_of(
-    query: CalibrationQuery, question: DesignQuestion, made: PosteriorQuestion, model: Model, posterior: Posterior
+    query: CalibrationQuery, question: DesignQuestion, pours: PosteriorQuestion, model: Model, posterior: Posterior
 ) -> dict[str, object]:
     """Return the expected information of weighing a pour at each candidate, in addition to those made."""
     context_dimension = query.context_dimension
@@ -157,7 +158,7 @@ def design_of(
         model.process,
         np.array(posterior.points),
         np.array(posterior.discrepancies),
-        WeighedDesign(array(made.contexts, context_dimension), np.array(made.offsets), made.noise),
+        WeighedDesign(array(pours.contexts, context_dimension), np.array(pours.offsets), pours.noise),
         array(question.candidates, context_dimension),
         array(question.targets, context_dimension),
     )
@@ -311,6 +312,7 @@ def _fills_space(query: ProposalQuery, arrays: QueryArrays, model: Model, index:
     """
     if not isinstance(query, MinimumQuery) or query.plain or query.mean != "constant" or _seeks_minimum(query):
         return False
+    # `evidence`: log-likelihood ratio of the GP and pure noise; e² : 1 (STRUCTURE) counts as structure.
     number = len(arrays.known) + len(arrays.busy) + index
     if query.replicates:
         return number % FILL_EVERY == FILL_EVERY - 1 and model.process.evidence < STRUCTURE

@@ -159,6 +159,7 @@ class AbsoluteProcess:
         m, J = len(points), len(self.context)
         joint = np.concatenate([np.repeat(points, J, axis=0), np.tile(self.context, (m, 1))], axis=1)
         mean, deviation = (values.reshape(m, J) for values in self.process.predict(joint))
+        # E|f| = s √(2/π) e^(−m²/2s²) + m (2Φ(m/s) − 1), Var|f| = m² + s² − (E|f|)²
         ratio = mean / deviation
         folded = deviation * math.sqrt(2 / math.pi) * np.exp(-0.5 * ratio**2) + mean * (2 * ndtr(ratio) - 1)
         spread = np.sqrt(np.maximum(mean**2 + deviation**2 - folded**2, 0.0))

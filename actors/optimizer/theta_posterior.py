@@ -100,6 +100,8 @@ def sample_posterior(
     def density(x: Array) -> Array:
         inside = np.all((x[:, :dimension] >= 0.0) & (x[:, :dimension] <= 1.0), axis=1)
         values = np.full(len(x), -np.inf)
+        # log p(θ, log σ_δ | pours) + const: likelihood, log-normal prior of σ_δ, normal priors of θ, and the mixtures
+        # log(w N(θ) + (1 − w) · 1) of the memory, whose uniform part has the density 1 in the cube.
         if inside.any():
             logs = x[inside, dimension]
             values[inside] = likelihood(x[inside, :dimension], np.exp(logs))
@@ -129,6 +131,7 @@ def sample_posterior(
     chosen = flat[np.linspace(0, len(flat) - 1, count).round().astype(int)]
     held = []
     for group in memory:
+        # Bayes: P(normals | θ) = w N(θ) / (w N(θ) + 1 − w), averaged over the chain
         share = group.weight * group.density(flat)
         held.append(float(np.mean(share / (share + 1.0 - group.weight))))
     return Sampled(snap(chosen[:, :dimension]), np.exp(chosen[:, dimension]), _effective(samples), tuple(held))
@@ -177,8 +180,10 @@ class _Likelihood:
         means, V = self._process.projected(joint)
         errors = means.reshape(m, n) + self._offsets
         V = V.reshape(len(V), m, n).transpose(1, 2, 0)
+        # C(θ) = S(θ) + (n² + n_s²) 1 + σ_δ² M, S = prior − Vᵀ V: see `sample_posterior`
         C = self._prior - V @ V.transpose(0, 2, 1) + self._scatter + discrepancies[:, None, None] ** 2 * self._lack
         C = C + 1e-9 * np.trace(self._prior) / n * np.eye(n)
+        # log N(e; 0, C) = −½ |L⁻¹ e|² − Σ log L_ii + const, C = L Lᵀ
         L = np.linalg.cholesky(C)
         white = np.linalg.solve(L, errors[:, :, None])[:, :, 0]
         logs = np.log(np.diagonal(L, axis1=1, axis2=2)).sum(axis=1)
@@ -187,6 +192,8 @@ class _Likelihood:
 
 def _stretched(x: Array, density: Callable[[Array], Array], rng: np.random.Generator) -> Array:
     """The chain of an ensemble (walkers, d): (STEPS, walkers, d)."""
+    # Stretch move (Goodman & Weare 2010): Y = X_k + z (X_j − X_k), z ~ 1/√z on [1/a, a], a = STRETCH, accepted with
+    # min(1, z^{d−1} p(Y) / p(X_j)). The halves of the ensemble move in turn, each around walkers of the other one.
     walkers, d = x.shape
     halves = np.arange(walkers) % 2
     values = density(x)
@@ -209,6 +216,7 @@ def _effective(chain: Array) -> float:
 
     Source: Geyer's initial positive sequence on the walkers' mean autocovariance.
     """
+    # τ = 1 + 2 Σ_k ρ_k up to the first ρ_k < 0.05, N_eff = steps · walkers / τ
     steps, walkers, d = chain.shape
     worst = 1.0
     for i in range(d):
@@ -276,17 +284,21 @@ def expected_reductions(
     contexts = np.concatenate([poured, targets])
     unit = np.full((len(poured), thetas.shape[1]), 0.5)
     prior = process.prior_covariance(np.concatenate([unit, poured], axis=1))
-    lack = matern(poured, poured, np.full(poured.shape[1], DISCREPANCY_LENGTH))[0]
+    correlation = matern(poured, poured, np.full(poured.shape[1], DISCREPANCY_LENGTH))[0]
     scatter = weighed.noise**2 + process.noise**2 + 1e-10
     rows, unexplained = [], np.zeros(m)
     for theta, deviation in zip(thetas, lacks, strict=True):
         means, V = process.projected(np.concatenate([np.tile(theta, (len(contexts), 1)), contexts], axis=1))
+        # R: prior covariance of e between poured places and candidates, given the simulations and θ. Conditioned on the
+        # weighed pours (Rasmussen & Williams, equations 2.25 and 2.26), with e = weighed − simulated:
+        #     mean weightsᵀ e,  variance v(c) = R_cc − R_cn weights,    weights = (R_nn + n² 1)⁻¹ R_nc
         near = V[:, : n + m]
-        R = prior - near.T @ near + deviation**2 * lack
+        R = prior - near.T @ near + deviation**2 * correlation
         weights = np.linalg.solve(R[:n, :n] + scatter * np.eye(n), R[:n, n:])  # (n, m)
         corrected = weights.T @ (means[:n] + weighed.offsets) - means[n : n + m]
         rows.append(np.concatenate([corrected, -means[n + m :]]))
         unexplained += np.maximum(np.diag(R[n:, n:]) - (R[:n, n:] * weights).sum(axis=0), 0.0)
+    # C: covariance over the draws of θ; reductions = C(c, t)² / (C(c, c) + v(c) + n²)
     f = np.array(rows)
     f = f - f.mean(axis=0)
     C = f.T @ f / len(thetas)

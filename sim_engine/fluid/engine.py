@@ -228,16 +228,16 @@ class _Pool(Generic[T]):
         self._offsets: dict[int, int] = {}
         self._size = 0
 
-    def add(self, part: NDArray[T], known_as: object = None) -> int:
+    def add(self, array: NDArray[T], known_as: object = None) -> int:
         """Add an array and return its offset in the pool.
 
         Arrays that are `known_as` the same object are stored once.
         """
-        key = id(part if known_as is None else known_as)
+        key = id(array if known_as is None else known_as)
         if key not in self._offsets:
             self._offsets[key] = self._size
-            self._parts.append(part.ravel())
-            self._size += part.size
+            self._parts.append(array.ravel())
+            self._size += array.size
         return self._offsets[key]
 
     def array(self) -> NDArray[T]:
