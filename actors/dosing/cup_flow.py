@@ -100,6 +100,7 @@ class CupFlow:
 
     def volume_per_tilt(self, volume: float, head: float) -> float:
         """−dV/dθ at a constant head: the flow of a cup that turns with 1 rad/s [m³/rad]."""
+        # −ΔV/Δθ by central differences over 4 % of the capacity
         around = np.clip(volume + np.array([-0.02, 0.02]) * self.capacity, 0.0, self.capacity)
         low, high = self.tilt_for(around, np.full(2, head))
         return float(np.diff(around)[0] / max(low - high, 1e-4))
@@ -112,6 +113,7 @@ class CupFlow:
 
         Source: linear theory of a round tank: ω² = 1.841 g/R · tanh(1.841 h/R) (Lamb, Hydrodynamics, § 257).
         """
+        # ω² = g k tanh(k h), k = 1.841/R, the first zero of J_1'; T = 2π/ω
         depth = volume / (math.pi * self._radius**2)
         wave_number = 1.841 / self._radius
         return 2.0 * math.pi / math.sqrt(wave_number * GRAVITY * math.tanh(max(wave_number * depth, 0.1)))
@@ -126,6 +128,7 @@ class CupFlow:
         Returns:
             inf if no tabulated flow reaches it.
         """
+        # We = ρ U² e / σ with the film e = C_d A / w of the wetted area A = ∫ w ds and U = q / (w e), at every head
         depth = np.maximum(self._head_grid[:, None] - self._s * math.sin(tilt), 0.0)
         step = np.gradient(self._s)
         area = ((depth > 0.0) * self._width) @ step
@@ -144,6 +147,8 @@ class CupFlow:
 
     def _flow_of_heads(self, tilt: float) -> Floats:
         """Outflow at the heads of the grid, increasing [m³/s]."""
+        # q_inertia = C_d ∫ w √(2g (h − s sin θ)) ds and q_viscous = w g h³ / 3ν (Nusselt 1916), joined as in the
+        # module's equation; strictly increasing, so that `head_for` can invert it.
         depth = np.maximum(self._head_grid[:, None] - self._s * math.sin(tilt), 0.0)
         width = ((depth > 0.0) * self._width).max(axis=1)
         inertia = DISCHARGE * (np.sqrt(2.0 * GRAVITY * depth) * self._width) @ np.gradient(self._s)
@@ -162,6 +167,8 @@ def _opening(vessel: Vessel) -> tuple[Floats, Floats]:
     known = np.linspace(0.0, 2.0 * math.pi, len(radius) + 1)
     closed = np.append(radius, radius[0])
     half = [np.interp(a, known, closed) for a in (angle, 2.0 * math.pi - angle)]
+    # Width w(s) = Σ over both halves of the outline's |y| where x = x_lip − s; s is quadratic in its index, because w
+    # grows as √s at the lip.
     x = [r * np.cos(angle) for r in half]
     length = x[0][0] - x[0][-1]
     s = length * ((np.arange(240) + 0.5) / 240.0) ** 2
@@ -174,6 +181,7 @@ def _opening(vessel: Vessel) -> tuple[Floats, Floats]:
 
 def _bilinear(table: Floats, row: Floats, column: Floats) -> Floats:
     """Values of a table at fractional places, clamped to it, elementwise."""
+    # (1 − u) ((1 − v) t_ij + v t_i,j+1) + u (…)_i+1
     rows, columns = table.shape
     row = np.minimum(np.maximum(row, 0.0), rows - 1.000001)
     column = np.minimum(np.maximum(column, 0.0), columns - 1.000001)

@@ -89,6 +89,7 @@ class DisplayBelief:
         gaps = np.diff(times)
         middle = float(np.median(gaps))
         # the median, because a lost reading leaves a gap of two intervals
+        # deviation of a normal = 1.48 · median |x − median|; a gap is the difference of two times, hence √2
         jitter = 1.48 * float(np.median(np.abs(gaps - middle))) / math.sqrt(2.0)
         return cls(repeats.beta(), step=step, interval=middle, jitter=jitter, longest=float(np.max(gaps)))
 
@@ -107,6 +108,7 @@ class DisplayBelief:
             interval: between two readings [s].
             repeated: share of repeated readings.
         """
+        # Beta with the mean `repeated` and the weight of 20 readings
         beta = (20.0 * max(repeated, 0.005), 20.0 * (1.0 - max(repeated, 0.005)))
         return cls((beta, beta), step=step, interval=interval)
 
@@ -180,6 +182,7 @@ class Repeats:
         Returns:
             Probability that the reading is a new one.
         """
+        # Bayes over p in REPEATS: likelihood 1 − p of a different reading, p + (1 − p) L of an equal one, L = chance.
         repeated = self.next
         if not equal:
             self._log[self._state] = self._log[self._state] + np.log1p(-REPEATS)
@@ -198,6 +201,7 @@ class Repeats:
 
     def in_a_row(self, chance: float) -> int:
         """Number of repeated readings that are followed by a further one with less than a probability."""
+        # P(n repeats) ≤ start · on^(n − 1) < chance, hence n = 1 + ⌈log(chance / start) / log on⌉
         start, on = (self._upper(state) for state in (0, 1))
         return 1 + max(math.ceil(math.log(chance / start) / math.log(on)), 0) if start > chance else 0
 
@@ -208,6 +212,7 @@ class Repeats:
 
 def _log_beta(a: float, b: float) -> Floats:
     """Logarithm of a Beta distribution at `REPEATS`, up to a constant; each stands for its part of 0 … 1."""
+    # (a − 1) log p + (b − 1) log(1 − p), plus the width of the interval around p
     edges = np.concatenate(([0.0], 0.5 * (REPEATS[1:] + REPEATS[:-1]), [1.0]))
     log: Floats = (a - 1.0) * np.log(REPEATS) + (b - 1.0) * np.log1p(-REPEATS) + np.log(np.diff(edges))
     return log
@@ -220,6 +225,7 @@ def _shortened(beta: Beta) -> Beta:
 
 def _beta_of(weights: Floats) -> Beta:
     """The Beta distribution with the mean and variance of weighted `REPEATS`."""
+    # Moments: a = m n, b = (1 − m) n with n = m (1 − m) / v − 1
     mean = float(weights @ REPEATS)
     variance = max(float(weights @ (REPEATS - mean) ** 2), 1e-5)
     count = max(mean * (1.0 - mean) / variance - 1.0, 0.5)

@@ -99,6 +99,7 @@ def fine_flow(
         limit: tolerance of the dose [kg]; a slow balance needs a slower flow.
         interval: between two readings [s].
     """
+    # min(ρ q at We = FINE_WEBER, flow at which `unseen` equals the tolerance), within the settings
     clean = cup.clean_flow(tilt, FINE_WEBER) * cup.density
     seen = limit / unseen(1.0, interval) if interval > 0.0 else math.inf
     return min(max(min(clean, seen), settings.smallest_flow), settings.largest_fine_flow)
@@ -400,6 +401,7 @@ class DoseController:
             return self._return()
         if ahead < early:
             return self._towards(early + 0.01, self._settings.approach_speed, ahead)
+        # Growth dm/dθ = ρ (−dV/dθ) [kg/rad] of the flow's rate with the speed of the tilt
         aim = float(np.quantile(self._tilts_for(self.fine_flow), 0.35))
         growth = self._cup.volume_per_tilt(float(np.median(e.volume)), 2e-3) * self._cup.density
         # the flow at the moment when the stream is seen is about growth × speed × delay / lag of the cup
@@ -417,6 +419,7 @@ class DoseController:
             float(np.median(e.volume)),
             float(self._cup.head_for(np.array([wanted / self._cup.density]), aim)[0]),
         )
+        # Feedforward θ' = q / (−dV/dθ), which keeps the head, plus feedback 4/s · (aim − θ), θ predicted by the latency
         feed = wanted / self._cup.density / self._cup.volume_per_tilt(volume, head)
         ahead = self._tilt + self._speed * self._settings.latency
         speed = feed + 4.0 * (aim - ahead)
@@ -436,6 +439,7 @@ class DoseController:
 
     def _return_acceleration(self) -> float:
         """Acceleration of a return that raises little of a wave [rad/s²]."""
+        # Ramp to the return speed v over RETURN_RAMP wave periods: a = v / (RETURN_RAMP · T)
         s, period = self._settings, self._cup.wave_period(float(np.median(self._estimator.volume)))
         return min(s.acceleration, s.return_speed / (RETURN_RAMP * period))
 
@@ -471,6 +475,8 @@ class DoseController:
         times, masses = (np.array(values) for values in zip(*((r.time, r.mass) for r in readings), strict=True))
         # a filter's lag, a filter that gets slower at rest, and liquid that runs off late have similar times
         shape = np.exp((times[-1] - times) / max(LATE_TIME, lag))
+        # Regression m(t) = final − rise e^{(t_last − t)/τ}, with a normal prior of `rise` of the deviation REST_BAND:
+        # rise = −Σ (e − ē) m / (Σ (e − ē)² + σ²/σ_rise²), final = m̄ + ē rise
         shape_mean, centred = float(shape.mean()), shape - shape.mean()
         step, rounded = self._step_size, self._step_size**2 / 12.0
         new = max(1.0 - float(self._estimator.repeats.weights(1) @ REPEATS), min(self._interval / RECORDED_HOLD, 1.0))
@@ -524,6 +530,7 @@ class DoseController:
     @property
     def deviation(self) -> float:
         """Standard deviation of a weighed amount: zero, last readings, and late drops [kg]."""
+        # σ² = (d²/12 + σ_0²/4) of the zero, a mean of four readings, + that of the weighing + that of late drops
         zero = self._step_size**2 / 12.0 + self._noise**2 / 4.0
         return math.sqrt(zero + self._remainder**2 + LATE_DROPS[1] ** 2)
 
@@ -549,6 +556,7 @@ class DoseController:
         self.phase = DosePhase.DONE
         aim = self._aim()
         if self._expected is not None and known and end is DoseEnd.REACHED:
+            # aim += max(1/4, 1/(n + 2)) (late − aim): mean of the doses so far, later an exponential average
             late = min(max(amount - self._expected, -1e-3), 1e-3)
             aim += max(0.25, 1.0 / (self._belief.doses + 2)) * (late - aim)
         weighed = amount if known else None
@@ -567,6 +575,7 @@ class DoseController:
     def _wanted_flow(self) -> float:
         """Wanted flow [kg/s]: it falls to the fine flow with the remaining amount."""
         e, order, s = self._estimator, self._order, self._settings
+        # flow = fine + max(left − 0.7 s · fine, 0) / horizon: it decays over 0.9 s, the lag and the display's repeats
         after = 0.1 * self.flow
         left = order.amount - float(np.median(e.mass)) - after
         horizon = 0.9 + 1.0 * float(np.median(e.lag)) + self._blind()
@@ -575,6 +584,7 @@ class DoseController:
 
     def _tilts_for(self, flow: float) -> Floats:
         e = self._estimator
+        # θ_i = tilt(V_i, head(q / c_i)) + b_i: the tilt at which particle i has the flow
         head = self._cup.head_for(flow / self._cup.density / e.flow_factor, self._tilt)
         return self._cup.tilt_for(e.volume, head) + e.onset_bias
 
@@ -585,6 +595,7 @@ class DoseController:
         final = e.final_mass(
             self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=self._return_acceleration()
         )
+        # Return if median ≥ target, or P(final > target + limit) > 1 %: median + 2.33 σ ≥ target + limit
         middle, deviation = float(np.median(final)) + self._aim(), math.hypot(float(final.std()), 0.1e-3)
         left, wait = order.amount - middle, 0.0
         if middle + 2.33 * deviation < order.amount + order.limit:
@@ -603,6 +614,7 @@ class DoseController:
 
     def _towards(self, tilt: float, speed: float, ahead: float) -> float:
         """Speed of a turn that ends at a tilt, with a deceleration of a third of the allowed one."""
+        # v = √(2 a/3 · |left|): a constant deceleration a/3 ends at the tilt
         left = tilt - ahead
         return math.copysign(min(speed, math.sqrt(2.0 * self._settings.acceleration / 3.0 * abs(left))), left)
 

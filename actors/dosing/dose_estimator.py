@@ -147,6 +147,7 @@ class DoseBelief:
             lag: lags and their shapes (N,) each, see `draw_lags`.
             rng: draws the particles.
         """
+        # Independent: b ~ N(ONSET), log c ~ N(log 1, FLOW_FACTOR[1]²), V ~ N(volume), V ≥ 0
         count = len(lag[0])
         draws = np.stack([_even_normal(count, rng) for _ in range(3)])
         return cls(
@@ -177,6 +178,7 @@ class DoseBelief:
             middle, deviation, shape, spread = knowledge.lag
             lag_mean = np.clip(np.exp(middle + deviation * _even_normal(count, rng)), *LAG_RANGE)
             shape_mean = np.clip(shape + spread * _even_normal(count, rng), *SHAPE_RANGE)
+        # (b, log c) = mean + L z, L Lᵀ = covariance, z standard normal
         root = np.linalg.cholesky(np.reshape(knowledge.covariance, (2, 2)) + 1e-12 * np.eye(2))
         draws = root @ np.stack([_even_normal(count, rng) for _ in range(2)])
         return cls(
@@ -215,6 +217,7 @@ class DoseBelief:
 
     def widened(self, rng: np.random.Generator) -> DoseBelief:
         """The belief for the next dose: onset and flow differ a little from pour to pour (wetting, temperature)."""
+        # Random walk from dose to dose: 0.2° of b, 5 % of c, 3 % of T, 0.02 of ρ_s (standard deviations)
         count = len(self.volume)
         return replace(
             self,
@@ -277,7 +280,7 @@ class DoseEstimator:
         self.zero = step * rng.permutation((np.arange(count) + 0.5) / count - 0.5)
         self.repeats = Repeats(belief.display.repeats)
         self.noise, self._jitter = belief.display.noise, belief.display.jitter
-        self._age = belief.display.interval / math.sqrt(12.0)
+        self._age = belief.display.interval / math.sqrt(12.0)  # deviation of a uniform age within one interval [s]
         self._last: float | None = None
         self._log_weight = np.zeros(count)
         self._squares = [0.0, 0.0]
@@ -326,6 +329,7 @@ class DoseEstimator:
         if self._steps % 64 == 0:
             self._noise = self._rng.standard_normal((64, 3, len(self.mass))) * math.sqrt(TIME_STEP)
         noise = self._noise[self._steps % 64]
+        # Euler step of V' = −q, m' = ρq with q = c q_cup(h, θ), h = head(V, θ − b), q ≤ V / dt
         head = cup.head(self.volume, tilt - self.onset_bias)
         if head.max() > 0.0:
             flow = self.flow_factor * cup.flow(head, tilt)
@@ -334,7 +338,8 @@ class DoseEstimator:
             self.volume -= flow * TIME_STEP
             gained = cup.density * flow * TIME_STEP
             self.mass += gained + 0.02 * cup.density * flow * noise[0]
-            # flow and onset wander, because wetting and film are not constant
+            # Flow and onset wander, because wetting and film are not constant: Brownian motion of log c (0.03/√s) and b
+            # (0.1°/√s), three times as fast while the lip gets wet.
             self._flowed = np.where(flows, self._flowed + TIME_STEP, self._flowed)
             wetting = np.where(self._flowed < WETTING, 3.0, 1.0) * flows
             self.flow_factor *= np.exp(0.03 * wetting * noise[1])
@@ -345,14 +350,18 @@ class DoseEstimator:
             self.flow = np.zeros_like(self.mass)
             self._ended += TIME_STEP
         self._middle_flow = cup.density * float(np.median(self.flow))
+        # Peak of the flow with exponential decay over the time that the display still shows it: 0.3 s and its lag
         memory = 0.3 + float(self.lag[0])
         self._recent_flow = max(self._middle_flow, self._recent_flow * (1.0 - TIME_STEP / memory))
         if self._ended.min() < 4.0 * LATE[1]:
+            # Late liquid: m' = e^(−t/τ) / τ · aim, τ = LATE[1], whose integral over t ≥ 0 is `aim`; LATE[0] of scatter
             late = np.where(self._ended > 0.0, np.exp(-self._ended / LATE[1]), 0.0) / LATE[1]
             self.mass += late * (self._belief.aim * TIME_STEP + LATE[0] * math.sqrt(LATE[1]) * noise[0])
         self._steps += 1
         slot = self._steps % len(self._mass_history)
         self._mass_history[slot], self._flow_history[slot] = self.mass, self.flow
+        # load = m(t − t_f) + ρ q(t − t_f) t_f [kg], linear between steps: impact of a stream that falls from rest,
+        # ρ q v with v = g t_f [N], over g
         back = self._fall / TIME_STEP
         steps, fraction = int(back), back - int(back)
         first, second = (slot - steps) % len(self._mass_history), (slot - steps - 1) % len(self._mass_history)
@@ -361,7 +370,7 @@ class DoseEstimator:
         load = landed + cup.density * self._fall * impact
         self._before = self._lags[3].copy()
         slow, fast = self.lag_shape * self.lag, (1.0 - self.lag_shape) * self.lag / 3.0
-        # TIME_STEP/(τ + TIME_STEP) delays by exactly τ
+        # First-order lags τ y' = u − y, implicit Euler: y += dt/(τ + dt) (u − y), whose mean delay is exactly τ
         gain_slow, gain_fast = TIME_STEP / (slow + TIME_STEP), TIME_STEP / (fast + TIME_STEP)
         lags = self._lags
         lags[0] += gain_slow * (load - lags[0])
@@ -386,6 +395,8 @@ class DoseEstimator:
 
     def _scatter(self) -> float:
         """The same before the display rounds [kg]."""
+        # σ² = noise · (σ_0² + (σ_t q)² + (END_NOISE (q_peak − q))²) [kg²]: an error of time counts as flow times time,
+        # σ_t² = slosh² + jitter² + age² [s²]
         falls = max(self._recent_flow - self._middle_flow, 0.0)
         # a display that repeats most readings converts at times of its own
         age = self._age * float(self.repeats.weights(0) @ REPEATS)
@@ -407,6 +418,8 @@ class DoseEstimator:
         off = self.predicted(reading.time) + self.zero - reading.mass
         # particles are a coarse sample of the prediction: each stands for its neighbourhood
         width = math.hypot(self._scatter(), 0.3 * float(off.std()), INDIFFERENT, 0.5 * self._half)
+        # L_i = P(display shows the same | particle i) = Φ((half − off_i) / w) − Φ((−half − off_i) / w); the likelihood
+        # of an equal reading, repeated or new, is p + (1 − p) L_i
         chance = _normal((self._half - off) / width) - _normal((-self._half - off) / width)
         repeated = self.repeats.next
         new = self.repeats.see(True, float(chance.mean()))
@@ -427,19 +440,24 @@ class DoseEstimator:
             seen = self.seen(reading) if seen is None else seen
             if seen.likelihood is not None:
                 return self._weigh(reading, seen)
+        # Ensemble Kalman update with perturbed observations (Burgers, van Leeuwen & Evensen 1998): for a
+        # state x_i with the prediction y_i,
+        #     x_i += cov(x, y) / (var(y) + σ²) · (reading_i − y_i),
+        # reading_i − y_i is measured from y_i + ε_i to the nearest value in reading ± half, ε ~ N(0, σ²)
         self._resample(0.999)
         predicted = self.predicted(reading.time) + self.zero
         scatter, half = (self._scatter(), self._half) if sigma is None else (sigma, 0.0)
         innovation = reading.mass - float(predicted.mean())
         centred = predicted - predicted.mean()
         variance = float(centred @ centred) / (len(predicted) - 1)
-        deviation = math.sqrt(scatter**2 + half**2 / 3.0)
+        deviation = math.sqrt(scatter**2 + half**2 / 3.0)  # half² / 3: variance of a uniform rounding error
         if sigma is None:
             self._note(innovation**2 / max(variance + deviation**2, 1e-16))
         scattered = predicted + scatter * _even_normal(len(predicted), self._rng)
         perturbed = np.clip(scattered, reading.mass - half, reading.mass + half) - scattered
         shift = perturbed / max(variance + scatter**2, 1e-16) / (len(predicted) - 1)
 
+        # cov(x, y) = Σ (x_i − x̄)(y_i − ȳ) / (N − 1)
         def gained(values: Floats) -> Floats:
             return float((values - values.mean()) @ centred) * shift
 
@@ -469,6 +487,7 @@ class DoseEstimator:
 
     def _resample(self, share: float) -> None:
         """Draw the particles according to their weights, if fewer than a share of them have an effect."""
+        # Effective number 1 / Σ w² (Kong, Liu & Wong 1994); systematic resampling at (k + u) / N (Kitagawa 1996)
         weight = np.exp(self._log_weight - self._log_weight.max())
         weight /= weight.sum()
         count = len(weight)
@@ -493,7 +512,7 @@ class DoseEstimator:
         for name in ("_lags", "_mass_history", "_flow_history"):
             setattr(self, name, getattr(self, name)[:, chosen])
         self._before = self._before[chosen]
-        # copies of one particle must not stay the same
+        # Copies of one particle must not stay the same: they are spread by a fifth of the ensemble's deviation.
         self.onset_bias = self.onset_bias + 0.2 * float(self.onset_bias.std()) * _even_normal(count, self._rng)
         spread = 0.2 * float(np.log(self.flow_factor).std())
         self.flow_factor = np.clip(self.flow_factor * np.exp(spread * _even_normal(count, self._rng)), *FACTOR_RANGE)
@@ -504,6 +523,7 @@ class DoseEstimator:
         """Note a squared innovation over its predicted variance; the noise of readings follows their mean."""
         self._squares[0] += square
         self._squares[1] += 1.0
+        # Robbins & Monro 1951: log noise += (ε² − 1) / (NOISE_READINGS + n), at rest where the mean of ε² is 1
         pull = (min(square, LARGEST_SQUARE) - 1.0) / (NOISE_READINGS + self._squares[1])
         self.noise = min(max(self.noise * math.exp(pull), NOISE_RANGE[0]), NOISE_RANGE[1])
 
@@ -523,6 +543,7 @@ class DoseEstimator:
             back: speed of the return, positive [rad/s].
             acceleration: of the return [rad/s²].
         """
+        # The same V' = −q, m' = ρq without noise, while the tilt's speed falls with the acceleration to −back
         volume, total = self.volume.copy(), self.mass.copy()
         dt, elapsed = 0.02, 0.0
         while elapsed < latency + 0.6:
@@ -566,6 +587,7 @@ def calibrated_knowledge(tilt_zeros: Sequence[float]) -> DoseKnowledge:
     """
     draws = np.asarray(tilt_zeros, dtype=float)
     tolerance = SimulationParameters.info()["tilt_zero"].tolerance
+    # Var b: the tolerance's part of ONSET is replaced by the posterior's, Var = σ² − tolerance² + Var(tilt_zero)
     variance = ONSET[1] ** 2 - tolerance**2 + float(draws.var())
     pair = (ONSET[0] - float(draws.mean()), math.log(FLOW_FACTOR[0]))
     return DoseKnowledge(pair, (variance, 0.0, 0.0, FLOW_FACTOR[1] ** 2), None, FIRST_AIM, 0)

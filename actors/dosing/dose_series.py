@@ -190,6 +190,7 @@ class DoseSeries:
             amounts.append(float(truth.mass[0]))
             durations.append(duration)
             ends[result.end] += 1
+        # Quantiles 5 and 95 % of the simulated amounts; the weighing adds its own error, ±1.645 σ, in `reachable`.
         tilt = float(np.median(self._cup.tilt_for(widened.volume, np.zeros_like(widened.volume))))
         fine = fine_flow(self._cup, max(tilt, 0.1), self._settings, order.limit, widened.display.interval)
         low, high = (float(np.quantile(amounts, q)) for q in (0.05, 0.95))

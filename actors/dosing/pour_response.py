@@ -71,6 +71,7 @@ def respond(
     heads = cup.head(np.repeat(volume[:, None], len(grid), axis=1), tilt[None, :] - hypotheses.onset[:, None])
     flows = np.flatnonzero((heads > 0.0).any(axis=0))
     mass = np.zeros((count, len(grid)))
+    # V' = −c q_cup(h, θ), h = head(V, θ − b), by Euler's method; m = ρ (V(0) − V)
     for k in range(int(flows[0]) if len(flows) else len(grid), len(grid)):
         head = cup.head(volume, tilt[k] - hypotheses.onset)
         if head.max() > 0.0:
@@ -110,6 +111,7 @@ def displayed(
     """
     first, last = min(float(times[0]), float(at[0])), max(float(times[-1]), float(at[-1]))
     grid = np.arange(first, last + TIME_STEP, TIME_STEP)
+    # load = m(t − t_f) + t_f m'(t − t_f), then four lags: y_k = y_{k−1} + dt/(τ + dt) (u_k − y_{k−1}), at rest at first
     before = grid - fall_time
     load = np.interp(before, times, mass)
     if fall_time > 0.0:
@@ -128,4 +130,5 @@ def fall_time(height: float, speed: float = 0.1) -> float:
         height: of the fall [m].
         speed: downwards at the lip [m/s].
     """
+    # height = v t + g t²/2
     return (math.sqrt(speed**2 + 2.0 * GRAVITY * max(height, 0.0)) - speed) / GRAVITY

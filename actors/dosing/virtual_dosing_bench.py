@@ -172,6 +172,7 @@ def _tables_of(cup: TrueCup) -> tuple[_Table, _Table]:
     if cup not in _tables:
         tilts = np.radians(np.arange(0.0, 126.0, 0.5))
         x = cup.radius * np.cos((np.arange(80) + 0.5) * math.pi / 80)
+        # Cells of the cylinder: chord · dx · dz at (x, z), x = R cos t with even t, so that the ends are fine
         chord = 2.0 * np.sqrt(cup.radius**2 - x**2) * np.sqrt(cup.radius**2 - x**2) * math.pi / 80
         z = (np.arange(240) + 0.5) * cup.height / 240
         xs, zs = np.meshgrid(x, z, indexing="ij")
@@ -186,6 +187,8 @@ def _tables_of(cup: TrueCup) -> tuple[_Table, _Table]:
         if cup.spout_length > 0.0:
             width = np.maximum(width, cup.spout_width * np.sqrt(np.minimum(s / cup.spout_length, 1.0)))
         ds = np.gradient(s)
+        # Height of a cell in the world: z cos θ − x sin θ. The surface of a volume V is the height below which cells of
+        # the volume V lie; the flow is ∫ w √(2g (h − s sin θ)) ds.
         for tilt in tilts:
             heights = (zs * math.cos(tilt) - xs * math.sin(tilt)).ravel()
             order = np.argsort(heights)
@@ -220,6 +223,7 @@ class _Filter:
             self._window.append(load)
             self.value = self._sum / len(self._window)
         elif self._kind == "fourth":
+            # Two second-order sections s'' = ω² (u − s) − 2 ζ ω s', ζ = cos 22.5° and cos 67.5° (Butterworth 1930)
             for k, damping in ((0, 0.92388), (2, 0.38268)):
                 s, w, source = self._states, self._omega, load if k == 0 else self._states[0]
                 s[k + 1] += TIME_STEP * (w * w * (source - s[k]) - 2.0 * damping * w * s[k + 1])
@@ -229,6 +233,7 @@ class _Filter:
             lag = self._lag
             if self._kind == "switching":
                 lag *= 1.4 if abs(load - self.value) < 0.6e-3 else 0.8
+            # exact first-order step: y += (u − y) (1 − e^(−dt/τ))
             self.value += (load - self.value) * -math.expm1(-TIME_STEP / lag)
         return self.value
 
@@ -291,6 +296,7 @@ class VirtualDosingBench:
 
     def head(self, tilt: float, slosh: float) -> float:
         """Level above the lip at a tilt [rad] with slosh [m], less what the lip holds back [m]."""
+        # Held back: (1 − wetness) dry + wetness wet [m]
         hold = self._dry_hold + (self._wet_hold - self._dry_hold) * self._wetness
         return self._level(tilt - self.grip, self.volume) + slosh - hold
 
@@ -300,6 +306,7 @@ class VirtualDosingBench:
 
     def wet(self, flows: bool) -> None:
         """The lip gets wet in a step in which liquid flows; otherwise it dries slowly."""
+        # w' = (1 − w) / 0.25 s while it flows, w' = −0.6 w / 40 s otherwise
         if flows:
             self._wetness += (1.0 - self._wetness) * TIME_STEP / 0.25
         else:
@@ -377,7 +384,7 @@ class VirtualDosingBench:
             target += speed * dt
             if target < 0.0:
                 target, speed = 0.0, 0.0
-            tilt += (target - tilt) * dt / self._servo_lag
+            tilt += (target - tilt) * dt / self._servo_lag  # first-order lag of the servo
             if tilt > 0.01:
                 upright = time
             missed = fault is not None and fault.kind == "miss" and time > pour.first_flow + fault.at
@@ -466,6 +473,7 @@ class LivePour:
         film_share, film_time = (0.07, 0.7) if liquid.is_thick else (0.03, 0.25)
         omega = math.sqrt(1.841 * GRAVITY / cup.radius)
         # ---- cup
+        # First slosh mode of a deep cup: η'' + 0.08 ω η' + ω² η = −forcing by the tilt's acceleration; ω² = 1.841 g/R
         self._slosh_speed -= dt * (
             omega**2 * self._slosh
             + 0.08 * omega * self._slosh_speed
@@ -473,6 +481,7 @@ class LivePour:
         )
         self._slosh += dt * self._slosh_speed
         head = bench.head(tilt, self._slosh)
+        # Ornstein-Uhlenbeck process of the deviation 0.04 and the correlation time 0.3 s
         self._fluctuation += -self._fluctuation * dt / 0.3 + 0.04 * math.sqrt(2.0 * dt / 0.3) * noise
         outflow = 0.0
         if head > 0.0 and bench.volume > 0.0:
@@ -481,10 +490,13 @@ class LivePour:
             if spouted:
                 wide = cup.spout_width * math.sqrt(min(head / cup.spout_length, 1.0))
             wide = max(wide, 1e-4)
+            # q_i = C_d(h) q_ideal, q_v = 0.8 w g h³ / 3ν (Nusselt 1916), joined: q = q_i q_v / (q_i^1.5 +
+            # q_v^1.5)^(2/3)
             outflow = (bench.discharge + 0.06 * math.tanh(head / 4e-3)) * ideal
             viscous = 0.8 * wide * GRAVITY * head**3 / (3.0 * nu)
             outflow = outflow * viscous / (outflow**1.5 + viscous**1.5) ** (1.0 / 1.5)
             outflow = min(outflow * (1.0 + self._fluctuation), bench.volume / dt)
+            # We = ρ U² e / σ of the film e; below 1.5 times the critical number a part clings to the outside
             thickness = max(0.6 * head, 1e-5)
             weber = density * (outflow / (wide * thickness)) ** 2 * thickness / tension
             clings = clinging * min(max((1.5 * critical - weber) / critical, 0.0), 1.0)
@@ -495,6 +507,8 @@ class LivePour:
             bench.wet(False)
         bench.volume -= outflow * dt
         mass = density * outflow * dt
+        # Half of what clings drips into the receiver with the time constant 0.8 s, half is spilled; the film drains
+        # with `film_time`.
         clinging_mass = clings * mass
         self._late += 0.5 * clinging_mass - self._late * dt / 0.8
         self.spilled += 0.5 * clinging_mass
@@ -512,6 +526,7 @@ class LivePour:
         # ---- stream
         height = bench.fall_height - self.received / (density * math.pi * 0.035**2)
         fall = (math.sqrt(0.01 + 2.0 * GRAVITY * height) - 0.1) / GRAVITY
+        # t_f = (√(v² + 2 g H) − v) / g with v = 0.1 m/s at the lip, and landing spread over three steps
         place = k + int(fall / dt) + (k % 3)
         self._landing[place % 120] += leaves
         lands = self._landing[k % 120]
@@ -519,6 +534,7 @@ class LivePour:
         if missed:
             self.spilled, lands = self.spilled + lands, 0.0
         self.received += lands
+        # m' v / g [kg], v = √(0.1² + 2 g H) [m/s] at the surface
         impact = lands / dt * math.sqrt(0.01 + 2.0 * GRAVITY * height) / GRAVITY * (1.0 + 0.1 * kick)
         self.flow = leaves / dt
         self._k += 1
