@@ -36,8 +36,9 @@ FINEST = 0.0008
 MOST_BODIES = 30
 """Number of separate bodies that are examined."""
 
-FILLED = 0.01
-"""Smallest relative increase of the cavity without a body that counts as a filler."""
+FILLED, IMMERSED = 0.01, 0.2
+"""A body fills the cavity if this share of the cavity, or of the body, is in it: a spoon is small, and most of a handle
+is outside, though its ends may reach through the wall."""
 
 BISECTIONS = 8
 """Halvings of the interval of a spacing that contains the brim."""
@@ -127,13 +128,13 @@ def fillers(vertices: Floats, faces: Integers, *, together: bool = False) -> Ite
         chosen = component == body
         rest = remaining & ~chosen
         corners, others = vertices[faces[chosen]], vertices[faces[rest]]
-        within = np.all(corners.min(axis=(0, 1)) >= others.min(axis=(0, 1))) and np.all(
-            corners.max(axis=(0, 1)) <= others.max(axis=(0, 1))
-        )
-        if not within or whole is None:
+        middle = corners.mean(axis=(0, 1))[:2]
+        over = np.all(middle >= others.min(axis=(0, 1))[:2]) and np.all(middle <= others.max(axis=(0, 1))[:2])
+        if not over or whole is None:
             continue
         without = _held(vertices, faces[rest])
-        if without is None or without <= (1.0 + FILLED) * whole:
+        solid = abs(float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))) / 6.0
+        if without is None or without - whole <= min(FILLED * whole, IMMERSED * solid):
             continue
         size = " × ".join(f"{1e3 * x:.0f}" for x in np.ptp(corners.reshape(-1, 3), axis=0))
         both = f"it holds {1e6 * whole:.0f} mL with it and {1e6 * without:.0f} mL without it"

@@ -49,6 +49,9 @@ Integers = NDArray[np.int64]
 SMALLEST, LARGEST = 0.030, 0.400
 """Smallest and largest plausible extent of vessels on a bench [m]."""
 
+LEAST, MOST = 20e-6, 20e-3
+"""Smallest and largest plausible capacity of vessels whose unit is not given [m³]."""
+
 CRUMB = 0.02
 """Share of the surface below which a loose part is dropped."""
 
@@ -160,6 +163,12 @@ def mended(
         _require_igl()
         joined = _remade(vertices, faces, log)
     vertices, faces = joined
+    if unit is None and (held := log.capacity(vertices, faces)) and not LEAST <= held <= MOST:
+        sizes = ", ".join(
+            f"--unit {u} ({1e3 * extent * UNITS[u]:.4g} mm, {1e6 * held * (UNITS[u] / UNITS[length_unit]) ** 3:.3g} mL)"
+            for u in UNITS
+        )
+        raise VesselError(f"{path.name}: its unit is not clear from its size and its capacity; say which: {sizes}")
     return RepairedMesh(_thick_enough(vertices, faces, log), faces, length_unit, tuple(log.notes), tuple(log.warnings))
 
 
@@ -370,7 +379,7 @@ def _without_fillers(vertices: Floats, faces: Integers, drop: bool, log: _Log) -
         else:
             log.warnings.append(
                 f"a separate body of {body.size} fills a part of the cavity and counts as solid: {body.capacities}. "
-                "If it is the liquid, leave it out with --drop-bodies"
+                "If it is the liquid or a spoon, leave it out with --drop-bodies"
             )
     return faces[remaining]
 

@@ -222,6 +222,31 @@ def test_stem_and_foot_of_a_glass_without_thickness_are_kept(tmp_path: Path) -> 
     assert capacity(repaired) == pytest.approx(1e-3 * frustums, rel=0.01)
 
 
+def test_a_spoon_in_the_cup_is_a_warning_with_both_capacities(tmp_path: Path) -> None:
+    spoon = trimesh.creation.box((12.0, 3.0, 110.0))  # it leans out of the cup
+    spoon.apply_transform(trimesh.transformations.rotation_matrix(0.2, [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]))
+    spoon.apply_translation([15.0, 0.0, 56.0])
+    trimesh.util.concatenate([cup(), spoon]).export(tmp_path / "cup.stl")
+    repaired = mended(tmp_path / "cup.stl", unit="mm", wall=None)
+    (warning,) = repaired.warnings
+    with_it, without_it = map(float, re.findall(r"([\d.]+) mL with", warning))
+    assert without_it == pytest.approx(CUP, rel=0.005)
+    assert 2.0 <= without_it - with_it < 3.96  # of 3.96 mL, most is below the rim
+    assert "a spoon, leave it out with --drop-bodies" in warning
+
+
+def test_a_unit_that_makes_a_thimble_of_the_mesh_is_refused_with_all_capacities(tmp_path: Path) -> None:
+    mesh = cup()
+    mesh.apply_scale(1.26 / 90.0)
+    mesh.export(tmp_path / "cup.obj")
+    sizes = r"say which: .*--unit m \(1260 mm, .*--unit cm \(12.6 mm, .*--unit in \(32 mm, "
+    with pytest.raises(VesselError, match=sizes) as refusal:
+        mended(tmp_path / "cup.obj", unit=None, wall=None)
+    inches = re.search(r"--unit in \(32 mm, ([\d.]+) mL\)", str(refusal.value))
+    assert inches is not None
+    assert float(inches[1]) == pytest.approx(CUP * (32.004 / 90.0) ** 3, rel=0.01)
+
+
 def test_triangles_that_stand_on_the_surface_do_not_change_the_cavity(tmp_path: Path) -> None:
     fins().export(tmp_path / "cup.obj")
     assert capacity(mended(tmp_path / "cup.obj", unit="mm", wall=None)) == pytest.approx(CUP, rel=0.01)
