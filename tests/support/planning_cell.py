@@ -85,7 +85,8 @@ def cell_of(model: str, **changes: Any) -> UrArmSettings:
     """A cell of the size of a model's reach, with a home in the same posture as in `SPEC`."""
     robot = MODELS[model]
     small = model in ("ur3", "ur3e")
-    x = 0.38 if small else round(0.7 * (abs(robot.a2) + abs(robot.a3)), 3)
+    share = 0.75 if model == "ur18" else 0.7  # of the reach: nearer, the wide wrist of a UR18 meets its upper arm
+    x = 0.38 if small else round(share * (abs(robot.a2) + abs(robot.a3)), 3)
     spec = SPEC.with_values(
         model=model,
         limits=LIMITS.with_values(box=Box(low=Point.of(0.05, -0.9, -0.3), high=Point.of(1.6, 0.9, 1.2))),
