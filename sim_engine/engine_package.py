@@ -12,6 +12,7 @@ This module has no slow imports.
 from __future__ import annotations
 
 import ctypes
+import functools
 import importlib.metadata
 import importlib.util
 import logging
@@ -41,8 +42,8 @@ _log = logging.getLogger(__name__)
 def engine_name() -> str:
     """The package that compiles the solver.
 
-    If an earlier one of `ENGINES` is installed and cannot be loaded, this is logged once, with the remedy. Child
-    processes then use the same package: the choice is written to `DECANT_ENGINE`.
+    If an earlier one of `ENGINES` is installed and cannot be loaded, each process logs this once, with the remedy. Its
+    child processes find the same libraries, and so use the same package.
 
     Raises:
         EngineError: `DECANT_ENGINE` names an unknown package, or none can be used; the text gives the remedy.
@@ -60,9 +61,13 @@ def engine_name() -> str:
         raise EngineError(f"no engine can be used: {'; '.join(str(problem) for problem in problems.values())}")
     for name in ENGINES[: ENGINES.index(usable)]:
         if _is_installed(name):
-            _log.warning("%s. %s is used; outcomes agree within the spread of seeds", problems[name], usable.title())
-            os.environ[VARIABLE] = usable
+            _report(f"{problems[name]}. {usable.title()} is used; outcomes agree within the spread of seeds")
     return usable
+
+
+@functools.cache
+def _report(text: str) -> None:
+    _log.warning("%s", text)
 
 
 def engine_version() -> str:
