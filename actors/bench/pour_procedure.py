@@ -191,13 +191,14 @@ class BalanceReadings:
         while True:
             with contextlib.suppress(LaboratoryError):
                 weight = await self._balance.read()
-                if weight.status in ("stable", "unstable") and math.isfinite(weight.mass) and weight.time > last:
-                    last, now = weight.time, time.monotonic()
-                    # the driver's clock is this one, unless it runs on another machine
-                    moment = weight.time if 0.0 <= now - weight.time < 1.0 else now
-                    self.step = weight.step or self.step
-                    self._kept.append(DoseReading(self._scale * moment, weight.mass, weight.stable))
+                if math.isfinite(weight.mass):
                     self._report.show(weight.mass, weight.stable)
+                    if weight.status in ("stable", "unstable") and weight.time > last:
+                        last, now = weight.time, time.monotonic()
+                        # the driver's clock is this one, unless it runs on another machine
+                        moment = weight.time if 0.0 <= now - weight.time < 1.0 else now
+                        self.step = weight.step or self.step
+                        self._kept.append(DoseReading(self._scale * moment, weight.mass, weight.stable))
             await asyncio.sleep(self._interval)
 
 
