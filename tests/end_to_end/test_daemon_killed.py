@@ -165,7 +165,7 @@ def test_killed_during_a_pour_it_asks_what_came_of_it_writes_the_answer_down_and
     assert isinstance(poured, Poured)
     assert (poured.measurement.spilled, poured.measurement.retained) == pytest.approx((3.2e-3, 0.4e-3))
     answers = [e.body["answer"] for e in entries if e.kind == Kind.OPERATOR_ANSWERED]
-    assert answers == ["weighed 3.2 0.4"]
+    assert answers == ["weighed 3,2 g; 0.4 g"]
 
 
 def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_sees_the_campaign_end(
@@ -198,7 +198,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         card.get_by_label("Left in the pourer").fill("0.4")
         card.get_by_role("button", name="It was weighed").click()
         card.wait_for(state="detached")
-        page.locator("#ended").get_by_text("finished").wait_for()
+        page.locator("#ended li").get_by_text("finished").wait_for()
         assert laboratory.told("queue", "list", key)["state"] == "finished"
         assert laboratory.end() == 0
 
