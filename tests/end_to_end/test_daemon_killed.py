@@ -165,7 +165,7 @@ def test_killed_during_a_pour_it_asks_what_came_of_it_writes_the_answer_down_and
     assert isinstance(poured, Poured)
     assert (poured.measurement.spilled, poured.measurement.retained) == pytest.approx((3.2e-3, 0.4e-3))
     answers = [e.body["answer"] for e in entries if e.kind == Kind.OPERATOR_ANSWERED]
-    assert answers == ["weighed 3,2 g; 0.4 g"]
+    assert answers == ["weighed 3.2 0.4"]
 
 
 def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_sees_the_campaign_end(
