@@ -141,7 +141,8 @@ def main() -> None:
     asked = parser.parse_args()
     sources: dict[str, dict[str, list[float]]] = {}
     for row in measure(asked.seeds):
-        errors = [round(1e3 * row.profile, 2), round(100 * row.capacity, 1), round(max(row.spillage, key=abs), 3)]
+        largest: float = max(row.spillage, key=abs)
+        errors = [round(1e3 * row.profile, 2), round(100 * row.capacity, 1), round(largest, 3)]
         sources.setdefault(row.source, {})[row.vessel] = errors
     text = json.dumps(sources, indent=1)
     DATA.write_text(re.sub(r"\[\s+([^\]]+?)\s+\]", lambda m: f"[{' '.join(m[1].split())}]", text) + "\n")
