@@ -206,7 +206,7 @@ def test_killed_during_a_pour_the_page_that_stands_open_asks_is_answered_and_see
         assert started_after_they_were_finished(entries) == []
         assert [e.body["attempt"] for e in entries if e.kind == Kind.POUR_STARTED and e.body["id"] == unknown] == [1]
         (said,) = [e.body["answer"] for e in entries if e.kind == Kind.OPERATOR_ANSWERED]
-        assert said == "weighed 3.2 0.4"
+        assert said == "weighed 3,2 g; 0.4 g"
 
 
 def test_told_to_end_it_finishes_the_pour_and_goes_on_by_itself_when_it_is_started_again(
