@@ -287,7 +287,8 @@ class SpillWatch:
                         self._tell(Notice("warning", f"spill sensor: {error}"))
                     failed = True
                 with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(over.wait(), LOOK)
+                    async with asyncio.timeout(LOOK):
+                        await over.wait()
 
         task = asyncio.create_task(follow())
         try:

@@ -123,9 +123,9 @@ class PinnedNode:
         Ray itself needs fifteen seconds to detect this; a dead node's raylet refuses connections at once. If a
         connection times out, a packet may have been lost: then Ray decides."""
         try:
-            _, writer = await asyncio.wait_for(
-                asyncio.open_connection(self.node.address, self.node.port), timeout=_PATIENCE
-            )
+            # not `wait_for`, which in Python 3.11 loses a cancellation that comes together with the refusal
+            async with asyncio.timeout(_PATIENCE):
+                _, writer = await asyncio.open_connection(self.node.address, self.node.port)
             writer.close()
             await writer.wait_closed()
             return False

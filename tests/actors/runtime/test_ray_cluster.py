@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import socket
@@ -14,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from actors.runtime.ray_cluster import Node, PinnedNode
 from tests.support.local_cluster import LocalCluster
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 from tests.support.waiting import PATIENCE
@@ -165,3 +167,26 @@ def under_way(log: Path, pid: int) -> bool:
 def busy_on_both(log: Path) -> bool:
     """Whether two simulators have worked."""
     return len({line.split()[1] for line in log.read_text().splitlines() if line.startswith("end")}) == 2
+
+
+@pytest.mark.parametrize("turns", range(12))
+def test_a_task_that_asks_for_a_dead_node_again_and_again_can_be_cancelled_at_any_moment(turns):
+    async def ask_again(node: PinnedNode) -> None:
+        while True:
+            assert await node.is_gone()
+
+    async def cancelled(node: PinnedNode) -> bool:
+        task = asyncio.create_task(ask_again(node))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        task.cancel()
+        done, _ = await asyncio.wait({task}, timeout=0.5)
+        while not task.done():
+            task.cancel()
+            await asyncio.sleep(0.001)
+        return bool(done)
+
+    with socket.socket() as free:  # bound and not listening: it refuses connections
+        free.bind(("127.0.0.1", 0))
+        node = PinnedNode(Node("id", "here", "127.0.0.1", free.getsockname()[1], {}), {})
+        assert asyncio.run(cancelled(node))
