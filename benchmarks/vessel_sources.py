@@ -24,7 +24,7 @@ from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.vessel.shapes import VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel
-from tests.support.measured_vessel import FOCAL, MeasuredVessel, vessel
+from tests.support.measured_vessel import MeasuredVessel, vessel
 
 PAGE, DATA = Path("docs/evidence/results.md"), Path("docs/data/vessel-sources.json")
 PARTICLES = 600
@@ -65,7 +65,6 @@ def vessel_sources(of: MeasuredVessel, folder: Path) -> dict[str, dict[str, Any]
         "photograph": {"photo": photo, "known_height": outside, "wall": wall, "floor": floor},
         "points": {"points": of.save_cloud(folder / "cloud.csv"), "unit": "mm", "wall": wall, "floor": floor},
         "points of one side, a hole": {"points": half, "unit": "mm", "wall": wall, "floor": floor},
-        "depth image": {"depth": of.depth(folder / "depth.png"), "focal": FOCAL, "wall": wall, "floor": floor},
         "fill table": {"height": tall, "fill": fill, "wall": wall, "floor": floor},
         "tilt table": {"height": tall, "tilt": tilt, "wall": wall, "floor": floor},
         "all tables and callipers": {

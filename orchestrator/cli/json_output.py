@@ -193,7 +193,7 @@ OUTPUTS: dict[str, Any] = {
     "pour": PourOutput | EmptyPourOutput | DryRunOutput,
     "report": ReportOutput,
     "plugins": PluginsOutput,
-    **{f"vessel {source}": VesselOutput for source in ("profile", "photo", "points", "depth", "mesh")},
+    **{f"vessel {source}": VesselOutput for source in ("profile", "photo", "points", "mesh")},
     "validate-solver": ValidateSolverOutput,
     "runs list": RunsOutput,
     "runs pours": PoursOutput,

@@ -1,7 +1,7 @@
 """The commands `decant vessel ...`: each makes a vessel file from one kind of source.
 
-`profile`, `photo`, `points` and `depth` fit a turned vessel to their source and to the sizes and tables that are given
-(`Sizes`); `mesh` repairs a mesh and uses it alone. Tables and images are read in `vessel_tables`; the fits are in
+`profile`, `photo` and `points` fit a turned vessel to their source and to the sizes and tables that are given
+(`Sizes`); `mesh` repairs a mesh and uses it alone. Tables and photographs are read in `vessel_tables`; the fits are in
 `sim_engine.vessel_acquisition`.
 """
 
@@ -31,7 +31,7 @@ CALLIPERS = 2e-4
 """Standard deviation of a radius measured with callipers [m]."""
 
 HEIGHT = 3e-4
-"""Standard deviation of the rim's height [m]; for a depth image, at least one pixel."""
+"""Standard deviation of the rim's height [m]."""
 
 RULER, BALANCE, ANGLE = 5e-4, 5e-4, 0.005
 """Standard deviations of a level [m], of a mass [kg] and of a tilt [rad] in tables."""
@@ -176,7 +176,7 @@ def photo(
 
 @grouped
 def points(
-    cloud: Annotated[Path, typer.Argument(help="Points: PLY, PCD, XYZ, or CSV with x, y, z.", metavar="POINTS")],
+    cloud: Annotated[Path, typer.Argument(help="Points: PLY, XYZ, or CSV with x, y, z.", metavar="POINTS")],
     out: Out,
     unit: Unit = None,
     up: Up = "z",
@@ -195,40 +195,6 @@ def points(
         from sim_engine.vessel_acquisition.point_cloud import scan_of
 
         return _scanned(out, sizes, vessel, notes, scan_of(read_points(cloud, _unit(unit), _axis(up), notes)))
-
-    _make(out, vessel, work)
-
-
-@grouped
-def depth(
-    image: Annotated[Path, typer.Argument(help="Depth image: PNG of 16 bits, or NPY.", metavar="IMAGE")],
-    out: Out,
-    focal: Annotated[float | None, typer.Option(help="Focal length of the depth camera [pixels].", min=1.0)] = None,
-    centre: Annotated[
-        str | None, typer.Option(help="Column and row of the axis: '318.2, 241.5'; default: the image's centre.")
-    ] = None,
-    unit: Annotated[str | None, typer.Option(help="Unit of the distances: m, cm, mm, in; default: mm.")] = None,
-    *,
-    sizes: Sizes,
-    vessel: Vessel,
-) -> None:
-    """Make the file of a turned vessel from a depth image of it alone on a flat table, 5° to 25° above the horizontal.
-
-    Give `--focal` and `--wall`, and `--height` if you can. Sizes and tables of the same vessel are combined with it.
-    """
-
-    def work(notes: list[str]) -> Made:
-        from orchestrator.extra_commands.vessel_tables import read_depth
-        from sim_engine.vessel_acquisition.point_cloud import points_on_table, scan_of
-
-        if focal is None:
-            raise RefusalError(
-                "a depth image needs its camera's focal length in pixels: --focal 615; the camera's software tells it "
-                "(fx)"
-            )
-        points = points_on_table(read_depth(image, _unit(unit)), focal, _centre(centre))
-        pixel = float(points[:, 1].min()) / focal
-        return _scanned(out, sizes, vessel, notes, scan_of(points, "outer", underside=0.0), pixel)
 
     _make(out, vessel, work)
 
@@ -329,14 +295,12 @@ def _turned(
     seen: Callable[[float, float], tuple[Radii, float]] | None = None,
     *,
     wall: float | None = None,
-    pixel: float = 0.0,
 ) -> Made:
     """Make a surface of revolution from all measurements.
 
     Args:
         seen: for a wall and a floor, the radii of a source and the height inside [m].
         wall: as the source shows it, unless it is given [m].
-        pixel: resolution of the source's height [m].
     """
     import numpy as np
 
@@ -351,12 +315,11 @@ def _turned(
         raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'")
     floor = wall if floor is None else floor
     evidence: list[Evidence] = []
-    off = HEIGHT
     if seen is not None:
         radii, inside = seen(wall, floor)
         evidence.append(radii)
         if height is None:
-            height, off = inside, max(off, pixel)
+            height = inside
     if height is None:
         raise RefusalError(
             "how deep is it inside, from floor to rim? Say it with --height, for example --height '95 mm'"
@@ -364,7 +327,7 @@ def _turned(
     evidence += _measured(sizes, vessel, height)
 
     def fitted(measurements: Sequence[Evidence]) -> FittedOutline:
-        return find_outline(height, measurements, wall, floor, height_deviation=off)
+        return find_outline(height, measurements, wall, floor, height_deviation=HEIGHT)
 
     outline = fitted(evidence)
     if sizes.tare is None:
@@ -481,13 +444,13 @@ def _doubts(outline: FittedOutline, vessel: Vessel) -> list[str]:
     return doubts
 
 
-def _scanned(out: Path, sizes: Sizes, vessel: Vessel, notes: list[str], scan: Scan, pixel: float = 0.0) -> Made:
-    """Make a vessel from a scan; from that of a depth image if a size of its pixels is given [m]."""
+def _scanned(out: Path, sizes: Sizes, vessel: Vessel, notes: list[str], scan: Scan) -> Made:
+    """Make a vessel from a scan."""
     from sim_engine.vessel_acquisition.point_cloud import mesh_of, radii_of, wall_between
 
     wall, floor, _ = sizes.lengths()
     between = wall_between(scan)
-    surfaces = {"both": "both surfaces", "inner": "the inner surface", "outer": "the outer surface"}[scan.seen]
+    surfaces = "both surfaces" if scan.both else "the outer surface"
     notes.append(
         f"{len(scan.points):,} points of {surfaces}, {1e3 * scan.scatter:.2f} mm about it, "
         f"{1e3 * scan.out_of_round:.2f} mm out of round"
@@ -501,22 +464,9 @@ def _scanned(out: Path, sizes: Sizes, vessel: Vessel, notes: list[str], scan: Sc
         )
 
     def seen(wall: float, floor: float) -> tuple[Radii, float]:
-        radii = radii_of(scan, wall, floor)
-        named = replace(radii, name="depth image") if pixel else radii
-        return named, scan.height - (0.0 if scan.seen == "inner" else floor)
+        return radii_of(scan, wall, floor), scan.height - floor
 
-    return _turned(out, sizes, vessel, notes, seen, wall=between, pixel=pixel)
-
-
-def _centre(text: str | None) -> tuple[float, float] | None:
-    """Parse column and row of '318.2, 241.5'."""
-    if text is None:
-        return None
-    try:
-        column, row = map(float, text.split(","))
-    except ValueError:
-        raise RefusalError(f"--centre {text!r}: should be a column and a row, such as '318.2, 241.5'") from None
-    return column, row
+    return _turned(out, sizes, vessel, notes, seen, wall=between)
 
 
 def _unit(text: str | None) -> LengthUnit | None:
@@ -673,7 +623,6 @@ def register(app: typer.Typer) -> None:
         "decant vessel photo side.png cup.yaml --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
     )
     add(points, "decant vessel points cloud.ply cup.yaml --unit mm --wall '3 mm'")
-    add(depth, "decant vessel depth depth.png cup.yaml --focal 615 --wall '3 mm' --height '95 mm'")
     add(
         mesh,
         "decant vessel mesh scan.stl mug.yaml --unit mm --wall '3 mm'",

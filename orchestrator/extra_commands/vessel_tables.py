@@ -1,4 +1,4 @@
-"""Input of `decant vessel`: pairs of lengths, tables of two columns, points, photographs and depth images.
+"""Input of `decant vessel`: pairs of lengths, tables of two columns, points and photographs.
 
 Every reader reports invalid input as a `RefusalError` with file and line.
 """
@@ -190,7 +190,7 @@ def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str])
     """Read points of a surface, z up, shape (n, 3) [m].
 
     Args:
-        path: PLY, PCD, NPY, or text with x, y, z in each row.
+        path: PLY, NPY, or text with x, y, z in each row.
         unit: of its numbers; None: determined by their extent.
         up: axis that points out of the opening.
         notes: a note of points that are left out is appended.
@@ -230,9 +230,7 @@ def _loaded(path: Path) -> Any:
         # without materials: textures are often missing, and the reader would print the traceback of its search
         return np.asarray(trimesh.load(path, process=False, skip_materials=True).vertices, dtype=float)
     if path.suffix.lower() == ".pcd":
-        from sim_engine.vessel_acquisition.pcd_file import read_pcd
-
-        return read_pcd(path)
+        raise RefusalError(f"{path}: PCD files are not read; save the points as PLY, XYZ or CSV")
     if path.suffix.lower() == ".npy":
         return np.load(path, allow_pickle=False).astype(float)
     text = path.read_text(encoding="utf-8-sig", errors="replace")
@@ -259,32 +257,6 @@ def read_photograph(path: Path) -> Floats:
             return np.asarray(upright.convert("L"), dtype=float)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # truncated, damaged
         raise RefusalError(f"{path}: is not a picture that can be read ({error})") from None
-
-
-def read_depth(path: Path, unit: LengthUnit | None) -> Floats:
-    """Read a depth image, rows from the top, shape (rows, columns) [m]; 0 for missing values.
-
-    Raises:
-        RefusalError: it is not a depth image, or its unit is not clear (exit code 2).
-    """
-    from PIL import Image, UnidentifiedImageError
-
-    _check_size(path)
-    try:
-        if path.suffix.lower() == ".npy":
-            depth = np.load(path, allow_pickle=False)
-        else:
-            with Image.open(path) as picture:
-                depth = np.asarray(picture)
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        raise RefusalError(f"{path}: is not a depth image that can be read ({error})") from None
-    if depth.ndim != 2 or depth.dtype.kind not in "uif" or depth.dtype.itemsize < 2:
-        raise RefusalError(
-            f"{path}: should be a grey image of 16 bits, or an array of rows and columns, with distances in it; a "
-            "picture in colours or of 8 bits shows them, and has none"
-        )
-    result: Floats = np.nan_to_num(depth.astype(float), posinf=0.0, neginf=0.0) * UNITS[unit or "mm"]
-    return result
 
 
 def _check_size(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A vessel from points on its surface, as scanners and depth cameras measure them.
+"""A vessel from points on its surface, as scanners measure them.
 
 **Scans** (`scan_of`). The axis is the line about which the points of every height are closest to circles. If points of
 both the inner and the outer surface were measured, their distance from the axis distinguishes them. Limitations: along
@@ -6,20 +6,12 @@ a ray from the axis each surface is met at most once (no handle, no bulge that h
 stands roughly upright. Remove points of the table beforehand.
 
 **Meshes** (`mesh_of`). A vessel that is not round becomes a mesh: the radius by direction and height, and the wall.
-
-**Depth images** (`points_on_table`). A depth camera measures the vessel's outside from one position. The table is the
-plane that contains most pixels; it defines the vertical. The vessel is the connected region that stands on it and does
-not touch the picture's border. Only its near half is kept: beyond its axis the camera measures the inside of the far
-wall. Limitations: a pinhole camera without distortion; the vessel stands alone on a flat table, except for objects that
-touch the picture's border. Clear glass and shining metal give no depth.
-
-Source: Fischler & Bolles, Random sample consensus, Comm. ACM 24 (1981), for the plane.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,14 +47,14 @@ class Layer:
 
     Attributes:
         z: mean height [m].
-        inner, outer: radius of each surface; None if it was not measured [m].
+        inner, outer: radius of each surface; None for an inner one that was not measured [m].
         scatter: standard deviation of the points about it [m].
         count: of points.
     """
 
     z: float
     inner: float | None
-    outer: float | None
+    outer: float
     scatter: float
     count: int
 
@@ -77,7 +69,7 @@ class Scan:
         layers: from below.
         scatter: of the points about the surface of revolution, median over the layers [m].
         out_of_round: standard deviation of the radius around the vessel [m].
-        seen: which surfaces were measured.
+        both: whether the inner surface was measured, too, and not only the outer one.
     """
 
     points: Floats
@@ -85,7 +77,7 @@ class Scan:
     layers: tuple[Layer, ...]
     scatter: float
     out_of_round: float
-    seen: Literal["inner", "outer", "both"]
+    both: bool
 
     @property
     def round(self) -> bool:
@@ -93,15 +85,11 @@ class Scan:
         return self.out_of_round <= max(ROUND, 0.5 * self.scatter)
 
 
-def scan_of(
-    points: Floats, surface: Literal["auto", "inner", "outer"] = "auto", *, underside: float | None = None
-) -> Scan:
+def scan_of(points: Floats) -> Scan:
     """Find the axis and the surfaces of a cloud of points.
 
     Args:
         points: z up, shape (n, 3) [m].
-        surface: the measured surface; 'auto': both if there are two, else the outer one.
-        underside: its height, if it is known more accurately than from the lowest points [m].
 
     Raises:
         VesselError: too few points, or no axis.
@@ -135,19 +123,17 @@ def scan_of(
     moved = _moved(centred, polished.x, size)
     low, high = _ends(moved, min(float(polished.fun) * size, ROUND))
     moved = moved[(moved[:, 2] >= low - 0.1 * (high - low)) & (moved[:, 2] <= high + 0.1 * (high - low))]
-    if underside is not None:
-        low = underside - float(points[:, 2].min())
     moved[:, 2] -= low
-    layers, seen = _layers(moved, surface)
+    layers, both = _layers(moved)
     if len(layers) < LAYERS // 4:
         raise VesselError("the points don't lie around an axis; is the vessel upright in them, and alone?")
-    if len(layers) < 0.75 * LAYERS and seen == "both":
+    if len(layers) < 0.75 * LAYERS and both:
         raise VesselError(
             f"inner and outer surface can be told apart at only {len(layers)} of {LAYERS} heights: cut a handle away, "
             "or give the points of one surface"
         )
     scatter = float(np.median([layer.scatter for layer in layers]))
-    return Scan(moved, high - low, tuple(layers), scatter, _out_of_round(moved, layers), seen)
+    return Scan(moved, high - low, tuple(layers), scatter, _out_of_round(moved, layers), both)
 
 
 def _moved(points: Floats, values: Floats, size: float) -> Floats:
@@ -228,37 +214,36 @@ def surfaces(radii: Floats) -> list[Floats]:
     return [surface for surface in parts if len(surface) >= max(len(ordered) // 8, 3)][:2] or [ordered]
 
 
-def _layers(points: Floats, surface: str) -> tuple[list[Layer], Literal["inner", "outer", "both"]]:
+def _layers(points: Floats) -> tuple[list[Layer], bool]:
     layers: list[Layer] = []
     slices = [
         (points_of_slice, surfaces(np.hypot(points_of_slice[:, 0], points_of_slice[:, 1])))
         for points_of_slice in _slices(points)
         if len(points_of_slice) >= 6
     ]
-    twice = sum(len(parts) == 2 for _, parts in slices) > len(slices) // 2 and surface == "auto"
+    twice = sum(len(parts) == 2 for _, parts in slices) > len(slices) // 2
     for points_of_slice, parts in slices:
         if twice and len(parts) < 2:
             continue
         radii = [float(np.median(each)) for each in parts]
         if not twice:
-            radii = radii[-1:] if surface == "outer" else radii[:1]
+            radii = radii[:1]
         scatter = float(np.median([1.4826 * np.median(np.abs(each - np.median(each))) for each in parts]))
-        inner = radii[0] if twice or surface == "inner" else None
-        outer = radii[-1] if surface != "inner" else None
-        layers.append(Layer(float(points_of_slice[:, 2].mean()), inner, outer, scatter, len(points_of_slice)))
-    return layers, "both" if twice else "inner" if surface == "inner" else "outer"
+        inner = radii[0] if twice else None
+        layers.append(Layer(float(points_of_slice[:, 2].mean()), inner, radii[-1], scatter, len(points_of_slice)))
+    return layers, twice
 
 
 def _out_of_round(points: Floats, layers: list[Layer]) -> float:
     """Standard deviation of the radius around the vessel, without the part due to the points' own scatter [m]."""
     z = np.array([layer.z for layer in layers])
-    r = np.array([float((la.inner if la.outer is None else la.outer) or 0.0) for la in layers])
+    r = np.array([layer.outer for layer in layers])
     inside = (points[:, 2] >= z[0]) & (points[:, 2] <= z[-1])
     radius = np.hypot(points[inside, 0], points[inside, 1])
     offset = radius - np.interp(points[inside, 2], z, r)
     near = np.abs(offset) < max(6.0 * float(np.median([layer.scatter for layer in layers])), 0.1 * r.mean())
-    if all(layer.inner is not None and layer.outer is not None for layer in layers):
-        walls = np.interp(points[inside, 2], z, [(la.outer or 0.0) - (la.inner or 0.0) for la in layers])
+    if all(layer.inner is not None for layer in layers):
+        walls = np.interp(points[inside, 2], z, [layer.outer - (layer.inner or 0.0) for layer in layers])
         near = np.abs(offset) < walls / 2.0
     angle = np.arctan2(points[inside, 1], points[inside, 0])[near]
     place = np.floor((angle + np.pi) / (2.0 * np.pi) * 24.0).astype(int) % 24
@@ -278,7 +263,7 @@ def radii_of(scan: Scan, wall: float, floor: float) -> Radii:
         wall, floor: thickness [m]. If the inner surface was measured, the wall is not needed.
     """
     z = np.array([layer.z for layer in scan.layers])
-    if scan.seen == "outer":
+    if not scan.both:
         outer = np.array([layer.outer for layer in scan.layers], dtype=float)
         slope = np.gradient(outer, z)
         inner = outer - wall * np.sqrt(1.0 + np.clip(slope, -3.0, 3.0) ** 2)
@@ -287,14 +272,13 @@ def radii_of(scan: Scan, wall: float, floor: float) -> Radii:
     counts: Floats = np.array([layer.count for layer in scan.layers], dtype=float)
     scatter = np.array([layer.scatter for layer in scan.layers])
     deviations = np.hypot(scatter / np.sqrt(counts), max(LEAST_DEVIATION, 0.3 * scan.out_of_round))
-    below = 0.0 if scan.seen == "inner" else floor  # an inner surface begins at the inner floor
-    usable = (z >= below) & (inner > 0.0)
-    return Radii("points", z[usable] - below, inner[usable], deviations[usable])
+    usable = (z >= floor) & (inner > 0.0)
+    return Radii("points", z[usable] - floor, inner[usable], deviations[usable])
 
 
 def wall_between(scan: Scan) -> float | None:
     """Thickness of the wall if both surfaces were measured: median over the layers [m]."""
-    both = [la.outer - la.inner for la in scan.layers if la.inner is not None and la.outer is not None]
+    both = [layer.outer - layer.inner for layer in scan.layers if layer.inner is not None]
     return float(np.median(both)) if both else None
 
 
@@ -358,9 +342,9 @@ def mesh_of(scan: Scan, wall: float | None, floor: float | None) -> tuple[Floats
     grid = np.array(
         [np.median(radii_of_slice[0]) if len(radii_of_slice) == 1 + both else np.nan for radii_of_slice in parts]
     )
-    inner = _whole(grid.reshape(rows, directions)) - (0.0 if both or scan.seen == "inner" else wall)
+    inner = _whole(grid.reshape(rows, directions)) - (0.0 if both else wall)
     below = wall if floor is None else floor
-    levels = np.linspace(0.0, scan.height - (0.0 if scan.seen == "inner" else below), rows)
+    levels = np.linspace(0.0, scan.height - below, rows)
     return _between(inner, inner + wall, levels, below)
 
 
@@ -403,91 +387,3 @@ def _between(inner: Floats, outer: Floats, levels: Floats, floor: float) -> tupl
     last = (len(rings) - 1) * columns
     faces.append(np.column_stack([np.full(columns, bottom), last + there, last + here]))
     return vertices, np.vstack(faces).astype(np.int64)
-
-
-DRAWS = 400
-"""Number of planes that are tried."""
-
-ON_TABLE = 0.004
-"""Distance from the plane within which a pixel belongs to it [m]: three deviations of a common camera."""
-
-STEEP = 0.9
-"""Smallest cosine between the table's normal and the picture's upward direction: the camera looks down by 25° at most,
-since from higher up it sees too much of the inside."""
-
-JUMP = 0.012
-"""Difference of depth between neighbouring pixels that counts as an edge [m]."""
-
-LEAST_PIXELS = 400
-
-
-def points_on_table(depth: Floats, focal: float, centre: tuple[float, float] | None = None) -> Floats:
-    """The near half of the vessel's outer surface.
-
-    Args:
-        depth: along the camera's axis, rows from the top, shape (rows, columns) [m]; 0 for pixels without depth.
-        focal: focal length [pixels].
-        centre: column and row of the camera's axis; None: the picture's middle.
-
-    Returns:
-        Points with z up from the table, shape (n, 3) [m].
-
-    Raises:
-        VesselError: no table, or nothing that stands on it.
-    """
-    from scipy.ndimage import label, maximum_filter, minimum_filter
-
-    rows, columns = depth.shape
-    column, row = ((columns - 1) / 2.0, (rows - 1) / 2.0) if centre is None else centre
-    seen = np.isfinite(depth) & (depth > 0.0)
-    v, u = np.mgrid[:rows, :columns]
-    points = np.stack([(u - column) / focal * depth, depth, (row - v) / focal * depth], axis=-1)
-    up, level = _table(points[seen])
-    above = np.where(seen, points @ up - level, 0.0)
-    # Behind an edge there are pixels that belong to neither side; at a silhouette the last ones are too far back.
-    # Pixels below the rim are kept, because they determine its height.
-    jump = depth - minimum_filter(np.where(seen, depth, np.inf), 3)
-    jump = np.maximum(jump, maximum_filter(depth, (1, 3)) - depth)
-    body, count = label(seen & (above > ON_TABLE) & (jump < JUMP), structure=np.ones((3, 3)))
-    edge = np.unique(np.concatenate([body[0], body[-1], body[:, 0], body[:, -1]]))
-    sizes = np.bincount(body.ravel(), minlength=count + 1)
-    sizes[edge] = sizes[0] = 0
-    if sizes.max() < LEAST_PIXELS:
-        raise VesselError(
-            f"nothing of at least {LEAST_PIXELS} pixels stands on the table without touching the picture's border; is "
-            "the whole vessel in it, and is its focal length right?"
-        )
-    across = np.cross([0.0, 1.0, 0.0], up)
-    across /= np.linalg.norm(across)
-    aligned: Floats = points[body == int(np.argmax(sizes))] @ np.column_stack([across, np.cross(up, across), up])
-    aligned[:, 2] -= level
-    low, high = np.quantile(aligned[:, 0], [0.01, 0.99])
-    axis = float(np.quantile(aligned[:, 1], 0.01)) + 0.5 * float(high - low)
-    near: Floats = aligned[aligned[:, 1] < axis]
-    return near
-
-
-def _table(points: Floats) -> tuple[Floats, float]:
-    """Unit normal and level of the plane that contains most points, among roughly horizontal ones."""
-    rng = np.random.default_rng(0)
-    few = points[rng.integers(len(points), size=min(len(points), 20_000))] if len(points) else points
-    if len(few) < LEAST_PIXELS:
-        raise VesselError(f"{len(points)} pixels have a depth; is it the right file?")
-    best, up = 0, np.zeros(3)
-    for a, b, c in few[rng.integers(len(few), size=(DRAWS, 3))]:
-        normal = np.cross(b - a, c - a)
-        length = float(np.linalg.norm(normal))
-        if length < 1e-9 or abs(normal[2]) < STEEP * length:
-            continue
-        normal *= np.sign(normal[2]) / length
-        held = int(np.count_nonzero(np.abs((few - a) @ normal) < ON_TABLE))
-        if held > best:
-            best, up, level = held, normal, float(a @ normal)
-    if best < 0.05 * len(few):
-        raise VesselError("no table is seen that the vessel stands on; take it from 5° to 25° above the level")
-    # the least-squares plane through its points
-    held_points = points[np.abs(points @ up - level) < ON_TABLE]
-    middle = held_points.mean(axis=0)
-    refined = np.linalg.eigh(np.cov((held_points - middle).T))[1][:, 0]
-    up = refined * np.sign(refined[2])
-    return up, float(middle @ up)

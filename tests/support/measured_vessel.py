@@ -10,7 +10,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFilter
-from scipy.ndimage import gaussian_filter
 
 from orchestrator.extra_commands import vessel_command
 from sim_engine.vessel.profile import outer_profile
@@ -23,13 +22,11 @@ Floats = NDArray[np.float64]
 
 WATER = 998.0
 PIXELS_PER_MM = 6.0
-FOCAL = 320.0
-"""Of the depth camera [pixels]."""
 
 
 def vessel(out: Path, **options: Any) -> None:
-    """Run the command of `decant vessel` whose source is among the options: photo, points, depth, mesh, or none."""
-    kind = next((one for one in ("photo", "points", "depth", "mesh") if one in options), "profile")
+    """Run the command of `decant vessel` whose source is among the options: photo, points, mesh, or none."""
+    kind = next((one for one in ("photo", "points", "mesh") if one in options), "profile")
     source = [options.pop(kind)] if kind in options else []
     getattr(vessel_command, kind)(*source, out, **options)
 
@@ -110,26 +107,6 @@ class MeasuredVessel:
     def save_cloud(self, path: Path, *, hole: bool = False, seen: float = 2.0) -> Path:
         points = 1e3 * self.cloud(hole=hole, seen=seen)
         np.savetxt(path, points, delimiter=",", header="x,y,z", comments="")
-        return path
-
-    def depth(self, path: Path, *, down: float = 0.2) -> Path:
-        """A depth image in millimetres, 16 bits: table and wall behind, noise, holes; looking down by so much [rad]."""
-        rows, columns, away = 240, 320, 0.45
-        v, u = np.mgrid[:rows, :columns].reshape(2, -1)
-        forward, below = np.array([0.0, np.cos(down), -np.sin(down)]), np.array([0.0, -np.sin(down), -np.cos(down)])
-        rays = forward + ((u[:, None] - 159.5) * [1.0, 0.0, 0.0] + (v[:, None] - 119.5) * below) / FOCAL
-        eye = np.array([0.0, 0.0, 0.5 * self.vessel.rim_height]) - away * forward
-        lengths = np.linalg.norm(rays, axis=1)
-        table = np.where(rays[:, 2] < 0.0, -eye[2] / np.minimum(rays[:, 2], -1e-9), np.inf)
-        end = np.minimum(table, (0.4 - eye[1]) / rays[:, 1])  # a wall 40 cm behind the vessel's axis
-        far = np.full(len(rays), 0.5 * away)
-        for _ in range(120):
-            far = np.minimum(far + self.vessel.grid.lower_bound(eye + far[:, None] * rays) / lengths, end)
-        picture = gaussian_filter(far.reshape(rows, columns), 0.5)  # at edges pixels float between near and far
-        picture += self.rng.normal(0.0, 5e-4, picture.shape)
-        picture[self.rng.random(picture.shape) < 0.03] = 0.0
-        picture[115:130, 150:170] = 0.0
-        Image.fromarray(np.round(1e3 * picture).astype(np.uint16)).save(path)
         return path
 
 

@@ -17,7 +17,7 @@ from orchestrator.extra_commands.vessel_tables import read_fill_table, read_phot
 from sim_engine.errors import DecantError
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
-from tests.support.measured_vessel import FOCAL, MeasuredVessel, vessel
+from tests.support.measured_vessel import MeasuredVessel, vessel
 
 VESSELS = Path("configs/vessels")
 
@@ -59,11 +59,6 @@ def points(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return {"points": of.save_cloud(folder / "cloud.csv"), "unit": "mm", "floor": f"{of.shape.floor} m"}
 
 
-def depth(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
-    wall, floor = f"{of.shape.wall} m", f"{of.shape.floor} m"
-    return {"depth": of.depth(folder / "depth.png"), "focal": FOCAL, "wall": wall, "floor": floor}
-
-
 def mesh(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     of.solid().export(folder / "scan.stl")
     return {"mesh": folder / "scan.stl"}
@@ -73,11 +68,11 @@ def mesh(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
 @pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "door",
-    [callipers, fill, tilt, photo, *(pytest.param(each, marks=pytest.mark.slow) for each in (points, depth, mesh))],
+    [callipers, fill, tilt, photo, *(pytest.param(each, marks=pytest.mark.slow) for each in (points, mesh))],
 )
 def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
-    of, within = measured(name), 0.03 if door is depth else 0.015  # a pixel of the camera is 1.4 mm on the cup
-    assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=within)
+    of = measured(name)
+    assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -252,10 +247,6 @@ def tiny(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return {"mesh": folder / "tiny.stl"}
 
 
-def steep(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
-    return depth(of, folder) | {"depth": of.depth(folder / "steep.png", down=0.7)}
-
-
 def written(text: str) -> Door:
     def door(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
         (folder / "fill.csv").write_text(text)
@@ -289,10 +280,6 @@ def written(text: str) -> Door:
             },
             r"not the same on both sides",
         ),
-        (lambda of, folder: depth(of, folder) | {"focal": None}, r"focal length in pixels: --focal"),
-        (lambda of, folder: depth(of, folder) | {"centre": "318"}, r"--centre '318': should be a column and a row"),
-        (lambda of, folder: {"depth": of.photo(folder / "p.png"), "focal": FOCAL, "wall": "3 mm"}, r"16 bits"),
-        (steep, r"no table is seen"),
         (written("mass_g\n2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
         (written("level,mass\n1,2\n"), r"fill.csv:1:1: level: has no unit; write 'level_mm' or 'level \[mm\]'"),
         (
