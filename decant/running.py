@@ -30,12 +30,13 @@ from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.learning.calibration.calibration_scores import calibration_residual
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import CampaignPlan
-from orchestrator.live_view.live_server import recorder_of
+from orchestrator.live_view.rerun_subscriber import recorder_of
 from orchestrator.records.events import Subscriber as Watch
 from orchestrator.records.run_clock import run_time
 from orchestrator.reports.progress_state import ProgressState
-from orchestrator.reports.publishing import not_simulated, publish_run
+from orchestrator.reports.publishing import publish_run
 from orchestrator.reports.stage_views import evaluation_of
+from orchestrator.reports.validity_warnings import not_simulated
 from orchestrator.runs.bench_check import BenchReport, check_bench
 from orchestrator.runs.motion_approval import read_record
 from orchestrator.runs.run_folder import create_run

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -55,32 +56,34 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
         from orchestrator.cli.foreground_run import (
             check_campaign_can_run,
             read_campaign,
-            run_directory,
-            run_task_at_terminal,
+            resources_with_operator,
+            resumed_run,
+            run_at_terminal,
         )
         from orchestrator.cli.motion_control import require_campaign_flag
         from orchestrator.cli.view_command import live_view
         from orchestrator.reports.run_summary import summary_json
         from orchestrator.runs.run_tasks import TASKS
 
-        resumed = functools.partial(run_directory, resume=True, run_id=run_id) if resume else None
+        if run_id is not None and not resume:
+            raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun")
+        if answer is not None and not resume:
+            raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer")
+        resumed = functools.partial(resumed_run, run_id=run_id) if resume else None
         request = TASKS[task](read_campaign(campaign, laboratory, seed, resumed))
         plan = request.campaign
         check_campaign_can_run(request)
-        if answer is not None and not resume:
-            raise RefusalError(f"--answer {answer!r}: goes with --resume; a new run has nothing to answer")
         require_campaign_flag(request, enabled=enable_motion, task=task)
         flag = "" if laboratory is None else f" --laboratory {laboratory}"
         flag += "" if seed is None else f" --seed {seed}"
         flag += " --enable-motion" if plan.laboratory.mode == "hardware" else ""
-        result, published = run_task_at_terminal(
+        if resumed is not None:
+            request = replace(request, folder=resumed(plan), resume=True)
+        result, published = run_at_terminal(
             request,
-            in_process=in_process,
+            resources_with_operator(request, in_process=in_process, answer=answer),
             again=lambda folder: f"decant {task} {campaign} --resume --run {folder.name}{flag}",
-            resume=resume,
-            run_id=run_id,
-            answer=answer,
-            live=lambda: live_view(plan, live=live, at=live_at),
+            live=live_view(plan, live=live, at=live_at),
         )
         if published.theta is not None:
             print_note(f"the parameters to use are in {published.theta}; give them with --parameters")
@@ -171,17 +174,17 @@ def plan(
 
     Actions are shown in deg, deg/s, mm and s.
     """
-    from orchestrator.cli.foreground_run import check_campaign_can_run, read_campaign, run_task_at_terminal
-    from orchestrator.cli.simulate_command import prediction_inputs
+    from orchestrator.cli.foreground_run import check_campaign_can_run, read_campaign, read_draws, run_at_terminal
     from orchestrator.learning.deployment.deployment_result import Deployed
     from orchestrator.learning.single_action import PredictedPour
     from orchestrator.records.codec import result_of
     from orchestrator.reports.run_summary import PLANNED
+    from orchestrator.runs.run_service import RunResources
     from orchestrator.runs.stages import DEPLOYMENT, PREDICTION
 
     base = read_campaign(campaign, laboratory, seed)
-    known = prediction_inputs(base, parameters, thetas, seeds)
-    request = planning_request(base, parameters, receiver, iterations, seeds=seeds, draws=known.drawn)
+    draws = read_draws(parameters, thetas, seeds, base.parameters)
+    request = planning_request(base, parameters, receiver, iterations, seeds=seeds, draws=draws)
     chosen = request.campaign
     assert chosen.deployment is not None
     check_campaign_can_run(request)
@@ -189,10 +192,9 @@ def plan(
         print_note(
             f"note: no --parameters given; planning with the campaign's ({json.dumps(chosen.parameters.model_dump())})"
         )
-    run_result, published = run_task_at_terminal(
+    run_result, published = run_at_terminal(
         request,
-        in_process=in_process,
-        plain_processes=True,
+        RunResources(in_process=in_process, plain_processes=True),
         again=lambda folder: f"Plan again: decant plan {campaign}",
         not_resumed="this planning is not resumed; what was simulated",
     )

@@ -228,18 +228,18 @@ def pour_doses(request: RunRequest, *, in_process: bool, as_json: bool, again: s
     Raises:
         RefusalError: refused (exit code 2), or not every dose was poured (1).
     """
-    from orchestrator.cli.foreground_run import run_task_at_terminal
+    from orchestrator.cli.foreground_run import resources_with_operator, run_at_terminal
     from orchestrator.learning.dispense import Dispensed
     from orchestrator.records.codec import result_of
     from orchestrator.runs.stages import DOSES
 
     assert request.campaign.dispense is not None
-    finished, _ = run_task_at_terminal(
+    motion = f"doses          {len(request.campaign.dispense.doses)}", None
+    finished, _ = run_at_terminal(
         request,
-        in_process=in_process,
+        resources_with_operator(request, in_process=in_process, motion=motion),
         again=lambda folder: again,
         not_resumed="these doses are not resumed; what was weighed of them",
-        motion=(f"doses          {len(request.campaign.dispense.doses)}", None),
     )
     directory = finished.directory
     result: Dispensed = result_of(finished.results, DOSES, Dispensed)

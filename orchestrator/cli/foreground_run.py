@@ -13,16 +13,13 @@ import errno
 import signal
 import sys
 from collections.abc import Awaitable, Callable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from actors.arm.arm_interface import PathReport
-from actors.interfaces import LaboratoryError, Operator
-from actors.laboratory_settings import LaboratorySettings
-from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.campaigns.fingerprint import fingerprint
+from actors.interfaces import LaboratoryError
+from orchestrator.campaigns.file_loading import load_campaign, load_posterior, predicts_with_posterior
 from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.cli.console import (
     FAILED,
@@ -40,12 +37,11 @@ from orchestrator.cli.motion_control import consent_to_motion
 from orchestrator.cli.terminal_operator import TerminalOperator, somebody_at_the_terminal
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
-from orchestrator.live_view.live_server import LiveView, can_record, recorder_of
-from orchestrator.live_view.rerun_subscriber import RerunMonitor
-from orchestrator.records.codec import digest
+from orchestrator.live_view.live_server import LiveView
+from orchestrator.live_view.rerun_subscriber import RerunMonitor, can_record, recorder_of
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_file import MB, TO_BEGIN, JournalError, free_space
-from orchestrator.records.run_record import CampaignResult, read_header, read_record, read_result
+from orchestrator.records.run_record import CampaignResult, read_record, read_result
 from orchestrator.records.states import State
 from orchestrator.runs.resume import AskOperator
 from orchestrator.runs.run_folder import RESOLVED, create_run, find_run
@@ -53,6 +49,7 @@ from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, R
 
 if TYPE_CHECKING:
     from orchestrator.reports.publishing import Published
+    from sim_engine.liquids import SimulationParameters
 
 
 def read_campaign(
@@ -77,6 +74,30 @@ def read_campaign(
         return plan
     memory = load_campaign(resumed(plan) / RESOLVED).memory
     return load_campaign(path, laboratory, seed, memory=memory)
+
+
+def read_draws(
+    parameters: Path | None, thetas: int | None, seeds: int, base: SimulationParameters
+) -> tuple[SimulationParameters, ...]:
+    """Draws of the posterior of θ that predictions use in turn, as requested on the command line; empty: θ alone.
+
+    Args:
+        parameters: theta.json of a calibration, or the user's own file; None: the campaign's θ.
+        thetas: number of draws; None: as many as `seeds` if the file has a posterior and recommends the calibrated θ;
+            0: θ alone.
+        seeds: simulations of a pour.
+        base: values of θ that the file does not contain.
+
+    Raises:
+        ConfigError, RefusalError: the file is invalid, or it lacks the requested posterior.
+    """
+    if parameters is None:
+        if thetas:
+            raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration")
+        return ()
+    if thetas is None:
+        thetas = seeds if predicts_with_posterior(parameters) else 0
+    return load_posterior(parameters, thetas, base) if thetas else ()
 
 
 def check_campaign_can_run(request: RunRequest) -> None:
@@ -108,97 +129,91 @@ def check_laboratory_answers(request: RunRequest, resources: RunResources) -> No
         RunService().check_laboratory(request, resources)
 
 
-def run_task_at_terminal(
+def resources_with_operator(
     request: RunRequest,
     *,
     in_process: bool,
-    again: Callable[[Path], str],
-    plain_processes: bool = False,
-    not_resumed: str = "",
     motion: tuple[str, PathReport | None] = ("", None),
-    resume: bool = False,
-    run_id: str | None = None,
     answer: str | None = None,
-    live: Callable[[], LiveView | None] = lambda: None,
-) -> tuple[CampaignResult, Published]:
-    """Run a task that was checked: the operator's consent, the laboratory, the folder, then the run itself.
+) -> RunResources:
+    """Resources of a run that may pour: the operator's consent to its motion, and who answers questions.
 
     Args:
-        request: of the task, without a folder.
-        in_process, plain_processes: see `RunResources`.
-        again: makes the command for the message after an interruption from the folder of the run.
-        not_resumed, answer: see `run_in_front_of_people`.
+        request: of the run.
+        in_process: see `RunResources`.
         motion: what the operator consents to, if hardware moves; see `consent_to_motion`.
-        resume, run_id: see `run_directory`.
-        live: makes the view to open while it runs.
+        answer: outcome of a pour that was under way when the run died; None: a person at the terminal is asked.
 
     Raises:
-        RefusalError: refused (exit code 2), or as `run_in_front_of_people`.
+        RefusalError: motion is not enabled, or the bench asks a person and there is no terminal (exit code 2).
     """
     checksum = consent_to_motion(request, *motion)
-    if request.pours:
-        check_somebody_is_there(request.campaign.laboratory)
-    resources = RunResources(in_process=in_process, approved_checksum=checksum, plain_processes=plain_processes)
-    check_laboratory_answers(request, resources)
-    view = live()
-    folder = run_directory(request.campaign, resume=resume, run_id=run_id)
-    return run_in_front_of_people(
-        replace(request, folder=folder, resume=resume),
-        resources,
-        again=again(folder),
-        not_resumed=not_resumed,
-        answer=answer,
-        live=view,
-    )
+    laboratory, operator = request.campaign.laboratory, None
+    if request.pours and laboratory.needs_person:
+        if not somebody_at_the_terminal():
+            raise RefusalError(
+                f"laboratory {laboratory.name} asks a person (operator: answers: person), and there is no terminal to "
+                "ask at; run this in a terminal, with nothing piped into it"
+            )
+        operator = TerminalOperator(laboratory.operator)
+    ask = asked_about_unknown_pours(answer)
+    return RunResources(in_process=in_process, approved_checksum=checksum, operator=operator, ask_operator=ask)
 
 
-def run_directory(plan: CampaignPlan, *, resume: bool, run_id: str | None) -> Path:
-    """A new run's directory, or the one to go on with.
+def resumed_run(plan: CampaignPlan, run_id: str | None) -> Path:
+    """The folder of the run to go on with.
 
     Raises:
-        RefusalError: there is none, or it can't be made (exit code 2).
+        RefusalError: there is none (exit code 2).
     """
-    if run_id is not None and not resume:
-        raise RefusalError(f"--run {run_id}: goes with --resume; without it a new run is begun")
+    with Refused(RunError, OSError):
+        return find_run(plan, run_id)
+
+
+def new_run(plan: CampaignPlan) -> Path:
+    """The folder of a new run.
+
+    Raises:
+        RefusalError: it can't be made (exit code 2).
+    """
     try:
-        return find_run(plan, run_id) if resume else create_run(plan)
+        return create_run(plan)
     except RunError as error:
         raise RefusalError(str(error)) from None
     except OSError as error:
         raise RefusalError(f"{plan.outputs.folder}: can't be written: {error.strerror}") from None
 
 
-def run_in_front_of_people(
+def run_at_terminal(
     request: RunRequest,
     resources: RunResources,
     *,
-    again: str,
+    again: Callable[[Path], str],
     not_resumed: str = "",
-    answer: str | None = None,
     live: LiveView | None = None,
 ) -> tuple[CampaignResult, Published]:
-    """Run a campaign with a live display, a recording, figures and a summary.
+    """Run a task that was checked, with a live display, a recording, figures and a summary.
 
     Args:
-        request: with the folder of the run.
-        resources: to run it with; operator, display and recorder are added here.
-        again: the command that resumes the run, or starts another one, for the message after an interruption.
+        request: without a folder for a new run.
+        resources: to run it with; display and recorder are added here.
+        again: makes the command that resumes the run, or starts another one, from the folder of this one.
         not_resumed: for a run that can't be resumed: its name, and the part of it that is kept.
-        answer: outcome of a pour that was under way when the run died; None: a person at the terminal is asked.
         live: view to open while it runs.
 
     Returns:
         The result of the run, and the files written about it.
 
     Raises:
-        RefusalError: it failed, was interrupted, or needs a person.
+        RefusalError: something is missing (exit code 2), it failed, was interrupted, or needs a person.
     """
     from orchestrator.reports.console_progress import ProgressDisplay
     from orchestrator.reports.console_view import print_summary
-    from orchestrator.reports.publishing import not_simulated, publish_run
+    from orchestrator.reports.publishing import publish_run
+    from orchestrator.reports.validity_warnings import not_simulated
 
-    plan, directory = request.campaign, request.folder
-    assert directory is not None
+    check_laboratory_answers(request, resources)
+    plan, directory = request.campaign, request.folder or new_run(request.campaign)
     print_note(f"run {directory}  ({plan.laboratory.mode} bench)" if request.pours else f"run {directory}")
     if not request.resume:
         for line in not_simulated(plan, print_message):
@@ -207,32 +222,28 @@ def run_in_front_of_people(
     def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
         if live is not None and can_record(plan):
             print_note(f"live view: {live.open()}")
-        return recorder_of(plan, run, print_message, live)
+        return recorder_of(plan, run, print_message, "" if live is None else live.stream)
 
     handle: RunHandle | None = None
     result: CampaignResult | None = None
     try:
         display = ProgressDisplay(plan, quiet=is_quiet())
-        resources = replace(
-            resources,
-            operator=person_at_the_terminal(plan.laboratory, display.paused) if request.pours else None,
-            ask_operator=asked_about_unknown_pours(answer),
-            subscribers=[display],
-            recorder=recorder,
+        if isinstance(resources.operator, TerminalOperator):
+            resources.operator.paused = display.paused
+        handle = RunService().start(
+            replace(request, folder=directory), replace(resources, subscribers=[display], recorder=recorder)
         )
-        handle = RunService().start(request, resources)
         with display, stdout_for_results():
             result = asyncio.run(_until_signalled(handle.wait, resumable=not not_resumed))
     except (RunError, LaboratoryError) as error:
         problem = getattr(error, "problem", error) if not_resumed else error
-        way_on = _way_on(directory, again, not_resumed)
+        way_on = _way_on(directory, again(directory), not_resumed)
         raise RefusalError(f"{problem}{way_on}", error.exit_code) from None
     except OSError as error:
         if error.errno is None:
             raise  # not a file's: a defect, which wants its traceback
-        raise RefusalError(
-            f"{file_trouble(error, directory)}{_way_on(directory, again, not_resumed)}", FAILED
-        ) from None
+        way_on = _way_on(directory, again(directory), not_resumed)
+        raise RefusalError(f"{file_trouble(error, directory)}{way_on}", FAILED) from None
     except (asyncio.CancelledError, KeyboardInterrupt):
         if done := finished_without_report(directory):
             way_on = done
@@ -240,14 +251,14 @@ def run_in_front_of_people(
             unknown = "".join(
                 f" while {pour} was under way: what it poured is unknown" for pour in given_up_pours(directory)
             )
-            way_on = unknown + _way_on(directory, again, not_resumed)
+            way_on = unknown + _way_on(directory, again(directory), not_resumed)
         else:
-            way_on = interruption(directory, plan, again)
+            way_on = interruption(directory, plan, again(directory))
         raise RefusalError(f"interrupted{way_on}", INTERRUPTED) from None
     finally:
         if result is None:
             _close(handle, live)
-            if (page := report_of_what_stands(plan, directory)) is not None:
+            if handle is not None and (page := report_of_what_stands(handle)) is not None:
                 print_note(f"report of what stands  {page}")
     try:
         _close(handle, live)
@@ -352,17 +363,17 @@ def given_up_pours(directory: Path) -> list[str]:
     return []
 
 
-def report_of_what_stands(plan: CampaignPlan, directory: Path) -> Path | None:
-    """Write the report of a run that was interrupted or broke off; None where there is nothing to report on.
+def report_of_what_stands(handle: RunHandle) -> Path | None:
+    """Write the report of a run that was interrupted or broke off; None if it was refused, or can't be reported on.
 
     Whatever goes wrong with it, a further Ctrl-C too, is no reason to say less about the run itself.
     """
     from orchestrator.reports.publishing import report_on
 
     with contextlib.suppress(Exception, KeyboardInterrupt):
-        if digest(read_header(directory).fingerprint) != digest(fingerprint(plan)):
-            return None  # it was refused, since this is another campaign
-        return report_on(plan, read_result(directory), draw=plan.outputs.figures)[0]
+        if handle.begun:
+            plan = handle.campaign
+            return report_on(plan, read_result(handle.folder), draw=plan.outputs.figures)[0]
     return None
 
 
@@ -376,33 +387,6 @@ def file_trouble(error: OSError, directory: Path) -> str:
         f"{text}; {free_space(directory) / MB:.1f} MB are free there. A run needs {TO_BEGIN / MB:.0f} MB to begin, and "
         "more for long ones with recordings"
     )
-
-
-def person_at_the_terminal(
-    spec: LaboratorySettings, paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
-) -> Operator | None:
-    """Who answers the bench's questions; None where a virtual operator does.
-
-    Args:
-        spec: of the laboratory.
-        paused: entered while a question is open.
-    """
-    if not spec.needs_person:
-        return None
-    return TerminalOperator(spec.operator, paused=paused)
-
-
-def check_somebody_is_there(spec: LaboratorySettings) -> None:
-    """A bench that asks a person needs a terminal to ask at.
-
-    Raises:
-        RefusalError: there is none (exit code 2).
-    """
-    if spec.needs_person and not somebody_at_the_terminal():
-        raise RefusalError(
-            f"laboratory {spec.name} asks a person (operator: answers: person), and there is no terminal to ask at; "
-            "run this in a terminal, with nothing piped into it"
-        )
 
 
 def asked_about_unknown_pours(answer: str | None) -> AskOperator | None:

@@ -241,17 +241,18 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool)
     Raises:
         RefusalError: refused (exit code 2), or nothing was poured (1).
     """
-    from orchestrator.cli.foreground_run import run_task_at_terminal
+    from orchestrator.cli.foreground_run import resources_with_operator, run_at_terminal
     from orchestrator.learning.single_action import OnePoured
     from orchestrator.records.codec import result_of
     from orchestrator.runs.run_tasks import POUR, pour_task
 
-    finished, _ = run_task_at_terminal(
-        pour_task(chosen.plan, chosen.scene, chosen.action),
-        in_process=in_process,
+    request = pour_task(chosen.plan, chosen.scene, chosen.action)
+    motion = "pours          1", None if chosen.path is None else chosen.path.report
+    finished, _ = run_at_terminal(
+        request,
+        resources_with_operator(request, in_process=in_process, motion=motion),
         again=lambda folder: again,
         not_resumed="this pour is not resumed; what was weighed of it",
-        motion=("pours          1", None if chosen.path is None else chosen.path.report),
     )
     result = result_of(finished.results, POUR, OnePoured)
     if result.weighed is None:

@@ -1,6 +1,6 @@
 """The command `decant simulate`: predicts one pour, or all pours of a table of weighed pours, without a laboratory.
 
-`PredictionInputs` holds θ with draws of its posterior, and makes the simulations of a pour; `decant plan` uses it too.
+`PredictionInputs` holds θ with draws of its posterior, and makes the simulations of a pour.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _simulate_pour(path: Path, options: SimulateOptions) -> None:
     from sim_engine.simulator import InvalidSceneError, PourSimulator
 
     plan = read_campaign(path)
-    known = prediction_inputs(plan, options.parameters, options.thetas, options.seeds)
+    known = prediction_inputs(plan, options)
     vessel = None if options.receiver is None else load_vessel(options.receiver)
     scene, space = scene_to_simulate(plan, options.scene)
     if vessel is not None:
@@ -286,7 +286,7 @@ def _predict_table(path: Path, options: SimulateOptions, source: Path) -> None:
     from sim_engine.simulator import PourSimulator
 
     plan = read_campaign(path)
-    known = prediction_inputs(plan, options.parameters, options.thetas, options.seeds)
+    known = prediction_inputs(plan, options)
     scene, records = _scene(plan, options, source)
     known = known.at(scene)
     table, pours = _pours(scene, records, source)
@@ -522,32 +522,22 @@ class PredictionInputs:
         return f"intervals from {', '.join(parts[:-1])} and {parts[-1]} alone (the residual of calibration is unknown)"
 
 
-def prediction_inputs(plan: CampaignPlan, parameters: Path | None, thetas: int | None, seeds: int) -> PredictionInputs:
+def prediction_inputs(plan: CampaignPlan, options: SimulateOptions) -> PredictionInputs:
     """Read θ and its posterior as requested on the command line.
 
     Args:
         plan: campaign with the values of θ that the file does not contain.
-        parameters: theta.json of a calibration, or the user's own file; None: the campaign's θ.
-        thetas: number of posterior draws; None: as many as `seeds` if the file has a posterior and recommends the
-            calibrated θ; 0: θ alone.
-        seeds: simulations of a pour.
+        options: of the command.
 
     Raises:
         ConfigError, RefusalError: the file is invalid, or it lacks the requested posterior.
     """
-    from orchestrator.campaigns.file_loading import (
-        load_discrepancy,
-        load_parameters,
-        load_posterior,
-        predicts_with_posterior,
-    )
+    from orchestrator.campaigns.file_loading import load_discrepancy, load_parameters
+    from orchestrator.cli.foreground_run import read_draws
 
-    if parameters is None:
-        if thetas:
-            raise RefusalError(f"--thetas {thetas}: goes with --parameters, the theta.json of a calibration")
+    draws = read_draws(options.parameters, options.thetas, options.seeds, plan.parameters)
+    if options.parameters is None:
         return PredictionInputs(plan.parameters)
-    theta = load_parameters(parameters, plan.parameters)
-    if thetas is None:
-        thetas = seeds if predicts_with_posterior(parameters) else 0
-    draws = load_posterior(parameters, thetas, plan.parameters) if thetas else ()
-    return PredictionInputs(theta, draws, load_discrepancy(parameters))
+    return PredictionInputs(
+        load_parameters(options.parameters, plan.parameters), draws, load_discrepancy(options.parameters)
+    )

@@ -41,21 +41,16 @@ class TerminalOperator:
 
     Args:
         spec: time limits of answers.
-        paused: context that is entered while a question is open; it pauses a live display.
         stdin: file descriptor of the terminal.
         out: stream for questions; by default stderr, so that stdout contains only results.
+
+    Attributes:
+        paused: makes the context that is entered while a question is open; it pauses a live display.
     """
 
-    def __init__(
-        self,
-        spec: OperatorSettings,
-        *,
-        paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext,
-        stdin: int = 0,
-        out: TextIO | None = None,
-    ) -> None:
+    def __init__(self, spec: OperatorSettings, *, stdin: int = 0, out: TextIO | None = None) -> None:
         self._spec = spec
-        self._paused = paused
+        self.paused: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext
         self._stdin = stdin
         self._out = out
         self._one_question = asyncio.Lock()
@@ -69,7 +64,7 @@ class TerminalOperator:
             LaboratoryError: there is no terminal, no answer came in time, or the pour is given up.
         """
         async with self._one_question:
-            with self._paused(), _Lines(self._stdin) as lines:
+            with self.paused(), _Lines(self._stdin) as lines:
                 if self._counting is not None:
                     self._counting.cancel()  # a new question ends the countdown of a previous announcement
                 self._write(f"\a\n{_worded(question)}\n{self._expected(question)}\n> ")

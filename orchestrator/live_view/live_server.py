@@ -2,7 +2,7 @@
 
     with LiveView() as live:
         print(live.url)
-        monitor = live.watcher_for(plan, directory)   # a subscriber of the campaign
+        monitor = RerunMonitor(path, plan, url=live.stream)   # a subscriber of the campaign
 
 Viewers can't slow a campaign down. Events pass through a bounded queue to a process that writes them (`RerunMonitor`),
 and from there to a server in a third process, which viewers connect to.
@@ -15,18 +15,14 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 from urllib.parse import quote
 
 from actors.runtime.child_process import ChildProcess, python_module
-from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
-from orchestrator.live_view.rerun_subscriber import CAPACITY, RerunMonitor
 from orchestrator.live_view.viewer_server import environment
-from sim_engine.resources import installed
 
 LOOPBACK = "127.0.0.1"
 
@@ -38,9 +34,6 @@ STREAM_PORT = 9876
 
 MEMORY = "512MiB"
 """Memory for viewers that connect late; older data are in the recording on disk."""
-
-RECORDING = "campaign.rrd"
-"""File name of a run's recording."""
 
 _START_TIME = 40.0
 _TRIED = 100
@@ -141,19 +134,6 @@ class LiveView:
         """Whether the server is running."""
         return self._process is not None and self._process.alive
 
-    def watcher_for(self, plan: CampaignPlan, run: Path, *, capacity: int = CAPACITY) -> RerunMonitor:
-        """Return a subscriber that writes a run's recording and sends it here. Close it when the run has ended.
-
-        Args:
-            plan: plan of the campaign.
-            run: folder of the run.
-            capacity: largest number of waiting events.
-
-        Raises:
-            OSError: the recording can't be written.
-        """
-        return RerunMonitor(run / RECORDING, plan, url=self.stream, capacity=capacity)
-
     def close(self) -> None:
         """Stop serving. Viewers keep the data they have received. May be called again."""
         process, self._process = self._process, None
@@ -196,29 +176,3 @@ def answers(host: str, port: int) -> bool:
             return True
     except OSError:
         return False
-
-
-def can_record(plan: CampaignPlan) -> bool:
-    """Whether runs of a campaign are recorded: recording is enabled and Rerun is installed."""
-    return plan.outputs.recording and installed("rerun")
-
-
-def recorder_of(
-    plan: CampaignPlan, run: Path, tell: Callable[[str], object], live: LiveView | None = None
-) -> RerunMonitor | None:
-    """Return the subscriber that writes a run's recording; None if recording is disabled or Rerun is not installed.
-
-    Args:
-        plan: plan of the campaign.
-        run: folder of the run.
-        tell: called with the reason if recording is enabled but impossible.
-        live: view that also shows the recording.
-
-    Raises:
-        OSError: the recording can't be written.
-    """
-    if not can_record(plan):
-        if plan.outputs.recording:
-            tell("no recording: it needs Rerun, which is not installed (pip install 'decant-pouring[live]')")
-        return None
-    return RerunMonitor(run / RECORDING, plan) if live is None else live.watcher_for(plan, run)

@@ -28,9 +28,10 @@ from actors.runtime.child_process import ChildProcess
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.live_view.viewer_server import SENDING, environment
 from orchestrator.records.events import Event
+from orchestrator.runs.run_folder import RECORDING
+from sim_engine.resources import installed
 
 if TYPE_CHECKING:
-    from orchestrator.learning.campaign_plan import CampaignPlan
     from orchestrator.live_view.run_recording import CampaignRecording
 
 
@@ -197,6 +198,30 @@ class RerunMonitor:
                 "recording %s: %d event(s) could not be drawn; the first: %s",
                 *(self.path.name, self._report["failed"], self._report["problem"]),
             )
+
+
+def can_record(plan: CampaignPlan) -> bool:
+    """Whether runs of a campaign are recorded: recording is enabled and Rerun is installed."""
+    return plan.outputs.recording and installed("rerun")
+
+
+def recorder_of(plan: CampaignPlan, run: Path, tell: Callable[[str], object], url: str = "") -> RerunMonitor | None:
+    """Return the subscriber that writes a run's recording; None if recording is disabled or Rerun is not installed.
+
+    Args:
+        plan: plan of the campaign.
+        run: folder of the run.
+        tell: called with the reason if recording is enabled but impossible.
+        url: see `RerunMonitor`.
+
+    Raises:
+        OSError: the recording can't be written.
+    """
+    if can_record(plan):
+        return RerunMonitor(run / RECORDING, plan, url=url)
+    if plan.outputs.recording:
+        tell("no recording: it needs Rerun, which is not installed (pip install 'decant-pouring[live]')")
+    return None
 
 
 def _start_writer() -> ChildProcess:

@@ -1,22 +1,39 @@
-"""Progress of a running campaign, counted from its events.
+"""Progress of a running campaign, counted from its events, and the estimate of its remaining time.
 
 `ProgressState` adds to the `RunState` what displays show: lines of text, the load of the pool, the best losses and the
 time estimate. It does not print, and its only clock is the time of the events.
+
+The remaining time is the planned work that is left, times the median of recent durations. `work_of` derives the
+expected work of each stage (`WorkEstimate`) from the plan, and `Forecast` measures the times between outcomes. Until
+some are measured, the planned time of a pour counts, and a time proportional to the particles of a simulation. The
+estimate is for display only; no decision depends on it.
+
+Limitations: the operator's speed is unknown before the first pour; simulations of all stages count as equally long.
 """
 
 from __future__ import annotations
 
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 
-from orchestrator.learning.campaign_plan import CampaignPlan
-from orchestrator.learning.requests import Simulated
+from actors.laboratory_settings import LaboratorySettings
+from orchestrator.learning.calibration.calibration_scores import DRAWS
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
+from orchestrator.learning.requests import Failed, Pour, Simulate, Simulated
 from orchestrator.learning.single_action import CONFIRM
-from orchestrator.records.events import CampaignOpened, Event, RequestFinished
+from orchestrator.learning.strategy import Progress
+from orchestrator.records.events import CampaignOpened, Event, RequestFinished, RequestStarted, StageOpened
 from orchestrator.records.journal_file import Header
-from orchestrator.records.run_record import RunPour, RunState
+from orchestrator.records.run_record import NOT_REPORTED, RunPour, RunState
 from orchestrator.reports.loss_units import LossUnit, is_calibration, minimised_loss, unit_of_pour
 from orchestrator.reports.summarise import pour_summary
-from orchestrator.reports.time_estimate import Forecast, work_of
+from orchestrator.runs.stages import CALIBRATION, CONFIRMATION, DEPLOYMENT, DOSES, EVALUATION, POURS
+from sim_engine.action import ACTION_DIMENSIONS
+from sim_engine.scene import Scene
+from sim_engine.search_space import Space
 
 CHECKPOINT_WORDS = {
     "operator": "waiting for the operator",
@@ -160,3 +177,173 @@ class ProgressState:
         dose = progress.dose
         amounts = f"{1e3 * dose.amount:.1f} ± {2e3 * dose.deviation:.1f} g of {1e3 * dose.target:g} g"
         return f"{amounts}   {1e3 * dose.flow:.1f} g/s"
+
+
+PRICE = 1e-3
+"""Assumed time of a simulated pour on one core, per particle, before the first measurement [s]."""
+
+RECENT = 9
+"""Number of recent durations whose median counts: operators get faster, and other programs start and stop."""
+
+
+@dataclass(frozen=True)
+class WorkEstimate:
+    """Expected work of a stage, before the strategy reports its own progress.
+
+    Attributes:
+        simulations, pours: total numbers.
+        beside: number of the simulations that run during each pour.
+        pour_time: planned duration of one pour [s of wall time].
+    """
+
+    simulations: int = 0
+    pours: int = 0
+    beside: int = 0
+    pour_time: float = 0.0
+
+
+class Forecast:
+    """Measures the times between outcomes and estimates the remaining time.
+
+    Args:
+        run: state of the run, which takes each event before the forecast.
+        particles: particles of a simulation.
+    """
+
+    def __init__(self, run: RunState, particles: float) -> None:
+        self._run, self._particles = run, particles
+        self._works: Mapping[str, WorkEstimate] = {}
+        self._cycles: deque[float] = deque(maxlen=RECENT)
+        self._waits: deque[float] = deque(maxlen=RECENT)
+        self._stage, self._pouring, self._since = "", False, 0.0
+
+    def begin(self, works: Mapping[str, WorkEstimate]) -> None:
+        """Begin a run with the expected work of each stage."""
+        self._works = works
+
+    def __call__(self, event: Event) -> None:
+        """Measure an event: the time from a pour's end to the next one's, and between simulations before any pour."""
+        match event:
+            case _ if event.replayed:
+                return
+            case StageOpened():
+                self._stage, self._pouring, self._since = event.stage, False, event.time
+            case RequestStarted(request=Pour()) if not self._pouring:
+                self._pouring, self._since = True, event.time
+            case RequestFinished(request=Pour()):
+                if not (isinstance(event.outcome, Failed) and event.outcome.kind == "invalid_action"):
+                    self._cycles.append(event.time - self._since)
+                    self._since = event.time
+            case RequestFinished(request=Simulate()) if not self._pouring:
+                self._waits.append(event.time - self._since)
+                self._since = event.time
+
+    def stage_left(self, name: str, now: float) -> float | None:
+        """Seconds to the end of a stage; None for an unknown stage."""
+        work = self._works.get(name)
+        if work is None:
+            return None
+        recorded, current = self._run.stages[name], name == self._stage
+        if recorded.closed_at is not None:
+            return 0.0
+        progress = recorded.progress
+        if progress is NOT_REPORTED:
+            progress = Progress(0, work.simulations, 0, work.pours)
+        simulations = max(progress.simulations_left - work.beside * progress.pours_left, 0)
+        if current and self._pouring:
+            simulations = 0
+        # The planned duration counts twice: the first outcome includes the start of simulators, or of the bench.
+        price = PRICE * self._particles / max(min(self._run.slots, self._run.simulators), 1)
+        wait = median([price, price, *self._waits])
+        planned = max(work.pour_time, work.beside * wait)
+        cycle = median([planned, planned, *self._cycles])
+        left = simulations * wait + progress.pours_left * cycle
+        if current:
+            left -= min(max(now - self._since, 0.0), 0.9 * (wait if simulations else cycle))
+        return max(left, 0.0)
+
+    def left(self, now: float) -> float | None:
+        """Seconds to the end of the campaign; None before it has begun."""
+        if not self._works:
+            return None
+        return sum(self.stage_left(name, now) or 0.0 for name in self._works)
+
+
+WEIGHINGS = 15.0
+"""Weighing and settling in one pour [s of bench time]; see `actors.bench`."""
+
+WAYS = 8.0
+"""Motion to the pour and back home [s of bench time]."""
+
+
+def work_of(plan: CampaignPlan, stages: Sequence[str]) -> dict[str, WorkEstimate]:
+    """Expected work of each stage, by name; empty for stages that are not the plan's own."""
+    return {name: _work(plan, name) for name in stages}
+
+
+def _work(plan: CampaignPlan, name: str) -> WorkEstimate:
+    calibration, deployment = plan.calibration, plan.deployment
+    if plan.dispense is not None and name == DOSES:
+        doses = len(plan.dispense.doses)
+        return WorkEstimate(pours=doses, pour_time=pour_time(plan.laboratory, plan.dispense.scenes[0]))
+    if calibration is not None:
+        if name == POURS:
+            pour = pour_time(plan.laboratory, calibration.scene, calibration.actions)
+            return WorkEstimate(calibration.design_simulations, calibration.pour_count, pour_time=pour)
+        if name == CALIBRATION:
+            return WorkEstimate(calibration.simulations)
+        if name == EVALUATION:
+            return WorkEstimate(_scored(calibration))
+    if deployment is not None and name.startswith((DEPLOYMENT, CONFIRMATION)):
+        pour = pour_time(plan.laboratory, deployment.scenes[0], deployment.actions)
+        if name.startswith(CONFIRMATION):
+            return WorkEstimate(pours=deployment.confirm, pour_time=pour)
+        settings = deployment.settings
+        pours = deployment.pours if settings.learns_on_pours else min(deployment.pours, 1)
+        return WorkEstimate(settings.simulations, pours, settings.simulations_beside, pour)
+    return WorkEstimate()
+
+
+def _weighed(plan: CalibrationPlan) -> int:
+    """Number of pours that θ* is evaluated on: made by then, or recorded."""
+    records = 0 if plan.records is None else len(plan.records.pours)
+    return plan.pour_count + records + (0 if plan.transfer is None else len(plan.transfer.pours))
+
+
+def _unseen(plan: CalibrationPlan) -> int:
+    """Number of these pours that calibration does not use."""
+    records = [] if plan.records is None else list(plan.records.pours)
+    transfer = 0 if plan.transfer is None else len(plan.transfer.pours)
+    return plan.holdout + sum(pour.split != "train" for pour in records) + transfer
+
+
+def _scored(plan: CalibrationPlan) -> int:
+    """Simulations of the evaluation: θ* and the uncalibrated θ on all pours; posterior draws and random rivals on
+    unused pours."""
+    draws = DRAWS if plan.random_baseline and plan.settings.makes_posterior else 0
+    return 2 * _weighed(plan) + (plan.random_baseline + draws) * _unseen(plan)
+
+
+def pour_time(laboratory: LaboratorySettings, scene: Scene, actions: Space | None = None) -> float:
+    """Duration of one whole pour with the operator's part, as planned [s of wall time].
+
+    Args:
+        laboratory: laboratory with the operator and the bench.
+        scene: scene with the fixed parameters of the motion.
+        actions: searched parameters of the motion; the middle of their ranges is used. None: nothing is searched.
+    """
+    values = {**{name: d.lower for name, d in ACTION_DIMENSIONS.items()}, **scene.fixed}
+    values |= {axis.name: 0.5 * (axis.lower + axis.upper) for axis in (() if actions is None else actions.axes)}
+    angle, speed, back, hold = (
+        values.get(name) for name in ("max_angle", "angular_velocity", "return_velocity", "hold_time")
+    )
+    motion = (angle or 0.0) / (speed or math.inf) + (scene.max_hold_time / 2.0 if hold is None else hold)
+    motion += (angle or 0.0) / back if back else 0.0
+    bench = laboratory.bench
+    liquid = 0.0 if bench is None else PRICE * bench.theta.particles  # a virtual bench simulates its liquid
+    if laboratory.arm is not None:
+        seconds = laboratory.operator.time + laboratory.arm.warning_time + WAYS + motion + WEIGHINGS
+        return laboratory.arm.on_clock(seconds) + liquid
+    if bench is None or bench.time_scale <= 0.0:
+        return liquid
+    return (bench.operator_time + WAYS + motion + WEIGHINGS) / bench.time_scale + liquid

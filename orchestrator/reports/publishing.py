@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from orchestrator.catalogue.run_reading import read_run
 from orchestrator.learning.calibration.calibration_base import CalibratedTheta
@@ -22,21 +21,19 @@ from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_check import check_journal
 from orchestrator.records.run_record import CampaignResult, read_record, read_result
 from orchestrator.records.states import State
-from orchestrator.reports import validity_warnings as regimes
 from orchestrator.reports.html_report import REPORT_NAME, run_page
 from orchestrator.reports.run_figures import draw_figures
 from orchestrator.reports.run_summary import SUMMARY_NAME, RunFiles, RunSummary, Totals, write_summary
 from orchestrator.reports.stage_views import evaluation_of, theta_of
 from orchestrator.reports.summarise import pool_use, summarise, summarise_record
-from orchestrator.runs.run_folder import FIGURES, read_versions
+from orchestrator.reports.validity_warnings import best_action_warnings, campaign_warnings, worked_out
+from orchestrator.runs.run_folder import FIGURES, RECORDING, read_versions
 from sim_engine.settings.plugin_registry import own_extras
 
 if TYPE_CHECKING:
     from orchestrator.runs.run_service import RunHandle, RunRequest
 
-W = TypeVar("W")
-
-THETA_FILE, RECORDING = "theta.json", "campaign.rrd"
+THETA_FILE = "theta.json"
 
 KEPT_THETAS = 50
 """Draws of the posterior in that file."""
@@ -172,8 +169,8 @@ def summary_of(plan: CampaignPlan, result: CampaignResult, files: RunFiles | Non
         versions=read_versions(directory),
         check=check_journal(directory / JOURNAL_NAME),
         files=files,
-        not_covered=worked_out(lambda: regimes.campaign_warnings(plan)),
-        best_not_covered=worked_out(lambda: regimes.best_action_warnings(plan, result.results)),
+        not_covered=worked_out(lambda: campaign_warnings(plan)),
+        best_not_covered=worked_out(lambda: best_action_warnings(plan, result.results)),
         totals=Totals(
             mode=plan.laboratory.mode if record.pours or plan.laboratory.pours else "none",
             simulations=result.simulations,
@@ -268,24 +265,3 @@ def theta_file(
         thinned = draws[:: max(len(draws) // KEPT_THETAS, 1)]
         data["posterior"] = [{"theta": theta | values, "weight": 1.0 / len(thinned)} for values in thinned]
     return data
-
-
-def worked_out(
-    work: Callable[[], dict[str, list[W]]], tell: Callable[[str], None] = _log.warning
-) -> dict[str, list[W]]:
-    """Warnings, or none if they can't be worked out: that is not a reason to lose a summary."""
-    try:
-        return work()
-    except (ValueError, OSError) as error:
-        tell(f"note: whether something is not simulated could not be worked out: {error}")
-        return {}
-
-
-def not_simulated(plan: CampaignPlan, tell: Callable[[str], None] = _log.warning) -> list[str]:
-    """Effects that are not simulated in a campaign's action spaces: lines for the user before it begins.
-
-    Args:
-        plan: of the campaign.
-        tell: called if that can't be worked out.
-    """
-    return regimes.lines(worked_out(lambda: regimes.campaign_warnings(plan), tell))

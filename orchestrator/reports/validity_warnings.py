@@ -6,8 +6,10 @@ They are warnings, never errors. `sim_engine.model_validity` defines the limits 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+import logging
+from collections.abc import Callable
 from functools import lru_cache
+from typing import TypeVar
 
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.records.codec import Results
@@ -24,6 +26,9 @@ from sim_engine.vessel.vessel import build_vessel
 MOST_CORNERS = 32
 """Maximum number of corners of a space that are tried."""
 
+W = TypeVar("W")
+
+_log = logging.getLogger(__name__)
 _vessel = lru_cache(maxsize=16)(build_vessel)
 
 
@@ -116,8 +121,25 @@ def best_action_warnings(plan: CampaignPlan, results: Results) -> dict[str, list
     return by_scene
 
 
-def lines(warnings: Mapping[str, Sequence[NotSimulated]]) -> list[str]:
-    """Warnings of a campaign for the terminal."""
+def worked_out(
+    work: Callable[[], dict[str, list[W]]], tell: Callable[[str], None] = _log.warning
+) -> dict[str, list[W]]:
+    """Warnings, or none if they can't be worked out: that is not a reason to lose a summary."""
+    try:
+        return work()
+    except (ValueError, OSError) as error:
+        tell(f"note: whether something is not simulated could not be worked out: {error}")
+        return {}
+
+
+def not_simulated(plan: CampaignPlan, tell: Callable[[str], None]) -> list[str]:
+    """Effects that are not simulated in a campaign's action spaces: lines for the user before it begins.
+
+    Args:
+        plan: of the campaign.
+        tell: called if that can't be worked out.
+    """
+    warnings = worked_out(lambda: campaign_warnings(plan), tell)
     if not warnings:
         return []
     texts = ["not simulated (docs/explanation/simulator.md has what to do):"]

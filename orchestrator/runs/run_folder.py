@@ -37,9 +37,8 @@ from sim_engine.solver_fingerprint import ROOT, folder_digest, solver_fingerprin
 RESOLVED, VERSIONS = "resolved.json", "versions.json"
 """Files with the resolved plan of a run and with the versions of the program that began it."""
 
-
-FIGURES = "figures"
-"""Folder of a run's pictures."""
+FIGURES, RECORDING = "figures", "campaign.rrd"
+"""Folder of a run's pictures, and the file of its Rerun recording."""
 
 SIMULATOR, SIMULATOR_FILE = "simulator", "simulator.json"
 """Key of the solver's version in `versions.json`, and the file of the state directory that keeps it."""

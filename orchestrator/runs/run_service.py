@@ -254,6 +254,7 @@ class RunHandle:
         recorder: of its recording; None without one.
         result: after `wait`.
         state: what the run's events say so far.
+        begun: whether there were any: a resumption can be refused before.
     """
 
     def __init__(
@@ -272,7 +273,7 @@ class RunHandle:
             self._subscribers.append(recorder)
         if (series := request.campaign.dispense) is not None and series.laboratory:
             self._subscribers.append(VesselAccount.open().follow(series))
-        self._pausing = self._aborting = self._abandoning = False
+        self.begun = self._pausing = self._aborting = self._abandoning = False
         self._winding_down = asyncio.Event()
         self.result: CampaignResult | None = None
         self._task: asyncio.Task[CampaignResult] | None = None
@@ -283,6 +284,7 @@ class RunHandle:
         return self.state.checkpoint
 
     def _note(self, event: Event) -> None:
+        self.begun = True
         self.state.take(event)
         if self.state.state in (State.PAUSING, State.PAUSED, State.UNKNOWN, State.FAILED, State.STOPPING):
             self._winding_down.set()

@@ -29,8 +29,8 @@ from orchestrator.daemon.state.notifications import Counts
 from orchestrator.daemon.state.run_readout import Pours, found_at, prune_recordings
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
-from orchestrator.live_view.live_server import LiveView, recorder_of
-from orchestrator.live_view.rerun_subscriber import RerunMonitor
+from orchestrator.live_view.live_server import LiveView
+from orchestrator.live_view.rerun_subscriber import RerunMonitor, recorder_of
 from orchestrator.records.events import CampaignStateChanged, Event
 from orchestrator.records.journal_file import MB, JournalError, free_space
 from orchestrator.records.run_clock import run_time
@@ -38,7 +38,8 @@ from orchestrator.records.run_record import CampaignResult
 from orchestrator.records.run_registry import make_state_directory
 from orchestrator.records.states import State
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
-from orchestrator.reports.publishing import not_simulated, publish_run, publish_so_far
+from orchestrator.reports.publishing import publish_run, publish_so_far
+from orchestrator.reports.validity_warnings import not_simulated
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
@@ -229,7 +230,7 @@ class Running:
         assert self._progress is not None
 
         def recorder(plan: CampaignPlan, run: Path) -> RerunMonitor | None:
-            return recorder_of(plan, run, self._log_warning, live if live is not None and live.alive else None)
+            return recorder_of(plan, run, self._log_warning, live.stream if live is not None and live.alive else "")
 
         return RunResources(
             in_process=self._shared.settings.in_process,

@@ -64,10 +64,10 @@ def begun(monkeypatch: pytest.MonkeyPatch, command: str) -> Any:
     plans = []
 
     def begin(request: Any, *args: Any, **kwargs: Any) -> NoReturn:
-        plans.append((request.campaign, kwargs["again"]))
+        plans.append((request.campaign, kwargs["again"](Path("runs/small-1"))))
         raise SeenError
 
-    monkeypatch.setattr(common, "run_in_front_of_people", begin)
+    monkeypatch.setattr(common, "run_at_terminal", begin)
     result = invoke(command)
     assert isinstance(result.exception, SeenError), result.output
     return plans[0]
@@ -78,7 +78,7 @@ def test_a_run_takes_another_seed_and_tells_so_in_the_command_that_goes_on(
 ) -> None:
     plan, again = begun(monkeypatch, "run small.yaml --seed 41")
     assert (plan.seed, plan.resolved["seed"]) == (41, 41)
-    assert re.search(r"decant run small\.yaml --resume --run small-\d+-1 --seed 41$", again)
+    assert re.search(r"decant run small\.yaml --resume --run small-1 --seed 41$", again)
     plan, again = begun(monkeypatch, "calibrate small.yaml")
     assert plan.seed == 3
     assert "--seed" not in again

@@ -11,7 +11,7 @@ import pytest
 
 from actors.interfaces import LaboratoryError
 from orchestrator.cli.console import RefusalError
-from orchestrator.cli.foreground_run import file_trouble, given_up_pours, interruption, run_in_front_of_people
+from orchestrator.cli.foreground_run import file_trouble, given_up_pours, interruption, run_at_terminal
 from orchestrator.learning.run_errors import RunError
 from orchestrator.runs.request_executor import PourNotMadeError
 from orchestrator.runs.run_service import RunRequest, RunResources, RunService
@@ -93,5 +93,5 @@ def test_the_exit_code_tells_a_failure_from_a_question(
     monkeypatch.setattr(RunService, "start", fail)
     request = RunRequest(toy_plan(tmp_path), (), tmp_path / "run")
     with pytest.raises(RefusalError, match=str(error)) as refused:
-        run_in_front_of_people(request, RunResources(), again="decant run toy.yaml --resume")
+        run_at_terminal(request, RunResources(), again=lambda folder: "decant run toy.yaml --resume")
     assert refused.value.exit_code == code

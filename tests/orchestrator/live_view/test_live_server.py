@@ -21,6 +21,7 @@ from orchestrator.live_view.recording_sink import SENDING
 from orchestrator.live_view.rerun_subscriber import RerunMonitor
 from orchestrator.live_view.viewer_server import run_rerun
 from orchestrator.records.events import LogLine
+from orchestrator.runs.run_folder import RECORDING
 from sim_engine.errors import DecantError
 from tests.support import example_run
 from tests.support.rerun_recordings import Contents, seen, tabs_as_they_came, viewer
@@ -51,7 +52,7 @@ def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
     with LiveView() as live:
         with urllib.request.urlopen(live.url, timeout=60.0) as page:
             assert b"<html" in page.read().lower()
-        monitor = live.watcher_for(plan, tmp_path)
+        monitor = RerunMonitor(tmp_path / RECORDING, plan, url=live.stream)
         for event in example_run.events(plan):
             monitor(event)
         with viewer(live.stream, tmp_path / "seen.rrd"):
@@ -73,7 +74,7 @@ def test_viewer_who_joins_late_sees_all_that_happened(tmp_path: Path) -> None:
 def test_who_comes_late_gets_the_newest_first_in_the_arrangement_that_is_shown_now(tmp_path: Path) -> None:
     plan = example_run.campaign()
     with LiveView() as live:
-        monitor = live.watcher_for(plan, tmp_path)
+        monitor = RerunMonitor(tmp_path / RECORDING, plan, url=live.stream)
         told = list(example_run.events(plan))[:-1]
         while not monitor.path.stat().st_size:  # what comes while programs are loaded is sent in one piece
             time.sleep(0.1)
@@ -96,7 +97,7 @@ def test_who_comes_late_gets_the_newest_first_in_the_arrangement_that_is_shown_n
 def test_two_campaigns_are_served_side_by_side(tmp_path: Path) -> None:
     plan = example_run.campaign(pours=1)
     with LiveView() as live:
-        monitors = [live.watcher_for(plan, tmp_path / name) for name in ("first", "second")]
+        monitors = [RerunMonitor(tmp_path / name / RECORDING, plan, url=live.stream) for name in ("first", "second")]
         for monitor in monitors:
             for event in example_run.events(plan):
                 monitor(event)
@@ -142,7 +143,7 @@ def test_address_that_is_not_one_is_refused_with_what_would_be_right() -> None:
 def test_server_that_dies_or_hangs_costs_the_recording_nothing(tmp_path: Path, death: signal.Signals) -> None:
     plan = example_run.campaign(pours=1)
     with LiveView() as live:
-        monitor = live.watcher_for(plan, tmp_path)
+        monitor = RerunMonitor(tmp_path / RECORDING, plan, url=live.stream)
         monitor(LogLine(level="info", text="before"))
         pid = live.server_pid
         os.kill(pid, death)

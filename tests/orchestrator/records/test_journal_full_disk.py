@@ -14,7 +14,7 @@ import pytest
 
 from actors.interfaces import DoseSource, DoseTarget, Notice, ProgressCallback
 from actors.runtime.child_process import child_environment
-from orchestrator.cli.foreground_run import RefusalError, run_directory
+from orchestrator.cli.foreground_run import RefusalError, new_run
 from orchestrator.learning.campaign_plan import OutputSettings
 from orchestrator.learning.requests import Poured
 from orchestrator.records.events import Event, LogLine
@@ -149,7 +149,7 @@ def test_a_run_says_at_once_which_disk_is_full_and_how_much_it_needs(disk: Path)
     with pytest.raises(
         RefusalError, match=rf"runs: 3.\d MB are free on its disk, and {TO_BEGIN // MB} MB are needed"
     ) as e:
-        run_directory(plan, resume=False, run_id=None)
+        new_run(plan)
     assert e.value.exit_code == 2
     assert not (disk / "runs").exists()
 

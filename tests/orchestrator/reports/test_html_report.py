@@ -35,6 +35,8 @@ from orchestrator.reports.summarise import summarise
 from orchestrator.runs.request_executor import FILM_RATE
 from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.run_folder import create_run
+from orchestrator.runs.run_service import RunRequest, RunResources, RunService
+from orchestrator.runs.stages import stages_of
 from sim_engine.outcome import SimulatedPour
 from sim_engine.scene import PourTask
 from tests.support import example_run
@@ -280,9 +282,12 @@ def test_a_failed_run_says_why_and_what_stands(tmp_path: Path) -> None:
     bench, directory = ToyBench(), create_run(plan)
     calls = iter(range(1, 100))
     bench.fails = lambda seed: LaboratoryError("the hose came off") if next(calls) == 4 else None
+    opened = laboratory(bench, Asked(lambda: len(bench.poured) == 4))
+    resources = RunResources(laboratory=lambda settings, pours: opened)
+    handle = RunService().start(RunRequest(plan, stages_of(plan), directory), resources)
     with pytest.raises(RunError, match="cable"):
-        asyncio.run(run_campaign(plan, laboratory(bench, Asked(lambda: len(bench.poured) == 4)), directory))
-    page = report_of_what_stands(plan, directory)
+        asyncio.run(handle.wait())
+    page = report_of_what_stands(handle)
     assert page is not None
     said = texts(page.read_text(encoding="utf-8"))
     assert "Its state is 'failed'" in said
@@ -294,8 +299,12 @@ def test_a_failed_run_says_why_and_what_stands(tmp_path: Path) -> None:
 
 def test_a_run_of_another_campaign_is_not_reported_as_this_one(made: Made, tmp_path: Path) -> None:
     other = load_campaign(write_campaign(tmp_path, CAMPAIGN.replace("100 g", "90 g")))
-    assert report_of_what_stands(other, made.result.directory) is None
-    assert report_of_what_stands(made.plan, tmp_path) is None
+    directory = made.result.directory
+    request = RunRequest(other, stages_of(other), directory, resume=True)
+    handle = RunService().start(request, RunResources(in_process=True))
+    with pytest.raises(RunError, match="mass"):
+        asyncio.run(handle.wait())
+    assert report_of_what_stands(handle) is None
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from orchestrator.reports.summarise import summarise
 from orchestrator.reports.validity_warnings import (
     best_action_warnings,
     campaign_warnings,
-    lines,
+    not_simulated,
     numbers_line,
     regimes_of,
 )
@@ -60,7 +60,7 @@ def test_a_warning_names_the_worst_action_and_how_many_were_tried() -> None:
     (dribbling,) = (one for one in warnings["narrow cup"] if one.kind == "dribbling")
     assert dribbling.action_si["max_angle"] == pytest.approx(66 * DEG)
     assert (dribbling.hit, dribbling.tried) == (3, 5)  # the middle of 93° and those to 66°, not those to 120°
-    (header, *told) = lines(warnings)
+    (header, *told) = not_simulated(deploying(mixed), print)
     assert header.startswith("not simulated")
     assert any("into narrow, dribbling: " in line and "3 of 5 actions tried)" in line for line in told)
     assert any("max angle 66 deg" in line for line in told)
@@ -158,7 +158,7 @@ def test_a_campaign_begins_with_what_is_not_simulated_in_it_each_kind_once(verb:
 
 
 def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from orchestrator.cli.foreground_run import run_in_front_of_people
+    from orchestrator.cli.foreground_run import run_at_terminal
     from orchestrator.runs.run_service import RunResources
     from orchestrator.runs.run_tasks import run_task
     from sim_engine.errors import DecantError
@@ -167,7 +167,7 @@ def test_a_resumed_run_does_not_say_it_again(folder: Path, capsys: pytest.Captur
     resumed = replace(request, resume=True)
     for each, times in ((request, 1), (resumed, 0)):
         with pytest.raises(DecantError, match="No space left"):
-            run_in_front_of_people(each, RunResources(), again="")
+            run_at_terminal(each, RunResources(), again=str)
         assert capsys.readouterr().err.count("not simulated (docs") == times
 
 

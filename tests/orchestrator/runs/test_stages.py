@@ -27,9 +27,9 @@ from orchestrator.records.codec import canonical
 from orchestrator.records.events import Event, RequestFinished
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.reports.console_view import summary_table
+from orchestrator.reports.progress_state import work_of
 from orchestrator.reports.publishing import publish
 from orchestrator.reports.summarise import summarise
-from orchestrator.reports.time_estimate import work_of
 from orchestrator.runs.motion_approval import pour_count
 from orchestrator.runs.stages import deployed_theta, scenes_of, stages_of
 from sim_engine.liquids import SimulationParameters

@@ -1,4 +1,4 @@
-"""`time_estimate`: what is told of the time that is left comes true."""
+"""`progress_state`: what is told of the time that is left comes true."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from orchestrator.records.events import (
 )
 from orchestrator.records.journal_file import Header
 from orchestrator.records.run_record import RunState
-from orchestrator.reports.time_estimate import PRICE, Forecast, WorkEstimate, pour_time, work_of
+from orchestrator.reports.progress_state import PRICE, Forecast, WorkEstimate, pour_time, work_of
 from sim_engine.liquids import SimulationParameters
 from tests.support import example_run
 from tests.support.toy_campaign import SCENE, SPACE, toy_plan
