@@ -228,7 +228,7 @@ def draw(browser: Browser, lab: Lab) -> None:
     number = lab.call("questions")[0]["id"]
     lab.call(f"questions/{number}/answer", {"answer": "yes"}, "POST")
     until(lambda: lab.checkpoint() == "tilt")
-    lab.call("emergency-stop", {"reason": "the tray slipped"}, "POST")
+    lab.call("emergency-stop?reason=the+tray+slipped", method="POST")
     picture(
         browser,
         lab,

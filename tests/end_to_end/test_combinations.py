@@ -53,7 +53,7 @@ def by_the_daemon(run: Run, folder: Path, environment: dict[str, str]) -> Path:
 def result_of(run: Run, folder: Path) -> tuple[Path, dict[str, Any]]:
     """Make a run. Returns its folder, and the published summary."""
     write_campaign(folder, run.features)
-    environment = {"DECANT_ENGINE": "quadrants" if "Quadrants" in run.ways else "taichi"}
+    environment = {"DECANT_ENGINE": "quadrants"} if "Quadrants" in run.ways else {}
     in_process = "in process" in run.ways
     if "daemon" in run.ways:
         directory = by_the_daemon(run, folder, environment)

@@ -96,4 +96,5 @@ def test_engine_ends_cleanly_without_having_simulated() -> None:
         timeout=PATIENCE,
         env=child_environment(),
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    replaced = "Taichi can't be loaded without " in done.stderr  # one line, where its libraries are missing
+    assert (done.returncode, len(done.stderr.splitlines())) == (0, int(replaced)), done.stderr

@@ -93,7 +93,7 @@ def test_queries_of_a_daemon_print_what_is_documented(tmp_path: Path) -> None:
     try:
         reach = f"--url {real.url} --state {tmp_path / 'state'}"
         said(f"queue pause {reach}")
-        submitted = said(f"queue submit {ROOT / 'configs/campaigns/quickstart.yaml'} {reach} --json")
+        submitted = said(f"queue submit {shlex.quote(str(ROOT / 'configs/campaigns/quickstart.yaml'))} {reach} --json")
         key = validated("queue submit", submitted)["id"]
         assert validated("queue list", said(f"queue list {reach} --json"))["campaigns"]
         assert validated("queue list", said(f"queue list {key} {reach} --json"))["id"] == key

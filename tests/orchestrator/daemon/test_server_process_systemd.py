@@ -58,10 +58,11 @@ def test_other_users_submit_and_look_with_a_token_and_nothing_else(tmp_path: Pat
 
     try:
         assert typed("queue pause", Role.OPERATOR).exit_code == 0
-        submitted = typed(f"queue submit {shipped('campaigns/quickstart.yaml')}", Role.OPERATOR)
+        quickstart = shlex.quote(str(shipped("campaigns/quickstart.yaml")))
+        submitted = typed(f"queue submit {quickstart}", Role.OPERATOR)
         assert submitted.exit_code == 0, submitted.stderr
         assert submitted.stdout.strip() in typed("queue list", Role.VIEWER).stdout
-        refused = typed(f"queue submit {shipped('campaigns/quickstart.yaml')}", Role.VIEWER)
+        refused = typed(f"queue submit {quickstart}", Role.VIEWER)
         assert refused.exit_code != 0
         assert "this takes operator" in refused.stderr
     finally:
