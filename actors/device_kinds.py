@@ -197,12 +197,6 @@ class UrArmKind(ArmKind[UrArmSettings]):
 
         return UrDiagnostics.at(self.spec)
 
-    def diagnostics_of(self, recorded: Mapping[str, Any]) -> ArmDiagnostics:
-        """See `ArmKind.diagnostics_of`."""
-        from actors.arm.ur.commissioning import UrDiagnostics
-
-        return UrDiagnostics.of_record(self.spec, recorded)
-
     def readiness(self) -> DeviceCheck | None:
         """See `ArmKind.readiness`."""
         from actors.arm.ur.commissioning import readiness

@@ -24,7 +24,7 @@ def find_runs(*words: str, **conditions: Unpack[Conditions]) -> pd.DataFrame:
             `state` as `decant runs` shows it ('finished', 'interrupted' …). All given conditions must hold.
 
     Returns:
-        One row for each run; the data dictionary of `decant runs export` describes the columns. `attrs['units']` has
+        One row for each run; the reference of the catalogue describes the columns. `attrs['units']` has
         the units, in Parquet files, too. Numbers of things are of type Int64, texts of type string.
 
     Raises:

@@ -85,7 +85,7 @@ class ArmDiagnostics:
         return checks
 
     def recorded(self) -> dict[str, Any]:
-        """The values that were read, JSON-ready, for `ArmKind.diagnostics_of`; empty if they are not kept."""
+        """The values that were read, JSON-ready; empty if they are not kept."""
         return {}
 
     def at_home(self) -> DeviceCheck:
@@ -310,14 +310,6 @@ class ArmKind(ABC, Generic[S]):
         finally:
             arm.close()
         return ArmDiagnostics(facts.checksum, facts.serial, facts.model, facts.version, facts.problem)
-
-    def diagnostics_of(self, recorded: Mapping[str, Any]) -> ArmDiagnostics:
-        """The diagnostics of values that were recorded before (`ArmDiagnostics.recorded`); nothing is connected.
-
-        Raises:
-            ValueError: the values cannot be read.
-        """
-        raise ValueError("this kind of arm has no recorded readouts")
 
     def readiness(self) -> DeviceCheck | None:
         """Read whether a motion could begin now, for a display while no run uses the arm.

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, Self
 from zlib import crc32
 
 from orchestrator.catalogue.annotations import ANNOTATIONS_NAME, add_note
-from orchestrator.catalogue.export import write_tables
 from orchestrator.catalogue.queries import condition_sql
 from orchestrator.catalogue.run_reading import TABLES, UNREADABLE, Column, RunRows, read_run, unreadable
 from orchestrator.learning.run_errors import RunError
@@ -177,15 +176,6 @@ class Catalogue:
         row = self._find(name)
         notes = add_note(Path(row["path"]), text, by)
         return {"run": row["run"], "notes": [note.model_dump() for note in notes]}
-
-    def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
-        """Write runs and pours into files.
-
-        Returns 'files' and the numbers of 'runs' and 'pours'. Raises MissingExtraError, OSError.
-        """
-        tables = {"run": self.runs(conditions), "pour": self.pours(conditions)}
-        files = write_tables(tables, folder, formats)
-        return {"files": [str(path) for path in files], **{f"{name}s": len(rows) for name, rows in tables.items()}}
 
     def posteriors(self) -> list[KnownPosterior]:
         """The posteriors of all calibrations, the oldest first, and then the imported ones of other runs.

@@ -115,7 +115,7 @@ POURS = (
 """Columns of the table of pours; one row for each pour that had begun."""
 
 TABLES: dict[str, tuple[Column, ...]] = {"run": RUNS, "pour": POURS}
-"""The columns of both tables: for the index, exports, their data dictionary and the API."""
+"""The columns of both tables: for the index, tables, their reference and the API."""
 
 _TYPES: dict[str, Any] = {
     "text": str | None,

@@ -146,11 +146,6 @@ _robot(
     "decant robot check configs/laboratories/ur10-kern.yaml --accept-safety   # after reading them on the pendant",
 )
 _robot(
-    robot_commands.archive,
-    "decant robot archive day-one.zip day-one-robot.json day-one-balance.jsonl runs/first-pour-20300131-1",
-    "decant robot archive day-one.zip   # replay it without the rig",
-)
-_robot(
     robot_commands.jog,
     "decant robot jog configs/laboratories/virtual.yaml         # practise without a robot",
     "decant robot jog configs/laboratories/ur10-kern.yaml --enable-motion",

@@ -251,14 +251,6 @@ class StudyCostOutput(CommandOutput):
     cpu_hours: float
 
 
-class ExportOutput(CommandOutput):
-    """Exported tables."""
-
-    files: list[str]
-    runs: int
-    pours: int
-
-
 class PredictedDoseOutput(CommandOutput):
     """One dose, predicted."""
 

@@ -2,7 +2,6 @@
 
 - `check` checks whether a bench is ready to pour, and advises how to solve each problem. Nothing moves; the balance is
   tared only on request.
-- `archive` collects the recordings of a commissioning day in one file, and replays them.
 - `jog` moves the arm by typed steps, `home` brings it home; the session itself is in `motion_control`.
 - `teach` writes the arm's pose into the laboratory file as a place; `try` moves to one and back.
 """
@@ -12,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import getpass
+import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -49,7 +49,7 @@ def check(
         Path | None,
         typer.Option(
             "--record",
-            help="Also write what the controller sent into this new file (.json), for 'decant robot archive'.",
+            help="Also write what the controller sent into this new file (.json), for the key 'calibration_file'.",
         ),
     ] = None,
     as_json: Json = False,
@@ -63,7 +63,6 @@ def check(
     from actors.interfaces import LaboratoryError
     from actors.laboratory import check_bench_packages
     from orchestrator.cli.command_results import CheckOutput
-    from orchestrator.cli.commissioning_archive import ArchiveError, write_robot_check
     from orchestrator.runs.bench_check import check_bench
     from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
@@ -91,8 +90,8 @@ def check(
     def read(look: ArmDiagnostics) -> SafetyRecord | None:
         accepted = _accept(laboratory, look) if accept_safety and not virtual else record
         if record_to is not None:
-            with Refused(OSError, ArchiveError, at=f"--record {record_to}: "):
-                write_robot_check(record_to, laboratory, look, accepted, virtual=virtual)
+            with Refused(OSError, at=f"--record {record_to}: "):
+                _write_readout(record_to, laboratory, look, accepted, virtual=virtual)
         return accepted
 
     report = check_bench(spec, laboratory, record, tare=tare, read=read)
@@ -106,37 +105,27 @@ def check(
     print_message("ready" if all(check.state == "ok" for check in report.checks) else "ready, with warnings")
 
 
-def archive(
-    archive: Annotated[Path, typer.Argument(help="The archive (.zip); created if it does not exist.")],
-    recordings: Annotated[
-        list[Path] | None, typer.Argument(help="Recordings to add: files of '--record', and run folders.")
-    ] = None,
-    as_json: Json = False,
+def _write_readout(
+    path: Path, laboratory: Path, look: ArmDiagnostics, record: SafetyRecord | None, *, virtual: bool
 ) -> None:
-    """Keep the recordings of a commissioning day in one file, and replay them all without the rig.
+    """Write the readout of a controller, with the laboratory's text, into a new file.
 
-    A replay reads every recording again and compares the results with those of the day: the lines of 'robot check', the
-    stable weights of the balance, the weighed pours of runs. Exit code 1 if this version of Decant reads one of them
-    differently. Nothing is connected.
+    Raises:
+        RefusalError: this kind of arm offers no readout.
+        OSError: a file can't be read or written.
     """
-    from orchestrator.cli.command_results import CheckOutput
-    from orchestrator.cli.commissioning_archive import CommissioningArchive
-
-    with Refused(OSError):
-        stored = CommissioningArchive(archive)
-        if recordings:
-            stored.add(recordings)
-        elif not archive.exists():
-            raise RefusalError(f"{archive}: there is no such archive, and no recording to begin one with")
-    checks = list(stored.replay())
-    failed = [c for c in checks if c.state == "fail"]
-    if as_json:
-        print_json(CheckOutput(laboratory=str(archive), mode="", ready=not failed, checks=checks))
-    else:
-        print_table(checks)
-    if failed:
-        raise RefusalError(f"{len(failed)} of {len(checks)} recordings are read differently", FAILED)
-    print_message(f"{archive}: {len(checks)} recordings, read as on the day")
+    if not (readout := look.recorded()):
+        raise RefusalError("the driver of this arm has no readout that could be recorded")
+    data = {
+        "decant_robot_check": 1,
+        "source": "virtual" if virtual else "hardware",
+        "date": time.strftime("%Y-%m-%d"),
+        "laboratory": laboratory.read_text(encoding="utf-8"),
+        "accepted": None if record is None else dataclasses.asdict(record),
+        "readout": readout,
+    }
+    with path.open("x", encoding="utf-8") as file:
+        json.dump(data, file, indent=1, ensure_ascii=False)
 
 
 def without_arm(path: Path, spec: LaboratorySettings, purpose: str) -> RefusalError:

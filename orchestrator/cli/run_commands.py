@@ -359,37 +359,6 @@ def note(
 
 
 @_command(
-    "decant runs export table/ --since 2030-03 --until 2030-03",
-    "decant runs export table/ --format csv",
-    conditions=("words", "limit"),
-)
-def export(
-    folder: Annotated[Path, typer.Argument(help="Folder for the files.")],
-    conditions: dict[str, Any],
-    formats: Annotated[list[str] | None, typer.Option("--format", help="csv or parquet; default: both.")] = None,
-    state: State = None,
-    daemon: Daemon = False,
-    as_json: Json = False,
-) -> None:
-    """Export runs and pours as CSV and Parquet, with a data dictionary: `runs.*`, `pours.*` and `dictionary.csv`."""
-    from orchestrator.catalogue.export import FORMATS
-    from sim_engine.resources import MissingExtraError
-
-    if wrong := sorted(set(formats or ()) - set(FORMATS)):
-        raise RefusalError(f"--format {wrong[0]}: should be {' or '.join(FORMATS)}")
-    try:
-        with _client(daemon) as client:
-            exported = client.export(folder, conditions, formats or FORMATS)
-    except MissingExtraError as error:
-        raise RefusalError(f"{error}; or --format csv") from None
-    if as_json:
-        print_json(exported)
-        return
-    print_note(f"{exported['runs']} runs, {exported['pours']} pours")
-    print("\n".join(exported["files"]))
-
-
-@_command(
     "decant runs add runs/",
     "decant runs add /media/usb/runs/quickstart-20300301-1",
     "decant runs add beaker.yaml   # a posterior from another machine",

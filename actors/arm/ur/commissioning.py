@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +21,6 @@ from actors.arm.ur.controller_readout import (
     Exchange,
     Findings,
     ReadoutError,
-    findings_of,
     look_at,
     read_status,
     recorded_findings,
@@ -147,12 +146,6 @@ class UrDiagnostics(ArmDiagnostics):
     def at(cls, spec: UrArmSettings) -> UrDiagnostics:
         """Read everything from the controller."""
         return cls._of(spec, look_at(spec.address))
-
-    @classmethod
-    def of_record(cls, spec: UrArmSettings, recorded: Mapping[str, Any]) -> UrDiagnostics:
-        """From `recorded`."""
-        findings = findings_of(recorded)
-        return cls._of(spec.with_values(address=findings.address), findings)
 
     def recorded(self) -> dict[str, Any]:
         """See `ArmDiagnostics.recorded`."""

@@ -1,21 +1,17 @@
 """Routes of the HTTP API for the catalogue of previous runs; the counterpart of `decant runs`.
 
-Viewers list and export runs and pours. Operators add notes. Queries run in a thread, since the first
+Viewers list runs and pours. Operators add notes. Queries run in a thread, since the first
 one may read many journals. The catalogue itself is in `orchestrator.catalogue`.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
-import tempfile
-import zipfile
 from collections.abc import Callable
-from io import BytesIO
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from fastapi import APIRouter, Depends, HTTPException, Query, Response
+from fastapi import APIRouter, Depends, HTTPException, Query
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
@@ -24,11 +20,9 @@ from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
 from orchestrator.daemon.api.access_control import Daemon, Operator, Viewer
-from orchestrator.daemon.rigs.materials import Materials
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.run_readout import REPORT
 from orchestrator.learning.run_errors import RunError
-from sim_engine.resources import MissingExtraError
 
 T = TypeVar("T")
 
@@ -61,13 +55,8 @@ def _filters(name: str, **others: Any) -> Callable[..., dict[str, Any]]:
 
 
 _RUN = (Annotated[str | None, Field(max_length=200)], Field(default=None, description="Name of one run's folder."))
-_FORMATS = (
-    list[Literal["csv", "parquet"]],
-    Field(default=["csv"], min_length=1, max_length=2, description="One format or both."),
-)
 RunsAsked = Annotated[dict[str, Any], Depends(_filters("RunsAsked"))]
 PoursAsked = Annotated[dict[str, Any], Depends(_filters("PoursAsked", run=_RUN))]
-ExportAsked = Annotated[dict[str, Any], Depends(_filters("ExportAsked", format=_FORMATS))]
 
 
 class NoteIn(BaseModel):
@@ -97,7 +86,7 @@ async def _in_catalogue(daemon: SharedServices, query: Callable[[Catalogue], T])
         return await asyncio.to_thread(work)
     except NoSuchRunError as error:
         raise HTTPException(404, str(error)) from None
-    except (ValueError, MissingExtraError) as error:
+    except ValueError as error:
         raise HTTPException(422, str(error)) from None
     except (RunError, OSError) as error:
         raise HTTPException(409, str(error)) from None
@@ -117,36 +106,6 @@ async def runs(daemon: Daemon, person: Viewer, conditions: RunsAsked) -> Any:
 async def pours(daemon: Daemon, person: Viewer, conditions: PoursAsked) -> Any:
     """List the pours of all runs, oldest first: the action, the measured spillage and the prediction."""
     return await _in_catalogue(daemon, lambda catalogue: catalogue.pours(conditions))
-
-
-@router.get(
-    "/runs/export",
-    operation_id="export_runs",
-    response_class=Response,
-    responses={200: {"content": {"application/zip": {}}, "description": "runs.*, pours.*, dictionary.csv."}},
-)
-async def export(daemon: Daemon, person: Viewer, conditions: ExportAsked) -> Response:
-    """Export runs and pours as files with a data dictionary, in one zip archive.
-
-    If vessels are registered, `account.csv` is the account of the materials, with the run of each ordered pour.
-    """
-    formats = dict.fromkeys(conditions.pop("format"))
-    account = Materials(daemon.store).table()
-
-    def written(catalogue: Catalogue) -> bytes:
-        archive = BytesIO()
-        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packed:
-            report = catalogue.export(Path(folder), conditions, list(formats))
-            for path in map(Path, report.pop("files")):
-                packed.write(path, path.name)
-            if account:
-                packed.writestr("account.csv", account)
-            packed.comment = json.dumps(report).encode()
-        return archive.getvalue()
-
-    content = await _in_catalogue(daemon, written)
-    headers = {"Content-Disposition": 'attachment; filename="decant-runs.zip"'}
-    return Response(content, media_type="application/zip", headers=headers)
 
 
 @router.get("/runs/{run}", operation_id="run", response_model=PreviousRunDetail)

@@ -11,10 +11,8 @@ import os
 import re
 import ssl
 import time
-import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -285,19 +283,6 @@ class RemoteCatalogueClient:
     def note(self, name: str, text: str) -> Row:
         """See `Catalogue`."""
         return dict(self._client.post(f"{_of(name)}/notes", {"text": text}))
-
-    def export(self, folder: Path, conditions: Mapping[str, Any], formats: Sequence[str]) -> Row:
-        """See `Catalogue`."""
-        packed = self._client.fetch("/runs/export", format=list(formats), **conditions)
-        folder.mkdir(parents=True, exist_ok=True)
-        files = []
-        with zipfile.ZipFile(BytesIO(packed)) as archive:
-            counts: Row = json.loads(archive.comment)
-            for name in archive.namelist():
-                path = folder / Path(name).name
-                path.write_bytes(archive.read(name))
-                files.append(str(path))
-        return {"files": files, **counts}
 
 
 def _of(name: str) -> str:

@@ -7,12 +7,10 @@ checked before anything moves. A vessel `LABORATORY/VESSEL`, the source of a cam
 
 from __future__ import annotations
 
-import csv
 import json
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -222,24 +220,6 @@ class Materials:
             *(rig, rig),
         )
         return {name: row["id"] for row in rows for name in (row["code"], row["id"]) if name}
-
-    def table(self) -> str:
-        """Return the account as CSV, for the export of runs: masses in g, and the run of each pour; '' if empty."""
-        runs = {
-            row["id"]: row["run"]
-            for row in self._store.rows(
-                "select pour_order.id, run from pour_order join campaign on campaign.id = campaign"
-            )
-        }
-        entries = self.account.history(count=-1)
-        if not entries:
-            return ""
-        text = StringIO()
-        columns = ("t", "vessel", "kind", "mass_g", "deviation_g", "liquid", "pour", "run", "by", "note")
-        writer = csv.DictWriter(text, columns)
-        writer.writeheader()
-        writer.writerows({**entry.json_entry(), "run": runs.get(entry.pour, "")} for entry in reversed(entries))
-        return text.getvalue()
 
     # ---- look-up
 

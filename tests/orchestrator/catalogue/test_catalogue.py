@@ -4,7 +4,6 @@ itself.
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 import os
@@ -17,14 +16,13 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
 from orchestrator.catalogue import catalogue as index
 from orchestrator.catalogue.catalogue import INDEX_NAME, Catalogue
 from orchestrator.catalogue.queries import moment
-from orchestrator.catalogue.run_reading import POURS, RUNS, RunRows, read_run
+from orchestrator.catalogue.run_reading import RunRows, read_run
 from orchestrator.cli import console
 from orchestrator.cli.app import app
 from orchestrator.records import run_registry as registry
@@ -266,23 +264,6 @@ def test_one_command_says_which_action_was_used_for_a_vessel_and_what_it_spilled
     assert [pour["spilled_g"] for pour in told["pours"]] == [pour["spilled_g"] for pour in asked("pour")]
 
 
-def test_exports_hold_everything_and_say_what_it_means(tmp_path: Path, state: Path) -> None:
-    made(tmp_path)
-    folder = tmp_path / "table"
-    assert invoke(f"runs export {folder}").exit_code == 0
-    parquet = pq.read_table(folder / "pours.parquet")
-    with (folder / "pours.csv").open() as file:
-        lines = list(csv.DictReader(file))
-    assert parquet["spilled_g"].to_pylist() == [float(line["spilled_g"]) for line in lines]
-    assert parquet["time"].to_pylist()[0].isoformat(timespec="milliseconds") == lines[0]["time"]
-    assert parquet.schema.field("spilled_g").metadata[b"unit"] == b"g"
-    with (folder / "dictionary.csv").open() as file:
-        explained = {(line["table"], line["column"]): line["meaning"] for line in csv.DictReader(file)}
-    assert set(explained) == {("runs", c.name) for c in RUNS} | {("pours", c.name) for c in POURS}
-    assert all(explained.values())
-    assert pq.read_table(folder / "runs.parquet")["receiver"].to_pylist() == [["cup"]]
-
-
 @pytest.mark.parametrize(
     ("command", "says"),
     [
@@ -290,7 +271,6 @@ def test_exports_hold_everything_and_say_what_it_means(tmp_path: Path, state: Pa
         ("runs list --mode maybe", "mode 'maybe' is not one of virtual, real, hardware"),
         ("runs show nothing", "nothing: no such run in the catalogue"),
         ("runs add nowhere", "nowhere: is not a folder"),
-        ("runs export x --format xls", "--format xls: should be csv or parquet"),
     ],
 )
 def test_bad_input_is_one_clear_error(command: str, says: str, state: Path) -> None:

@@ -5,7 +5,6 @@ it.
 from __future__ import annotations
 
 import asyncio
-import csv
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -13,11 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pyarrow import parquet
 
 import decant
 from orchestrator.campaigns.file_loading import load_campaign
-from orchestrator.catalogue.export import write_tables
 from orchestrator.catalogue.run_reading import TABLES, read_run
 from orchestrator.daemon.state.event_feed import event_json
 from orchestrator.learning.strategy_registry import OBJECTIVES
@@ -115,15 +112,6 @@ def test_fractions_of_a_run_are_the_ratios_of_the_masses_beside_them(run: Any, t
     for row in published.simulations.to_dict("records"):
         assert row["spillage"] == pytest.approx(row["spilled"] / row["poured"])
         assert row["poured"] + row["retained"] == pytest.approx(1.0)
-
-
-def test_fractions_of_exported_tables_are_the_ratios_of_the_masses_beside_them(run: Any, tmp_path: Path) -> None:
-    pours = read_run(run[0].directory).pours
-    write_tables({"pour": pours}, tmp_path)
-    with (tmp_path / "pours.csv").open(newline="", encoding="utf-8") as file:
-        rows = [{name: float(row[name]) for name in (*MASSES, "spillage")} for row in csv.DictReader(file)]
-    assert wrong_in(rows) == (len(pours), [])
-    assert wrong_in(parquet.read_table(tmp_path / "pours.parquet").to_pylist()) == (len(pours), [])
 
 
 def properties(schema: Any) -> Iterator[tuple[str, str, Mapping[str, Any]]]:

@@ -4,11 +4,8 @@ role.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import shlex
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -75,19 +72,10 @@ def test_what_can_not_be_found_or_asked_says_why(tmp_path: Path) -> None:
     run(work())
 
 
-def test_runs_are_exported_and_their_reports_read(tmp_path: Path) -> None:
+def test_reports_of_earlier_runs_are_read(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path) as served:
-            first, second = await finished(served), await finished(served)
-            answer = await served.http.get(
-                "/api/v1/runs/export", params={"format": ["csv", "parquet"]}, headers=served.headers(Role.VIEWER)
-            )
-            archive = zipfile.ZipFile(io.BytesIO(answer.content))
-            assert sorted(archive.namelist()) == [
-                "dictionary.csv", "pours.csv", "pours.parquet", "runs.csv", "runs.parquet"
-            ]  # fmt: skip
-            table = list(csv.DictReader(io.StringIO(archive.read("pours.csv").decode())))
-            assert [row["run"] for row in table] == [first] * 3 + [second] * 3
+            first = await finished(served)
             report = await served.http.get(f"/api/v1/runs/{first}/report", headers=served.headers(Role.VIEWER))
             assert report.status_code == 200
             assert "<html" in report.text
@@ -111,10 +99,6 @@ def test_the_command_line_answers_the_same_through_the_daemon(tmp_path: Path, st
             assert there.stdout == here.stdout != ""
         assert "1 note" in say(f"runs note {directory.name} 'the tray was wet' --daemon").stdout
         assert json.loads(say("runs list tray --json").stdout)["runs"][0]["run"] == directory.name
-        for option in ("", "--daemon"):
-            told = json.loads(say(f"runs export {tmp_path}/tables{option} {option} --format csv --json").stdout)
-            assert [Path(path).name for path in told["files"]] == ["runs.csv", "pours.csv", "dictionary.csv"]
-            assert (told["runs"], told["pours"]) == (1, 4)
         refused = say("runs show nothing --daemon")
         assert refused.exit_code == 2
         assert "no such run" in refused.stderr
