@@ -13,17 +13,12 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.console import INTERRUPTED, RefusalError, fail, set_quiet
-from orchestrator.cli.shell_completion import files_of, local_runs
 from sim_engine.errors import DecantError
 
-Campaign = Annotated[
-    Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN", autocompletion=files_of("campaign"))
-]
+Campaign = Annotated[Path, typer.Argument(help="Campaign file (YAML).", metavar="CAMPAIGN")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one line of JSON, last on stdout.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue the newest unfinished run of this campaign.")]
-RunId = Annotated[
-    str | None, typer.Option("--run", help="With --resume: name of the run's folder.", autocompletion=local_runs)
-]
+RunId = Annotated[str | None, typer.Option("--run", help="With --resume: name of the run's folder.")]
 Answer = Annotated[
     str | None,
     typer.Option(
@@ -31,14 +26,10 @@ Answer = Annotated[
         "or on the virtual bench 'repeat'."
     ),
 ]
-Laboratory = Annotated[
-    Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY", autocompletion=files_of("laboratory"))
-]
+Laboratory = Annotated[Path, typer.Argument(help="Laboratory file (YAML).", metavar="LABORATORY")]
 OtherLaboratory = Annotated[
     Path | None,
-    typer.Option(
-        "--laboratory", help="Laboratory file (YAML) instead of the campaign's.", autocompletion=files_of("laboratory")
-    ),
+    typer.Option("--laboratory", help="Laboratory file (YAML) instead of the campaign's."),
 ]
 Seed = Annotated[
     int | None,
@@ -91,8 +82,9 @@ LiveAt = Annotated[
 Parameters = Annotated[Path | None, typer.Option(help="θ: theta.json of a calibration, or a YAML or JSON file.")]
 Receiver = Annotated[
     Path | None,
-    typer.Option(help="Vessel file (YAML) instead of the campaign's receiver.", autocompletion=files_of("vessel")),
+    typer.Option(help="Vessel file (YAML) instead of the campaign's receiver."),
 ]
+RunFolder = Annotated[Path, typer.Argument(help="Folder of a run, or its name in runs/.", metavar="RUN")]
 _QUIET = inspect.Parameter(
     "quiet",
     inspect.Parameter.KEYWORD_ONLY,
@@ -112,6 +104,11 @@ _QUIET = inspect.Parameter(
 def examples(*commands: str) -> str:
     """Format the examples at the end of a command's help."""
     return "Examples:\n\n" + "\n\n".join(f"`{command}`" for command in commands)
+
+
+def run_folder(run: Path) -> Path:
+    """The folder of a run, which may be given by its name in runs/."""
+    return run if run.exists() or len(run.parts) > 1 else Path("runs") / run
 
 
 def _expanded(path: Path) -> Path:

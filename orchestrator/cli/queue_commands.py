@@ -17,7 +17,6 @@ import typer
 
 from orchestrator.cli.command_options import Campaign, Json, OtherLaboratory, Parameters, Receiver, Seed
 from orchestrator.cli.console import RefusalError, print_json, print_message, print_note
-from orchestrator.cli.shell_completion import files_of, queued_campaigns
 
 if TYPE_CHECKING:
     from orchestrator.daemon.api.daemon_client import Client
@@ -27,16 +26,15 @@ CampaignId = Annotated[
     typer.Argument(
         metavar="CAMPAIGN_ID",
         help="Id as shown by 'decant queue list', or a prefix of it.",
-        autocompletion=queued_campaigns,
     ),
 ]
 CampaignOrQueue = Annotated[
     str | None,
-    typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue.", autocompletion=queued_campaigns),
+    typer.Argument(metavar="[CAMPAIGN_ID]", help="Default: the whole queue."),
 ]
 CampaignOrAll = Annotated[
     str | None,
-    typer.Argument(metavar="[CAMPAIGN_ID]", help="Show this campaign.", autocompletion=queued_campaigns),
+    typer.Argument(metavar="[CAMPAIGN_ID]", help="Show this campaign."),
 ]
 Url = Annotated[
     str | None, typer.Option(help="URL of the daemon; default: $DECANT_URL, or the daemon on this machine.")
@@ -47,7 +45,7 @@ State = Annotated[Path | None, typer.Option(help="The daemon's state directory; 
 def start(
     settings: Annotated[
         Path | None,
-        typer.Argument(help="Settings file (YAML); default: a virtual laboratory.", autocompletion=files_of("daemon")),
+        typer.Argument(help="Settings file (YAML); default: a virtual laboratory."),
     ] = None,
     state: State = None,
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="TCP port; 0 selects a free one.")] = None,
@@ -231,7 +229,6 @@ def logs(
         typer.Argument(
             metavar="[CAMPAIGN_ID]",
             help="Only events of this campaign; default: all events.",
-            autocompletion=queued_campaigns,
         ),
     ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Wait for new events; Ctrl-C ends it.")] = False,

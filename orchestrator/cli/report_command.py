@@ -7,20 +7,12 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json
+from orchestrator.cli.command_options import Json, RunFolder, run_folder
 from orchestrator.cli.console import FAILED, RefusalError, check_output, print_json, print_note, print_warning
-from orchestrator.cli.shell_completion import RUNS, local_runs
 
 
 def report(
-    run: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder of a run, or its name in runs/.",
-            metavar="RUN",
-            autocompletion=local_runs,
-        ),
-    ],
+    run: RunFolder,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Other file than report.html in the run's folder.")
     ] = None,
@@ -36,7 +28,7 @@ def report(
     from orchestrator.records.journal import JOURNAL_NAME
 
     check_output(output, "--output", ".html")
-    folder = run if run.exists() or len(run.parts) > 1 else RUNS / run
+    folder = run_folder(run)
     if (folder / JOURNAL_NAME).is_file():
         page, figures = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
     elif folder.suffix in (".yaml", ".yml"):

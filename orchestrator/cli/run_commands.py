@@ -23,7 +23,6 @@ from actors.laboratory_settings import MODE_LABELS
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
 from orchestrator.cli.console import FAILED, RefusalError, print_json, print_message, print_note
-from orchestrator.cli.shell_completion import catalogued, catalogued_runs
 
 if TYPE_CHECKING:
     from orchestrator.catalogue.catalogue import Catalogue
@@ -80,16 +79,14 @@ Daemon = Annotated[
 ]
 Which = Annotated[
     str,
-    typer.Argument(help="A run: its folder's name, a prefix of the name, or its path.", autocompletion=catalogued_runs),
+    typer.Argument(help="A run: its folder's name, a prefix of the name, or its path."),
 ]
 
 _LIMIT = Annotated[int | None, typer.Option("--limit", min=1, help="Show at most this many, the newest.")]
 _WORDS = Annotated[list[str] | None, typer.Argument(metavar="[WORDS]", help="Words in a run's names or notes.")]
 _OTHERS: dict[str, Any] = {
     "words": _WORDS,
-    "run": Annotated[
-        str | None, typer.Option("--run", help="Folder name or path of one run.", autocompletion=catalogued_runs)
-    ],
+    "run": Annotated[str | None, typer.Option("--run", help="Folder name or path of one run.")],
     "limit": _LIMIT,
 }
 _CONDITIONS: dict[str, Any] = {
@@ -98,7 +95,6 @@ _CONDITIONS: dict[str, Any] = {
         typer.Option(
             "--in-state" if name == "state" else f"--{name}",
             help=text,
-            autocompletion=catalogued(name),
         ),
     ]
     for name, text in CONDITIONS.items()

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import LiveAt
+from orchestrator.cli.command_options import LiveAt, run_folder
 from orchestrator.cli.console import FAILED, RefusalError, Refused, check_output, print_message, print_note
-from orchestrator.cli.shell_completion import local_runs
 
 if TYPE_CHECKING:
     from orchestrator.learning.campaign_plan import CampaignPlan
@@ -31,7 +30,6 @@ def view(
         typer.Argument(
             help="Folders of runs, their names in runs/, or recordings (.rrd).",
             metavar="RUN…",
-            autocompletion=local_runs,
         ),
     ],
     pour: Annotated[
@@ -152,7 +150,7 @@ def _recording_of(source: Path) -> Path:
 def _run_of(source: Path) -> Path:
     from orchestrator.records.journal import JOURNAL_NAME
 
-    run = source if source.exists() or len(source.parts) > 1 else Path("runs") / source
+    run = run_folder(source)
     if not (run / JOURNAL_NAME).is_file():
         raise RefusalError(f"{run}: is not the folder of a run: it has no {JOURNAL_NAME}")
     return run

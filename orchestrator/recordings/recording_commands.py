@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, Parameters, add_group
+from orchestrator.cli.command_options import Json, Parameters, RunFolder, add_group, run_folder
 from orchestrator.cli.console import (
     FAILED,
     RefusalError,
@@ -20,7 +20,6 @@ from orchestrator.cli.console import (
     print_warning,
     waiting_for,
 )
-from orchestrator.cli.shell_completion import RUNS, local_runs
 from sim_engine.settings.plugin_registry import FileKind
 
 if TYPE_CHECKING:
@@ -35,9 +34,7 @@ Recordings = Annotated[
 
 
 def export(
-    run: Annotated[
-        Path, typer.Argument(help="Folder of a run, or its name in runs/.", metavar="RUN", autocompletion=local_runs)
-    ],
+    run: RunFolder,
     to: Annotated[
         Path | None, typer.Option(help="Folder for the files; default: 'recordings' in the run's folder.")
     ] = None,
@@ -53,7 +50,7 @@ def export(
     from orchestrator.recordings.recording_outputs import RecordingExportOutput
     from orchestrator.records.journal import JOURNAL_NAME
 
-    folder = run if run.exists() or len(run.parts) > 1 else RUNS / run
+    folder = run_folder(run)
     if not (folder / JOURNAL_NAME).is_file():
         raise RefusalError(f"{folder}: is no run; name the folder of a run, which has a {JOURNAL_NAME}")
     with Refused(RunError, OSError):

@@ -13,7 +13,6 @@ import typer
 
 from orchestrator.cli.command_options import Json, add_group
 from orchestrator.cli.console import FAILED, INTERRUPTED, RefusalError, Refused, print_json, print_note
-from orchestrator.cli.shell_completion import files_of
 from sim_engine.settings.plugin_registry import FileKind
 
 if TYPE_CHECKING:
@@ -25,9 +24,7 @@ if TYPE_CHECKING:
 SHOWN_FAILURES = 5
 
 
-StudyPath = Annotated[
-    Path, typer.Argument(help="Study file (YAML).", metavar="STUDY", autocompletion=files_of("study"))
-]
+StudyPath = Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="STUDY")]
 
 
 def run_study(
