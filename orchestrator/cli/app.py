@@ -96,7 +96,6 @@ _add(
     simulate_command.simulate,
     "decant simulate my.yaml --set angular_velocity=40 --set x_offset=90   # deg/s and mm",
     "decant simulate my.yaml --set 'angular_velocity=0.7 rad/s' --set 'x_offset=9 cm' --png pour.png",
-    "decant simulate my.yaml --from pours.csv --parameters theta.json --csv scored.csv --png scored.png",
     quiet=True,
 )
 _add(

@@ -9,11 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from actors.arm.arm_interface import PathReport
 from actors.interfaces import DeviceCheck
-from orchestrator.reports.prediction_scores import Score, ScoredRow
 from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import PredictionInterval, SampleStatistics
 
@@ -120,27 +119,6 @@ class SimulateOutput(CommandOutput):
 
     not_covered: list[dict[str, Any]]
     """Effects of this pour that are not simulated: `kind`, `share`, `text`."""
-
-
-class SimulateTableOutput(CommandOutput):
-    """Predictions for a table of weighed pours (`--from`)."""
-
-    scene: str
-    from_: Path = Field(serialization_alias="from")
-    scores: dict[str, Score]
-    """By split, and for all."""
-
-    level: float
-    """Level of the intervals."""
-
-    theta: SimulationParameters
-    thetas: int
-    simulations: int
-    cpu_s: float
-    bands: dict[str, float | None]
-    """Standard deviations of the shifts in the intervals."""
-
-    pours: list[ScoredRow]
 
 
 class DryRunOutput(CommandOutput):

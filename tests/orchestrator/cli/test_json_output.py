@@ -63,7 +63,6 @@ def said(command: str) -> str:
         pytest.param("calibrate", "--in-process", marks=pytest.mark.slow),
         pytest.param("plan", "--in-process --iterations 2 --seeds 2", marks=pytest.mark.slow),
         ("simulate", f"{ACTION} --seeds 2"),
-        pytest.param("simulate", "--from pours.csv --seeds 2", marks=pytest.mark.slow),
         pytest.param("pour", f"{ACTION} --in-process", marks=pytest.mark.slow),
     ],
 )

@@ -78,38 +78,6 @@ def test_simulate_tells_people_the_spread_and_what_is_not_simulated(inputs: Path
     assert done.stderr.count("not simulated, dribbling: ") == 1  # for both seeds
 
 
-@pytest.mark.slow
-def test_a_table_of_weighed_pours_is_predicted_and_scored(inputs: Path) -> None:
-    theta = {"cohesion": 0.05}
-    draws = [{"theta": {"cohesion": 0.02 * i}, "weight": 1.0} for i in range(4)]
-    (inputs / "theta.json").write_text(
-        json.dumps({"theta": theta, "remaining_discrepancy": {"shift": 0.2}, "posterior": draws}), encoding="utf-8"
-    )
-    done = typed(
-        "simulate small.yaml --from pours.csv --parameters theta.json --seeds 2 --csv scored.csv --png scored.png "
-        "--json",
-        inputs,
-    )
-    (inputs / "theta.json").unlink()
-    found = json.loads(done.stdout)
-    assert found["scene"] == "calibration"
-    assert [pour["measured"] for pour in found["pours"]] == pytest.approx([4 / 90, 8 / 95, 0.09])
-    assert [pour["line"] for pour in found["pours"]] == [2, 3, 4]
-    assert {split: one["pours"] for split, one in found["scores"].items()} == {"train": 2, "test": 1, "all": 3}
-    errors = [abs(pour["measured"] - pour["predicted"]["mean"]) for pour in found["pours"]]
-    assert found["scores"]["all"]["error"] == pytest.approx(sum(errors) / 3)
-    assert found["scores"]["all"]["held"] == sum(
-        pour["band"]["low"] <= pour["measured"] <= pour["band"]["high"] for pour in found["pours"]
-    )
-    assert (found["simulations"], found["thetas"]) == (6, 2)
-    assert found["bands"]["discrepancy_shift"] == 0.2
-    for pour in found["pours"]:
-        assert pour["band"]["low"] <= pour["predicted"]["mean"] <= pour["band"]["high"]
-    assert len((inputs / "scored.csv").read_text(encoding="utf-8").splitlines()) == 4
-    assert (inputs / "scored.png").read_bytes().startswith(b"\x89PNG")
-    assert "3 pours, 2 simulations each, intervals from seeds, 2 θ of the posterior" in done.stderr
-
-
 def test_one_seed_has_no_spread_and_says_so() -> None:
     several = [example_run.outcome(spilled=s) for s in (0.05, 0.07)]
     assert "received 92.0 ± 1.4 %  spilled 6.0 ± 1.4 %" in told(several, spreads(several))
