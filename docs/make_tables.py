@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from make_validation import kept_records
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -44,7 +45,6 @@ from orchestrator.campaigns.yaml.section_validation import sections_in
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.daemon.state import daemon_settings as daemon
 from orchestrator.daemon.state.notifications import NotifySettings
-from orchestrator.extra_commands.physics_command import kept_records
 from orchestrator.learning.campaign_plan import OutputSettings
 from orchestrator.learning.deployment.disturbances import RiskSettings
 from orchestrator.learning.deployment.model_monitoring import (

@@ -42,12 +42,10 @@ class CaseEffort:
 
     Attributes:
         full: all resolutions and seeds; else the quick subset.
-        pours: random pours against walls; None: according to `full`.
         progress: called by long cases with the number of finished simulations and their total.
     """
 
     full: bool = False
-    pours: int | None = None
     progress: Callable[[int, int], None] | None = None
 
 
@@ -183,7 +181,7 @@ def _sensitivity(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Mea
 
 
 def _walls(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
-    many = effort.pours if effort.pours is not None else 40 if effort.full else 5
+    many = 40 if effort.full else 5
     return wall_tightness.walls(many, 10_000 if effort.full else 1_500), None
 
 
