@@ -1,6 +1,6 @@
 """The commands `decant runs …`: queries of the catalogue, printed as tables or JSON.
 
-The commands query this machine's catalogue or a daemon's. Everything slow is imported when a command is called, so that
+Everything slow is imported when a command is called, so that
 `--help` starts fast.
 """
 
@@ -26,7 +26,6 @@ from orchestrator.cli.console import FAILED, RefusalError, print_json, print_mes
 
 if TYPE_CHECKING:
     from orchestrator.catalogue.catalogue import Catalogue
-    from orchestrator.daemon.api.daemon_client import RemoteCatalogueClient
     from orchestrator.records.run_record import Row
 
 NEWEST = 20
@@ -67,14 +66,6 @@ State = Annotated[
         callback=_state,
         is_eager=True,
         help="The state directory; default: $DECANT_STATE, or ~/.local/state/decant.",
-    ),
-]
-Daemon = Annotated[
-    bool,
-    typer.Option(
-        "--daemon",
-        help="Query a daemon instead of this machine's catalogue: the one at $DECANT_URL, with $DECANT_TOKEN, or the "
-        "one that uses the state directory.",
     ),
 ]
 Which = Annotated[
@@ -138,25 +129,24 @@ def _command(
 
 
 @runs.callback()
-def newest(context: typer.Context, state: State = None, daemon: Daemon = False) -> None:
+def newest(context: typer.Context, state: State = None) -> None:
     """Run `decant runs` without a command."""
     if context.invoked_subcommand is None:
-        call(list_runs, {"limit": NEWEST}, daemon=daemon)
+        call(list_runs, {"limit": NEWEST})
 
 
 @_command(
     "decant runs list --receiver beaker --mode real --since 2030-03",
     "decant runs list water spring-clean   # both words, anywhere: names, vessels, notes",
-    "decant runs list --daemon --since 7d   # on the machine at $DECANT_URL",
     name="list",
     conditions=("words", "limit"),
 )
-def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
+def list_runs(conditions: dict[str, Any], state: State = None, as_json: Json = False) -> None:
     """List runs, newest first; all given conditions must hold."""
     from orchestrator.reports.console_view import print_table
 
-    with _client(daemon) as client:
-        listed = client.runs(conditions)
+    with _catalogue() as catalogue, _refusing():
+        listed = catalogue.runs(conditions)
     if as_json:
         print_json({"runs": listed})
         return
@@ -188,10 +178,10 @@ def list_runs(conditions: dict[str, Any], state: State = None, daemon: Daemon = 
     "decant runs pours --liquid glycerol --mode real --json",
     conditions=("words", "run", "limit"),
 )
-def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
+def pours(conditions: dict[str, Any], state: State = None, as_json: Json = False) -> None:
     """List pours with their actions, weighed spillage and predictions."""
-    with _client(daemon) as client:
-        listed = client.pours(conditions)
+    with _catalogue() as catalogue, _refusing():
+        listed = catalogue.pours(conditions)
     if as_json:
         print_json({"pours": listed})
     elif listed:
@@ -201,10 +191,10 @@ def pours(conditions: dict[str, Any], state: State = None, daemon: Daemon = Fals
 
 
 @_command("decant runs show quickstart-20300301-1")
-def show(run: Which, state: State = None, daemon: Daemon = False, as_json: Json = False) -> None:
+def show(run: Which, state: State = None, as_json: Json = False) -> None:
     """Show one run: state, θ*, recommendations, pours, notes, and files."""
-    with _client(daemon) as client:
-        entry = client.run(run)
+    with _catalogue() as catalogue, _refusing():
+        entry = catalogue.run(run)
     if as_json:
         print_json(entry)
         return
@@ -309,8 +299,8 @@ def _folder(run: str) -> Path:
 
     folder = Path(run)
     if not folder.is_dir():
-        with _client() as client:
-            return Path(client.run(run)["path"])
+        with _catalogue() as catalogue, _refusing():
+            return Path(catalogue.run(run)["path"])
     if not has_begun(folder / JOURNAL_NAME):
         raise RefusalError(f"{folder}: there is no run in this folder")
     return folder
@@ -346,11 +336,10 @@ def note(
     run: Which,
     text: Annotated[str, typer.Argument(help="Text of the note.")],
     state: State = None,
-    daemon: Daemon = False,
 ) -> None:
     """Add a note to a run, with date and author. It is in the run's folder; `decant runs list` finds its words."""
-    with _client(daemon) as client:
-        entry = client.note(run, text)
+    with _catalogue() as catalogue, _refusing():
+        entry = catalogue.note(run, text)
     print(f"{entry['run']}: {len(entry['notes'])} note{'s' * (len(entry['notes']) > 1)}")
 
 
@@ -497,20 +486,6 @@ def _date(seconds: float | None) -> str:
 
 
 # -- access to the catalogue -----------------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def _client(daemon: bool = False) -> Iterator[Catalogue | RemoteCatalogueClient]:
-    """Open a client of this machine's catalogue or of the daemon's."""
-    if daemon:
-        from orchestrator.cli.queue_commands import connected_client
-        from orchestrator.daemon.api.daemon_client import RemoteCatalogueClient
-
-        with connected_client(None, None) as client, _refusing():
-            yield RemoteCatalogueClient(client)
-    else:
-        with _catalogue() as catalogue, _refusing():
-            yield catalogue
 
 
 @contextlib.contextmanager

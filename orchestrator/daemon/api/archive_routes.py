@@ -1,6 +1,6 @@
-"""Routes of the HTTP API for the catalogue of previous runs; the counterpart of `decant runs`.
+"""Routes of the HTTP API for the catalogue of previous runs; for the operator's page.
 
-Viewers list runs and pours. Operators add notes. Queries run in a thread, since the first
+Viewers list runs and read reports. Operators add notes. Queries run in a thread, since the first
 one may read many journals. The catalogue itself is in `orchestrator.catalogue`.
 """
 
@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 from orchestrator.catalogue.annotations import Note
 from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.queries import CONDITIONS
-from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
+from orchestrator.catalogue.run_reading import PreviousRun
 from orchestrator.daemon.api.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.run_readout import REPORT
@@ -29,11 +29,7 @@ T = TypeVar("T")
 router = APIRouter(tags=["previous runs"])
 
 
-def _several(model: Any) -> Any:
-    return list[model]
-
-
-def _filters(name: str, **others: Any) -> Callable[..., dict[str, Any]]:
+def _filters() -> Callable[..., dict[str, Any]]:
     """Make a dependency that returns the filters in a request's query."""
     text = Annotated[str | None, Field(max_length=200)]
     fields: dict[str, Any] = {
@@ -44,7 +40,7 @@ def _filters(name: str, **others: Any) -> Callable[..., dict[str, Any]]:
         Field(default=[], max_length=20, description="Words that must all occur in a run's names or notes."),
     )
     fields["limit"] = (int, Field(default=200, ge=1, le=1000, description="Return at most this many, the newest."))
-    model = create_model(name, __config__=ConfigDict(extra="forbid"), **fields, **others)
+    model = create_model("RunsAsked", __config__=ConfigDict(extra="forbid"), **fields)
 
     def asked(query: Any) -> dict[str, Any]:
         conditions: dict[str, Any] = query.model_dump()
@@ -54,9 +50,7 @@ def _filters(name: str, **others: Any) -> Callable[..., dict[str, Any]]:
     return asked
 
 
-_RUN = (Annotated[str | None, Field(max_length=200)], Field(default=None, description="Name of one run's folder."))
-RunsAsked = Annotated[dict[str, Any], Depends(_filters("RunsAsked"))]
-PoursAsked = Annotated[dict[str, Any], Depends(_filters("PoursAsked", run=_RUN))]
+RunsAsked = Annotated[dict[str, Any], Depends(_filters())]
 
 
 class NoteIn(BaseModel):
@@ -92,7 +86,7 @@ async def _in_catalogue(daemon: SharedServices, query: Callable[[Catalogue], T])
         raise HTTPException(409, str(error)) from None
 
 
-@router.get("/runs", operation_id="runs", response_model=_several(PreviousRun))
+@router.get("/runs", operation_id="runs", response_model=list[PreviousRun])  # type: ignore[valid-type]
 async def runs(daemon: Daemon, person: Viewer, conditions: RunsAsked) -> Any:
     """List the runs of this machine, newest first.
 
@@ -100,18 +94,6 @@ async def runs(daemon: Daemon, person: Viewer, conditions: RunsAsked) -> Any:
     names may contain the wildcards * and ?.
     """
     return await _in_catalogue(daemon, lambda catalogue: catalogue.runs(conditions))
-
-
-@router.get("/runs/pours", operation_id="run_pours", response_model=_several(PreviousPour))
-async def pours(daemon: Daemon, person: Viewer, conditions: PoursAsked) -> Any:
-    """List the pours of all runs, oldest first: the action, the measured spillage and the prediction."""
-    return await _in_catalogue(daemon, lambda catalogue: catalogue.pours(conditions))
-
-
-@router.get("/runs/{run}", operation_id="run", response_model=PreviousRunDetail)
-async def run(daemon: Daemon, person: Viewer, run: str) -> Any:
-    """Return one run by its folder's name or a prefix of it: θ*, recommendation, pours and notes."""
-    return await _in_catalogue(daemon, lambda catalogue: catalogue.run(run))
 
 
 @router.get(

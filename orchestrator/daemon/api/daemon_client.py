@@ -1,7 +1,6 @@
 """HTTP client of the daemon, for the command line on this machine or another.
 
 `Client` makes the calls and follows the event stream; it passes refusals on unchanged as `DaemonError`.
-`RemoteCatalogueClient` queries the catalogue on the daemon's machine as `Catalogue` does.
 """
 
 from __future__ import annotations
@@ -11,11 +10,10 @@ import os
 import re
 import ssl
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
+from typing import Any
 
 import httpx
 from pydantic import ValidationError
@@ -25,9 +23,6 @@ from orchestrator.daemon.rigs.pour_request import PourIn, problems_text
 from orchestrator.daemon.state.access_tokens import Role, token_of
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.run_registry import state_directory
-
-if TYPE_CHECKING:  # a command that only asks the daemon reads no run
-    from orchestrator.records.run_record import Row
 
 V1 = "/api/v1"
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
@@ -256,34 +251,3 @@ def _token(state: Path) -> str:
             2,
         )
     return token
-
-
-class RemoteCatalogueClient:
-    """The queries of a `Catalogue`, answered by a daemon.
-
-    Args:
-        client: an open client.
-    """
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-
-    def runs(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """See `Catalogue`."""
-        return list(self._client.get("/runs", **conditions))
-
-    def pours(self, conditions: Mapping[str, Any]) -> list[Row]:
-        """See `Catalogue`."""
-        return list(self._client.get("/runs/pours", **conditions))
-
-    def run(self, name: str) -> Row:
-        """See `Catalogue`."""
-        return dict(self._client.get(_of(name)))
-
-    def note(self, name: str, text: str) -> Row:
-        """See `Catalogue`."""
-        return dict(self._client.post(f"{_of(name)}/notes", {"text": text}))
-
-
-def _of(name: str) -> str:
-    return f"/runs/{quote(name, safe='')}"

@@ -89,7 +89,7 @@ async def pours(
     limit: Annotated[int, Query(ge=1, le=1000)] = 100,
     source: Annotated[str, Query(max_length=60, description="Only pours from this vessel.")] = "",
 ) -> list[dict[str, Any]]:
-    """List ordered pours, newest first. Pours of all runs are at `runs/pours`."""
+    """List ordered pours, newest first."""
     return [await orders.pour_out(row["id"]) for row in orders.book.list(limit, source)]
 
 

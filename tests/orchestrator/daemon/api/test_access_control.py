@@ -28,7 +28,7 @@ from tests.support.toy_daemon import Served, held, run, serving
 
 LOOKING = (
     *("/status", "/campaigns", "/campaigns/x", "/questions", "/rigs", "/events", "/metrics", "/campaigns/x/report"),
-    *("/runs", "/pours", "/runs/pours", "/runs/x", "/runs/x/report"),
+    *("/runs", "/pours", "/runs/x/report"),
 )
 DOING = (
     "/campaigns",

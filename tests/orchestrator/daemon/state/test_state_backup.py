@@ -33,9 +33,10 @@ def test_a_restored_daemon_has_results_and_account_and_waits_for_an_operator(tmp
             while len(served.laboratories) < 2:
                 await asyncio.sleep(0.01)
             await served.laboratories[-1].bench.begun.wait()
-            await served.post("/pours", order("queued", amount="5 g", hold=True))
+            await served.post("/pours", order("queued", amount="5 g"))
             found = await asyncio.to_thread(back_up, here / "state", archive)
             assert found["runs"] == 2
+            await served.post("/queue/pause")
             served.laboratories[-1].bench.go.set()
             await until_pour(served, "begun", "weighed")
         restore(archive, there / "state")
