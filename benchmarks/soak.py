@@ -373,10 +373,9 @@ def ordering(lab: Laboratory, begun: float) -> None:
                 **vessels,
                 "action": action,
                 "predict": False,
+                "priority": 10,
             }
             ordered = lab.call("post", "/pours", body)
-            with contextlib.suppress(DaemonError):  # it has begun
-                lab.call("post", f"/campaigns/{ordered['campaign']}/move", {"before": ""})
             lab.note(what="order", id=key, campaign=ordered.get("campaign"))
             for repetition in range(100_000):
                 if repetition < 2 or repetition % 8 == 0:

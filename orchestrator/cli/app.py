@@ -211,7 +211,7 @@ _queue = _group(
 _queue(
     queue_commands.submit,
     "decant queue submit configs/campaigns/quickstart.yaml",
-    "decant queue submit my.yaml --rig left",
+    "decant queue submit my.yaml --rig left --priority 5",
     "decant queue submit my.yaml --task plan --parameters theta.json --receiver configs/vessels/bowl.yaml",
 )
 _queue(

@@ -104,9 +104,13 @@ def submit(
     campaign: Campaign,
     task: Annotated[str, typer.Option(help="Task: run, calibrate or plan.")] = "run",
     rig: Annotated[str, typer.Option(help="Rig to run on, if several match.")] = "",
+    priority: Annotated[int, typer.Option(help="Higher priorities run first.")] = 0,
     caller_id: Annotated[
         str, typer.Option("--id", help="Id of your own: the same campaign with the same id is queued once.")
     ] = "",
+    not_before: Annotated[
+        str | None, typer.Option(metavar="TIME", help="Earliest start with its zone: 2026-11-27T08:00:00+01:00.")
+    ] = None,
     laboratory: OtherLaboratory = None,
     seed: Seed = None,
     parameters: Parameters = None,
@@ -134,8 +138,8 @@ def submit(
     except OSError as error:
         raise RefusalError(f"{error.filename}: {error.strerror}") from None
     with connected_client(url, state) as client:
-        body = {"text": packed, "files": files, "task": task, "rig": rig, "id": caller_id}
-        queued = client.post("/campaigns", body)
+        body = {"text": packed, "files": files, "task": task, "rig": rig, "priority": priority, "id": caller_id}
+        queued = client.post("/campaigns", {**body, "not_before": not_before})
     if as_json:
         print_json(queued)
         return

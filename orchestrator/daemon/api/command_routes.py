@@ -149,11 +149,11 @@ async def resume(daemon: Daemon, queue: Queue, person: Operator, key: str) -> Ca
 
 @router.post("/campaigns/{key}/move", operation_id="move")
 async def move(daemon: Daemon, queue: Queue, person: Operator, key: str, body: MoveIn) -> CampaignOut:
-    """Move a campaign to another place in the queue."""
+    """Move a campaign to another place in the queue, or change its earliest start."""
     if body.before:
         found_item(queue, body.before)
     with _refusing():
-        return campaign_out(daemon, queue, queue.move(key, person.name, body.before))
+        return campaign_out(daemon, queue, queue.move(key, person.name, **body.model_dump()))
 
 
 @contextlib.contextmanager

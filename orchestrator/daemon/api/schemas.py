@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.daemon.rigs.pour_request import RequestModel
+from orchestrator.daemon.rigs.pour_request import Moment, RequestModel
 from orchestrator.reports.run_summary import PourSummary
 
 
@@ -29,8 +29,12 @@ class AnswerIn(RequestModel):
 class MoveIn(RequestModel):
     """A new place in the queue."""
 
-    before: str = Field(max_length=80)
+    before: str | None = Field(default=None, max_length=80)
     """Id of the campaign to move in front of; '' for the head of the queue."""
+
+    priority: int | None = Field(default=None, ge=-1000, le=1000)
+    not_before: Moment | None = None
+    """Earliest start; 0 removes it."""
 
 
 class EnableIn(RequestModel):
@@ -94,6 +98,7 @@ class CampaignOut(ResponseModel):
     mode: str
     """'virtual', 'hardware', or 'none' if nothing is poured."""
 
+    priority: int
     state: str
     """One of: queued, preparing, running, pausing, paused, waiting for operator, stopping, finished, failed, unknown,
     stopped, withdrawn.
@@ -112,6 +117,9 @@ class CampaignOut(ResponseModel):
 
     caller_id: str
     """Id that its caller chose; '' without one."""
+
+    not_before: float | None
+    """Earliest start."""
 
     waits_for: str
     """What has to happen before it starts or continues; '' if only its turn."""

@@ -10,6 +10,7 @@ import secrets
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from datetime import datetime
 
 from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
 from orchestrator.daemon.rigs.rig_worker import SharedServices
@@ -86,21 +87,35 @@ class CampaignQueue:
             raise RequestRefusedError(f"{item.id} is {item.state}; only a queued campaign {change}")
         return item
 
-    def move(self, key: str, by: str, before: str) -> QueueItem:
-        """Move a queued campaign in front of another one, or to the head ('').
+    def move(
+        self,
+        key: str,
+        by: str,
+        *,
+        before: str | None = None,
+        priority: int | None = None,
+        not_before: float | None = None,
+    ) -> QueueItem:
+        """Move a queued campaign in front of another one or to the head (''), or change its priority or earliest start.
 
         Raises:
             KeyError: the campaign does not exist.
             RequestRefusedError: it is not queued.
         """
         item = self._queued(key, "has a place in the queue")
-        queue = [e for e in self._store.items(["queued"]) if e.id != item.id]
-        at = 0 if before == "" else next((i for i, e in enumerate(queue) if e.id == self.item(before).id), None)
-        if at is None:
-            raise RequestRefusedError(f"{before} is not in the queue")
-        behind = queue[at].rank if queue else 1.0
-        ahead = queue[at - 1].rank if at > 0 else behind - 2.0
-        self._store.change(item.id, rank=0.5 * (ahead + behind))
+        if priority is not None:
+            self._store.change(item.id, priority=priority)
+        if not_before is not None:
+            self._store.change(item.id, not_before=not_before or None)
+        if before is not None:
+            queue = [e for e in self._store.items(["queued"]) if e.id != item.id]
+            at = 0 if before == "" else next((i for i, e in enumerate(queue) if e.id == self.item(before).id), None)
+            if at is None:
+                raise RequestRefusedError(f"{before} is not in the queue")
+            level = queue[at].priority if queue else item.priority
+            behind = queue[at].rank if queue else 1.0
+            ahead = queue[at - 1].rank if at > 0 and queue[at - 1].priority == level else behind - 2.0
+            self._store.change(item.id, priority=level, rank=0.5 * (ahead + behind))
         self._shared.note(by, "move", item.id)
         self._shared.wake()
         return self.item(item.id)
@@ -171,6 +186,9 @@ class CampaignQueue:
             return f"an operator has to enable its motion: 'decant queue enable {item.id}'"
         if item.state == "queued" and shared.queue_paused:
             return "the queue is paused: the command 'resume', or 'decant queue resume'"
+        if item.state == "queued" and item.not_before is not None and item.not_before > time.time():
+            begins = datetime.fromtimestamp(item.not_before).astimezone()
+            return f"its earliest start, {begins.isoformat(' ', 'seconds')}"
         return ""
 
     def resume(self, key: str, by: str) -> QueueItem:

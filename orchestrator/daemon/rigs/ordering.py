@@ -140,7 +140,9 @@ class Ordering:
             raise RequestRefusedError(reason)
         rig = self._rig(order, request.rig)
         self._queue.refuse_new_work(rig)
-        submission = Submission(task=POUR, rig=rig, order=order)
+        submission = Submission(
+            task=POUR, rig=rig, priority=request.priority, order=order, not_before=request.not_before
+        )
         item = await asyncio.to_thread(prepare, settings, submission, self._queue.new_key(), by)
         try:
             predicted = await self._predicted(item) if request.predict or request.dry_run else None

@@ -6,14 +6,70 @@ help texts and arguments have its descriptions. The module imports pydantic alon
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping
+from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 CallerId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,79}$")]
 Key = Annotated[str, Field(min_length=1, max_length=80)]
 Quantity = Annotated[str, Field(max_length=40)]
+
+
+def moment(value: object) -> object:
+    """Convert a time with its zone to seconds since 1970; numbers stay.
+
+    Args:
+        value: text in ISO 8601, such as '2026-11-27T08:00:00+01:00', or seconds since 1970.
+
+    Raises:
+        ValueError: the text is no time, or has no zone.
+    """
+    if not isinstance(value, str):
+        return value
+    try:
+        read = datetime.fromisoformat(value.strip())
+    except ValueError:
+        raise ValueError(
+            f"{value!r} should be a time with its zone, such as '2026-11-27T08:00:00+01:00', or seconds since 1970"
+        ) from None
+    if read.tzinfo is None:
+        utc, local = f"{value.strip()}Z", read.astimezone().isoformat()
+        raise ValueError(f"{value!r} has no zone: '{utc}' is the time in UTC, '{local}' the time at this machine")
+    return read.timestamp()
+
+
+def _near(value: float) -> float:
+    """Refuse a time that can't be meant: in milliseconds, or counted from now. 0 stands for no time.
+
+    Raises:
+        ValueError: it is more than a year away; the message shows the readings.
+    """
+    now = time.time()
+    if value == 0 or abs(value - now) <= YEAR:
+        return value
+    meant = ""
+    for kind, seconds in (("in milliseconds", 1e-3 * value), ("counted from now", now + value)):
+        if now - YEAR <= seconds <= now + YEAR and value > 0:
+            iso = datetime.fromtimestamp(seconds).astimezone().isoformat(timespec="seconds")
+            meant += f"; {kind} it would be '{iso}': give {seconds:.0f} if that is meant"
+    raise ValueError(
+        f"{value:.15g} is in the year {1970.0 + value / 31_556_952.0:.6g} as seconds since 1970, and a start should be "
+        f"within a year{meant}"
+    )
+
+
+YEAR = 366.0 * 86400.0
+"""Largest distance of a start from now [s]."""
+
+Moment = Annotated[
+    float,
+    BeforeValidator(moment),
+    Field(allow_inf_nan=False, description="Seconds since 1970, or a time with its zone: 2026-11-27T08:00:00+01:00."),
+    AfterValidator(_near),
+]
 
 
 class RequestModel(BaseModel):
@@ -73,6 +129,10 @@ class PourIn(RequestModel):
     rig: str = Field(default="", max_length=60)
     """Rig; '' for the one on which the vessels stand."""
 
+    priority: int = Field(default=0, ge=-1000, le=1000)
+    not_before: Moment | None = None
+    """Earliest start."""
+
     dry_run: bool = False
     """Check and predict the pour; nothing is queued and nothing moves."""
 
@@ -96,8 +156,14 @@ class SubmissionIn(RequestModel):
     rig: str = Field(default="", max_length=60)
     """Rig to run on; '' selects the matching one."""
 
+    priority: int = Field(default=0, ge=-1000, le=1000)
+    """Higher priorities run first."""
+
     id: CallerId | Literal[""] = ""
     """Chosen by the caller. The same campaign with the same id is queued once, however often it is sent."""
+
+    not_before: Moment | None = None
+    """Earliest start."""
 
 
 def problems_text(errors: Iterable[Mapping[str, Any]], begin: int = 0) -> str:

@@ -405,7 +405,7 @@ class RigWorker:
                 self.running = None if item is None else Running(self._shared, item, self.rig)
             if item is None or self.running is None:
                 with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(RETRY):
+                    async with asyncio.timeout(self._pause()):
                         await self.wake.wait()
                 continue
             self._resting.clear()
@@ -475,9 +475,17 @@ class RigWorker:
         store = self._shared.store
         mine = store.wanted(self.rig.name)
         begun = sorted((c for c in mine if c.run is not None), key=lambda c: c.begun or 0.0)
-        queued = [] if self._shared.queue_paused else [c for c in mine if c.state == "queued"]
+        now = time.time()
+        queued = [c for c in mine if c.state == "queued" and (c.not_before is None or c.not_before <= now)]
+        if self._shared.queue_paused:
+            queued = []
         following = next((c for c in (*begun, *queued) if c.mode != "hardware" or c.motion_enabled), None)
         return following if following is not None and self._has_room() else None
+
+    def _pause(self) -> float:
+        """Time until the queue is read again at the latest [s]: sooner if a campaign may start by its time."""
+        times = self._shared.store.coming(self.rig.name, time.time())
+        return min([RETRY, *(max(at - time.time(), 0.01) for at in times)])
 
     def _has_room(self) -> bool:
         settings = self._shared.settings

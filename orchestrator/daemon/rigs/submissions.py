@@ -216,6 +216,7 @@ class Submission:
     Attributes:
         rig: name of the rig; '' selects the matching one.
         order: an ordered pour instead of a campaign.
+        not_before: see `QueueItem`.
     """
 
     text: str = ""
@@ -223,7 +224,9 @@ class Submission:
     path: str = ""
     task: str = "run"
     rig: str = ""
+    priority: int = 0
     order: PourOrder | None = None
+    not_before: float | None = None
 
 
 def prepare(settings: DaemonSettings, submission: Submission, key: str, by: str) -> QueueItem:
@@ -283,12 +286,14 @@ def _prepared(settings: DaemonSettings, submission: Submission, key: str, by: st
         submission.task,
         "",
         "none",
+        submission.priority,
         0.0,
         "queued",
         str(DesiredState.RUN),
         "",
         by,
         0.0,
+        not_before=submission.not_before,
     )
     anywhere = run_request(settings, draft, Rig(ANY_RIG))
     rig = _rig(settings, submission.rig, anywhere)

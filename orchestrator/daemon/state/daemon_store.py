@@ -25,16 +25,16 @@ from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import locked_alone
 from orchestrator.records.run_registry import make_state_directory
 
-FORMAT = 6
+FORMAT = 5
 
 _SCHEMA = """
 create table campaign (
     id text primary key, name text not null, task text not null, rig text not null, mode text not null,
-    rank real not null, state text not null, desired_state text not null,
+    priority integer not null, rank real not null, state text not null, desired_state text not null,
     reason text not null,
     by text not null, created real not null, begun real, ended real, run text, motion_enabled integer not null,
     answers text not null check (json_valid(answers)),
-    caller_id text not null default '', body_hash text not null default ''
+    caller_id text not null default '', body_hash text not null default '', not_before real
 ) strict;
 create unique index campaign_by_caller_id on campaign (caller_id) where caller_id != '';
 create index campaign_by_state on campaign (state, rig);
@@ -127,7 +127,8 @@ class QueueItem:
         task: task: 'run', 'calibrate', 'plan', or 'pour' for an ordered pour.
         rig: rig that it leases; 'none' if it pours nothing.
         mode: mode of that rig: 'virtual', 'hardware' or 'none'.
-        rank: order in the queue, smallest first.
+        priority: higher priorities run first.
+        rank: order within one priority, smallest first.
         state: state of the run (`orchestrator.records.states`), or 'stopped', 'withdrawn'.
         desired_state: desired state.
         reason: reason of the state, for the operator.
@@ -136,6 +137,7 @@ class QueueItem:
         motion_enabled: whether motion is enabled for the coming part of its run.
         caller_id: id that its caller chose; '' without one.
         body_hash: digest of its caller's request, by which a repeated one is recognised.
+        not_before: earliest start, seconds since 1970; None: at once.
     """
 
     id: str
@@ -143,6 +145,7 @@ class QueueItem:
     task: str
     rig: str
     mode: str
+    priority: int
     rank: float
     state: str
     desired_state: str
@@ -156,6 +159,7 @@ class QueueItem:
     answers: dict[str, Any] = field(default_factory=dict)
     caller_id: str = ""
     body_hash: str = ""
+    not_before: float | None = None
 
 
 class QuestionOut(BaseModel):
@@ -290,7 +294,7 @@ class Store:
         rows = self._db.execute(
             f"select * from campaign {where} order by "
             f"case when state = 'queued' then 1 when state in ({_quoted(AT_REST)}) then 2 else 0 end, "
-            "case when state = 'queued' then rank else 0 end, "
+            "case when state = 'queued' then -priority else 0 end, case when state = 'queued' then rank else 0 end, "
             "created desc limit ?",
             [*wanted, limit],
         )
@@ -306,7 +310,8 @@ class Store:
         """Return the campaigns of a rig that rest, have not ended and should run: the queue in its order first."""
         rows = self._db.execute(
             f"select * from campaign where state in ({_quoted(AT_REST)}) and state not in ({_quoted(ENDED)}) and "
-            "rig = ? and desired_state = ? order by case when state = 'queued' then 0 else 1 end, rank",
+            "rig = ? and desired_state = ? order by case when state = 'queued' then 0 else 1 end, "
+            "priority desc, rank",
             [rig, str(DesiredState.RUN)],
         )
         return [_item(row) for row in rows]
@@ -319,6 +324,13 @@ class Store:
     def counts(self) -> dict[str, int]:
         """Return the number of campaigns in each state."""
         return dict(self._db.execute("select state, count(*) from campaign group by state").fetchall())
+
+    def coming(self, rig: str, now: float) -> list[float]:
+        """Return the later times at which queued campaigns of a rig may start."""
+        rows = self.rows(
+            "select not_before as at from campaign where state = 'queued' and rig = ? and not_before > ?", rig, now
+        )
+        return [float(row["at"]) for row in rows]
 
     # ---- questions
 

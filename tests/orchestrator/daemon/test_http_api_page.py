@@ -172,7 +172,7 @@ def test_what_somebody_types_survives_all_news(page: Any, tmp_path: Path) -> Non
         key = asked(lab)
         page.goto(lab.address(Role.OPERATOR))
         page.get_by_label("Weight").fill("3.")
-        lab.do(lab.served.submit())
+        lab.do(lab.served.submit(priority=5))
         page.get_by_text("Take out").wait_for()
         assert page.get_by_label("Weight").input_value() == "3."
         assert page.evaluate("document.activeElement.tagName") == "INPUT"

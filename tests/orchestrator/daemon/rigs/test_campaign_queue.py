@@ -8,16 +8,23 @@ import asyncio
 import contextlib
 import gc
 import json
+import re
 import socket
+import time
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 from typer.testing import CliRunner
 
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
+from orchestrator.cli import queue_commands
 from orchestrator.cli.app import app
 from orchestrator.cli.queue_commands import submit
+from orchestrator.daemon.rigs.pour_request import SubmissionIn
 from orchestrator.daemon.rigs.submissions import Submission, SubmissionError, pack, prepare, run_request
 from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
 from orchestrator.daemon.state.daemon_store import QueueItem
@@ -96,22 +103,23 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
     assert len(read) == 1
 
 
-def test_campaigns_run_in_their_order_which_people_may_change(tmp_path: Path) -> None:
+def test_higher_priorities_come_first_and_people_may_change_the_order(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path) as served:
             await served.post("/queue/pause")
-            a, b, c, d = [await served.submit() for _ in range(4)]
+            a, b, c = [await served.submit() for _ in range(3)]
+            d = await served.submit(priority=5)
 
             async def order() -> list[str]:
                 return [one["id"] for one in await served.get("/campaigns", state="queued")]
 
-            assert await order() == [a, b, c, d]
+            assert await order() == [d, a, b, c]
             await served.post(f"/campaigns/{c}/move", {"before": b})
-            assert await order() == [a, c, b, d]
+            assert await order() == [d, a, c, b]
             await served.post(f"/campaigns/{b}/move", {"before": ""})
-            assert await order() == [b, a, c, d]
-            await served.post(f"/campaigns/{a}/move", {"before": ""})
-            assert await order() == [a, b, c, d]
+            assert await order() == [b, d, a, c]
+            await served.post(f"/campaigns/{a}/move", {"priority": 9})
+            assert await order() == [a, b, d, c]
             assert not served.laboratories
             await served.post(f"/campaigns/{d}/stop")
             await served.post("/queue/resume")
@@ -141,8 +149,7 @@ def test_the_queue_outlives_the_daemon(tmp_path: Path) -> None:
     async def work() -> None:
         async with serving(tmp_path) as served:
             await served.post("/queue/pause")
-            keys = [await served.submit(), await served.submit()]
-            await served.post(f"/campaigns/{keys[1]}/move", {"before": ""})
+            keys = [await served.submit(), await served.submit(priority=1)]
         async with serving(tmp_path) as served:
             assert (await served.get("/status"))["queue_paused"]
             assert [one["id"] for one in await served.get("/campaigns")] == [keys[1], keys[0]]
@@ -337,7 +344,7 @@ def test_a_campaign_that_is_sent_again_with_its_id_is_queued_once(tmp_path: Path
             assert first["id"] == second["id"] == (await served.post("/campaigns", body, status=200))["id"]
             assert [one["caller_id"] for one in await served.get("/campaigns")] == ["study-1"]
             assert (await served.get("/campaigns/study-1"))["id"] == first["id"]
-            told = await served.post("/campaigns", {**body, "task": "calibrate"}, status=409)
+            told = await served.post("/campaigns", {**body, "priority": 1}, status=409)
             assert told["detail"].startswith(f"id study-1 belongs to another campaign, {first['id']}")
             for _ in range(2):  # without an id, every request is another campaign
                 await served.submit()
@@ -347,3 +354,59 @@ def test_a_campaign_that_is_sent_again_with_its_id_is_queued_once(tmp_path: Path
             assert (await served.post("/campaigns", body, status=200))["id"] == first["id"]
 
     run(work())
+
+
+def test_a_campaign_waits_for_its_earliest_start_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            start = datetime.now(UTC).replace(microsecond=0) + timedelta(days=90)
+            late = await served.submit(not_before=start.astimezone(timezone(timedelta(hours=1))).isoformat())
+            early = await served.submit(not_before=(datetime.now(UTC) + timedelta(seconds=0.3)).isoformat())
+            await served.until(early, "finished")
+            found = await served.get(f"/campaigns/{late}")
+            assert found["state"] == "queued"
+            assert found["not_before"] == start.timestamp()
+            assert found["waits_for"] == f"its earliest start, {start.astimezone().isoformat(' ')}"
+            paths = "/status", "/campaigns", "/questions", f"/campaigns/{late}"
+            answers = {path: await served.get(path) for path in paths}
+            client = SimpleNamespace(get=lambda path, **query: answers[path])
+            monkeypatch.setattr(queue_commands, "connected_client", lambda *where: contextlib.nullcontext(client))
+            for key in (None, late):
+                queue_commands.list_campaigns(key)
+                assert found["waits_for"] in capsys.readouterr().out, key
+            await served.post(f"/campaigns/{late}/move", {"not_before": 0})
+            await served.until(late, "finished")
+
+    run(work())
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ("2026-11-27T08:00", "has no zone: '2026-11-27T08:00Z' is the time in UTC"),
+        ("20261127", "has no zone"),
+        ("tomorrow", "should be a time with its zone, such as '2026-11-27T08:00:00+01:00'"),
+        ("1764230400", "should be a time with its zone"),
+        ("", "should be a time with its zone"),
+        (float("inf"), "finite number"),
+        (3600, "3600 is in the year 1970 as seconds since 1970, and a start should be within a year; counted from now"),
+        ("2126-11-27T08:00:00+01:00", "is in the year 2126"),
+        (-5, "is in the year 1970"),
+        (1e300, "is in the year"),
+    ],
+)
+def test_an_earliest_start_that_is_no_time_is_refused(value: object, text: str) -> None:
+    with pytest.raises(ValidationError, match=re.escape(text)):
+        SubmissionIn.model_validate({"not_before": value})
+
+
+def test_an_earliest_start_in_milliseconds_is_refused_with_both_readings() -> None:
+    """As `Date.now()` of JavaScript gives it: such a campaign would wait for ever."""
+    now = int(time.time())
+    shown = datetime.fromtimestamp(now).astimezone().isoformat()
+    text = f"is in the year 5.*; in milliseconds it would be '{re.escape(shown)}': give {now} if that is meant"
+    with pytest.raises(ValidationError, match=text):
+        SubmissionIn.model_validate({"not_before": 1000 * now})
+    assert SubmissionIn.model_validate({"not_before": now + 60}).not_before == now + 60
