@@ -331,7 +331,12 @@ def test_the_files_of_other_programs_are_explained(tmp_path, content, note):
             "As '7E1' they are weights: set 'format: 7E1'",
         ),
         (b"12 pcs\r\n", "Set the balance to print the weight in g with its unit"),
+        (
+            bytes(b | b.bit_count() % 2 << 7 for b in b"+   62.916 g  \r\n" * 3),  # a Sartorius prints as 7O1 or 7E1
+            "As '7E1' they are weights: set 'format: 7E1'",
+        ),
         (b"S S 12 PCS\r\n", "no dialect reads a weight"),
+        (b"S D 12:07.50 lb:oz\r\n", "no dialect reads a weight"),  # artisan-roaster-scope/artisan, pull request 2223
         (b"dear colleague,\nthe balance does not work\n", "no dialect reads a weight"),
     ],
 )
@@ -342,6 +347,33 @@ def test_lines_without_any_weight_fit_no_dialect(tmp_path, content, said):
     assert result.exit_code == 1
     assert said in result.stderr
     assert "best fit" not in result.stdout
+
+
+GG = b"     0.00 GN\r\n-  450.38 GN\r\n     0.000 g \r\n-  29.182 g \r\n     0.665 g \r\n"
+KERN = b"        0.000 g  \r\n      -29.186 g  \r\n        0.665 g  \r\n"
+INTERVAL = b"       0.01 g    00:00:00\r\n     176.30 g ? 00:00:15\r\n     192.21 g\r\n     207.80 g TOTAL\r\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "weights", "notes"),
+    [
+        # G&G PLC100BC and Kern, eamars/OpenTrickler-RP2040-Controller, issue 15
+        (GG, "0.000 g, 0.665 g", ["1 × invalid: '-  29.182 g ': "]),
+        (KERN, "0.000 g, -29.186 g, 0.665 g", []),
+        # Ohaus RS232 Interface Manual, p. EN-3: interval printing and a sum
+        (INTERVAL, "192.21 g", ["2 × a line of interval printing, not a weight", "1 × a sum ('TOTAL'), not a weight"]),
+        # Kern SFB-BA-e-1324, p. 51
+        (b"ST,GS   1.000KG\r\nUS,GS   1.342KG\r\n", "1.000 KG", []),
+    ],
+)
+def test_what_other_people_have_captured_is_read_or_named_and_never_another_weight(tmp_path, content, weights, notes):
+    path = tmp_path / "capture.txt"
+    path.write_bytes(content)
+    result = explain(path)
+    assert result.exit_code == 0, result.stderr
+    assert f"  stable weights: {weights}\n" in result.stdout
+    for note in notes:
+        assert note in result.stdout
 
 
 @pytest.mark.parametrize(
