@@ -222,7 +222,7 @@ def draw(browser: Browser, lab: Lab) -> None:
         page.get_by_label("Spilled").fill("3,2")
         page.get_by_label("Left in the pourer").fill("0,4")
         page.get_by_role("button", name="It was weighed").click()
-        page.locator("#pours").get_by_text("3.21 %").first.wait_for(timeout=1e3 * PATIENCE)
+        page.locator("#pours").get_by_text("3.2 g").first.wait_for(timeout=1e3 * PATIENCE)
     lab.answer_until(lambda question: lab.call(f"campaigns/{first}")["state"] == "finished")
     lab.answer_until(lambda question: question["wants"] == "yes or no")
     number = lab.call("questions")[0]["id"]
