@@ -173,9 +173,9 @@ LARGEST_REMAINDER = (1e-3, 0.1e-3)
 RECORDED_HOLD = 1.1
 """Longest time with one and the same reading in recorded pours [s]."""
 
-LONGEST_HOLD = 1.6
-"""Time with one and the same reading, while the flow should change it, after which the cup is turned back and weighed
-[s]."""
+LONGEST_HOLD = (1.6, 5.0)
+"""Time with one and the same reading, while the flow should change it, after which the cup is turned back and weighed:
+[s], and at least so many readings."""
 
 IMPROBABLE_HOLD = math.log(0.005)
 """Logarithm of the probability of such a row of equal readings after which this happens earlier."""
@@ -211,17 +211,24 @@ as soon as the load hardly moves."""
 LATE_TIME = 0.9
 """Time in which late liquid arrives, and in which filters that get slower at rest come to their end [s]."""
 
-REST_BAND = (0.2e-3, 0.3)
+REST_BAND = (0.1e-3, 0.3)
 """Standard deviation of what a reading still rises: [kg], and display steps."""
 
-LARGEST_RISE = (0.1e-3, 0.4)
+LARGEST_RISE = (0.05e-3, 0.4)
 """Largest such rise of a weighed reading: [kg], or display steps."""
 
-LAG_REST = 0.04e-3
-"""Standard deviation of a weighed reading for each second of the display's lag [kg/s]."""
+UNKNOWN_RISE = 1.25
+"""Standard deviation of what a reading still rises because the time of the rise is unknown, as a part of the rise."""
 
-LATE_DROPS = (0.03e-3, 0.043e-3)
-"""Mean and standard deviation of what still falls into the receiver after it was weighed [kg]."""
+LATE_DROPS = (0.05e-3, 1.0, 3.0)
+"""Drops that fall from the lip after the return: mass of one [kg], mean number, and the time in which they fall [s]."""
+
+TRACKED = (4.0, 0.25, 0.144)
+"""A display that shows zero may be corrected to zero while the load rises slowly: within so many steps, mean and
+standard deviation of the rate [steps per second]. OIML R 76-1, 4.5.7 allows 0.5; all rates below are equally likely."""
+
+TARED = 0.25
+"""Largest error of a zero that was set, in display steps (OIML R 76-1, 4.5.2)."""
 
 LONGEST_SETTLING = (10.0, 15.0)
 """Time without rest of the balance after which the amount is unknown: [s], and at least so many readings."""
@@ -241,6 +248,12 @@ class TiltCommand:
 
     speed: float
     finished: bool = False
+
+
+def _late_drops(waited: float) -> float:
+    """Mean mass of the drops that fall later than a time after the return [s] [kg]."""
+    drop, count, time = LATE_DROPS
+    return drop * count * math.exp(-waited / time)
 
 
 # More than 25 methods: one method for each phase of a dose and each reason to stop.
@@ -302,6 +315,7 @@ class DoseController:
         self._interval, self._longest_gap = belief.display.interval, belief.display.longest
         self._before_silence: float | None = None
         self._unchanged_since = 0.0
+        self._tared, self._tracked, self._late_drops = False, 0.0, _late_drops(RUN_OFF)
         self._factor_before = float(np.median(belief.flow_factor))
         self._idle_since: float | None = None
         self._late_volume = float(belief.volume.mean() - 2.0 * belief.volume.std())
@@ -355,6 +369,7 @@ class DoseController:
         else:
             self._estimator.advance(time, tilt)
         self._note_late_stream(time - self._now, tilt)
+        self._note_tracking(time - self._now)
         self._tick += 0.2 * (min(time - self._now, 0.2) - self._tick)
         self._now, self._tilt = time, tilt
         if paused and tilt > 0.0:
@@ -379,6 +394,7 @@ class DoseController:
             spread = max(r.mass for r in last) - min(r.mass for r in last)
             if spread <= max(3.0 * self._step_size, 1e-4):
                 self._zero = math.fsum(r.mass for r in last) / 4.0
+                self._tared = abs(self._zero) <= self._step_size
                 expected = self._order.receiver_mass
                 if expected is not None and abs(self._zero - expected) > max(2e-3, 0.03 * expected):
                     self._finish(DoseEnd.RECEIVER_MISSING, known=True)
@@ -459,12 +475,13 @@ class DoseController:
             flat = spread <= max(2.0 * self._step_size, 1.5e-4) and abs(late - early) <= max(
                 0.6 * self._step_size, 5e-5
             )
-            flat = flat and abs(rise) <= max(LARGEST_RISE[0], LARGEST_RISE[1] * self._step_size)
+            rests = abs(rise) <= max(LARGEST_RISE[0], LARGEST_RISE[1] * self._step_size)
             early_enough = flat and self._behind(last[-1].time)
             late_enough = waited > 3.0 * lag and (flat or all(r.stable for r in last))
-            if early_enough or late_enough:
+            if rests and (early_enough or late_enough):
                 self._remainder = deviation
-                self._weighed(final + LATE_DROPS[0])
+                self._late_drops = _late_drops(waited)
+                self._weighed(final + self._late_drops)
                 return 0.0
         if waited > self._patience(LONGEST_SETTLING):
             self._finish(self._end or (DoseEnd.CONNECTION_LOST if self._silent() else DoseEnd.UNSTABLE), known=False)
@@ -473,20 +490,20 @@ class DoseController:
     def _approached(self, readings: Sequence[DoseReading], lag: float) -> tuple[float, float, float]:
         """The reading that these ones approach, its standard deviation, and how far it is from the last one [kg]."""
         times, masses = (np.array(values) for values in zip(*((r.time, r.mass) for r in readings), strict=True))
-        # a filter's lag, a filter that gets slower at rest, and liquid that runs off late have similar times
-        shape = np.exp((times[-1] - times) / max(LATE_TIME, lag))
+        # a filter's lag, and a filter that gets slower at rest or liquid that runs off late, one after the other
+        shape = np.exp((times[-1] - times) / math.hypot(LATE_TIME, lag))
         # Regression m(t) = final − rise e^{(t_last − t)/τ}, with a normal prior of `rise` of the deviation REST_BAND:
         # rise = −Σ (e − ē) m / (Σ (e − ē)² + σ²/σ_rise²), final = m̄ + ē rise
         shape_mean, centred = float(shape.mean()), shape - shape.mean()
         step, rounded = self._step_size, self._step_size**2 / 12.0
-        new = max(1.0 - float(self._estimator.repeats.weights(1) @ REPEATS), min(self._interval / RECORDED_HOLD, 1.0))
-        variance = (rounded + self._noise**2) / new
+        variance = (rounded + self._noise**2) / self._new
         stiffness = float(centred @ centred) + variance / (REST_BAND[0] ** 2 + (REST_BAND[1] * step) ** 2)
         rise = -float(centred @ masses) / stiffness
-        # readings whose last digit no noise moves are rounded alike: they show a rest, but no rise within one step
-        alike = 1.0 - min(4.0 * self._noise / step, 1.0)
+        alike = self._alike
         scatter = variance * (1.0 / len(readings) + shape_mean**2 / stiffness)
-        deviation = math.sqrt(alike * rounded + (1.0 - alike) * scatter + (LAG_REST * lag) ** 2)
+        # a rise beyond its own scatter ends later or earlier than e^{-t/τ} does
+        scatter += UNKNOWN_RISE**2 * max(rise**2 - variance / stiffness, 0.0)
+        deviation = math.sqrt(alike * rounded + (1.0 - alike) * scatter)
         approached = float(masses.mean()) + shape_mean * rise
         return alike * float(masses[len(masses) // 2 :].mean()) + (1.0 - alike) * approached, deviation, rise
 
@@ -529,10 +546,25 @@ class DoseController:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of a weighed amount: zero, last readings, and late drops [kg]."""
-        # σ² = (d²/12 + σ_0²/4) of the zero, a mean of four readings, + that of the weighing + that of late drops
-        zero = self._step_size**2 / 12.0 + self._noise**2 / 4.0
-        return math.sqrt(zero + self._remainder**2 + LATE_DROPS[1] ** 2)
+        """Standard deviation of a weighed amount: zero, last readings, late drops and tracking of the zero [kg]."""
+        # zero: a mean of four readings, n of them new: σ² = a d²/12 + ((1 − a) d²/12 + σ_0²) / n, a rounded alike, or
+        # (d/4)²/3 after a tare; drops: their number has a Poisson distribution, σ² = drop · mean mass
+        rounded, alike = self._step_size**2 / 12.0, self._alike
+        zero = rounded * (4.0 * TARED**2 if self._tared else alike)
+        zero += ((1.0 - alike) * rounded + self._noise**2) / (1.0 + 3.0 * self._new)
+        return math.sqrt(zero + self._remainder**2 + LATE_DROPS[0] * self._late_drops + self._tracked**2)
+
+    @property
+    def _alike(self) -> float:
+        """Share of the rounding error's variance that all readings at rest have in common."""
+        # exp(−4π² σ²/d²) for a noise σ and steps d: first harmonic of the mean rounding error (Widrow 1961, dither)
+        return math.exp(-((2.0 * math.pi * self._noise / self._step_size) ** 2))
+
+    @property
+    def _new(self) -> float:
+        """Share of new readings at rest."""
+        repeated = float(self._estimator.repeats.weights(1) @ REPEATS)
+        return max(1.0 - repeated, min(self._interval / RECORDED_HOLD, 1.0))
 
     def _patience(self, limit: tuple[float, float]) -> float:
         """The larger one of a time and of a number of readings [s]."""
@@ -671,6 +703,14 @@ class DoseController:
         self._late_flow = flow * self._cup.density
         self._late_mass += self._late_flow * min(seconds, 0.2)
 
+    def _note_tracking(self, seconds: float) -> None:
+        """Let the zero of a display that shows zero follow the load that flows onto it."""
+        band, mean, deviation = (value * self._step_size for value in TRACKED)
+        pours = self.phase in (DosePhase.APPROACH, DosePhase.POUR) and self.flow > 0.0
+        if self._zero is not None and self._tared and pours and self._recent[-1].mass <= band:
+            self._zero -= mean * seconds
+            self._tracked += deviation * seconds
+
     def _watch(self) -> None:
         """Turn back where it is not safe to pour on."""
         if self.phase not in (DosePhase.APPROACH, DosePhase.POUR) or not self._recent:
@@ -703,7 +743,7 @@ class DoseController:
     def _holds_too_long(self) -> bool:
         """Whether the display shows one reading for longer than displays do, although the load has changed."""
         e, shown = self._estimator, self._recent[-1].mass - (self._zero or 0.0)
-        rare = e.repeats.run < IMPROBABLE_HOLD or self._now - self._unchanged_since > LONGEST_HOLD
+        rare = e.repeats.run < IMPROBABLE_HOLD or self._now - self._unchanged_since > self._patience(LONGEST_HOLD)
         if e.repeats.run == 0.0 or not rare:
             return False
         surely = float(np.quantile(e.reading, 0.1)) - 0.5 * self._step_size

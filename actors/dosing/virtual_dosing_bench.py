@@ -95,8 +95,8 @@ class TrueScale:
         delay: until a reading arrives [s].
         step: of the display [kg].
         noise: standard deviation before the display [kg].
-        behaviour: how the display departs from an ideal one. Its zero is tracked at the load before the readings, as
-            of a balance that was tared with the receiver on it.
+        behaviour: how the display departs from an ideal one. A balance that tracks its zero is tared with the receiver
+            on it before a dose, so that there is a zero to be tracked.
     """
 
     kind: Literal["first", "fourth", "average", "switching"] = "first"
@@ -344,7 +344,7 @@ class VirtualDosingBench:
         dt = TIME_STEP
         missing = fault is not None and fault.kind == "receiver missing"
         base = 0.0 if missing else self.receiver_mass
-        cell, shown = _Filter(scale, base), self._display(base)
+        cell, shown = _Filter(scale, base), self._display(base, zero=self.tare)
         drops = int(rng.integers(0, 4))
         tilt = target = speed = ordered = 0.0
         fresh, pending = 0.0, deque[tuple[float, float]]()
@@ -419,11 +419,16 @@ class VirtualDosingBench:
             tuple(delivered),
         )
 
-    def _display(self, load: float) -> _Display:
-        """The display with a load at rest [kg]."""
+    @property
+    def tare(self) -> float:
+        """Load that the display shows as zero during a dose [kg]; only a zero can be tracked."""
+        return self.receiver_mass if self.scale.behaviour.zero_tracking else 0.0
+
+    def _display(self, load: float, zero: float = 0.0) -> _Display:
+        """The display with a load at rest, and the load that it shows as zero [kg]."""
         self._displays += 1
         seed = (*self._display_seed, self._displays)
-        return _Display(self.scale, self._rng, DisplayModel(self.scale.behaviour, self.scale.step, seed, load))
+        return _Display(self.scale, self._rng, DisplayModel(self.scale.behaviour, self.scale.step, seed, load), zero)
 
     def pour(self) -> LivePour:
         """Liquid that follows a tilt from elsewhere, such as that of an emulated arm."""
@@ -548,13 +553,13 @@ class LivePour:
 class _Display:
     """Rounds, repeats, delays and loses readings, and reports when the value rests."""
 
-    def __init__(self, scale: TrueScale, rng: np.random.Generator, model: DisplayModel) -> None:
-        self._scale, self._rng, self._model, self._load = scale, rng, model, model.value
+    def __init__(self, scale: TrueScale, rng: np.random.Generator, model: DisplayModel, zero: float) -> None:
+        self._scale, self._rng, self._model, self._zero = scale, rng, model, zero
         self._last: deque[float] = deque(maxlen=max(round(0.6 / scale.interval), 3))
 
     def advance(self, value: float) -> None:
         """Let one step of time pass, with this value of the filter [kg]."""
-        self._model.advance(value, TIME_STEP, self._load)
+        self._model.advance(value, TIME_STEP, self._zero)
 
     def readings(self, due: float) -> list[DoseReading]:
         """The reading that is due then [s]; none if it is lost."""
@@ -567,4 +572,5 @@ class _Display:
 
     def _new(self) -> float:
         step = self._scale.step
-        return round((self._model.value + self._scale.noise * float(self._rng.standard_normal())) / step) * step
+        value = self._model.value - self._zero + self._scale.noise * float(self._rng.standard_normal())
+        return round(value / step) * step

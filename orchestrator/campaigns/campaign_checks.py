@@ -447,12 +447,14 @@ class _Checker:
         from actors.laboratory import expected_display
 
         display = expected_display(laboratory.balance)
+        if display is None:
+            return
         for i, dose in enumerate(plan.doses):
             try:
-                if display is not None:
-                    check_display(display, dose.limit, laboratory.dosing)
+                check_display(display, dose.limit, laboratory.dosing)
             except InvalidActionError as error:
                 self.add((("dispense", "doses", i), ("dispense",)), str(error))
+                return  # mostly all doses have one tolerance
 
     def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
         """Recorded pours were possible: if their vessels touch, the description of the scene is wrong."""

@@ -227,6 +227,50 @@ def test_a_balance_that_sends_seldom_is_not_lost(interval: float, lost: float) -
     assert result.amount == pytest.approx(record.received, abs=0.3e-3)
 
 
+def test_a_slow_display_that_repeats_readings_is_no_reason_to_stop() -> None:
+    """One repeated reading of a display with one each second lasts 2 s."""
+    scale = TrueScale(lag=0.3, interval=1.0, behaviour=DisplayBehaviour(repeat_probability=0.42))
+    record, controller = one_dose(0.1, scale=scale, seed=2)
+    assert controller.result is not None
+    assert controller.result.end is DoseEnd.REACHED
+    assert record.received == pytest.approx(0.1, abs=2.5e-3)
+    assert record.duration < 0.9 * DosingSettings().time_limit
+
+
+def weighing_errors(scale: TrueScale, receiver: float = 0.18) -> list[tuple[float, float]]:
+    """Errors of weighed amounts, and half of the stated 90 % intervals [kg]."""
+    errors = []
+    for seed in range(4):
+        bench, rng = (
+            VirtualDosingBench(SPOUTED, WATER, scale, seed, receiver_mass=receiver),
+            np.random.default_rng(seed),
+        )
+        placed = bench.place_receiver()
+        series = DoseSeries(CUP, DosingSettings(), SourceContent(0.3), placed, rng, particles=80, step=scale.step)
+        order = DoseOrder(0.1, receiver_mass=bench.receiver_mass - bench.tare)
+        controller = series.controller(order, seed=seed)
+        record, result = bench.dose(controller), controller.result
+        assert result is not None
+        assert result.amount is not None
+        errors.append((result.amount - record.received, 1.645 * result.deviation))
+    return errors
+
+
+def test_a_display_that_corrects_its_zero_hides_a_part_of_the_dose_that_its_interval_contains() -> None:
+    """The display hides up to 0.8 g."""
+    scale = TrueScale(lag=0.3, step=1e-3, behaviour=DisplayBehaviour(zero_tracking=0.5, zero_band=4.0))
+    errors = weighing_errors(scale, receiver=0.1803)
+    assert all(abs(error) < half for error, half in errors)
+    assert abs(float(np.mean([error for error, _ in errors]))) < 0.5e-3
+
+
+def test_a_weight_that_still_rises_slowly_is_not_taken_for_the_amount() -> None:
+    """Two slow filters, one after the other."""
+    scale = TrueScale(lag=1.05, behaviour=DisplayBehaviour(rest_lag=1.0, rest_band=4.0))
+    errors = weighing_errors(scale)
+    assert all(abs(error) < half for error, half in errors)
+
+
 def test_a_balance_that_is_too_slow_for_a_tolerance_is_refused_with_the_one_that_it_supports() -> None:
     settings = DosingSettings()
     for interval, limit in ((0.1, 1e-3), (1.0, 1e-3), (2.0, 1.5e-3)):
