@@ -118,6 +118,13 @@ def test_a_balance_that_is_too_slow_for_the_tolerance_is_refused_before_anything
     assert "a new reading each 2 s" in result.stderr
     assert "ask for a tolerance of 1.5 g" in result.stderr
     assert not Path("runs").exists()
+    series = small_campaign.write_campaign(campaign.parent, SERIES)
+    series.write_text(
+        re.sub("laboratory: .*", f"laboratory: {slow}", series.read_text(encoding="utf-8")), encoding="utf-8"
+    )
+    checked = decant("validate", str(series))
+    assert checked.exit_code == 2
+    assert (checked.output.count("is too slow"), "dispense.doses[0]" in checked.output) == (1, True)
 
 
 def test_an_amount_is_needed(campaign: Path) -> None:
