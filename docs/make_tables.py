@@ -38,7 +38,7 @@ from actors.interfaces import OperatorSettings, RaySettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
 from actors.places import PlaceSettings, UnattendedSettings
 from orchestrator.campaigns import campaign_file as campaign
-from orchestrator.campaigns import vessel_file as vessel
+from orchestrator.campaigns import file_references as vessel
 from orchestrator.campaigns.pour_table import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.campaigns.scene_builder import DEFAULTS, NEEDED
 from orchestrator.campaigns.yaml.section_validation import sections_in

@@ -18,8 +18,8 @@ from ruamel.yaml import YAML
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.campaign_file import CampaignFile
 from orchestrator.campaigns.file_loading import load_campaign, load_vessel
+from orchestrator.campaigns.file_references import VesselFile
 from orchestrator.campaigns.search_ranges import EXAMPLES
-from orchestrator.campaigns.vessel_file import VesselFile
 from orchestrator.campaigns.yaml.section_validation import sections_in
 from orchestrator.cli import console as common
 from orchestrator.daemon.state.daemon_settings import DaemonFile

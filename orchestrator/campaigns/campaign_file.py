@@ -15,8 +15,8 @@ from pydantic import Field, create_model
 from actors.laboratory_settings import LaboratorySettings
 from actors.places import UnattendedSettings
 from orchestrator.campaigns.campaign_prior import AnyPrior
+from orchestrator.campaigns.file_references import VesselFile
 from orchestrator.campaigns.search_ranges import Actions, Motion, Parameters
-from orchestrator.campaigns.vessel_file import VesselFile
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import (
     LEAST_TRAINING_POURS,

@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Discriminator, Field, Tag, create_model
 
 from actors.laboratory_settings import LaboratorySettings
+from orchestrator.campaigns.file_references import YAML_SUFFIXES, References
 from orchestrator.campaigns.fingerprint import deciding, scene_by_content
-from orchestrator.campaigns.yaml.references import YAML_SUFFIXES, References
 from orchestrator.campaigns.yaml.yaml_source import Place
 from orchestrator.learning.calibration.campaign_memory import (
     LIQUID,

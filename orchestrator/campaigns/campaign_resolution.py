@@ -28,12 +28,12 @@ from orchestrator.campaigns.campaign_file import (
     owners_of_priors,
 )
 from orchestrator.campaigns.campaign_prior import PosteriorSource, PriorNeeds, ResolvedPrior, resolve_prior
+from orchestrator.campaigns.file_references import References
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.scene_builder import SceneBuilder
 from orchestrator.campaigns.search_ranges import ParametersBase
 from orchestrator.campaigns.weighed_pours import read_table, records_of_run, resolve_data, resolve_records
 from orchestrator.campaigns.yaml.file_access import resolved
-from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.section_validation import PlacedProblems
 from orchestrator.campaigns.yaml.yaml_source import Place, Report
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory

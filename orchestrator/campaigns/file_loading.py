@@ -15,10 +15,9 @@ from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.campaign_file import CampaignFile
 from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource, ResolvedPrior, no_posteriors
 from orchestrator.campaigns.campaign_resolution import resolve_campaign
+from orchestrator.campaigns.file_references import MESH_SUFFIXES, References, VesselFile, resolve_vessel
 from orchestrator.campaigns.run_snapshot import as_file
-from orchestrator.campaigns.vessel_file import MESH_SUFFIXES, VesselFile, resolve_vessel
 from orchestrator.campaigns.yaml.file_access import resolved
-from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.section_validation import validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report, wrong_kind

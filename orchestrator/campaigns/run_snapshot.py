@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 from pydantic import Tag
 
 from orchestrator.campaigns.campaign_file import CalibrationSection, LearningSettings
+from orchestrator.campaigns.file_references import References
 from orchestrator.campaigns.search_ranges import Parameters
 from orchestrator.campaigns.yaml.file_access import resolved
-from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
 from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
 from sim_engine.settings.model import IN_FILE, FieldMark, Settings

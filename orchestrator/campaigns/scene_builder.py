@@ -13,8 +13,8 @@ from typing import Any
 from actors.optimizer.questions import Linear
 from orchestrator.campaigns.action_assignments import parse_constraint
 from orchestrator.campaigns.campaign_file import CampaignFile
+from orchestrator.campaigns.file_references import References
 from orchestrator.campaigns.search_ranges import EXAMPLES, ActionsBase, MotionBase
-from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.yaml_errors import dotted
 from orchestrator.campaigns.yaml.yaml_source import Place, Report
 from orchestrator.learning.calibration.action_prior import actions_of_prior

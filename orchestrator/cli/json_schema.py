@@ -9,7 +9,7 @@ from typing import Any
 
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.campaign_file import CampaignFile
-from orchestrator.campaigns.vessel_file import VesselFile
+from orchestrator.campaigns.file_references import VesselFile
 from sim_engine.settings.model import SchemaGenerator, Settings
 from sim_engine.settings.plugin_registry import file_kind
 

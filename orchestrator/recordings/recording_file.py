@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from actors.dosing.dose_estimator import DoseReading
-from orchestrator.campaigns.vessel_file import VesselFile
+from orchestrator.campaigns.file_references import References, VesselFile
 from orchestrator.campaigns.yaml.file_access import resolved
-from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.section_validation import validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report, wrong_kind

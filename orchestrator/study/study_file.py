@@ -17,10 +17,10 @@ from pydantic import Field, create_model
 
 from actors.laboratory_settings import BenchSettings, LaboratorySettings, TrueLiquid
 from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.file_references import References
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.search_ranges import Parameters, ParametersBase
 from orchestrator.campaigns.yaml.file_access import missing_file, resolved
-from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.section_validation import PlacedProblems, validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report, wrong_kind

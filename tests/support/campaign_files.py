@@ -9,8 +9,8 @@ from textwrap import dedent
 import pytest
 
 from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.file_references import References
 from orchestrator.campaigns.run_snapshot import as_file
-from orchestrator.campaigns.yaml.references import References
 from orchestrator.campaigns.yaml.section_validation import validate
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.campaigns.yaml.yaml_source import Document, Place, Report
