@@ -25,12 +25,19 @@ of a total loss would gain from each failed pour over one that is less certain.
 The prior draws are coarse: with steep walls, a few pours leave a handful of 2,048. The ones that are used for
 predictions are therefore moved by Markov chains that keep the posterior.
 
+**After a calibration.** Its weighed pours have simulations c_i and a surrogate f̂_c of these in their own scene.
+Hypothesis j predicts them as clip(e^{g_j} (c_i + f̂_c(z_j(x_i)) − f̂_c(x_i)), 0, 1) + δ, with its noise. Its weight is
+prior times ((1 − ε) L_j / Σ_k w_k L_k + ε), L_j the likelihood of these pours to the power that they have for another
+receiver. With the probability ε the calibration misleads, and only the prior is known; so it is after a change of the
+bench.
+
 **A bench that changes.** Once an observation lies outside its 99 % prediction interval, the hypotheses are weighed
 together with the start of the present segment: the observations before it were made on another bench, and say nothing
 of this one. Two Cholesky factors of every hypothesis, in both orders, give the marginal likelihoods of all beginnings
 and ends. Alternatively the latest observation is an outlier.
 
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001;
+power prior of earlier data, Ibrahim & Chen 2000, in a robust mixture, Schmidli et al., Biometrics 2014;
 changes, Adams & MacKay, Bayesian online changepoint detection, 2007, and binary segmentation, Scott & Knott 1974;
 moves after resampling, Gilks & Berzuini 2001.
 Limitations: the weights of the groups, and of the starts of a segment, come from the prior draws; predictions use 48
@@ -48,9 +55,9 @@ from scipy.spatial.distance import cdist
 from scipy.special import ndtr, ndtri
 from scipy.stats import qmc
 
-from actors.optimizer.gaussian_process import GaussianProcess
+from actors.optimizer.gaussian_process import GaussianProcess, constant_mean_process
 from actors.optimizer.prediction_intervals import highest_density_intervals
-from actors.optimizer.questions import ModelDiscrepancy
+from actors.optimizer.questions import CalibrationPours, ModelDiscrepancy
 
 Array = NDArray[np.float64]
 Remake = Callable[[Array], "Hypotheses"]
@@ -101,6 +108,10 @@ costs count with this resolution, so that no hypothesis gains by being more cert
 probability of an observation by any hypothesis."""
 FORGOTTEN = 1e3
 """Noise of an observation that does not count."""
+MISLED = 1.0 / 22.0
+"""ε: probability that a calibration says nothing about the bench of the observations, because something was moved or
+exchanged since. None of the 20 calibrations in docs/evidence/results.md (quickstart) misled; by Laplace's rule of
+succession the next one does with (0 + 1) / (20 + 2)."""
 STEPS = (0.5, 0.25, 0.12) * 4
 """Sizes of the steps of the Markov chains, relative to the prior's standard deviation."""
 RECENT = 4
@@ -223,6 +234,33 @@ class _Segments:
     since: int | None
 
 
+@dataclass(frozen=True)
+class _CalibratedScene:
+    """The weighed pours (n) of a calibration in one scene, with a surrogate of their simulations.
+
+    Attributes:
+        corrections: simulated costs less those of the surrogate, in the cost's unit.
+        centre: (dimension,), the simulated best there.
+        power: exponent of the likelihood.
+    """
+
+    points: Array
+    costs: Array
+    surrogate: GaussianProcess
+    corrections: Array
+    centre: Array
+    power: float
+
+    @classmethod
+    def of(cls, pours: CalibrationPours, worst: float) -> _CalibratedScene:
+        """Fit the surrogate."""
+        points, simulated = np.array(pours.points), np.array(pours.simulated)
+        surrogate = constant_mean_process(points, simulated)
+        corrections = simulated - surrogate.predict(points)[0]
+        costs = np.clip(np.array(pours.costs) / worst, 0.0, 1.0)
+        return cls(points, costs, surrogate, corrections, _least(surrogate), pours.power)
+
+
 class ModelAveragedProcess:
     """The real cost, averaged over hypotheses; see the module docstring. Its `predict` is a `Surrogate`'s.
 
@@ -249,9 +287,13 @@ class ModelAveragedProcess:
         latent = ndtri(np.concatenate([rows, rows[:CONTRARY]]))  # the same for the same question, and even
         contrary = np.arange(J) >= HYPOTHESES
         self._all = Hypotheses.of(discrepancy, centre, latent, contrary)
+        self._calibration = [_CalibratedScene.of(pours, discrepancy.worst) for pours in discrepancy.calibration or ()]
         numbers = HYPOTHESES, CONTRARY, len(UNINFORMATIVE_LENGTHS)
         shares = 1.0 - distrust, CONTRARY_SHARE * distrust, (1.0 - CONTRARY_SHARE) * distrust
-        segments = self._segments(np.log(np.repeat(np.divide(shares, numbers), numbers)))  # prior weights
+        prior = np.log(np.repeat(np.divide(shares, numbers), numbers))
+        calibrated = np.concatenate([self._calibrated(self._all), self._calibrated(None)])
+        self._calibrated_total = _log_sum(prior + calibrated)
+        segments = self._segments(prior, prior + self._reliance(calibrated))
         self.since, weights = segments.since, segments.weights
         informed, uninformative = weights[:, :J], weights[:, J:]
         self._trusting = np.where(self._all.contrary, 0.0, informed.sum(axis=0))
@@ -273,19 +315,25 @@ class ModelAveragedProcess:
         at_data = self._prior(points, self._costs)
         counting = np.concatenate([counting, segments.counting[uninformative.argmax(axis=0)]])
         self._at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        self._inverses = np.linalg.inv(self._factorised(self._at_data, self._lengths, points))
+        self._inverses = np.linalg.inv(_factorised(self._at_data, self._lengths, points))
         self._residuals = np.einsum("jik,jk->ji", self._inverses, self._costs - self._at_data.means)
         self._recent: dict[bytes, tuple[_Prior, Array]] = {}
 
     # -- prior moments ---------------------------------------------------------------------------------------------
 
-    def _informed(self, hypotheses: Hypotheses, points: Array) -> _Prior:
+    def _informed(self, hypotheses: Hypotheses, points: Array, scene: _CalibratedScene | None = None) -> _Prior:
+        """Moments in the scene of the observations, or at the pours of a calibration's scene."""
         J, m = len(hypotheses.gains), len(points)
         if m == 0:
             return _Prior(*(np.empty((J, 0)) for _ in range(3)))
+        if scene is not None:
+            hypotheses = replace(hypotheses, centre=scene.centre)
+        simulated = self.simulated if scene is None else scene.surrogate
         mean, deviation = (
-            moments.reshape(J, m) for moments in self.simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
+            moments.reshape(J, m) for moments in simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
         )
+        if scene is not None:
+            mean = mean + scene.corrections
         # μ_j = clip(e^{g_j} f̂_s(z_j(x)), 0, 1), contrary: 1 − f̂_s; v_j = √(σ_j² + e^{2 g_j} s_s²); noise n_j + m_j
         # μ_j
         gain = np.exp(hypotheses.gains)[:, None] / self.worst
@@ -305,6 +353,26 @@ class ModelAveragedProcess:
         return _joined(self._informed(self._kept, points), self._uninformative(points, seen))
 
     # -- posterior weights -----------------------------------------------------------------------------------------
+
+    def _calibrated(self, hypotheses: Hypotheses | None) -> Array:
+        """Logarithms (J,) of L_j, the likelihoods of the calibration's pours to their powers; None: of the
+        uninformative group."""
+        logs = np.zeros(len(UNINFORMATIVE_LENGTHS) if hypotheses is None else len(hypotheses.gains))
+        for scene in self._calibration:
+            if hypotheses is None:
+                prior, lengths = self._uninformative(scene.points, scene.costs), UNINFORMATIVE_LENGTHS
+            else:
+                prior, lengths = self._informed(hypotheses, scene.points, scene), hypotheses.lengths
+            logs += scene.power * _sequential(prior, lengths, scene.points, scene.costs)[0].sum(axis=1)
+        return logs
+
+    def _reliance(self, calibrated: Array) -> Array:
+        """Logarithms (J,) of the factors on prior weights by the calibration, whose log-likelihoods are given."""
+        if not self._calibration:
+            return np.zeros(len(calibrated))
+        # (1 − ε) L_j / Σ_k w_k L_k + ε: with the probability ε = MISLED, the weights are those without a calibration
+        relative = calibrated - self._calibrated_total
+        return np.asarray(np.logaddexp(np.log1p(-MISLED) + relative, np.log(MISLED)))
 
     def _resampled(self, latent: Array, sample: Hypotheses, counting: NDArray[np.bool_], make: Remake) -> Hypotheses:
         """Move drawn hypotheses (k) by Markov chains that keep the posterior: the drawn ones are few, and coarse.
@@ -336,36 +404,42 @@ class ModelAveragedProcess:
         """
         at_data = self._informed(hypotheses, self.points)
         at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        chances = self._sequential(at_data, hypotheses.lengths, np.arange(len(self.points)))[0]
-        unlikely = np.where(hypotheses.near & ~counting[:, 0], np.log(NEAR_CHANGED), 0.0)
-        return np.asarray(np.where(counting, chances, 0.0).sum(axis=1) + unlikely)
+        chances = _sequential(at_data, hypotheses.lengths, self.points, self._costs)[0]
+        changed = ~counting[:, :1].all(axis=1)
+        weights = self._reliance(self._calibrated(hypotheses))
+        weights = np.where(changed, np.where(hypotheses.near, np.log(NEAR_CHANGED), 0.0), weights)
+        return np.asarray(np.where(counting, chances, 0.0).sum(axis=1) + weights)
 
-    def _segments(self, prior: Array) -> _Segments:
-        """Weigh the starts of the present segment together with the hypotheses, of log prior weights (J,).
+    def _segments(self, prior: Array, calibrated: Array) -> _Segments:
+        """Weigh the starts of the present segment together with the hypotheses.
+
+        Args:
+            prior: log prior weights (J,) on a bench of which nothing is known, as after a change.
+            calibrated: the same with the calibration.
 
         If the observations after the likeliest change hold another one, they alone are weighed.
         """
         at_data = _joined(self._informed(self._all, self.points), self._uninformative(self.points, self._costs))
         lengths = np.concatenate([self._all.lengths, UNINFORMATIVE_LENGTHS])
-        weighted = self._weighed(at_data, lengths, prior, 0)
+        weighted = self._weighed(at_data, lengths, prior, calibrated, 0)
         while weighted.since is not None:
-            later = self._weighed(at_data, lengths, prior, weighted.since)
+            later = self._weighed(at_data, lengths, prior, calibrated, weighted.since)
             if later.since is None:
                 return replace(later, since=weighted.since) if later.surprised else weighted
             weighted = later
         return weighted
 
-    def _weighed(self, at_data: _Prior, lengths: Array, prior: Array, begin: int) -> _Segments:
+    def _weighed(self, at_data: _Prior, lengths: Array, prior: Array, calibrated: Array, begin: int) -> _Segments:
         """Weights of the starts of a segment among the observations from `begin`, with at most one change there."""
         n, m = len(self.points), len(self.points) - begin
         order = np.arange(begin, n)
-        chances, residuals = self._sequential(at_data, lengths, order)
+        chances, residuals = _sequential(at_data, lengths, self.points, self._costs, order)
         changed = prior + np.log(
             np.append(np.where(self._all.near, NEAR_CHANGED, 1.0), np.ones(len(UNINFORMATIVE_LENGTHS)))
         )
         changed -= _log_sum(changed)
         # before[j, t] = log w_j + Σ_{i<t} log p_j(y_i | y_<i): joint with the observations before t (chain rule)
-        first = changed if begin else prior
+        first = changed if begin else calibrated
         before = first[:, None] + np.concatenate([np.zeros((len(prior), 1)), np.cumsum(chances, axis=1)], axis=1)
         so_far = np.exp(before[:, :-1] - before[:, :-1].max(axis=0, initial=-np.inf))
         # Probability integral transform: P(y_i < observed | y_<i) = Σ_j w_j(t) Φ(residual_j)
@@ -373,7 +447,7 @@ class ModelAveragedProcess:
         surprising = np.abs(below - 0.5) > 0.5 * SURPRISE
         counting, logs = [np.arange(n) >= begin], [before[:, m]]
         if surprising.any():
-            after = np.cumsum(self._sequential(at_data, lengths, order[::-1])[0], axis=1)[:, ::-1]
+            after = np.cumsum(_sequential(at_data, lengths, self.points, self._costs, order[::-1])[0], axis=1)[:, ::-1]
             # Change before `start`: Σ_j of the old bench's evidence, times CHANGE, times w_j p_j(y_start … y_n) of the
             # new (Adams & MacKay 2007, with one change).
             for start in range(1, m):
@@ -391,37 +465,7 @@ class ModelAveragedProcess:
         since = None if since == n - 1 else since  # a single observation may be a mishap
         return _Segments(np.array(counting), weights, bool(surprising.any()), since)
 
-    def _sequential(self, prior: _Prior, lengths: Array, order: NDArray[np.int_]) -> tuple[Array, Array]:
-        """Log probabilities (J, n) of observations given those before them in an order, and standardised residuals."""
-        if not len(order):
-            return np.empty((len(lengths), 0)), np.empty((len(lengths), 0))
-        prior = _Prior(*(getattr(prior, name)[:, order] for name in ("means", "spreads", "noises")))
-        L = self._factorised(prior, lengths, self.points[order])
-        costs = self._costs[order]
-        # Residuals L⁻¹ (y − μ): the i-th is (y_i − E[y_i | y_<i]) / L_ii, L_ii its conditional deviation. The
-        # probability of an interval [low, high] of it is Φ(high) − Φ(low), from the side on which it is not a
-        # difference of numbers near 1.
-        residuals = np.linalg.solve(L, (costs - prior.means)[:, :, None])[:, :, 0]
-        deviations = np.diagonal(L, axis1=1, axis2=2)
-        high = np.where(costs > TOTAL, np.inf, residuals + 0.5 * RESOLUTION / deviations)
-        low = np.where(
-            costs > TOTAL, residuals - (costs - TOTAL) / deviations, residuals - 0.5 * RESOLUTION / deviations
-        )
-        low = np.where(costs < 0.5 * RESOLUTION, -np.inf, low)
-        chances = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
-        return np.log(np.maximum(chances, LEAST_CHANCE)), np.asarray(residuals)
-
     # -- posterior moments -----------------------------------------------------------------------------------------
-
-    def _factorised(self, prior: _Prior, lengths: Array, points: Array) -> Array:
-        """Lower Cholesky factors (J, n, n) of the observations' covariances."""
-        n = len(points)
-        if n == 0:
-            return np.zeros((len(lengths), 0, 0))
-        # K_j = v_j(x) v_j(x′) M_{ℓ_j}(x, x′) + n_j(x)² 1
-        K = _correlation(points, points, lengths) * prior.spreads[:, :, None] * prior.spreads[:, None, :]
-        K[:, np.arange(n), np.arange(n)] += prior.noises**2
-        return np.asarray(np.linalg.cholesky(K))
 
     def components(self, points: Array) -> tuple[Array, Array, Array]:
         """Posterior means, deviations and noises (components, m) at points (m, dimension), in units of the worst."""
@@ -514,6 +558,38 @@ class ModelAveragedProcess:
     def heaviest(self) -> tuple[Hypotheses, Array]:
         """The hypotheses used for predictions, and their weights."""
         return self._kept, self.mixture[: len(self._kept.gains)]
+
+
+def _factorised(prior: _Prior, lengths: Array, points: Array) -> Array:
+    """Lower Cholesky factors (J, n, n) of the observations' covariances."""
+    n = len(points)
+    if n == 0:
+        return np.zeros((len(lengths), 0, 0))
+    # K_j = v_j(x) v_j(x′) M_{ℓ_j}(x, x′) + n_j(x)² 1
+    K = _correlation(points, points, lengths) * prior.spreads[:, :, None] * prior.spreads[:, None, :]
+    K[:, np.arange(n), np.arange(n)] += prior.noises**2
+    return np.asarray(np.linalg.cholesky(K))
+
+
+def _sequential(
+    prior: _Prior, lengths: Array, points: Array, costs: Array, order: NDArray[np.int_] | slice = slice(None)
+) -> tuple[Array, Array]:
+    """Log probabilities (J, n) of observations given those before them in an order, and standardised residuals."""
+    if not len(points[order]):
+        return np.empty((len(lengths), 0)), np.empty((len(lengths), 0))
+    prior = _Prior(*(getattr(prior, name)[:, order] for name in ("means", "spreads", "noises")))
+    L = _factorised(prior, lengths, points[order])
+    costs = costs[order]
+    # Residuals L⁻¹ (y − μ): the i-th is (y_i − E[y_i | y_<i]) / L_ii, L_ii its conditional deviation. The
+    # probability of an interval [low, high] of it is Φ(high) − Φ(low), from the side on which it is not a
+    # difference of numbers near 1.
+    residuals = np.linalg.solve(L, (costs - prior.means)[:, :, None])[:, :, 0]
+    deviations = np.diagonal(L, axis1=1, axis2=2)
+    high = np.where(costs > TOTAL, np.inf, residuals + 0.5 * RESOLUTION / deviations)
+    low = np.where(costs > TOTAL, residuals - (costs - TOTAL) / deviations, residuals - 0.5 * RESOLUTION / deviations)
+    low = np.where(costs < 0.5 * RESOLUTION, -np.inf, low)
+    chances = np.where(low > 0.0, ndtr(-low) - ndtr(-high), ndtr(high) - ndtr(low))
+    return np.log(np.maximum(chances, LEAST_CHANCE)), np.asarray(residuals)
 
 
 def _least(simulated: GaussianProcess) -> Array:

@@ -67,6 +67,23 @@ def found_good(costs: Iterable[float]) -> bool:
 
 
 @dataclass(frozen=True)
+class CalibrationPours:
+    """Weighed pours of a calibration in one scene, each with its simulation by the θ that the simulations use.
+
+    Attributes:
+        points: of the actions, in the unit cube of the query's space; actions may lie outside.
+        costs: weighed.
+        simulated: costs that the simulator predicts without the pour itself.
+        power: exponent of the likelihood of these pours, 0 < power ≤ 1: how much they say about another scene.
+    """
+
+    points: tuple[Point, ...]
+    costs: Numbers
+    simulated: Numbers
+    power: float
+
+
+@dataclass(frozen=True)
 class ModelDiscrepancy:
     """The ways in which the simulator may be wrong, and the budget of pours.
 
@@ -79,6 +96,7 @@ class ModelDiscrepancy:
         pours_left: number of real observations after the proposed one.
         limit: kept by proposals, if any action keeps it.
         lookahead: whether the next observation may be chosen for its information about other places.
+        calibration: pours of a calibration, which weigh the hypotheses before the first observation; None without any.
     """
 
     offset_priors: tuple[OffsetPrior, ...]
@@ -88,6 +106,7 @@ class ModelDiscrepancy:
     pours_left: int = 0
     limit: Limit | None = None
     lookahead: bool = True
+    calibration: tuple[CalibrationPours, ...] | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)

@@ -459,6 +459,12 @@ def _check_discrepancy(discrepancy: ModelDiscrepancy, dimension: int) -> None:
     valid = 0.0 < discrepancy.uninformative < 1.0 and 0.0 < discrepancy.worst < math.inf
     if not valid or discrepancy.pours_left < 0:
         raise ValueError("discrepancy: 0 < uninformative < 1, worst > 0 and pours_left ≥ 0 are required")
+    for pours in discrepancy.calibration or ():
+        _check_points("calibration", pours.points, dimension)
+        if not 2 <= len(pours.points) == len(pours.costs) == len(pours.simulated) or not 0.0 < pours.power <= 1.0:
+            raise ValueError("calibration: two pours at least, two costs of each and 0 < power ≤ 1 are required")
+        if not all(math.isfinite(cost) for cost in (*pours.costs, *pours.simulated)):
+            raise ValueError("calibration: a cost is not finite")
 
 
 def _check_posterior(query: CalibrationQuery) -> None:

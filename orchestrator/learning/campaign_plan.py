@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from actors.laboratory_settings import LaboratorySettings
-from actors.optimizer.questions import WRITTEN_IF_SET, BenchOffset, Linear, Point
+from actors.optimizer.questions import WRITTEN_IF_SET, BenchOffset, CalibrationPours, Linear, Point
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.deployment.objectives import Objectives
 from sim_engine.action import Action
@@ -311,6 +311,19 @@ class NormalPrior:
 
 
 @dataclass(frozen=True)
+class CalibrationEvidence:
+    """What the weighed pours of a calibration show about the simulator, for a deployment in one scene.
+
+    Attributes:
+        pours: by scene of the calibration; may be empty.
+        lines: the used pours, and the reasons why others are not used, one text each.
+    """
+
+    pours: tuple[CalibrationPours, ...]
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class StagePlan:
     """Base of the plans for one strategy.
 
@@ -421,6 +434,7 @@ class DeploymentPlan(StagePlan):
         left_over: residual of a calibration, given in the same case as `thetas`; None if unknown. A strategy
             gets it for its scene.
         memory: what earlier campaigns tell, if no calibration of the same campaign uses it.
+        evidence: pours of the preceding calibration; None without any, and for strategies that do not learn offsets.
     """
 
     settings: DeploymentSettings
@@ -435,6 +449,7 @@ class DeploymentPlan(StagePlan):
     bench: tuple[BenchOffset, ...] = ()
     left_over: CalibrationResidual | None = None
     memory: CampaignMemory | None = field(default=None, metadata=WRITTEN_IF_SET)
+    evidence: CalibrationEvidence | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property
     def pours(self) -> int:

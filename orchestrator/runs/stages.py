@@ -39,6 +39,7 @@ from orchestrator.learning.campaign_plan import (
     MeasuredPour,
     RecordSet,
 )
+from orchestrator.learning.deployment.calibration_evidence import calibration_evidence
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import displacement
@@ -259,6 +260,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
         def build(results: Results, seed: int) -> Strategy:
             known = with_left_over(with_posterior(deployment, results), results, plan.calibration, scene)
             known = with_offsets(known, results, _theta(plan, results))
+            known = with_evidence(known, results, plan.calibration, scene)
             return known.settings.build(known, scene, _theta(plan, results), seed)
 
         return build
@@ -386,6 +388,19 @@ def with_offsets(deployment: DeploymentPlan, results: Results, best: SimulationP
         return deployment
     worlds = drawn_worlds(best, POSTERIOR_DRAWS, 0, posterior=posterior, known=known)
     return replace(deployment, bench=tuple(displacement(best, world, deployment.actions) for world in worlds))
+
+
+def with_evidence(
+    deployment: DeploymentPlan, results: Results, calibration: CalibrationPlan | None, scene: Scene
+) -> DeploymentPlan:
+    """The deployment with the weighed pours of an evaluated preceding calibration, as evidence about the simulator."""
+    if calibration is None or not deployment.settings.learns_offsets or EVALUATION not in results:
+        return deployment
+    weighed = [*measured_pours(calibration, results), *_recorded(calibration.transfer)]
+    scores, searched = result_of(results, EVALUATION, Scores), len(calibrated_theta(results).searched)
+    theta = deployed_theta(results)
+    evidence = calibration_evidence(deployment, scene, theta, calibration, weighed, scores, searched)
+    return replace(deployment, evidence=evidence)
 
 
 def by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:

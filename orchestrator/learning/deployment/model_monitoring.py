@@ -215,7 +215,10 @@ class SimulatorMonitor:
             self.decisions.append(Decision(f"{self.text}; the simulator is weighted accordingly", urgent=True))
             return ""
         limit = rules.limit
-        if limit is None or not any(cost <= limit.loss for cost in weighed) or not discrepancy.exceedances:
+        if limit is None or not discrepancy.exceedances:
+            if limit is not None and not pours:
+                text = "no calibration supports the risk limit: it applies after the first pour that keeps it"
+                self.decisions.append(Decision(text, urgent=True))
             return ""
         risk = discrepancy.exceedances[0]
         if risk <= limit.probability * (1.0 + 1e-9):

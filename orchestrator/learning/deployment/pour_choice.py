@@ -13,6 +13,7 @@ from orchestrator.learning.deployment.deployment_base import DeploymentReport
 from orchestrator.learning.deployment.deployment_ledger import DeploymentRequests
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import Rules, SimulatorMonitor, offset_priors
+from orchestrator.learning.requests import Decision
 
 
 class PourChoice:
@@ -36,6 +37,9 @@ class PourChoice:
         self._simulated, self._rules = simulated, rules
         worst = self._ledger.costing.worst
         self._monitor = None if rules is None else SimulatorMonitor(rules, self._plan.actions, worst)
+        evidence = None if rules is None else self._plan.evidence
+        self._calibration = () if evidence is None else evidence.pours
+        self._ledger.decisions += [Decision(line) for line in (() if evidence is None else evidence.lines)]
         self.ended: str | None = None
         requests.warned = rules is not None
 
@@ -67,7 +71,9 @@ class PourChoice:
         if self._rules is None:
             return None
         ledger, limit = self._ledger, self._rules.limit
-        if limit is not None and not any(p.cost is not None and p.cost <= limit.loss for p in ledger.pours):
+        weighed = [pour.cost for pour in ledger.pours if pour.cost is not None]
+        supported = any(cost <= limit.loss for cost in weighed) if weighed and limit else bool(self._calibration)
+        if not supported:
             limit = None  # no poured action keeps it and could be repeated
         return ModelDiscrepancy(
             offset_priors(self._plan.actions),
@@ -77,6 +83,7 @@ class PourChoice:
             limit=limit,
             # an informative first pour may end in a corner, and a limit would keep the following pours there
             lookahead=self._rules.limit is None or limit is not None,
+            calibration=self._calibration or None,
         )
 
     # -- answers ---------------------------------------------------------------------------------------------------

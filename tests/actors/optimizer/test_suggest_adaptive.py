@@ -12,6 +12,7 @@ from actors.optimizer.knowledge_gradient import predicted_minimum
 from actors.optimizer.prediction_intervals import highest_density_intervals
 from actors.optimizer.questions import (
     BenchOffset,
+    CalibrationPours,
     Data,
     Limit,
     MinimumQuery,
@@ -74,6 +75,59 @@ def averaged(question):
 
 
 POURED = [(0.47, 0.6), (0.3, 0.75), (0.42, 0.45), (0.2, 0.5)]
+
+
+def calibrated(weighed, power=0.4):
+    """Twelve pours into another receiver, simulated as `cup`, and weighed as another function says."""
+    points = np.random.default_rng(5).random((12, 2))
+    return (CalibrationPours(tuple(map(tuple, points)), tuple(weighed(points)), tuple(cup(points)), power),)
+
+
+def first_pour(calibration):
+    discrepancy = ModelDiscrepancy(PRIORS, pours_left=10, calibration=calibration)
+    return propose(asked(cup, [], acquisition="least_loss", discrepancy=discrepancy))
+
+
+def width(answer):
+    return answer.bands[0][1] - answer.bands[0][0]
+
+
+def test_pours_that_the_simulator_predicted_narrow_what_the_first_pour_is_expected_to_lose():
+    without, known = first_pour(None), first_pour(calibrated(cup))
+    assert known.means[0] < 0.25 * without.means[0]
+    assert width(known) < 0.3 * width(without)
+    assert known.discrepancy.uninformative < 0.01
+    assert width(known) < width(first_pour(calibrated(cup, power=0.1))) < width(without)
+
+
+def test_pours_that_the_simulator_missed_widen_what_the_first_pour_may_lose():
+    def missed(points):
+        return np.clip(cup(points) + 0.15 * np.sin(9.0 * points[:, 0]), 0.0, 1.0)
+
+    assert width(first_pour(calibrated(missed))) > 2.0 * width(first_pour(calibrated(cup)))
+    contradicted = first_pour(calibrated(lambda points: 1.0 - cup(points), power=1.0))
+    assert contradicted.discrepancy.uninformative > 0.5
+
+
+@pytest.mark.parametrize("lost", [0.6, 0.98])
+def test_after_one_pour_that_a_calibration_did_not_expect_it_is_doubted_as_without_calibration(lost):
+    place = first_pour(calibrated(cup, power=1.0)).points[0]
+    without, known = (
+        propose(asked(cup, [], data=data_of([place], [lost]), acquisition="least_loss", discrepancy=discrepancy))
+        for discrepancy in (
+            ModelDiscrepancy(PRIORS, pours_left=9),
+            ModelDiscrepancy(PRIORS, pours_left=9, calibration=calibrated(cup, power=1.0)),
+        )
+    )
+    assert known.discrepancy.uninformative > 0.7 * without.discrepancy.uninformative
+    assert max(known.discrepancy.deviations) > 0.7 * max(without.discrepancy.deviations)
+    assert width(known) > 0.7 * width(without)
+
+
+def test_pours_of_a_calibration_without_their_simulations_are_refused():
+    known = replace(calibrated(cup)[0], simulated=(0.1,))
+    with pytest.raises(ValueError, match="calibration: two pours at least"):
+        first_pour((known,))
 
 
 def test_pours_tell_by_how_much_the_receiver_is_displaced():

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from actors.optimizer.questions import CalibrationPours, PourQuery
+from orchestrator.learning.campaign_plan import CalibrationEvidence
 from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import (
@@ -206,6 +208,52 @@ def test_a_limit_that_can_not_be_kept_is_said_before_the_pour(otherwise: Any) ->
     told = [text for text in said(strategy) if "no action is known to keep the limit" in text]
     assert told
     assert (len(losses(strategy)) == 6) == (otherwise == "go on")
+
+
+def evidence(spill: Any, seed: int = 3) -> CalibrationEvidence:
+    """Twelve weighed pours that a simulator of another receiver predicted, or missed."""
+    rng = np.random.default_rng(seed)
+    points = [tuple(map(float, row)) for row in rng.random((12, 2))]
+    simulated = [narrow_cup(SCENE.action(ACTIONS.decode(point)), THETA, rng) for point in points]
+    pours = CalibrationPours(tuple(points), tuple(spill(c) for c in simulated), tuple(simulated), 0.4)
+    return CalibrationEvidence((pours,), ("12 calibration pours", "not used: 2 pours of another liquid"))
+
+
+def test_with_a_calibration_the_limit_holds_for_the_first_pour_which_is_expected_to_lose_little() -> None:
+    plan = deployment_plan(model="adaptive", simulations_per_pour=1, pours=1, risk_limit=RiskLimitSettings())
+    strategy = Hybrid(replace(plan, evidence=evidence(lambda c: c)), SCENE, THETA, 1)
+    play = StrategyHarness(narrow_cup).run(strategy)
+    pour = next(r.query for r in play.asked if isinstance(r, Suggest) and r.purpose == "pour")
+    assert isinstance(pour, PourQuery)
+    assert pour.discrepancy is not None
+    assert pour.discrepancy.limit is not None
+    texts = [decision.text for decision in strategy.decisions]
+    assert texts[:2] == ["12 calibration pours", "not used: 2 pours of another liquid"]
+    assert not [text for text in texts if "supports the risk limit" in text]
+    (first,) = strategy.result().pours
+    assert first.predicted is not None
+    assert first.predicted < 0.06
+
+
+def test_without_a_calibration_a_limit_that_does_not_hold_yet_is_said_before_the_first_pour() -> None:
+    strategy = adaptive(pours=1, risk_limit=RiskLimitSettings())
+    StrategyHarness(narrow_cup).run(strategy)
+    (text,) = [text for text in said(strategy) if "no calibration supports the risk limit" in text]
+    order = [decision.text for decision in strategy.decisions]
+    assert order.index(text) < next(i for i, line in enumerate(order) if line.startswith("pour 1/1"))
+
+
+@pytest.mark.parametrize(("otherwise", "pours"), [("stop", 0), ("go on", 1)])
+def test_where_the_calibration_shows_that_no_first_pour_keeps_the_limit_the_fallback_decides(
+    otherwise: Any, pours: int
+) -> None:
+    limit = RiskLimitSettings(loss=0.05, probability=0.01, fallback=otherwise)
+    plan = deployment_plan(model="adaptive", simulations_per_pour=1, pours=1, risk_limit=limit)
+    missed = evidence(lambda c: min(max(1.0 - c, 0.0), 1.0))
+    strategy = Hybrid(replace(plan, evidence=missed), SCENE, THETA, 1)
+    StrategyHarness(narrow_cup).run(strategy)
+    assert [text for text in said(strategy) if "no action is known to keep the limit" in text]
+    assert len(losses(strategy)) == pours
 
 
 def test_rules_of_one_model_are_refused_with_another() -> None:
