@@ -49,6 +49,9 @@ Statistical Science 2000)."""
 LEAST_POURS = 2
 """Number of pours in a scene from which they are used; their simulations need a surrogate."""
 
+MOST_POURS = 40
+"""Number of pours in a scene that are used at most, evenly spread: every hypothesis factorises their covariance."""
+
 BEYOND = 1.0
 """Distance from the deployment's actions up to which a pour is used, in units of their range."""
 
@@ -100,6 +103,8 @@ def calibration_evidence(
         costing, shrunk = Costing.of(deployment, at, parameters), 1.0 - fitted / max(train, 1)
         near = [known for pour, pair in rows if (known := _pair(deployment.actions, costing, pour, pair, shrunk))]
         into, outside = f"calibration pours into {at.receiver.name}", len(rows) - len(near)
+        count = min(len(near), MOST_POURS)
+        used = [near[i * len(near) // count] for i in range(count)]
         if at.liquid.model_copy(update={"name": scene.liquid.name}) != scene.liquid:
             lines.append(f"not used: {len(rows)} {into}: another liquid or amount")
         elif at.pourer.shape != scene.pourer.shape:
@@ -111,15 +116,17 @@ def calibration_evidence(
             same = (digest := scene_digest(at)) is not None and digest == scene_digest(scene)
             groups.append(
                 CalibrationPours(
-                    tuple(known.point for known in near),
-                    tuple(known.cost for known in near),
-                    tuple(known.simulated for known in near),
+                    tuple(known.point for known in used),
+                    tuple(known.cost for known in used),
+                    tuple(known.simulated for known in used),
                     1.0 if same else TRANSFER,
                 )
             )
-            error = math.fsum(abs(known.cost - known.simulated) for known in near) / len(near) / costing.worst
-            missed = f"the simulator misses {len(near)} {into} by {100 * error:.1f} % of the largest loss on average"
+            error = math.fsum(abs(known.cost - known.simulated) for known in used) / len(used) / costing.worst
+            missed = f"the simulator misses {len(used)} {into} by {100 * error:.1f} % of the largest loss on average"
             lines.append(f"{missed}; the first predictions are based on this")
+            if count < len(near):
+                lines.append(f"not used: {len(near) - count} {into}: {MOST_POURS} of them are enough")
             if outside:
                 lines.append(f"not used: {outside} {into}: far from the deployment's actions")
     return CalibrationEvidence(tuple(groups), tuple(lines))

@@ -41,7 +41,7 @@ WORDS = (
 
 
 class RiskLimitSettings(Settings):
-    """D3 with `model: adaptive`: what no pour may lose; after a calibration from the first one, else once one kept it."""
+    """D3 with `model: adaptive`: what no pour may lose, from the first after a calibration, else once one kept it."""
 
     loss: Annotated[float, Quantity("1", "10 %", 1e-3, 1.0)] = 0.1
     """As a share of what spilling the whole load would cost."""

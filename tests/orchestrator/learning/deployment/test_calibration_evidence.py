@@ -88,3 +88,10 @@ def test_pours_that_say_nothing_about_the_deployment_are_named_with_the_reason(
 def test_a_calibration_that_is_used_says_by_how_much_its_simulator_misses() -> None:
     (line,) = evidence(searched=0).lines
     assert "misses 10 calibration pours into cup by 2.7 % of the largest loss" in line
+
+
+def test_of_very_many_pours_some_are_used_evenly() -> None:
+    found = evidence(train=60, test=30)
+    assert len(found.pours[0].costs) == 40
+    assert found.lines[1] == "not used: 50 calibration pours into cup: 40 of them are enough"
+    assert len(set(found.pours[0].simulated)) == 2  # unseen and training pours
