@@ -14,6 +14,7 @@ import asyncio
 import contextlib
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Mapping
 from typing import Any
 
@@ -202,7 +203,7 @@ class BalanceReadings:
             await asyncio.sleep(self._interval)
 
 
-class BenchProcedure:
+class BenchProcedure(ABC):
     """The frame of a pour and of a dose: the first steps, and what is reported after an error.
 
     Args:
@@ -256,17 +257,17 @@ class BenchProcedure:
         finally:
             await setup.ground_truth.end()
 
+    @abstractmethod
     async def _steps(self) -> PourMeasurement:
         """All steps in order."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def _remaining(self) -> str:
         """What is known of the liquid, as text."""
-        raise NotImplementedError
 
+    @abstractmethod
     async def _unknown(self, error: LaboratoryError) -> str:
         """What is known of the liquid after an error, as text."""
-        raise NotImplementedError
 
     async def _ready(self) -> None:
         """Connect arm, gripper and balance; no program runs."""
