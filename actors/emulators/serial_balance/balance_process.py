@@ -1,8 +1,7 @@
 """Starts an emulated serial balance in a child process, which ends with this process.
 
-`VirtualSerialBalance` starts an emulated balance and controls it; `RecordedBalance` replays a recording.
-`SerialBalanceEmulator` is the balance of a virtual bench. The emulation itself is in `emulated_balance`, the process in
-`line_server`.
+`VirtualSerialBalance` starts an emulated balance and controls it; `SerialBalanceEmulator` is the balance of a virtual
+bench. The emulation itself is in `emulated_balance`, the process in `line_server`.
 """
 
 from __future__ import annotations
@@ -33,13 +32,18 @@ class FarProcess:
     """A child process that serves a pseudo-terminal, or a TCP connection as a serial server does.
 
     Args:
-        settings: for `line_server.make_character`.
+        settings: for the process.
         baud: speed of the line; 0: any speed, and characters take no time.
         tcp: serve a TCP connection.
+
+    Attributes:
+        module: that the process runs; it calls `line_server.serve`.
 
     Raises:
         LaboratoryError: the process did not start.
     """
+
+    module = "actors.emulators.serial_balance.line_server"
 
     def __init__(self, settings: dict[str, Any], baud: int, tcp: bool = False) -> None:
         # With a Ray cluster of its own, in that cluster's folder, which is removed even after the program was killed.
@@ -48,7 +52,7 @@ class FarProcess:
         """Address of the line; it stays the same when the line is unplugged and plugged in again."""
         self._lock = threading.Lock()
         text = json.dumps({**settings, "link": self._link, "baud": baud, "tcp": tcp})
-        self._process = ChildProcess(python_module("actors.emulators.serial_balance.line_server", text))
+        self._process = ChildProcess(python_module(self.module, text))
         try:
             self.port = self._answer()["port"]
         except BaseException:
@@ -177,23 +181,6 @@ class VirtualSerialBalance(FarProcess):
     def state(self) -> dict[str, Any]:
         """Return the true load [kg], the display, bench time [s] and the number of received commands."""
         return self.order("state")
-
-
-class RecordedBalance(FarProcess):
-    """Replays a recording to a client that sends queries."""
-
-    @classmethod
-    def start(cls, recording: Path, *, speed: float = 1.0) -> RecordedBalance:
-        """Start the replay; unsolicited bytes arrive at their times, replies after their queries.
-
-        Args:
-            recording: file made by `decant balance record`.
-            speed: replay speed relative to the recording.
-
-        Raises:
-            LaboratoryError: it did not start.
-        """
-        return cls({"recording": str(recording), "speed": speed}, baud=0)
 
 
 USUAL_DIALECT = "kcp"

@@ -1,8 +1,7 @@
 """The process of an emulated balance: commands on standard input, characters on a terminal or TCP connection.
 
 `PtyEnd` is the balance's end of the terminal. It sends characters at the line's speed, garbles them for a client with
-another speed, and can be unplugged. `TcpEnd` is a serial server with one client at a time. `Replay` is an
-`EmulatedBalance` that gives each query the recorded reply.
+another speed, and can be unplugged. `TcpEnd` is a serial server with one client at a time.
 
 The process ends when its standard input ends or its parent ends, whichever comes first. A killed test therefore leaves
 no process behind.
@@ -22,10 +21,10 @@ import time
 import tty
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from actors.balance.line_recording import LineEvent, LineRecording
 from actors.balance.scale_model import ScaleSettings
 from actors.emulators.serial_balance.emulated_balance import EmulatedBalance, Emulation
 
@@ -228,80 +227,6 @@ class TcpEnd(LineEnd):
                 self._client.send(data)
 
 
-class Replay:
-    """See `emulated_balance.EmulatedBalance`.
-
-    Bytes before the first recorded query are sent without a query. A query is searched among the recorded ones,
-    starting at the last match and wrapping around once. The bytes recorded after it are then sent at their recorded
-    pace. An unrecorded query gets no reply.
-
-    Args:
-        recording: the recording.
-        speed: replay speed relative to the recording.
-    """
-
-    def __init__(self, recording: LineRecording, speed: float = 1.0) -> None:
-        self._events, self._speed = recording.events, speed
-        self._at = 0
-        self._received = b""
-        self._queue: list[tuple[float, bytes]] = []
-        self._begun = False
-
-    def hear(self, data: bytes, now: float) -> None:
-        """See `EmulatedBalance.hear`."""
-        self._begin(now)
-        self._received += data
-        while (command := self._find()) is not None:
-            self._received = self._received[len(self._events[command].data) :]
-            self._at = command + 1
-            self._play(command, now)
-        longest = max((len(e.data) for e in self._events if e.direction == "out"), default=0)
-        if len(self._received) >= longest:
-            self._received = b""
-
-    def speak(self, now: float) -> bytes:
-        """See `EmulatedBalance.speak`."""
-        self._begin(now)
-        ready = b"".join(data for at, data in self._queue if at <= now)
-        self._queue = [(at, data) for at, data in self._queue if at > now]
-        return ready
-
-    def due(self, now: float) -> float | None:
-        """See `EmulatedBalance.due`."""
-        return min((at for at, _ in self._queue), default=None if self._begun else now)
-
-    def control(self, order: dict[str, Any], now: float) -> dict[str, Any]:
-        """See `EmulatedBalance.control`; a recording only supports the command 'state'."""
-        if order.get("do") == "state":
-            return {"played": self._at, "of": len(self._events)}
-        raise ValueError(f"a recording can't do {order.get('do')!r}")
-
-    def _begin(self, now: float) -> None:
-        if not self._begun:
-            self._begun = True
-            self._play(-1, now)
-
-    def _find(self) -> int | None:
-        """Return the index of the next recorded query that matches the input."""
-        count = len(self._events)
-        for step in range(count):
-            index = (self._at + step) % count
-            event = self._events[index]
-            if event.direction == "out" and event.data and self._received.startswith(event.data):
-                return index
-        return None
-
-    def _play(self, question: int, now: float) -> None:
-        """Queue the bytes recorded between a query and the next one."""
-        start = self._events[question].time if question >= 0 else 0.0
-        following: list[LineEvent] = []
-        for event in self._events[question + 1 :]:
-            if event.direction == "out":
-                break
-            following.append(event)
-        self._queue = [(now + (event.time - start) / self._speed, event.data) for event in following]
-
-
 _PARENT_CHECK = 1.0
 """Interval of the check whether the parent is alive [s]."""
 
@@ -367,40 +292,32 @@ def tell(answer: dict[str, Any]) -> None:
         os.write(1, json.dumps(answer).encode("ascii") + b"\n")
 
 
-def make_character(settings: dict[str, Any]) -> EmulatedBalance:
-    """Create the emulated balance.
+def serve(settings: dict[str, Any], make: Callable[[], EmulatedBalance]) -> None:
+    """Serve an emulated balance until the parent ends.
 
     Args:
-        settings: as `VirtualSerialBalance` or `RecordedBalance` writes them.
+        settings: of the line, as `balance_process.FarProcess` writes them.
+        make: creates the emulated balance.
     """
-    if "recording" in settings:
-        from actors.balance.line_recording import LineRecording
-
-        return Replay(LineRecording.load(Path(settings["recording"])), settings["speed"])
-    return Emulation(
-        settings["dialect"],
-        ScaleSettings(**settings["scale"]),
-        settings["time_scale"],
-        settings["latency"],
-        tuple(settings["seed"]),
-    )
-
-
-def main() -> None:
-    """Serve with the settings of the first argument, JSON, until the parent ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the parent decides
-    settings = json.loads(sys.argv[1])
     link = Path(settings["link"])
     line = TcpEnd(settings["baud"]) if settings["tcp"] else PtyEnd(link, settings["baud"])
     try:
-        character = make_character(settings)
+        balance = make()
         tell({"port": line.port})
-        Server(line, character).run()
+        Server(line, balance).run()
     finally:
         line.unplug()
         with contextlib.suppress(OSError):
             link.parent.rmdir()
 
 
+def emulation(settings: dict[str, Any]) -> Emulation:
+    """The emulated balance of settings as `VirtualSerialBalance` writes them."""
+    scale, seed = ScaleSettings(**settings["scale"]), tuple(settings["seed"])
+    return Emulation(settings["dialect"], scale, settings["time_scale"], settings["latency"], seed)
+
+
 if __name__ == "__main__":
-    main()
+    given = json.loads(sys.argv[1])
+    serve(given, lambda: emulation(given))

@@ -19,9 +19,10 @@ from actors.balance.dialects.dialect import LineSettings
 from actors.balance.line_recording import LineEvent, LineRecording
 from actors.balance.serial_balance import SerialBalance
 from actors.balance.serial_port import Wire, port_advice, tcp_address
-from actors.emulators.serial_balance.balance_process import RecordedBalance, VirtualSerialBalance
+from actors.emulators.serial_balance.balance_process import VirtualSerialBalance
 from actors.emulators.serial_balance.emulated_balance import BalanceFaults
 from tests.actors.balance.conftest import OF_VOICE, PACE
+from tests.support.recorded_balance import RecordedBalance
 from tests.support.waiting import PATIENCE
 
 

@@ -17,9 +17,9 @@ from actors.balance.dialect_registry import dialects
 from actors.balance.line_recording import LineEvent, LineRecording
 from actors.balance.readings import Reading
 from actors.balance.serial_balance import SerialBalance
-from actors.emulators.serial_balance.balance_process import RecordedBalance
 from orchestrator.cli.app import app
 from tests.actors.balance.conftest import OF_VOICE, spec_for
+from tests.support.recorded_balance import RecordedBalance
 from tests.support.waiting import wait_for
 
 
