@@ -1,10 +1,8 @@
-"""The supported robots: lengths, masses and limits, and the calibration of a single robot. Plain values.
+"""The supported robots: lengths and limits, and the calibration of a single robot. Plain values.
 
 Sources:
 
 - lengths and joint speeds: `default_kinematics.yaml` and `joint_limits.yaml` of the manufacturer's ROS 2 description;
-- masses and centres: `physical_parameters.yaml` there, which cites the manufacturer's page "DH Parameters for
-  calculations of kinematics and dynamics". The values of the UR30 and the UR8 Long are those of a public fork of it;
 - payloads: product pages, second-hand. A UR10e takes 10 kg or 12.5 kg; its label says which;
 - robot types: the manufacturer's client library.
 
@@ -60,8 +58,6 @@ class RobotModel:
     Attributes:
         name: on the controller's dashboard.
         d1, a2, a3, d4, d5, d6: lengths [m]; a2 and a3 are negative by convention.
-        masses: of the links [kg].
-        centres: of the links' masses, in their own frames [m].
         joint_speed: largest speed of each joint [rad/s].
         payload: largest payload [kg].
         kind: type of robot in configuration data.
@@ -77,8 +73,6 @@ class RobotModel:
     d4: float
     d5: float
     d6: float
-    masses: tuple[float, ...]
-    centres: tuple[Vector, ...]
     joint_speed: Joints
     payload: float
     kind: int
@@ -124,174 +118,36 @@ _FAST = _speeds(180, 180, 240, 300, 300, 300)
 _HEAVY = _speeds(120, 120, 150, 210, 210, 210)
 
 
-def _centres(shoulder: Vector, upper: Vector, forearm: Vector, y: float, z: float, end: float) -> tuple[Vector, ...]:
-    """Centres of robots whose wrists 1 and 2 mirror each other: at ±y and z; wrist 3 at `end` along its axis."""
-    return shoulder, upper, forearm, (0.0, y, z), (0.0, -y, z), (0.0, 0.0, end)
-
-
-_CENTRES_3 = _centres((0.0, -0.02, 0.0), (0.13, 0.0, 0.1157), (0.05, 0.0, 0.0238), 0.0, 0.01, -0.02)
-_CENTRES_5 = _centres(
-    (0.0, -0.02561, 0.00193), (0.2125, 0.0, 0.11336), (0.15, 0.0, 0.0265), -0.0018, 0.01634, -0.001159
-)
-_CENTRES_10 = (
-    (0.021, 0.0, 0.027),
-    (0.38, 0.0, 0.158),
-    (0.24, 0.0, 0.068),
-    (0.0, 0.007, 0.018),
-    (0.0, 0.007, 0.018),
-    (0.0, 0.0, -0.026),
-)
-
-_CENTRES_16 = (
-    *((0.0, -0.016, 0.03), (0.302, 0.0, 0.16), (0.194, 0.0, 0.065)),
-    *((0.0, -0.009, 0.011), (0.0, 0.018, 0.012), (0.0, 0.0, -0.044)),
-)
-_CENTRES_20 = (
-    *((0.0, -0.061, 0.0062), (0.5226, 0.0, 0.2098), (0.3234, 0.0, 0.0604)),
-    *((0.0, -0.0026, 0.0393), (0.0, 0.0024, 0.0379), (0.0, 0.0, -0.0293)),
-)
-_CENTRES_30 = (
-    *((-0.0001, -0.06, 0.0069), (0.3894, 0.0, 0.2103), (0.2257, 0.0, 0.0629)),
-    *((0.0, -0.0048, 0.0353), (0.0, 0.0046, 0.0341), (0.0, 0.0, -0.0293)),
-)
-
-
-def _centres_15(upper: Vector, forearm: Vector) -> tuple[Vector, ...]:
-    wrists = (0.000025, -0.019695, 0.016413), (0.000025, 0.01996, 0.015886), (-0.000018, -0.000112, -0.053397)
-    return (0.000024, -0.033309, 0.025304), upper, forearm, *wrists
-
-
 def _robot(
     name: str,
     millimetres: tuple[float, ...],
-    masses: tuple[float, ...],
-    centres: tuple[Vector, ...],
     speeds: Joints,
     payload: float,
     kind: int,
     frequency: int = FREQUENCY,
 ) -> RobotModel:
     d1, a2, a3, d4, d5, d6 = (round(length / 1000.0, 9) for length in millimetres)
-    return RobotModel(name, d1, a2, a3, d4, d5, d6, masses, centres, speeds, payload, kind, frequency)
+    return RobotModel(name, d1, a2, a3, d4, d5, d6, speeds, payload, kind, frequency)
 
 
-_UR5E = _robot(
-    "UR5",
-    (162.5, -425, -392.2, 133.3, 99.7, 99.6),
-    (3.761, 8.058, 2.846, 1.37, 1.3, 0.365),
-    _CENTRES_5,
-    _MIDDLE,
-    5.0,
-    1,
-)
-_UR10E = _robot(
-    "UR10",
-    (180.7, -612.7, -571.55, 174.15, 119.85, 116.55),
-    (7.369, 13.051, 3.989, 2.1, 1.98, 0.615),
-    _CENTRES_10,
-    _LARGE,
-    12.5,
-    2,
-)
+_UR5E = _robot("UR5", (162.5, -425, -392.2, 133.3, 99.7, 99.6), _MIDDLE, 5.0, 1)
+_UR10E = _robot("UR10", (180.7, -612.7, -571.55, 174.15, 119.85, 116.55), _LARGE, 12.5, 2)
 
 MODELS = {
-    "ur3": _robot(
-        "UR3",
-        (151.9, -243.65, -213.25, 112.35, 85.35, 81.9),
-        (2.0, 3.42, 1.26, 0.8, 0.8, 0.35),
-        _CENTRES_3,
-        _SMALL,
-        3.0,
-        3,
-        CB3_FREQUENCY,
-    ),
-    "ur5": _robot(
-        "UR5",
-        (89.159, -425, -392.25, 109.15, 94.65, 82.3),
-        (3.7, 8.393, 2.33, 1.219, 1.219, 0.1879),
-        _CENTRES_5,
-        _MIDDLE,
-        5.0,
-        1,
-        CB3_FREQUENCY,
-    ),
-    "ur10": _robot(
-        "UR10",
-        (127.3, -612, -572.3, 163.941, 115.7, 92.2),
-        (7.1, 12.7, 4.27, 2.0, 2.0, 0.365),
-        _CENTRES_10,
-        _LARGE,
-        10.0,
-        2,
-        CB3_FREQUENCY,
-    ),
-    "ur3e": _robot(
-        "UR3",
-        (151.85, -243.55, -213.2, 131.05, 85.35, 92.1),
-        (1.98, 3.4445, 1.437, 0.871, 0.805, 0.261),
-        _CENTRES_3,
-        _SMALL,
-        3.0,
-        3,
-    ),
+    "ur3": _robot("UR3", (151.9, -243.65, -213.25, 112.35, 85.35, 81.9), _SMALL, 3.0, 3, CB3_FREQUENCY),
+    "ur5": _robot("UR5", (89.159, -425, -392.25, 109.15, 94.65, 82.3), _MIDDLE, 5.0, 1, CB3_FREQUENCY),
+    "ur10": _robot("UR10", (127.3, -612, -572.3, 163.941, 115.7, 92.2), _LARGE, 10.0, 2, CB3_FREQUENCY),
+    "ur3e": _robot("UR3", (151.85, -243.55, -213.2, 131.05, 85.35, 92.1), _SMALL, 3.0, 3),
     "ur5e": _UR5E,
     "ur7e": replace(_UR5E, payload=7.5),
     "ur10e": _UR10E,
     "ur12e": _UR10E,
-    "ur16e": _robot(
-        "UR16",
-        (180.7, -478.4, -360, 174.15, 119.85, 116.55),
-        (7.369, 10.45, 4.321, 2.18, 2.033, 0.907),
-        _CENTRES_16,
-        _LARGE,
-        16.0,
-        4,
-    ),
-    "ur8long": _robot(
-        "UR8L",
-        (218.6, -898.9, -714.9, 182.4, 136.1, 143.4),
-        (9.9883, 17.0738, 7.6393, 2.089, 2.0869, 1.0666),
-        _centres_15((0.565429, -0.000074, 0.19542), (0.416102, 0.000058, 0.065663)),
-        _FAST,
-        10.0,
-        6,
-    ),
-    "ur15": _robot(
-        "UR15",
-        (218.6, -647.5, -516.4, 182.4, 136.1, 143.4),
-        (9.9883, 14.9255, 6.1015, 2.089, 2.0869, 1.0666),
-        _centres_15((0.419009, -0.000083, 0.192787), (0.305471, 0.000019, 0.070552)),
-        _FAST,
-        17.5,
-        9,
-    ),
-    "ur18": _robot(
-        "UR18",
-        (218.6, -475, -338.9, 182.4, 136.1, 143.4),
-        (9.9883, 14.2009, 5.52, 2.089, 2.0869, 1.0666),
-        _centres_15((0.308664, -0.000088, 0.190204), (0.199652, 0.000021, 0.073101)),
-        _FAST,
-        18.0,
-        5,
-    ),
-    "ur20": _robot(
-        "UR20",
-        (236.3, -862, -728.7, 201, 159.3, 154.3),
-        (16.343, 29.632, 7.879, 3.054, 3.126, 0.926),
-        _CENTRES_20,
-        _HEAVY,
-        25.0,
-        7,
-    ),
-    "ur30": _robot(
-        "UR30",
-        (236.3, -637, -503.7, 201, 159.3, 154.3),
-        (16.343, 28.542, 7.156, 3.054, 3.126, 0.926),
-        _CENTRES_30,
-        _HEAVY,
-        35.0,
-        8,
-    ),
+    "ur16e": _robot("UR16", (180.7, -478.4, -360, 174.15, 119.85, 116.55), _LARGE, 16.0, 4),
+    "ur8long": _robot("UR8L", (218.6, -898.9, -714.9, 182.4, 136.1, 143.4), _FAST, 10.0, 6),
+    "ur15": _robot("UR15", (218.6, -647.5, -516.4, 182.4, 136.1, 143.4), _FAST, 17.5, 9),
+    "ur18": _robot("UR18", (218.6, -475, -338.9, 182.4, 136.1, 143.4), _FAST, 18.0, 5),
+    "ur20": _robot("UR20", (236.3, -862, -728.7, 201, 159.3, 154.3), _HEAVY, 25.0, 7),
+    "ur30": _robot("UR30", (236.3, -637, -503.7, 201, 159.3, 154.3), _HEAVY, 35.0, 8),
 }
 """Models by their names in configuration files."""
 

@@ -14,10 +14,8 @@ from math import exp, radians
 
 from actors.arm.ur import robot_models as models
 from actors.arm.ur.robot_models import Calibration, Joints, RobotModel
-from actors.emulators.ur_controller.motion.motion_lines import KinematicArm
 from actors.emulators.ur_controller.motion.mover import Mover, ViolationError
 from actors.emulators.ur_controller.robot_kinematics import (
-    IDENTITY,
     Kinematics,
     Transform,
     Vector,
@@ -61,7 +59,6 @@ class Robot:
         payload: [kg]; `cog` [m], `inertia` [kg m²].
         gravity: direction in the base's frame [m/s²].
         external_force: on the tool, in the base's frame [N], [N m]; it moves nothing.
-        recent: measured positions of the last cycles.
         history: (time, q) as executed, without noise, at `HISTORY_RATE`.
     """
 
@@ -69,8 +66,8 @@ class Robot:
         self.model = model
         self.kinematics = Kinematics(model)
         self.mover = Mover(model, q)
-        self.arm = KinematicArm(self.kinematics, transform_of((0.0,) * 6))
         self.tcp: Pose = (0.0,) * 6
+        self._tool = transform_of(self.tcp)
         self.payload = 0.0
         self.cog: Vector = (0.0, 0.0, 0.0)
         self.inertia: Pose = (0.0,) * 6
@@ -81,10 +78,9 @@ class Robot:
         self._random = random.Random(0)
         self._true = q
         self.q, self.qd = q, self.mover.qd
-        self._point = self.arm.frame(q)[1]
+        self._point = self.tool_frame(q)[1]
         self._steady_for = SETTLING
         self.history: deque[tuple[float, Joints]] = deque(maxlen=int(HISTORY_RATE * HISTORY_TIME))
-        self.recent: deque[Joints] = deque([q], maxlen=1000)
         self._next_memory = 0.0
         self._cache: dict[str, object] = {}
         self.configure(configuration)
@@ -98,9 +94,13 @@ class Robot:
     def set_tcp(self, pose: Pose) -> None:
         """Set the tool: its centre point in the flange's frame."""
         self.tcp = pose
-        self.arm = KinematicArm(self.kinematics, transform_of(pose))
-        self._point = self.arm.frame(self.mover.q)[1]
+        self._tool = transform_of(pose)
+        self._point = self.tool_frame(self.mover.q)[1]
         self._cache.clear()
+
+    def tool_frame(self, q: Joints) -> Transform:
+        """Transform of the tool centre point at joint positions [rad]."""
+        return compose(self.kinematics.flange(q), self._tool)
 
     def forget(self) -> None:
         """Reset as after a power cut: no tool, no payload, no history."""
@@ -125,7 +125,7 @@ class Robot:
             self._follow(now, dt, moves)
 
     def _check(self, dt: float) -> None:
-        before, point = self._point, self.arm.frame(self.mover.q)[1]
+        before, point = self._point, self.tool_frame(self.mover.q)[1]
         self._point = point
         speed = distance(before, point) / dt
         if speed > 1.05 * self.configuration.tool_speed:
@@ -165,7 +165,6 @@ class Robot:
             self.q = (noisy[0], noisy[1], noisy[2], noisy[3], noisy[4], noisy[5])
         else:
             self.q = self._true
-        self.recent.append(self.q)
         self._steady_for = self._steady_for + dt if max(map(abs, self.qd)) < STEADY else 0.0
         if now >= self._next_memory:
             self._next_memory = now + 1.0 / HISTORY_RATE - 1e-9
@@ -183,7 +182,7 @@ class Robot:
         """Transform of the tool centre point, as measured."""
         cached = self._cache.get("frame")
         if cached is None:
-            cached = self._cache["frame"] = self.arm.frame(self.q)
+            cached = self._cache["frame"] = self.tool_frame(self.q)
         return cached  # type: ignore[return-value]
 
     @property
@@ -199,7 +198,7 @@ class Robot:
         """Target pose of the tool centre point."""
         cached = self._cache.get("target_pose")
         if cached is None:
-            cached = self._cache["target_pose"] = pose_of(self.arm.frame(self.mover.q))
+            cached = self._cache["target_pose"] = pose_of(self.tool_frame(self.mover.q))
         return cached  # type: ignore[return-value]
 
     @property
@@ -231,30 +230,8 @@ class Robot:
         """Target velocity of the tool centre point [m/s], [rad/s]."""
         if self.mover.qd == _ZERO:
             return _ZERO
-        point = self.arm.frame(self.mover.q)[1]
+        point = self.tool_frame(self.mover.q)[1]
         return self.kinematics.velocity(self.mover.q, self.mover.qd, point)
-
-    @property
-    def holding_torques(self) -> Joints:
-        """Joint torques that hold the arm and its payload against gravity [N m]; friction and acceleration are left
-        out.
-        """
-        axes, origins = self.kinematics.axes(self.q)
-        frames, model = self.kinematics.links(self.q), self.model
-        weights = [
-            (mass, compose(frame, (IDENTITY, centre))[1])
-            for mass, centre, frame in zip(model.masses, model.centres, frames, strict=True)
-        ]
-        load = (self.payload, compose(frames[5], (IDENTITY, self.cog))[1])
-        gx, gy, gz = self.gravity
-        torques = []
-        for joint, ((ax, ay, az), (ox, oy, oz)) in enumerate(zip(axes, origins, strict=True)):
-            torque = 0.0
-            for mass, (px, py, pz) in (*weights[joint:], load):
-                rx, ry, rz = px - ox, py - oy, pz - oz
-                torque += mass * ((ay * rz - az * ry) * gx + (az * rx - ax * rz) * gy + (ax * ry - ay * rx) * gz)
-            torques.append(torque)
-        return torques[0], torques[1], torques[2], torques[3], torques[4], torques[5]
 
 
 _ZERO: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -1,19 +1,17 @@
-"""Forward and inverse kinematics of the six-axis arm, in closed form, and poses in a robot controller's format.
+"""Forward kinematics of the six-axis arm, in closed form, and poses in a robot controller's format.
 
 A pose is x, y, z [m] and a rotation vector [rad]. The functions use plain scalars because they run at 500 Hz. A
 rotation matrix is a tuple of its nine entries, row by row; a vector is a tuple of three.
 
-Source: standard Denavit–Hartenberg frames with twists π/2, 0, 0, π/2, −π/2, 0. Three parallel axes (2, 3, 4) decouple
-the inverse: joint 1 follows from the wrist position, 5 and 6 from the orientation, 2, 3, 4 from a triangle in the
-plane. There are up to eight solutions: shoulder left or right, wrist up or down, elbow up or down.
+Source: standard Denavit–Hartenberg frames with twists π/2, 0, 0, π/2, −π/2, 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from math import acos, asin, atan2, cos, hypot, pi, sin, sqrt
+from collections.abc import Sequence
+from math import atan2, cos, pi, sin, sqrt
 
-from actors.arm.ur.robot_models import Calibration, Joints, RobotModel
+from actors.arm.ur.robot_models import Calibration, RobotModel
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
@@ -87,11 +85,6 @@ def multiply(a: Matrix, b: Matrix) -> Matrix:
     )
 
 
-def transpose(m: Matrix) -> Matrix:
-    """Inverse of a rotation."""
-    return (m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8])
-
-
 def rotate(m: Matrix, v: Sequence[float]) -> Vector:
     """Matrix times vector."""
     x, y, z = v
@@ -105,13 +98,6 @@ def compose(a: Transform, b: Transform) -> Transform:
     return multiply(m, b[0]), (p[0] + x, p[1] + y, p[2] + z)
 
 
-def invert(a: Transform) -> Transform:
-    """Inverse of a transform."""
-    back = transpose(a[0])
-    x, y, z = rotate(back, a[1])
-    return back, (-x, -y, -z)
-
-
 def transform_of(pose: Sequence[float]) -> Transform:
     """Transform of a pose x, y, z, rx, ry, rz."""
     return rotation_matrix(pose[3:6]), (pose[0], pose[1], pose[2])
@@ -122,38 +108,15 @@ def pose_of(frame: Transform) -> tuple[float, float, float, float, float, float]
     return (*frame[1], *rotation_vector(frame[0]))
 
 
-def norm3(v: Sequence[float]) -> float:
-    """Length of a vector."""
-    return sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-
-
 def distance(a: Sequence[float], b: Sequence[float]) -> float:
     """Distance of two points, or of the positions of two poses [m]."""
     return sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
 
 
-def rotation_between(a: Matrix, b: Matrix) -> Vector:
-    """Rotation vector, in a's own axes, that turns a into b [rad]."""
-    return rotation_vector(multiply(transpose(a), b))
-
-
-def angle_between(a: Matrix, b: Matrix) -> float:
-    """Angle between two rotations [rad]."""
-    return norm3(rotation_between(a, b))
-
-
-_SINGULAR_WRIST = 1e-6
-"""Below this |sin q5| joints 4 and 6 turn about the same axis, and q6 keeps its given value."""
-
-
-_SHIFTS = 40
-"""Largest number of shifts; each leaves a few percent of the error, and more near a singularity."""
-
-
 class Kinematics:
     """Kinematics of one robot model. Poses are those of the flange; the caller composes a tool.
 
-    A calibrated robot follows its calibration: `flange`, `velocity` and `nearest`. The others use nominal lengths,
+    A calibrated robot follows its calibration: `flange` and `velocity`. The others use nominal lengths,
     since single frames of a calibrated robot may be hundreds of metres away.
 
     Args:
@@ -213,10 +176,6 @@ class Kinematics:
         w3 = (w2[0] + m.d5 * wrist[0], w2[1] + m.d5 * wrist[1], w2[2] + m.d5 * wrist[2])
         return [(0.0, 0.0, 1.0), across, across, across, wrist, tool], [(0.0, 0.0, 0.0), shoulder, elbow, w1, w2, w3]
 
-    def links(self, q: Sequence[float]) -> list[Transform]:
-        """Denavit–Hartenberg frames of the six links, each at its link's distal end, base frame."""
-        return _frames(q, self.model.nominal.parameters)
-
     def velocity(
         self, q: Sequence[float], qd: Sequence[float], point: Vector
     ) -> tuple[float, float, float, float, float, float]:
@@ -239,85 +198,6 @@ class Kinematics:
                 wz += rate * az
         return vx, vy, vz, wx, wy, wz
 
-    def inverse(self, flange: Transform, q6: float = 0.0) -> Iterator[Joints]:
-        """Yield all joint positions, each in (−π, π], for a flange transform; none if it is out of the workspace.
-
-        Args:
-            flange: target transform.
-            q6: used for a singular wrist, where joint 6 is arbitrary [rad].
-        """
-        m = self.model
-        r, p = flange
-        wx, wy, wz = p[0] - m.d6 * r[2], p[1] - m.d6 * r[5], p[2] - m.d6 * r[8]
-        radius = hypot(wx, wy)
-        if radius < m.d4 - 1e-9 or radius == 0.0:
-            return  # inside the cylinder about the base that the wrist cannot enter
-        bearing, offset = atan2(wy, wx), asin(min(1.0, m.d4 / radius))
-        for q1 in (bearing + offset, bearing + pi - offset):
-            s1, c1 = sin(q1), cos(q1)
-            cos5 = max(-1.0, min(1.0, s1 * r[2] - c1 * r[5]))
-            for q5 in (acos(cos5), -acos(cos5)):
-                sin5 = sin(q5)
-                if abs(sin5) < _SINGULAR_WRIST:
-                    sixth = q6
-                else:
-                    sixth = atan2(-(s1 * r[1] - c1 * r[4]) / sin5, (s1 * r[0] - c1 * r[3]) / sin5)
-                s6, c6 = sin(sixth), cos(sixth)
-                zx, zy, zz = -(r[0] * s6 + r[1] * c6), -(r[3] * s6 + r[4] * c6), -(r[6] * s6 + r[7] * c6)
-                q234 = atan2(c1 * zx + s1 * zy, -zz)
-                u = c1 * (wx - m.d5 * zx) + s1 * (wy - m.d5 * zy)
-                w = wz - m.d5 * zz - m.d1
-                cos3 = (u * u + w * w - m.a2 * m.a2 - m.a3 * m.a3) / (2.0 * m.a2 * m.a3)
-                if abs(cos3) > 1.0 + 1e-9:
-                    continue
-                bend = acos(max(-1.0, min(1.0, cos3)))
-                for q3 in (bend, -bend):
-                    q2 = atan2(w, u) - atan2(m.a3 * sin(q3), m.a2 + m.a3 * cos(q3))
-                    yield _turn(q1), _turn(q2), q3, _turn(q234 - q2 - q3), q5, sixth
-
-    def nearest(self, flange: Transform, near: Sequence[float]) -> Joints | None:
-        """Return the solution nearest to `near` within the joint ranges; None if there is none.
-
-        For a calibrated robot the target of the closed form is shifted until its solution leads to `flange`.
-
-        Args:
-            flange: target transform.
-            near: joint positions [rad]; solutions may lie beyond ±π to stay near them.
-        """
-        q = self._nominal_nearest(flange, near)
-        if self.model.calibration is None:
-            return q
-        target = flange
-        for _ in range(_SHIFTS):
-            if q is None:
-                return None
-            pose = self.flange(q)
-            if distance(pose[1], flange[1]) < 1e-9 and angle_between(pose[0], flange[0]) < 1e-9:
-                return q
-            target = compose(compose(flange, invert(pose)), target)
-            q = self._nominal_nearest(target, q)
-        return None
-
-    def _nominal_nearest(self, flange: Transform, near: Sequence[float]) -> Joints | None:
-        best: Joints | None = None
-        least = float("inf")
-        limits = self.model.joint_range
-        for solution in self.inverse(flange, near[5]):
-            total = 0.0
-            turned = []
-            for angle, previous, limit in zip(solution, near, limits, strict=True):
-                k = angle + 2.0 * pi * round((previous - angle) / (2.0 * pi))
-                if k > limit:
-                    k -= 2.0 * pi
-                elif k < -limit:
-                    k += 2.0 * pi
-                total += (k - previous) ** 2
-                turned.append(k)
-            if total < least:
-                least = total
-                best = (turned[0], turned[1], turned[2], turned[3], turned[4], turned[5])
-        return best
-
 
 def _frames(q: Sequence[float], dh: Calibration) -> list[Transform]:
     """Denavit–Hartenberg frames of the six links, base frame."""
@@ -329,7 +209,3 @@ def _frames(q: Sequence[float], dh: Calibration) -> list[Transform]:
         frame = compose(frame, (turned, (a * cos(angle), a * sin(angle), d)))
         frames.append(frame)
     return frames
-
-
-def _turn(angle: float) -> float:
-    return angle - 2.0 * pi * round(angle / (2.0 * pi))

@@ -20,6 +20,7 @@ from typing import Any
 from actors.arm.ur.rtde import DATA_PACKAGE, FORMATS, TEXT_MESSAGE, package
 from actors.emulators.ur_controller.controller import Controller
 from actors.emulators.ur_controller.registers import REGISTERS
+from actors.emulators.ur_controller.robot import Robot
 
 
 def text_message(protocol: int, message: str, source: str, level: int) -> bytes:
@@ -118,7 +119,6 @@ def output_fields(controller: Controller) -> dict[str, Field]:
     """Return the readable values, by name."""
     robot, mover, power = controller.robot, controller.robot.mover, controller.power
     safety, signals, registers = controller.safety, controller.signals, controller.registers
-    slow = _Slow(controller)
 
     def joint_modes() -> tuple[int, ...]:
         return (_RUNNING if power.running else _IDLE if power.powered else _POWER_OFF,) * 6
@@ -131,14 +131,14 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "target_q": ("VECTOR6D", lambda: mover.q),
         "target_qd": ("VECTOR6D", lambda: mover.qd),
         "target_qdd": ("VECTOR6D", lambda: mover.qdd),
-        "target_current": ("VECTOR6D", slow.currents),
-        "target_moment": ("VECTOR6D", slow.torques),
+        "target_current": ("VECTOR6D", lambda: _ZERO6),
+        "target_moment": ("VECTOR6D", lambda: _ZERO6),
         "actual_q": ("VECTOR6D", lambda: robot.q),
         "actual_qd": ("VECTOR6D", lambda: robot.qd),
-        "actual_current": ("VECTOR6D", slow.currents),
+        "actual_current": ("VECTOR6D", lambda: _ZERO6),
         "actual_current_window": ("VECTOR6D", lambda: _CURRENT_WINDOW if power.powered else _ZERO6),
-        "actual_moment": ("VECTOR6D", slow.torques),
-        "joint_control_output": ("VECTOR6D", slow.currents),
+        "actual_moment": ("VECTOR6D", lambda: _ZERO6),
+        "joint_control_output": ("VECTOR6D", lambda: _ZERO6),
         "actual_TCP_pose": ("VECTOR6D", lambda: robot.pose),
         "actual_TCP_speed": ("VECTOR6D", lambda: robot.tool_speed),
         "actual_TCP_force": ("VECTOR6D", lambda: robot.external_force),
@@ -151,7 +151,7 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "joint_mode": ("VECTOR6INT32", joint_modes),
         "safety_mode": ("INT32", lambda: safety.mode),
         "safety_status": ("INT32", lambda: safety.mode),
-        "actual_tool_accelerometer": ("VECTOR3D", slow.accelerometer),
+        "actual_tool_accelerometer": ("VECTOR3D", lambda: _accelerometer(robot)),
         "speed_scaling": ("DOUBLE", lambda: mover.scaling),
         "target_speed_fraction": ("DOUBLE", lambda: mover.slider),
         "actual_momentum": ("DOUBLE", lambda: 0.0),
@@ -195,7 +195,7 @@ def output_fields(controller: Controller) -> dict[str, Field]:
     }
     if controller.model.e_series:
         readers |= {
-            "ft_raw_wrench": ("VECTOR6D", slow.wrench),
+            "ft_raw_wrench": ("VECTOR6D", lambda: _wrench(robot)),
             "tcp_offset": ("VECTOR6D", lambda: robot.tcp),
             "tool_output_mode": ("UINT8", lambda: _DIGITAL_OUTPUTS),
             "tool_digital_output0_mode": ("UINT8", lambda: _SINKING),
@@ -224,34 +224,17 @@ def _bit(bits: Callable[[], int], at: int) -> Callable[[], bool]:
     return lambda: bool(bits() >> at & 1)
 
 
-class _Slow:
-    """Values derived from gravity: computed ten times per second of controller time, as no control loop uses them."""
+def _wrench(robot: Robot) -> tuple[float, ...]:
+    """The external force and the payload's weight. The base's frame is an assumption: no document names one."""
+    x, y, z, *torque = robot.external_force
+    gx, gy, gz = (-robot.payload * g for g in robot.gravity)
+    return (x + gx, y + gy, z + gz, *torque)
 
-    def __init__(self, controller: Controller) -> None:
-        self._controller = controller
-        self._due = -1.0
-        self._torques: tuple[float, ...] = _ZERO6
 
-    def torques(self) -> tuple[float, ...]:
-        if self._controller.now >= self._due:
-            self._due = self._controller.now + 0.1
-            self._torques = self._controller.robot.holding_torques if self._controller.power.powered else _ZERO6
-        return self._torques
-
-    def currents(self) -> tuple[float, ...]:
-        return tuple(t / 10.0 for t in self.torques())
-
-    def wrench(self) -> tuple[float, ...]:
-        """The external force and the payload's weight. The base's frame is an assumption: no document names one."""
-        robot = self._controller.robot
-        x, y, z, *torque = robot.external_force
-        gx, gy, gz = (-robot.payload * g for g in robot.gravity)
-        return (x + gx, y + gy, z + gz, *torque)
-
-    def accelerometer(self) -> tuple[float, float, float]:
-        m = self._controller.robot.frame[0]
-        x, y, z = self._controller.robot.gravity
-        return (m[0] * x + m[3] * y + m[6] * z, m[1] * x + m[4] * y + m[7] * z, m[2] * x + m[5] * y + m[8] * z)
+def _accelerometer(robot: Robot) -> tuple[float, float, float]:
+    m = robot.frame[0]
+    x, y, z = robot.gravity
+    return (m[0] * x + m[3] * y + m[6] * z, m[1] * x + m[4] * y + m[7] * z, m[2] * x + m[5] * y + m[8] * z)
 
 
 INPUT_KINDS: dict[str, str] = {

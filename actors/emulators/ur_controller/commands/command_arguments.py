@@ -13,7 +13,7 @@ from actors.emulators.ur_controller.robot import Robot
 from actors.emulators.ur_controller.safety_system import Safety
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.program import Program
-from actors.emulators.ur_controller.urscript.script_values import UrPose, number, numbers, show
+from actors.emulators.ur_controller.urscript.script_values import number, numbers, show
 
 SLOWEST, FASTEST = 1e-6, 1e4
 """Limits to which rates are clipped [rad/s], [m/s²] …; an arm never reaches either of them."""
@@ -26,11 +26,6 @@ def six(value: Any) -> Joints:
     """Return the six numbers of a list or a pose."""
     a, b, c, d, e, f = numbers(value, 6)
     return a, b, c, d, e, f
-
-
-def is_pose(value: Any) -> bool:
-    """Whether the value is a pose p[…]."""
-    return isinstance(value, UrPose)
 
 
 def positive(value: Any, name: str) -> float:

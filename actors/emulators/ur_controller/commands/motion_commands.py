@@ -5,39 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from actors.arm.ur.robot_models import Joints
 from actors.emulators.ur_controller.commands.command_arguments import (
     LONGEST,
     ControllerAccess,
-    is_pose,
     positive,
     rate,
     six,
 )
-from actors.emulators.ur_controller.motion.motion_actions import MotionAction
-from actors.emulators.ur_controller.motion.motion_lines import JointLine, Line, ToolLine, UnreachableError
+from actors.emulators.ur_controller.motion.motion_lines import JointLine
 from actors.emulators.ur_controller.motion.mover import ControlledElsewhereError
-from actors.emulators.ur_controller.robot_kinematics import (
-    Transform,
-    compose,
-    distance,
-    norm3,
-    rotation_between,
-    transform_of,
-)
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.program import Command, Steps
-from actors.emulators.ur_controller.urscript.script_values import number
+from actors.emulators.ur_controller.urscript.script_values import UrPose, number
 
 UNSUPPORTED = (
-    "force_mode",
-    "freedrive_mode",
-    "teach_mode",
-    "movec",
-    "direct_torque",
-    "conveyor_pulse_decode",
-    "track_conveyor_linear",
-    "track_conveyor_circular",
+    "movel movep movec servoc speedl direct_torque get_forward_kin get_inverse_kin get_inverse_kin_has_solution "
+    "is_within_safety_limits get_joint_torques get_target_waypoint get_target_tcp_speed get_actual_tool_flange_pose "
+    "get_actual_joint_positions_history tool_contact pose_trans pose_sub force_mode freedrive_mode teach_mode "
+    "conveyor_pulse_decode track_conveyor_linear track_conveyor_circular"
 )
 """Commands of real controllers that are not emulated; a program that calls one ends with an error."""
 
@@ -58,19 +43,15 @@ class MoveCommands:
         """Return the commands by name."""
         waiting: dict[str, Callable[..., Steps]] = {
             "movej": self.movej,
-            "movel": self.movel,
-            "movep": self.movel,
             "servoj": self.servoj,
-            "servoc": self.servoc,
             "speedj": self.speedj,
-            "speedl": self.speedl,
-            "stopj": self.stopj,
-            "stopl": self.stopl,
+            "stopj": self.stop,
+            "stopl": self.stop,
             "sync": self.sync,
             "sleep": self.sleep,
         }
         commands = {name: Command(function, waits=True) for name, function in waiting.items()}
-        for name in UNSUPPORTED:
+        for name in UNSUPPORTED.split():
             commands[name] = Command(_refuse(name))
         for name in ("end_force_mode", "end_freedrive_mode", "end_teach_mode"):
             commands[name] = Command(lambda: None)
@@ -80,33 +61,26 @@ class MoveCommands:
     # ---- paths
 
     def movej(self, q: Any, a: Any = 1.4, v: Any = 1.05, t: Any = 0, r: Any = 0) -> Steps:
-        """Move to joint positions or a pose, linearly in joint space."""
-        target = self._inverse(transform_of(six(q))) if is_pose(q) else six(q)
+        """Move to joint positions, linearly in joint space."""
+        if isinstance(q, UrPose) or number(r) > 0.0:
+            raise ScriptError("movej to a pose, or with a blend radius, is not supported by this virtual controller")
+        target = six(q)
         while beyond := self._controller.safety.configuration.joints_violation(target):
             self._controller.protective_stop(f"the target is not allowed: {beyond}")
             yield  # even if the program is resumed, the target stays forbidden
-        yield from self._follow(lambda start: JointLine(self._robot.arm, start, target), a, v, t, r)
-
-    def movel(self, pose: Any, a: Any = 1.2, v: Any = 0.25, t: Any = 0, r: Any = 0) -> Steps:
-        """Move to a pose or joint positions, linearly in tool space."""
-        target = transform_of(six(pose)) if is_pose(pose) else self._robot.arm.frame(six(pose))
-        self._inverse(target)
-        arm = self._robot.arm
-        return self._follow(lambda start: ToolLine(arm, arm.frame(start), target), a, v, t, r)
-
-    def _follow(self, line: Callable[[Joints], Line], a: Any, v: Any, t: Any, r: Any) -> Steps:
-        speed, acceleration = rate(v, "speed"), rate(a, "acceleration")
-        duration, radius = min(number(t), LONGEST), max(number(r), 0.0)
+        speed, acceleration, duration = rate(v, "speed"), rate(a, "acceleration"), min(number(t), LONGEST)
         duration = max(duration, self._controller.dt) if duration > 0.0 else 0.0
         thread = self._take()
         done = False
         try:
-            path = self._mover.follow(line, speed, acceleration, duration=duration, radius=radius)
-            while not path.released:
+            path = None
+            while path is None or not path.finished:
+                if path is None or self._mover.action is not path:
+                    # the first time, and after a protective stop ended the path and the program was resumed
+                    path = self._mover.follow(
+                        lambda start: JointLine(start, target), speed, acceleration, duration=duration
+                    )
                 yield
-                if not path.released and self._mover.action is not path:
-                    # A protective stop ended the path, and the program was resumed.
-                    path = self._mover.follow(line, speed, acceleration, duration=duration, radius=radius)
             done = True
         finally:
             self._release(thread, done)
@@ -122,23 +96,6 @@ class MoveCommands:
         strength = min(max(positive(gain, "gain"), 100.0), 2000.0)
         return self._hold(self._cycles(t), lambda: self._mover.servo(target, lookahead, strength))
 
-    def servoc(self, pose: Any, a: Any = 1.2, v: Any = 0.25, r: Any = 0) -> Steps:
-        """Move towards a pose at the tool speed, braking in time; to be called in every cycle."""
-        target, speed, acceleration = transform_of(six(pose)), rate(v, "speed"), rate(a, "acceleration")
-
-        def aim() -> None:
-            frame = self._robot.arm.frame(self._mover.q)
-            away = [b - c for b, c in zip(target[1], frame[1], strict=True)]
-            turn = rotation_between(frame[0], target[0])
-            left = max(norm3(away), norm3(turn))
-            pace = min(speed, (2.0 * 0.8 * acceleration * left) ** 0.5, left / (2.0 * self._controller.dt))
-            turned = compose((frame[0], (0.0, 0.0, 0.0)), ((1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0), turn))[1]
-            share = pace / left if left > 1e-9 else 0.0
-            velocity = [share * x for x in (*away, *turned)]
-            self._mover.tool_speed(self._robot.arm, velocity, acceleration, acceleration)
-
-        return self._hold(1, aim)
-
     def speedj(self, qd: Any, a: Any = 1.4, t: Any = None) -> Steps:
         """Hold joint speeds for a time; without a time, until they are reached."""
         target, acceleration = six(qd), rate(a, "acceleration")
@@ -146,21 +103,6 @@ class MoveCommands:
             self._cycles(t),
             lambda: self._mover.joint_speeds(target, acceleration),
             lambda: max(abs(x - self._mover.rate * y) for x, y in zip(self._mover.qd, target, strict=True)) < 1e-6,
-        )
-
-    def speedl(self, xd: Any, a: Any = 1.2, t: Any = None, aRot: Any = None) -> Steps:
-        """Hold a tool velocity for a time; without a time, until it is reached."""
-        target, acceleration = six(xd), rate(a, "acceleration")
-        turning = acceleration if aRot is None else rate(aRot, "aRot")
-
-        def reached() -> bool:
-            speed, scaled = self._robot.target_tool_speed, [self._mover.rate * x for x in target]
-            return distance(speed, scaled) < 1e-4 and distance(speed[3:], scaled[3:]) < 1e-4
-
-        return self._hold(
-            self._cycles(t),
-            lambda: self._mover.tool_speed(self._robot.arm, target, acceleration, turning),
-            reached,
         )
 
     def _cycles(self, t: Any) -> int:
@@ -183,19 +125,12 @@ class MoveCommands:
 
     # ---- stops and time
 
-    def stopj(self, a: Any) -> Steps:
-        """Stop in joint space."""
-        return self._stop(self._mover.stop_joints, a)
-
-    def stopl(self, a: Any, aRot: Any = None) -> Steps:
-        """Stop along the tool's path."""
-        return self._stop(lambda rate: self._mover.stop_tool(self._robot.arm, rate), a)
-
-    def _stop(self, begin: Callable[[float], MotionAction], a: Any) -> Steps:
+    def stop(self, a: Any, aRot: Any = None) -> Steps:
+        """Stop in joint space; so does stopl, which a real controller brakes along the path of the tool."""
         deceleration = rate(a, "deceleration")
         thread = self._take()
         try:
-            stop = begin(deceleration)
+            stop = self._mover.stop_joints(deceleration)
             while not stop.finished:
                 yield
                 if self._mover.action is None:
@@ -228,12 +163,6 @@ class MoveCommands:
         self._mover.let_go(thread)
         if not done:
             self._mover.abandon()
-
-    def _inverse(self, frame: Transform) -> Joints:
-        try:
-            return self._robot.arm.joints(frame, self._mover.q)
-        except UnreachableError as error:
-            raise ScriptError(f"inverse kinematics found no solution: {error}") from None
 
 
 def _refuse(name: str) -> Callable[..., None]:

@@ -1,7 +1,7 @@
 """Commands that read the arm's state, set tool, payload and messages, and access registers and signals.
 
-`Queries` reads poses, joints and reachability. `SettingCommands` sets TCP, payload and gravity, and sends messages.
-`Signalling` reads and writes registers and digital and analogue inputs and outputs.
+`Queries` reads joints, tool and payload. `SettingCommands` sets TCP, payload and gravity, and sends messages.
+`Signalling` reads and writes registers, digital inputs and digital outputs.
 """
 
 from __future__ import annotations
@@ -9,18 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from actors.arm.ur.robot_models import Joints
-from actors.emulators.ur_controller.commands.command_arguments import ControllerAccess, is_pose, positive, six, whole
-from actors.emulators.ur_controller.motion.motion_actions import Path
-from actors.emulators.ur_controller.motion.motion_lines import KinematicArm, ToolLine, UnreachableError
+from actors.emulators.ur_controller.commands.command_arguments import ControllerAccess, positive, six, whole
 from actors.emulators.ur_controller.registers import REGISTERS
-from actors.emulators.ur_controller.robot_kinematics import pose_of, transform_of
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.program import Command
 from actors.emulators.ur_controller.urscript.script_values import UrPose, number, numbers, show
-
-_HEAVY = {"get_inverse_kin", "get_inverse_kin_has_solution", "is_within_safety_limits", "get_joint_torques"}
-"""Commands that take about 0.1 ms."""
 
 
 class Queries:
@@ -32,107 +25,24 @@ class Queries:
 
     def __init__(self, controller: ControllerAccess) -> None:
         self._controller = controller
-        self._robot = controller.robot
 
     def commands(self) -> dict[str, Command]:
         """Return the commands by name."""
-        robot, controller = self._robot, self._controller
+        controller, robot = self._controller, self._controller.robot
         answers: dict[str, Callable[..., Any]] = {
             "get_actual_joint_positions": lambda: list(robot.q),
             "get_actual_joint_speeds": lambda: list(robot.qd),
             "get_target_joint_positions": lambda: list(robot.mover.q),
             "get_target_joint_speeds": lambda: list(robot.mover.qd),
-            "get_target_joint_accelerations": lambda: list(robot.mover.qdd),
-            "get_actual_joint_positions_history": self.history,
             "get_actual_tcp_pose": lambda: UrPose(robot.pose),
-            "get_actual_tcp_speed": lambda: list(robot.tool_speed),
-            "get_target_tcp_pose": lambda: UrPose(robot.target_pose),
-            "get_target_tcp_speed": lambda: list(robot.target_tool_speed),
-            "get_actual_tool_flange_pose": lambda: UrPose(pose_of(robot.kinematics.flange(robot.q))),
-            "get_target_waypoint": self.target_waypoint,
-            "get_forward_kin": self.forward,
-            "get_inverse_kin": self.inverse,
-            "get_inverse_kin_has_solution": self.has_solution,
-            "is_within_safety_limits": self.within_limits,
             "is_steady": lambda: robot.steady,
             "get_steptime": lambda: controller.dt,
-            "get_joint_torques": lambda: list(robot.holding_torques),
-            "get_joint_temp": lambda j: 30.0 + 0.0 * whole(j, 0, 5, "joint"),
-            "get_controller_temp": lambda: 35.0,
-            "get_tool_current": lambda: 0.0,
-            "get_tcp_force": lambda: [0.0] * 6,
-            "force": lambda: 0.0,
-            "tool_contact": lambda direction=None: 0,
             "get_tcp_offset": lambda: UrPose(robot.tcp),
             "get_target_payload": lambda: robot.payload,
             "get_target_payload_cog": lambda: list(robot.cog),
             "get_target_payload_inertia": lambda: list(robot.inertia),
         }
-        return {name: Command(answer, work=300 if name in _HEAVY else 30) for name, answer in answers.items()}
-
-    def history(self, steps: Any = 0) -> list[float]:
-        """Return the measured joint positions of some cycles ago."""
-        recent = self._robot.recent
-        back = min(whole(steps, 0, 1_000_000, "steps"), len(recent) - 1)
-        return list(recent[-1 - back])
-
-    def target_waypoint(self) -> UrPose:
-        """Return the target of the current path, or the target pose if there is none."""
-        action = self._robot.mover.action
-        line = action.target if isinstance(action, Path) else None
-        if line is None:
-            return UrPose(self._robot.target_pose)
-        if isinstance(line, ToolLine):
-            return UrPose(pose_of(line.end))
-        return UrPose(pose_of(self._robot.arm.frame(line.at(line.length, self._robot.mover.q))))
-
-    def _arm(self, tcp: Any) -> KinematicArm:
-        if tcp is None or tcp == "active_tcp":
-            return self._robot.arm
-        return KinematicArm(self._robot.kinematics, transform_of(six(tcp)))
-
-    def forward(self, q: Any = None, tcp: Any = None) -> UrPose:
-        """Return the tool pose at joint positions; measured ones by default."""
-        return UrPose(pose_of(self._arm(tcp).frame(self._robot.q if q is None else six(q))))
-
-    def _solve(self, x: Any, qnear: Any, tcp: Any) -> Joints:
-        near = self._robot.q if qnear is None else six(qnear)
-        return self._arm(tcp).joints(transform_of(six(x)), near)
-
-    def inverse(
-        self, x: Any, qnear: Any = None, maxPositionError: Any = 0, maxOrientationError: Any = 0, tcp: Any = None
-    ) -> list[float]:
-        """Return the joint positions for a pose, nearest to the given ones; the solution is exact, so the tolerances
-        are unused.
-        """
-        try:
-            return list(self._solve(x, qnear, tcp))
-        except UnreachableError as error:
-            raise ScriptError(f"inverse kinematics found no solution: {error}") from None
-
-    def has_solution(
-        self, x: Any, qnear: Any = None, maxPositionError: Any = 0, maxOrientationError: Any = 0, tcp: Any = None
-    ) -> bool:
-        """Whether a pose can be reached."""
-        try:
-            self._solve(x, qnear, tcp)
-        except UnreachableError:
-            return False
-        return True
-
-    def within_limits(self, x: Any) -> bool:
-        """Whether a pose or joint positions are reachable and allowed by the safety configuration."""
-        configuration, arm = self._robot.configuration, self._robot.arm
-        if is_pose(x):
-            frame = transform_of(six(x))
-            try:
-                q = arm.joints(frame, self._robot.q)
-            except UnreachableError:
-                return False
-        else:
-            q = six(x)
-            frame = arm.frame(q)
-        return configuration.joints_violation(q) is None and configuration.point_violation(frame[1]) is None
+        return {name: Command(answer) for name, answer in answers.items()}
 
 
 FARTHEST = 10.0
@@ -257,14 +167,6 @@ class Signalling:
             by_name[f"set_{group}_out"] = self._digital_setter(first, highest)
             by_name[f"get_{group}_out"] = self._digital_getter(first, highest, inputs=False)
             by_name[f"get_{group}_in"] = self._digital_getter(first, highest, inputs=True)
-        for name in ("set_analog_out", "set_standard_analog_out"):
-            by_name[name] = self.set_analog
-        for name in ("set_analog_outputdomain", "set_standard_analog_output_domain"):
-            by_name[name] = self.set_domain
-        for name in ("get_analog_out", "get_standard_analog_out"):
-            by_name[name] = lambda n: self._signals.analog_reading(whole(n, 0, 1, "output"))
-        for name in ("get_analog_in", "get_standard_analog_in"):
-            by_name[name] = lambda n: self._signals.analog_in[whole(n, 0, 1, "input")]
         return {name: Command(function) for name, function in by_name.items()}
 
     def _write_bit(self, at: Any, value: Any) -> None:
@@ -280,14 +182,6 @@ class Signalling:
             return bool(bits >> (first + whole(n, 0, highest, "signal")) & 1)
 
         return get
-
-    def set_analog(self, n: Any, f: Any) -> None:
-        """Set an analogue output as a fraction of its range."""
-        self._signals.analog_out[whole(n, 0, 1, "output")] = min(1.0, max(0.0, number(f)))
-
-    def set_domain(self, n: Any, domain: Any) -> None:
-        """Set the domain of an analogue output: ampere (0) or volt (1)."""
-        self._signals.analog_voltage[whole(n, 0, 1, "output")] = bool(whole(domain, 0, 1, "domain"))
 
 
 def _reader(store: list[Any]) -> Callable[..., Any]:

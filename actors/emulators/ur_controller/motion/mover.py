@@ -1,7 +1,7 @@
 """The mover of the arm: one action at a time, one step per control cycle.
 
-`Mover` generates target positions and velocities without jumps. A violation (a joint too fast or out of its range, a
-point out of the workspace) ends the action with a `ViolationError` and a stop.
+`Mover` generates target positions and velocities without jumps. A violation (a joint too fast or out of its range)
+ends the action with a `ViolationError` and a stop.
 
 The speed slider, and the controller's own slowing, scale the time of every motion but a stop: that of a path, and that
 of servo and speed commands, which return when their time has passed on this slower clock. At 0 the arm stands still
@@ -25,8 +25,8 @@ from math import degrees
 
 from actors.arm.ur.robot_models import Joints, RobotModel
 from actors.arm_geometry import JOINT_NAMES
-from actors.emulators.ur_controller.motion.motion_actions import STILL, JointSpeed, MotionAction, Path, Servo, ToolSpeed
-from actors.emulators.ur_controller.motion.motion_lines import KinematicArm, Line, UnreachableError
+from actors.emulators.ur_controller.motion.motion_actions import STILL, JointSpeed, MotionAction, Path, Servo
+from actors.emulators.ur_controller.motion.motion_lines import JointLine
 
 PROGRAM_STOP = 5.0
 """Deceleration when a program ends or is stopped while the arm moves [rad/s²]. Plausible, not measured."""
@@ -134,18 +134,15 @@ class Mover:
 
     def follow(
         self,
-        line: Callable[[Joints], Line],
+        line: Callable[[Joints], JointLine],
         speed: float,
         acceleration: float,
         *,
         duration: float = 0.0,
-        radius: float = 0.0,
     ) -> Path:
-        """Begin a path. The arm stops first, unless the current motion is a path that blends into it."""
-        prelude = self._action
-        if prelude is None or not isinstance(prelude, Path) or not prelude.released:
-            prelude = self._braking() if any(abs(v) > STILL for v in self.qd) else None
-        path = Path(line, speed, acceleration, self.joint_speed, duration=duration, radius=radius, prelude=prelude)
+        """Begin a path. The arm stops first."""
+        prelude = self._braking() if any(abs(v) > STILL for v in self.qd) else None
+        path = Path(line, speed, acceleration, self.joint_speed, duration=duration, prelude=prelude)
         self._set_out()
         self._action = path
         return path
@@ -172,23 +169,9 @@ class Mover:
             self._action = JointSpeed(target, acceleration)
         self._idle = 0
 
-    def tool_speed(self, arm: KinematicArm, target: Sequence[float], acceleration: float, turning: float) -> None:
-        """Execute one speed command in tool space."""
-        if isinstance(self._action, ToolSpeed):
-            self._action.aim(target, acceleration, turning)
-        else:
-            self._set_out()
-            self._action = ToolSpeed(arm, target, acceleration, turning)
-        self._idle = 0
-
     def stop_joints(self, deceleration: float) -> MotionAction:
         """Stop in joint space."""
         self._action = JointSpeed((0.0,) * 6, deceleration)
-        return self._action
-
-    def stop_tool(self, arm: KinematicArm, deceleration: float) -> MotionAction:
-        """Stop along the tool's path."""
-        self._action = ToolSpeed(arm, (0.0,) * 6, deceleration, deceleration)
         return self._action
 
     def abandon(self) -> None:
@@ -245,9 +228,8 @@ class Mover:
                 speeds = [v / before for v in self.qd] if before > 0.0 else _ZERO
                 q = action.step(self.q, (*speeds,), dt * self.rate)  # on the scaled clock
             self._check(q, dt)
-        except (UnreachableError, ViolationError) as error:
-            # Out of the workspace, near a singularity or out of range: the arm brakes in joint space. A stop needs no
-            # further action.
+        except ViolationError as error:
+            # The arm brakes. A stop needs no further action.
             self._break_off(dt)
             if _is_stop(action):
                 return
@@ -305,4 +287,4 @@ _ZERO: Joints = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def _is_stop(action: MotionAction) -> bool:
-    return isinstance(action, JointSpeed | ToolSpeed) and not any(action.target)
+    return isinstance(action, JointSpeed) and not any(action.target)

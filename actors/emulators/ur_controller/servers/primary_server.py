@@ -66,7 +66,7 @@ class PrimaryServer:
                 q=robot.q,
                 target_q=robot.mover.q,
                 qd=robot.qd,
-                currents=[t / 10.0 for t in robot.holding_torques],
+                currents=(0.0,) * 6,
                 pose=robot.pose,
                 tcp=robot.tcp,
                 digital_in=c.signals.digital_in,

@@ -45,7 +45,7 @@ class Bench:
             self.controller.tick()
             self.times.append(self.controller.now)
             self.joints.append(robot.mover.q)
-            self.points.append(robot.arm.frame(robot.mover.q)[1])
+            self.points.append(robot.tool_frame(robot.mover.q)[1])
 
     def start(self, program: str) -> None:
         """Upload a program, given as its statements."""
