@@ -59,12 +59,9 @@ def vessel_sources(of: MeasuredVessel, folder: Path) -> dict[str, dict[str, Any]
     fill, tilt = of.fill(folder / "fill.csv"), of.tilt(folder / "tilt.csv")
     photo = of.photo(folder / "side.png")
     of.solid().export(folder / "scan.stl")
-    half = of.save_cloud(folder / "half.csv", hole=True, seen=1.0)
     return {
         "callipers": {"height": tall, "diameters": diameters, "wall": wall, "floor": floor},
         "photograph": {"photo": photo, "known_height": outside, "wall": wall, "floor": floor},
-        "points": {"points": of.save_cloud(folder / "cloud.csv"), "unit": "mm", "wall": wall, "floor": floor},
-        "points of one side, a hole": {"points": half, "unit": "mm", "wall": wall, "floor": floor},
         "fill table": {"height": tall, "fill": fill, "wall": wall, "floor": floor},
         "tilt table": {"height": tall, "tilt": tilt, "wall": wall, "floor": floor},
         "all tables and callipers": {

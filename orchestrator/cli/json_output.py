@@ -191,7 +191,7 @@ OUTPUTS: dict[str, Any] = {
     "pour": PourOutput | EmptyPourOutput | DryRunOutput,
     "report": ReportOutput,
     "plugins": PluginsOutput,
-    **{f"vessel {source}": VesselOutput for source in ("profile", "photo", "points", "mesh")},
+    **{f"vessel {source}": VesselOutput for source in ("profile", "photo", "mesh")},
     "validate-solver": ValidateSolverOutput,
     "runs list": RunsOutput,
     "runs pours": PoursOutput,

@@ -1,7 +1,7 @@
 """The commands `decant vessel ...`: each makes a vessel file from one kind of source.
 
-`profile`, `photo` and `points` fit a turned vessel to their source and to the sizes and tables that are given
-(`Sizes`); `mesh` repairs a mesh and uses it alone. Tables and photographs are read in `vessel_tables`; the fits are in
+`profile` and `photo` fit a turned vessel to their source and to the sizes and tables that are given (`Sizes`); `mesh`
+repairs a mesh and uses it alone. Tables and photographs are read in `vessel_tables`; the fits are in
 `sim_engine.vessel_acquisition`.
 """
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from sim_engine.vessel.shapes import LengthUnit
     from sim_engine.vessel_acquisition.measurements import Radii
     from sim_engine.vessel_acquisition.outline_fit import Evidence, FittedOutline
-    from sim_engine.vessel_acquisition.point_cloud import Scan
 
 CALLIPERS = 2e-4
 """Standard deviation of a radius measured with callipers [m]."""
@@ -53,7 +52,6 @@ BAND = 2.0
 """Standard deviations that the band shows to either side."""
 
 Out = Annotated[Path, typer.Argument(help="Vessel file to write (YAML).", metavar="OUT")]
-Up = Annotated[str, typer.Option(help="Axis of the file that points out of the opening.")]
 Unit = Annotated[str | None, typer.Option(help="Unit of the file: m, cm, mm, in; default: by its extent.")]
 Wall = Annotated[str | None, typer.Option(help="Thickness of the wall: '3 mm'.")]
 
@@ -175,31 +173,6 @@ def photo(
 
 
 @grouped
-def points(
-    cloud: Annotated[Path, typer.Argument(help="Points: PLY, XYZ, or CSV with x, y, z.", metavar="POINTS")],
-    out: Out,
-    unit: Unit = None,
-    up: Up = "z",
-    *,
-    sizes: Sizes,
-    vessel: Vessel,
-) -> None:
-    """Make a vessel file from points of its surface; a shape that is not round becomes a mesh.
-
-    Remove the table first. If only one surface is visible, give `--wall`. Sizes and tables of the same vessel are
-    combined with the points.
-    """
-
-    def work(notes: list[str]) -> Made:
-        from orchestrator.extra_commands.vessel_tables import read_points
-        from sim_engine.vessel_acquisition.point_cloud import scan_of
-
-        return _scanned(out, sizes, vessel, notes, scan_of(read_points(cloud, _unit(unit), _axis(up), notes)))
-
-    _make(out, vessel, work)
-
-
-@grouped
 def mesh(
     file: Annotated[Path, typer.Argument(help="Mesh: STL, OBJ, PLY or GLB.", metavar="MESH")],
     out: Out,
@@ -293,14 +266,11 @@ def _turned(
     vessel: Vessel,
     notes: list[str],
     seen: Callable[[float, float], tuple[Radii, float]] | None = None,
-    *,
-    wall: float | None = None,
 ) -> Made:
     """Make a surface of revolution from all measurements.
 
     Args:
         seen: for a wall and a floor, the radii of a source and the height inside [m].
-        wall: as the source shows it, unless it is given [m].
     """
     import numpy as np
 
@@ -309,8 +279,7 @@ def _turned(
     from sim_engine.vessel_acquisition.outline_fit import find_outline
     from sim_engine.vessel_acquisition.wall_thickening import RESERVE, fits_grid, least_wall
 
-    depth, floor, height = sizes.lengths()
-    wall = depth or wall
+    wall, floor, height = sizes.lengths()
     if wall is None:
         raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'")
     floor = wall if floor is None else floor
@@ -442,31 +411,6 @@ def _doubts(outline: FittedOutline, vessel: Vessel) -> list[str]:
                 f"{1e6 * outline.capacity_deviation:.1f} mL: check the wall's thickness and the scale"
             )
     return doubts
-
-
-def _scanned(out: Path, sizes: Sizes, vessel: Vessel, notes: list[str], scan: Scan) -> Made:
-    """Make a vessel from a scan."""
-    from sim_engine.vessel_acquisition.point_cloud import mesh_of, radii_of, wall_between
-
-    wall, floor, _ = sizes.lengths()
-    between = wall_between(scan)
-    surfaces = "both surfaces" if scan.both else "the outer surface"
-    notes.append(
-        f"{len(scan.points):,} points of {surfaces}, {1e3 * scan.scatter:.2f} mm about it, "
-        f"{1e3 * scan.out_of_round:.2f} mm out of round"
-    )
-    if not scan.round:
-        notes.append("it is not round: the points became a mesh")
-        return _written_mesh(out, vessel, *mesh_of(scan, wall, floor), notes)
-    if (wall or between) is None:
-        raise RefusalError(
-            "the points are of one surface: how thick is the wall? Say it with --wall, for example --wall '3 mm'"
-        )
-
-    def seen(wall: float, floor: float) -> tuple[Radii, float]:
-        return radii_of(scan, wall, floor), scan.height - floor
-
-    return _turned(out, sizes, vessel, notes, seen, wall=between)
 
 
 def _unit(text: str | None) -> LengthUnit | None:
@@ -622,7 +566,6 @@ def register(app: typer.Typer) -> None:
         photo,
         "decant vessel photo side.png cup.yaml --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
     )
-    add(points, "decant vessel points cloud.ply cup.yaml --unit mm --wall '3 mm'")
     add(
         mesh,
         "decant vessel mesh scan.stl mug.yaml --unit mm --wall '3 mm'",

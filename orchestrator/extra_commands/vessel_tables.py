@@ -1,4 +1,4 @@
-"""Input of `decant vessel`: pairs of lengths, tables of two columns, points and photographs.
+"""Input of `decant vessel`: pairs of lengths, tables of two columns, and photographs.
 
 Every reader reports invalid input as a `RefusalError` with file and line.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +17,6 @@ from orchestrator.campaigns.table_columns import MASS, TILT, KnownColumn, column
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.cli.console import RefusalError, print_note
 from sim_engine.settings.quantity import QuantityError, typed_quantity
-from sim_engine.vessel.mesh import UNITS, scale_of, to_z
-from sim_engine.vessel.mesh_shape import Axis, MeshShape
-from sim_engine.vessel.shapes import LengthUnit, VesselError
-from sim_engine.vessel_acquisition.mesh_repair import likely_unit
 
 Floats = NDArray[np.float64]
 
@@ -184,60 +179,6 @@ def _read_rows(path: Path, column: str, *, upper: float, tare: float) -> list[tu
     if len(rows) < FEWEST_ROWS:
         raise RefusalError(f"{path}: has {len(rows)} row(s); at least {FEWEST_ROWS} say something about a shape")
     return rows
-
-
-def read_points(path: Path, unit: LengthUnit | None, up: Axis, notes: list[str]) -> Floats:
-    """Read points of a surface, z up, shape (n, 3) [m].
-
-    Args:
-        path: PLY, NPY, or text with x, y, z in each row.
-        unit: of its numbers; None: determined by their extent.
-        up: axis that points out of the opening.
-        notes: a note of points that are left out is appended.
-
-    Raises:
-        RefusalError: they can't be read, or their unit is not clear (exit code 2).
-    """
-    _check_size(path)
-    try:
-        points = _loaded(path)
-    except VesselError:
-        raise
-    except Exception as error:  # readers raise arbitrary errors for damaged files
-        raise RefusalError(f"{path}: can't be read as points ({error})") from None
-    if points.ndim != 2 or points.shape[1] < 3:
-        raise RefusalError(f"{path}: should have x, y, z in each row")
-    points = points[:, :3]
-    # depth cameras write pixels without a measurement as NaN, or as the camera's own position
-    measured = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
-    if not measured.any():
-        raise RefusalError(f"{path}: none of its {len(points):,} points has finite x, y and z")
-    if missing := len(points) - int(measured.sum()):
-        notes.append(
-            f"{missing:,} of {len(points):,} points without a measurement (not a number, or 0, 0, 0) were left out"
-        )
-    points = points[measured]
-    extent = float(np.ptp(points, axis=0).max())
-    scale = UNITS[likely_unit(extent, path)] if unit is None else scale_of(extent, MeshShape(path=path, unit=unit))
-    result: Floats = points @ to_z(up).T * scale
-    return result
-
-
-def _loaded(path: Path) -> Any:
-    if path.suffix.lower() == ".ply":
-        import trimesh
-
-        # without materials: textures are often missing, and the reader would print the traceback of its search
-        return np.asarray(trimesh.load(path, process=False, skip_materials=True).vertices, dtype=float)
-    if path.suffix.lower() == ".pcd":
-        raise RefusalError(f"{path}: PCD files are not read; save the points as PLY, XYZ or CSV")
-    if path.suffix.lower() == ".npy":
-        return np.load(path, allow_pickle=False).astype(float)
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    first = text.lstrip().split("\n", 1)[0]
-    comma = "," in first
-    header = any(character.isalpha() for character in first.lower().replace("nan", "").replace("e", ""))
-    return np.loadtxt(text.splitlines(), delimiter="," if comma else None, skiprows=int(header), ndmin=2)
 
 
 def read_photograph(path: Path) -> Floats:

@@ -104,8 +104,8 @@ def load_triangles(path: Path) -> Any:
         raise VesselError(f"{path.name}: not a readable {kind.upper()} file ({problem})") from problem
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise VesselError(
-            f"{path.name}: no triangles in it; a vessel needs a closed mesh, not points or lines (of points, decant "
-            "vessel points makes one)"
+            f"{path.name}: no triangles in it; a vessel needs a closed mesh, not points or lines; make one of "
+            "the points, for example with MeshLab"
         )
     if len(mesh.faces) > MOST_FACES:
         raise VesselError(f"{path.name}: {len(mesh.faces):,} triangles; simplify it to at most {MOST_FACES:,}")

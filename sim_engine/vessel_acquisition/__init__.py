@@ -1,1 +1,1 @@
-"""Vessel shapes from measurements: outlines, photographs, point clouds, meshes."""
+"""Vessel shapes from measurements: outlines, photographs, meshes."""

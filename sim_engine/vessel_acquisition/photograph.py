@@ -142,7 +142,7 @@ def _check_turned(halves: Floats) -> None:
         share = 1.0 - (worst + margin) / len(halves)
         raise VesselError(
             f"the silhouette is not the same on both sides, most at {share:.0%} of its height: this is for turned "
-            "vessels. Turn a handle or a spout out of sight, or use a mesh or points of all sides"
+            "vessels. Turn a handle or a spout out of sight, or use a mesh"
         )
 
 

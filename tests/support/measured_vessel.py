@@ -25,8 +25,8 @@ PIXELS_PER_MM = 6.0
 
 
 def vessel(out: Path, **options: Any) -> None:
-    """Run the command of `decant vessel` whose source is among the options: photo, points, mesh, or none."""
-    kind = next((one for one in ("photo", "points", "mesh") if one in options), "profile")
+    """Run the command of `decant vessel` whose source is among the options: photo, mesh, or none."""
+    kind = next((one for one in ("photo", "mesh") if one in options), "profile")
     source = [options.pop(kind)] if kind in options else []
     getattr(vessel_command, kind)(*source, out, **options)
 
@@ -92,22 +92,6 @@ class MeasuredVessel:
     def solid(self) -> trimesh.Trimesh:
         """Millimetres."""
         return trimesh.Trimesh(1e3 * self.vessel.solid_vertices, self.vessel.solid_faces)
-
-    def cloud(self, count: int = 12_000, noise: float = 2e-4, *, hole: bool = False, seen: float = 2.0) -> Floats:
-        """Points of its surface [m], shifted and leaning; `hole`: a patch is missing; `seen`: of its width from −y."""
-        points, _ = trimesh.sample.sample_surface(self.solid(), count, seed=self.seed)
-        found = np.asarray(points) / 1e3
-        if hole:
-            found = found[~((found[:, 0] > 0.0) & (np.abs(found[:, 2] - 0.5 * self.height) < 0.15 * self.height))]
-        found = found[found[:, 1] < (seen - 1.0) * np.abs(found[:, 1]).max()]
-        turn = trimesh.transformations.rotation_matrix(0.02, [1.0, 0.5, 0.0])[:3, :3]
-        result: Floats = (found + self.rng.normal(0.0, noise, found.shape)) @ turn.T + [0.1, -0.2, 0.5]
-        return result
-
-    def save_cloud(self, path: Path, *, hole: bool = False, seen: float = 2.0) -> Path:
-        points = 1e3 * self.cloud(hole=hole, seen=seen)
-        np.savetxt(path, points, delimiter=",", header="x,y,z", comments="")
-        return path
 
 
 def _table(path: Path, column: str, values: Floats, masses: Floats) -> Path:

@@ -55,10 +55,6 @@ def photo(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return {"photo": of.photo(folder / "side.png"), "known_height": f"{tall} m", "wall": wall, "floor": floor}
 
 
-def points(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
-    return {"points": of.save_cloud(folder / "cloud.csv"), "unit": "mm", "floor": f"{of.shape.floor} m"}
-
-
 def mesh(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     of.solid().export(folder / "scan.stl")
     return {"mesh": folder / "scan.stl"}
@@ -68,7 +64,7 @@ def mesh(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
 @pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "door",
-    [callipers, fill, tilt, photo, *(pytest.param(each, marks=pytest.mark.slow) for each in (points, mesh))],
+    [callipers, fill, tilt, photo, mesh],
 )
 def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
     of = measured(name)
@@ -224,16 +220,6 @@ def test_a_sheet_is_thickened_and_holes_are_closed(tmp_path: Path) -> None:
         made(tmp_path, {"mesh": tmp_path / "sheet.stl"})
     capacity = made(tmp_path, {"mesh": tmp_path / "sheet.stl", "wall": "3 mm"})
     assert capacity == pytest.approx(of.vessel.capacity, rel=0.02)
-
-
-@pytest.mark.slow
-def test_a_vessel_that_is_not_round_becomes_a_mesh(tmp_path: Path) -> None:
-    of = measured("tumbler")
-    oval = of.cloud(noise=1e-4) * [1.0, 0.8, 1.0]
-    np.savetxt(tmp_path / "oval.csv", 1e3 * oval, delimiter=",", header="x,y,z", comments="")
-    capacity = made(tmp_path, {"points": tmp_path / "oval.csv", "unit": "mm", "floor": "4 mm"})
-    assert load_vessel(tmp_path / "made.yaml").shape.kind == "mesh"
-    assert capacity == pytest.approx(0.8 * of.vessel.capacity, rel=0.04)
 
 
 def two_cups(of: MeasuredVessel, folder: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`mesh_repair`: meshes and points as scanners and CAD programs save them.
+"""`mesh_repair`: meshes as scanners and CAD programs save them.
 
 `tests/data/meshes` holds one cup (345 mL) in seven unusual forms, and a bowl of sheet metal (655 mL). Forms that are
 made here follow public reports; each test names its own.
@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 from orchestrator.campaigns.file_loading import load_vessel
 from orchestrator.cli.app import app
 from orchestrator.cli.file_commands import validate
-from orchestrator.extra_commands.vessel_tables import read_points
 from orchestrator.reports.pour_figures import section
 from sim_engine.errors import DecantError
 from sim_engine.vessel.exact_cavity import exact_cavity
@@ -145,7 +144,6 @@ def test_a_missing_texture_is_not_mentioned(
     path = unpacked("cup_texture.ply", tmp_path)
     with caplog.at_level(logging.INFO):
         mended(path, unit="mm", wall=None)
-        read_points(path, "mm", "z", [])
     assert capfd.readouterr() == ("", "")
     assert not caplog.records
 
@@ -365,55 +363,6 @@ def test_bodies_that_touch_along_an_edge_are_drawn() -> None:
     outlines = section(np.asarray(both.vertices, float), np.asarray(both.faces, np.int64))
     area = sum(0.5 * np.sum(o[:, 0] * np.roll(o[:, 1], -1) - np.roll(o[:, 0], -1) * o[:, 1]) for o in outlines)
     assert abs(area) == pytest.approx(2.0)
-
-
-# -- points
-
-
-POINTS = np.array([[1, 2, 3], [4, 5, 6], [np.nan, np.nan, np.nan], [70, 8, 90]], dtype=np.float32)
-
-
-def test_points_without_a_measurement_are_left_out_with_a_note(tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "cloud.xyz", POINTS)
-    notes: list[str] = []
-    np.testing.assert_allclose(read_points(tmp_path / "cloud.xyz", "mm", "z", notes), 1e-3 * POINTS[[0, 1, 3]])
-    assert notes == ["1 of 4 points without a measurement (not a number, or 0, 0, 0) were left out"]
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("cloud.xyz", "nan nan nan\n" * 4, r"none of its 4 points has finite x, y and z"),
-        ("cloud.pcd", "VERSION 0.7\n", r"PCD files are not read; save the points as PLY, XYZ or CSV"),
-    ],
-)
-def test_a_file_without_points_that_can_be_read_is_one_clear_error(
-    tmp_path: Path, name: str, content: str, said: str
-) -> None:
-    (tmp_path / name).write_text(content)
-    with pytest.raises(DecantError, match=said) as refused:
-        read_points(tmp_path / name, "mm", "z", [])
-    assert refused.value.exit_code == 2
-
-
-def test_points_in_metres_that_are_called_millimetres_are_refused_with_the_likely_unit(tmp_path: Path) -> None:
-    np.savetxt(tmp_path / "cloud.xyz", 1e-3 * POINTS)
-    with pytest.raises(DecantError, match=r"largest extent of 0\.087 mm is not a vessel's size.*'m' \(87 mm\)"):
-        read_points(tmp_path / "cloud.xyz", "mm", "z", [])
-
-
-def test_ply_with_other_elements_and_colours_is_read_without_a_word(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """Elements of scanners beside vertices: a camera, and no faces (MeshLab, Stanford's range scans)."""
-    (tmp_path / "cloud.ply").write_text(
-        "ply\nformat ascii 1.0\ncomment TextureFile ../scan 1.png\nobj_info num_cols 2\nelement vertex 3\n"
-        "property float x\nproperty float y\nproperty float z\nproperty uchar red\nproperty float confidence\n"
-        "element camera 1\nproperty float view_px\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
-        "1 2 3 255 0.5\n4 5 6 255 0.5\n70 8 90 255 0.5\n0.5\n"
-    )
-    np.testing.assert_allclose(read_points(tmp_path / "cloud.ply", "mm", "z", []), 1e-3 * POINTS[[0, 1, 3]], rtol=1e-6)
-    assert capfd.readouterr() == ("", "")
 
 
 def test_a_thin_wall_of_a_round_vessel_is_thickened_with_a_note(
