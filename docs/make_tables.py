@@ -42,6 +42,7 @@ from orchestrator.campaigns import file_references as vessel
 from orchestrator.campaigns.pour_table import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.campaigns.scene_builder import DEFAULTS, NEEDED
 from orchestrator.campaigns.yaml.section_validation import sections_in
+from orchestrator.catalogue.control_charts import QUANTITIES
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.daemon.state import daemon_settings as daemon
 from orchestrator.daemon.state.notifications import NotifySettings
@@ -345,6 +346,12 @@ def catalogued(table: str) -> str:
     """What the columns of one of the catalogue's tables mean."""
     rows = [(f"`{c.name}`", c.unit.replace("1", "fraction"), _one_line(c.meaning)) for c in CATALOGUE[table]]
     return _table(("column", "unit", "meaning"), rows)
+
+
+def charted() -> str:
+    """Quantities with a control chart, and what to check."""
+    rows = [(q.label, q.unit, ", ".join(q.groups), _one_line(q.check)) for q in QUANTITIES]
+    return _table(("quantity", "unit", "compared for the same", "if it leaves its limits"), rows)
 
 
 def section(model: type[Settings]) -> str:
@@ -752,6 +759,7 @@ def plugin_names() -> str:
 
 
 TABLES: dict[str, Callable[[], str]] = {
+    "charts": charted,
     "catalogue-runs": partial(catalogued, "run"),
     "catalogue-pours": partial(catalogued, "pour"),
     "actions": actions,

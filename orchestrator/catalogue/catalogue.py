@@ -33,10 +33,11 @@ from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 if TYPE_CHECKING:
     from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource
+    from orchestrator.catalogue.control_charts import LaboratoryChart
 
 INDEX_NAME = "catalogue.sqlite"
 
-FORMAT = 6
+FORMAT = 7
 """Version of the index's content. An index of another format, or of another version of Decant, is made again."""
 
 
@@ -159,6 +160,24 @@ class Catalogue:
             "pour", *condition_sql("pour", conditions), "time desc, path desc, id desc", conditions.get("limit")
         )
         return newest[::-1]
+
+    def charts(self, conditions: Mapping[str, Any]) -> list[LaboratoryChart]:
+        """The control charts of all laboratories, or of the pours that the conditions hold for.
+
+        They begin again with a note on a run that starts with 'new limits'.
+        """
+        from orchestrator.catalogue.control_charts import COLUMNS, NEW_LIMITS, charts_of  # numpy
+
+        where, values = condition_sql("pour", conditions)
+        names = ("laboratory", "mode", "path", "time", *COLUMNS)
+        laboratory = "(select coalesce(laboratory, '') from run where run.path = pour.path) as laboratory"
+        query = f"select {', '.join((laboratory, *names[1:]))} from pour where outcome = 'weighed' and {where}"
+        rows = self._connection.execute(f"{query} order by time, id", values).fetchall()
+        query = "select laboratory, mode, max(time) from note join run using (path) where lower(note.text) like ?"
+        noted = self._connection.execute(f"{query} group by laboratory, mode", [f"{NEW_LIMITS}%"]).fetchall()
+        begun = {(laboratory, mode): time for laboratory, mode, time in noted}
+        pours = (dict(zip(names, row, strict=True)) for row in rows if row[3] is not None)
+        return charts_of([pour for pour in pours if pour["time"] >= begun.get((pour["laboratory"], pour["mode"]), 0.0)])
 
     def run(self, name: str) -> Row:
         """One run, with its notes (time, by, text) and its pours under 'list_of_pours'."""

@@ -8,6 +8,9 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import math
+import statistics
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +21,7 @@ from pydantic import BaseModel, Field, create_model
 from orchestrator.campaigns.prior_data import scenes_in
 from orchestrator.catalogue.annotations import AnnotationsError, Note, read_notes
 from orchestrator.learning.run_errors import RunError
-from orchestrator.learning.stage_result import displayed_action
+from orchestrator.learning.stage_result import DOSE, displayed_action
 from orchestrator.records.codec import CodecError, from_json
 from orchestrator.records.events import StageClosed
 from orchestrator.records.run_record import Row, RunPour, RunState, read_record
@@ -111,6 +114,14 @@ POURS = (
     Column("loss_name", "text", "which loss, see `loss` of a campaign; 'objectives' for a weighted sum"),
     Column("reason", "text", "why it failed"),
     Column("seconds", "number", "from its request to its outcome", "s"),
+    Column("prediction_error", "number", "(loss − expected) / standard deviation of a single pour as predicted", "SD"),
+    Column("dose_error_g", "number", "received − wanted", "g"),
+    Column("onset_deg", "number", "tilt at which a dose began to flow, beyond what the vessel's shape predicts", "deg"),
+    Column("film_g", "number", "what stuck in the receiver before the pour", "g"),
+    Column("missing_g", "number", "of the liquid that was poured back before: left the receiver, did not arrive", "g"),
+    Column("empty_pourer_g", "number", "weight of the empty pourer, as weighed last", "g"),
+    Column("zero_g", "number", "mean reading after the tare, before the pour", "g"),
+    Column("reading_noise_g", "number", "standard deviation of these readings, with the rounding of the display", "g"),
 )
 """Columns of the table of pours; one row for each pour that had begun."""
 
@@ -145,6 +156,9 @@ PreviousRunDetail = create_model(
     list_of_pours=(list[PreviousPour], ...),  # type: ignore[valid-type]
 )
 
+
+FEWEST_READINGS, STEP = 4, 1e-3
+"""Number of readings at rest that have a scatter, and the step of a display that shows equal ones [g]."""
 
 UNREADABLE = "unreadable"
 """The state of a run of which only the folder is known; its reason is why it can't be read."""
@@ -254,7 +268,32 @@ def _pour(pour: RunPour, plan: Mapping[str, Any], scenes: Mapping[str, Any]) -> 
         "loss_name": "" if not minimised else "objectives" if loss is None else loss.name,
         "predicted_deviation": None if request.predicted is None else request.predicted.deviation,
         "seconds": pour.seconds,
+        **_checks(pour, measured),
     }
+
+
+def _checks(pour: RunPour, loss: float | None) -> Row:
+    """What shows the state of the laboratory, see `orchestrator.catalogue.control_charts`."""
+    row: Row = {}
+    predicted, target = pour.request.predicted, pour.request.dose
+    if loss is not None and predicted is not None and (predicted.deviation or predicted.scatter):
+        row["prediction_error"] = (loss - predicted.mean) / math.hypot(predicted.deviation, predicted.scatter or 0.0)
+    if pour.measured is None:
+        return row
+    notes = pour.measured.notes
+    about, cycle, signals = (notes.get(key) or {} for key in (DOSE, "cycle", "signals"))
+    if target is not None and about.get("received") is not None:
+        row["dose_error_g"] = 1e3 * (float(about["received"]) - target.amount)
+    if onset := (about.get("knowledge") or {}).get("onset_flow"):
+        row["onset_deg"] = math.degrees(onset[0])
+    row |= {name: cycle[name] for name in ("film_g", "missing_g") if name in cycle}
+    row["empty_pourer_g"] = (notes.get("weighings_g") or {}).get("pourer_empty")
+    before = [g for t, g in zip(signals.get("read_at", ()), signals.get("readings_g", ()), strict=True) if t < 0.0]
+    if len(before) >= FEWEST_READINGS:
+        steps = [abs(b - a) for a, b in itertools.pairwise(sorted(before)) if b != a]
+        row["zero_g"] = statistics.fmean(before)
+        row["reading_noise_g"] = math.hypot(statistics.stdev(before), min(steps, default=STEP) / math.sqrt(12.0))
+    return row
 
 
 def _strategy(plan: Mapping[str, Any], stage: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from orchestrator.campaigns.campaign_prior import KnownPosterior
+from orchestrator.catalogue.control_charts import LaboratoryChart
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
 from orchestrator.cli.command_results import (
     CalibrateOutput,
@@ -126,6 +127,12 @@ class KnownOutput(CommandOutput):
     posteriors: list[KnownPosterior]
 
 
+class ChartsOutput(CommandOutput):
+    """Control charts, by laboratory and quantity."""
+
+    charts: list[LaboratoryChart]
+
+
 class QueueOutput(CommandOutput):
     """State of the daemon, its campaigns and open questions."""
 
@@ -195,6 +202,7 @@ OUTPUTS: dict[str, Any] = {
     "validate-solver": ValidateSolverOutput,
     "runs list": RunsOutput,
     "runs pours": PoursOutput,
+    "runs chart": ChartsOutput,
     "runs show": PreviousRunDetail,
     "runs known": KnownOutput,
     "runs check": JournalCheck,

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import getpass
 import inspect
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -22,10 +23,11 @@ import typer
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.cli.command_options import Json, call, examples
-from orchestrator.cli.console import FAILED, RefusalError, print_json, print_message, print_note
+from orchestrator.cli.console import FAILED, RefusalError, check_output, print_json, print_message, print_note
 
 if TYPE_CHECKING:
     from orchestrator.catalogue.catalogue import Catalogue
+    from orchestrator.catalogue.control_charts import LaboratoryChart
     from orchestrator.records.run_record import Row
 
 NEWEST = 20
@@ -93,7 +95,7 @@ _CONDITIONS: dict[str, Any] = {
 
 
 def _command(
-    *lines: str, name: str | None = None, conditions: Sequence[str] = ()
+    *lines: str, name: str | None = None, conditions: Sequence[str] | None = None
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Make a decorator that registers a command.
 
@@ -103,7 +105,7 @@ def _command(
         conditions: names in `_OTHERS`; these and the catalogue's conditions become options, and the function gets their
             values as one mapping.
     """
-    options = {option: _OTHERS[option] for option in conditions} | (_CONDITIONS if conditions else {})
+    options = {} if conditions is None else {option: _OTHERS[option] for option in conditions} | _CONDITIONS
     # The state directory is an option as well, so the options have other names up to the call.
     names = {f"asked_{option}": option for option in options}
 
@@ -188,6 +190,59 @@ def pours(conditions: dict[str, Any], state: State = None, as_json: Json = False
         _print_pours(listed)
     else:
         print_note("no pour that this holds for")
+
+
+@_command(
+    "decant runs chart",
+    "decant runs chart north --mode real --since 2030-03 --png north.png",
+    name="chart",
+    conditions=(),
+)
+def chart_command(
+    conditions: dict[str, Any],
+    laboratory: Annotated[str | None, typer.Argument(help="Name of a laboratory, if there are several.")] = None,
+    png: Annotated[
+        Path | None, typer.Option(help="File of the picture; default: charts-LABORATORY-MODE.png in this folder.")
+    ] = None,
+    state: State = None,
+    as_json: Json = False,
+) -> None:
+    """Chart what every run measures, day by day, against limits from the laboratory's own history.
+
+    Quantities: error of predictions and doses, tilt at which a dose flows, film, masses that do not close, empty
+    pourer, zero and scatter of the balance, time of a pour. Limits come from up to 30 days in control. After a repair,
+    `decant runs note RUN 'new limits: another balance'` lets the charts of the run's laboratory begin again.
+    """
+    from orchestrator.reports.console_view import print_table
+    from orchestrator.reports.control_chart_figure import draw_charts
+    from orchestrator.reports.figure_style import safe_name, save
+
+    check_output(png, "--png", ".png")
+    with _catalogue() as catalogue, _refusing():
+        charts = catalogue.charts(conditions)
+    if laboratory is not None and laboratory not in (known := {chart.laboratory for chart in charts}):
+        raise RefusalError(
+            f"{laboratory}: no weighed pour of this laboratory; known: {', '.join(sorted(known)) or 'none'}"
+        )
+    charts = [chart for chart in charts if laboratory in (None, chart.laboratory)]
+    benches = list(dict.fromkeys((chart.laboratory, chart.mode) for chart in charts))
+    if as_json:
+        print_json({"charts": [chart.model_dump() for chart in charts]})
+        return
+    if png is not None and len(benches) > 1:
+        raise RefusalError(
+            f"--png: these are {', '.join(f'{name} ({mode})' for name, mode in benches)}; name one of them"
+        )
+    if not charts:
+        print_note("no weighed pour that this holds for")
+    for name, mode in benches:
+        shown = [chart for chart in charts if (chart.laboratory, chart.mode) == (name, mode)]
+        path = Path(f"charts-{safe_name(name)}-{_mode(mode).lower()}.png") if png is None else png
+        print_note(f"picture: {save(draw_charts(shown), path)}")
+        print_table([_chart_row(chart) for chart in shown], title=f"{name}  {_mode(mode)}", right=("days", "last"))
+        for chart in shown:
+            if chart.text:
+                print(chart.text)
 
 
 @_command("decant runs show quickstart-20300301-1")
@@ -438,6 +493,23 @@ def _print_pours(pours: Sequence[Row], *, of_one_run: bool = False) -> None:
             f"{total}: {_percent(mean)} spilled in the mean, at least {_percent(least['spillage'])} "
             f"(pour {least['number']} of {least['stage']}, {least['run']})"
         )
+
+
+def _chart_row(chart: LaboratoryChart) -> dict[str, str]:
+    last, lasting = chart.points[-1], chart.lasting
+    value, limits = f"{last.value:.4g}", "too few days"
+    if last.low is not None and last.high is not None:
+        places = max(1 - math.floor(math.log10(last.high - last.low)), 0) if last.high > last.low else 3
+        value, limits = f"{last.value:.{places}f}", f"{last.low:.{places}f} … {last.high:.{places}f}"
+    off = f"off since {_date(lasting.begun)[:10]}: {lasting.deviations:+.1f} standard deviations" if lasting else ""
+    return {
+        "quantity": f"{chart.label} [{chart.unit}]",
+        "days": str(len({_date(point.time)[:10] for point in chart.points})),
+        "last": value,
+        "limits": limits,
+        "state": off or ("" if last.low is None else "in control"),
+        "earlier violations": ", ".join(_date(v.begun)[:10] for v in chart.violations if v.ended is not None),
+    }
 
 
 def _loss(value: float | None, name: str | None, deviation: float | None = None) -> str:

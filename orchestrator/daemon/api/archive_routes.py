@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from orchestrator.catalogue.annotations import Note
 from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
+from orchestrator.catalogue.control_charts import LaboratoryChart
 from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.catalogue.run_reading import PreviousRun
 from orchestrator.daemon.api.access_control import Daemon, Operator, Viewer
@@ -94,6 +95,15 @@ async def runs(daemon: Daemon, person: Viewer, conditions: RunsAsked) -> Any:
     names may contain the wildcards * and ?.
     """
     return await _in_catalogue(daemon, lambda catalogue: catalogue.runs(conditions))
+
+
+@router.get("/runs/charts", operation_id="run_charts")
+async def charts(daemon: Daemon, person: Viewer) -> list[LaboratoryChart]:
+    """Return the control charts of all laboratories: daily means with limits from their history, and violations.
+
+    The charts of a laboratory begin again with a note on one of its runs that starts with 'new limits'.
+    """
+    return await _in_catalogue(daemon, lambda catalogue: catalogue.charts({}))
 
 
 @router.get(

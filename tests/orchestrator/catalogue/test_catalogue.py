@@ -264,6 +264,28 @@ def test_one_command_says_which_action_was_used_for_a_vessel_and_what_it_spilled
     assert [pour["spilled_g"] for pour in told["pours"]] == [pour["spilled_g"] for pour in asked("pour")]
 
 
+def test_the_command_draws_charts_of_a_laboratory_and_a_note_begins_new_limits(
+    tmp_path: Path,
+    state: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    directory = made(tmp_path)
+    shown = invoke("runs chart --json")
+    charts = json.loads(shown.stdout)["charts"]
+    assert [(chart["laboratory"], chart["quantity"]) for chart in charts] == [("toy", "seconds")]
+    assert sum(point["pours"] for point in charts[0]["points"]) == 4
+    table = invoke("runs chart").stdout
+    assert "time of a pour [s]" in table
+    assert "too few days" in table
+    assert (tmp_path / "charts-toy-virtual.png").stat().st_size > 5_000
+    refused = invoke("runs chart elsewhere")
+    assert refused.exit_code == 2
+    assert "elsewhere: no weighed pour of this laboratory; known: toy" in refused.stderr
+    assert invoke(f"runs note {directory.name} 'new limits: another balance'").exit_code == 0
+    assert json.loads(invoke("runs chart --json").stdout) == {"charts": []}
+
+
 @pytest.mark.parametrize(
     ("command", "says"),
     [

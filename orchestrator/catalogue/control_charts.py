@@ -1,0 +1,507 @@
+"""Control charts of a laboratory: what every run measures anyway, day by day, against limits from its own history.
+
+- `QUANTITIES` declares what is charted, and what to check if it leaves its limits.
+- `control_chart` has the statistics: arrays in, points and violations out.
+- `charts_of` makes the charts of every laboratory from rows of the catalogue.
+
+The charts are written for drifts over weeks. A point is the mean of a day's values, so that a run of sixty pours in one
+morning is one observation of what differs between days.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import BaseModel, ConfigDict
+
+FEWEST, HISTORY = 5, 30
+"""Number of days before the first limits, and the largest number of days that limits come from."""
+
+LIMIT, TWICE = 4.0, 3.0
+"""Standard deviations: a violation is a point beyond the first, or two of three successive points beyond the second on
+the same side. Shewhart's 3 is meant for one chart: nine charts with 60 points each would give 1.5 false alarms."""
+
+SLACK, DECISION = 0.5, 8.0
+"""Reference value k and decision interval h of the CUSUM [standard deviations]: a shift of one standard deviation is
+reported after about 17 days, a still process gives one false alarm in about 9,600 (Siegmund's formula). With limits
+from 5 to 30 days it is one in 60 charts of 60 days."""
+
+LARGEST = 4.0
+"""A point counts at most so much in the CUSUM: one bad day is no drift."""
+
+Rule = Literal["limit", "two of three", "cusum"]
+
+
+@dataclass(frozen=True)
+class ChartPoint:
+    """One day of one group.
+
+    Attributes:
+        day: its number.
+        group: number of the group.
+        values: number of values.
+        mean: of the values.
+        deviations: distance from the history's mean in standard deviations; None before there are limits.
+        limits: of a mean of so many values; None before there are any.
+    """
+
+    day: int
+    group: int
+    values: int
+    mean: float
+    deviations: float | None = None
+    limits: tuple[float, float] | None = None
+
+
+@dataclass
+class Violation:
+    """A period in which a chart was out of control. Points are numbered as in the chart.
+
+    Attributes:
+        begun: first point of the change, as estimated.
+        noticed: point at which a rule reported it.
+        ended: point at which no rule holds any more; None if it lasts.
+        rule: that reported it.
+        sign: 1 above the limits, -1 below.
+    """
+
+    begun: int
+    noticed: int
+    rule: Rule
+    sign: int
+    ended: int | None = None
+
+
+@dataclass
+class _History:
+    """Days of one group that were in control: number, mean and variance of their means, and variance within days."""
+
+    days: int = 0
+    mean: float = 0.0
+    squares: float = 0.0
+    inverse: float = 0.0
+    within: float = 0.0
+    freedom: int = 0
+
+    def add(self, point: ChartPoint, squares: float) -> None:
+        self.days += 1
+        step = point.mean - self.mean
+        self.mean += step / self.days
+        self.squares += step * (point.mean - self.mean)
+        self.inverse += 1.0 / point.values
+        self.within += squares
+        self.freedom += point.values - 1
+
+    def deviation(self, values: int, resolution: float) -> float:
+        """Standard deviation of the next day's difference from the mean, if it has so many values.
+
+        Days with fewer values than the history scatter more, by the variance within days. Those with more get no
+        narrower limits: the estimate would be too uncertain.
+        """
+        variance = self.squares / (self.days - 1)
+        within = self.within / self.freedom if self.freedom else 0.0
+        expected = variance + within * (1.0 / values - self.inverse / self.days)
+        spread = max(expected, variance, resolution**2)
+        return math.sqrt(spread * (1.0 + 1.0 / self.days))
+
+
+def control_chart(
+    days: ArrayLike, values: ArrayLike, groups: ArrayLike | None = None, *, resolution: float = 0.0
+) -> tuple[list[ChartPoint], list[Violation]]:
+    """The chart of one quantity: Shewhart limits with a run rule, and a two-sided CUSUM.
+
+    Every day is compared with the days of its group before it, at most the first `HISTORY` of them that were in
+    control. The distance is converted by Student's distribution, so that it is standard normal for a still process
+    however short the history is. Groups of different level (other vessels, other liquids) share one chart.
+
+    Args:
+        days: number of the day of each value (n,).
+        values: finite numbers (n,).
+        groups: number of the group of each value (n,); None: one group.
+        resolution: smallest standard deviation: differences of this size mean nothing, even in a constant history.
+
+    Returns:
+        The points, by day and group, and the violations, the oldest first.
+
+    Source: ISO 7870-2:2023 (individuals, run rules), ISO 7870-4:2021 (CUSUM), ISO 7870-8:2017 (groups in one chart).
+    Self-starting: Hawkins, The Statistician 36, 1987; Quesenberry, Journal of Quality Technology 23, 1991. Winsorised
+    CUSUM: Hawkins, Communications in Statistics 22, 1993.
+
+    Limitations: days count as independent. A change within the first `FEWEST` days is not seen, and a drift from the
+    first day on is seen late, because the limits contain it.
+    """
+    points: list[ChartPoint] = []
+    histories: dict[int, _History] = {}
+    violations: list[Violation] = []
+    sums, since = [0.0, 0.0], [0, 0]
+    recent: deque[float] = deque(maxlen=3)
+    for number, (point, squares) in enumerate(_days(days, values, groups)):
+        history = histories.setdefault(point.group, _History())
+        if history.days < FEWEST:
+            history.add(point, squares)
+            points.append(point)
+            continue
+        deviation = history.deviation(point.values, resolution)
+        # Beyond 37, Student's distribution is exactly 0 or 1 in floating-point numbers.
+        z = _normal((point.mean - history.mean) / max(deviation, 1e-300), history.days - 1)
+        half = _student(LIMIT, history.days - 1) * deviation
+        limits = (history.mean - half, history.mean + half)
+        points.append(ChartPoint(point.day, point.group, point.values, point.mean, z, limits))
+        recent.append(z)
+        for side, sign in enumerate((1, -1)):
+            if sums[side] == 0.0:
+                since[side] = number
+            counted = min(max(sign * z, -LARGEST), LARGEST)
+            sums[side] = min(max(sums[side] + counted - SLACK, 0.0), DECISION)
+        side = int(z < 0.0) if abs(z) > TWICE else int(sums[1] > sums[0])
+        rule = _rule(z, recent, sums[side])
+        lasting = violations[-1] if violations and violations[-1].ended is None else None
+        if rule is None and lasting is not None and max(sums) < 0.25 * DECISION:
+            lasting.ended = number
+        elif rule is not None and lasting is None:
+            begun = since[side] if sums[side] > 0.0 else number
+            violations.append(Violation(begun, number, rule, 1 - 2 * side))
+        elif rule is None and lasting is None and history.days < HISTORY:
+            history.add(point, squares)
+    return points, violations
+
+
+def _rule(z: float, recent: Iterable[float], cusum: float) -> Rule | None:
+    if abs(z) > LIMIT:
+        return "limit"
+    if abs(z) > TWICE and sum(math.copysign(other, other * z) > TWICE for other in recent) >= 2:
+        return "two of three"
+    return "cusum" if cusum >= DECISION else None
+
+
+def _days(days: ArrayLike, values: ArrayLike, groups: ArrayLike | None) -> list[tuple[ChartPoint, float]]:
+    """One point for each day and group, with the sum of squares of its values about their mean."""
+    number, value = np.asarray(days, dtype=np.int64), np.asarray(values, dtype=np.float64)
+    group = np.zeros_like(number) if groups is None else np.asarray(groups, dtype=np.int64)
+    keys, place, counts = np.unique(np.stack([number, group]), axis=1, return_inverse=True, return_counts=True)
+    place = place.reshape(-1)
+    means = np.bincount(place, value, len(counts)) / counts
+    squares = np.bincount(place, (value - means[place]) ** 2, len(counts))
+    rows = zip(*keys.tolist(), counts.tolist(), means.tolist(), squares.tolist(), strict=True)
+    return [(ChartPoint(d, g, n, mean), square) for d, g, n, mean, square in rows]
+
+
+def _normal(t: float, freedom: int) -> float:
+    """The standard normal value with the same probability as a value of Student's distribution."""
+    from scipy.special import ndtri, stdtr
+
+    return math.copysign(float(ndtri(max(stdtr(freedom, -abs(t)), 1e-300))), t)
+
+
+@cache
+def _student(z: float, freedom: int) -> float:
+    """The value of Student's distribution with the same probability as a standard normal value."""
+    from scipy.special import ndtr, stdtrit
+
+    return -float(stdtrit(freedom, ndtr(-z)))
+
+
+# ---- the charts of a laboratory
+
+
+@dataclass(frozen=True)
+class ChartedQuantity:
+    """A quantity with a chart.
+
+    Attributes:
+        column: of the table of pours.
+        label, unit: for people.
+        check: what to look at if it leaves its limits.
+        resolution: smallest standard deviation that means anything, in the unit (or of the logarithm).
+        groups: columns whose values have levels of their own.
+        logarithmic: whether ratios count, not differences.
+        once: whether it is measured once in a run, and repeated in the rows of its pours.
+    """
+
+    column: str
+    label: str
+    unit: str
+    check: str
+    resolution: float
+    groups: tuple[str, ...] = ()
+    logarithmic: bool = False
+    once: bool = False
+
+
+_VESSELS = ("pourer", "receiver", "liquid")
+
+QUANTITIES = (
+    ChartedQuantity(
+        "prediction_error",
+        "prediction error",
+        "SD",
+        "was the receiver, the tray or the arm moved, or is it another liquid? Measure the placement; else calibrate "
+        "again",
+        0.1,
+        _VESSELS,
+    ),
+    ChartedQuantity(
+        "dose_error_g",
+        "dose error",
+        "g",
+        "the display and the cables of the balance, drops at the lip, and the temperature of the liquid",
+        0.02,
+        ("pourer", "liquid"),
+    ),
+    ChartedQuantity(
+        "onset_deg",
+        "tilt at which doses begin to flow",
+        "deg",
+        "does the vessel slip in the gripper? Clean its pads, check its force, and teach the grip again; is it the "
+        "right vessel?",
+        0.1,
+        ("pourer", "liquid"),
+    ),
+    ChartedQuantity(
+        "film_g",
+        "film in the receiver",
+        "g",
+        "wash and dry the receiver; does it drain as long as before?",
+        0.01,
+        ("receiver", "liquid"),
+    ),
+    ChartedQuantity(
+        "missing_g",
+        "masses that do not close",
+        "g",
+        "is liquid on the table, or does it evaporate? Is it always the same vessel that is weighed?",
+        0.02,
+    ),
+    ChartedQuantity(
+        "empty_pourer_g",
+        "weight of the empty pourer",
+        "g",
+        "weigh a reference weight (`decant balance check`), adjust the balance; is the pourer dry, clean and the right "
+        "one?",
+        0.01,
+        ("pourer",),
+        once=True,
+    ),
+    ChartedQuantity(
+        "zero_g",
+        "zero of the balance",
+        "g",
+        "does something touch the pan? Level the balance, and keep draughts and warmth away",
+        0.005,
+    ),
+    ChartedQuantity(
+        "reading_noise_g",
+        "scatter of readings at rest",
+        "g",
+        "vibrations, draughts and static charge at the balance; its filter setting",
+        0.1,
+        logarithmic=True,
+    ),
+    ChartedQuantity(
+        "seconds",
+        "time of a pour",
+        "s",
+        "the speed slider of the arm, stable readings of the balance, and waiting questions",
+        0.05,
+        ("purpose", *_VESSELS),
+        logarithmic=True,
+    ),
+)
+"""What is charted, in the order in which it is shown."""
+
+COLUMNS = tuple(dict.fromkeys(name for q in QUANTITIES for name in (q.column, *q.groups)))
+"""Columns of the table of pours that charts need, besides the time and the run."""
+
+NEW_LIMITS = "new limits"
+"""Beginning of a note on a run, after which the charts of its laboratory begin again."""
+
+
+class DailyMean(BaseModel):
+    """One point of a chart: the mean of one day, of one vessel or liquid where these differ."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    time: float
+    """Time of the day's first value, seconds since 1970."""
+
+    about: str
+    """The vessels and the liquid; '' if the quantity does not depend on them."""
+
+    pours: int
+    """Number of values."""
+
+    value: float
+    """Their mean, in the unit of the chart; the geometric one for scatter and time."""
+
+    deviations: float | None
+    """Distance from the history's mean in standard deviations; null while there are fewer than five days."""
+
+    low: float | None
+    """Lower limit (four standard deviations)."""
+
+    high: float | None
+    """Upper limit."""
+
+
+class ChartViolation(BaseModel):
+    """A period in which a chart was out of control."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    begun: float
+    """Estimated begin of the change, seconds since 1970."""
+
+    noticed: float
+    """Day on which it was noticed, seconds since 1970."""
+
+    ended: float | None
+    """When it was in control again; null if it lasts."""
+
+    rule: Rule
+    """'limit': a point beyond four standard deviations; 'two of three' beyond three; 'cusum': a small change that
+    lasts."""
+
+    deviations: float
+    """Mean distance since it began, in standard deviations."""
+
+
+class LaboratoryChart(BaseModel):
+    """The control chart of one quantity of one laboratory."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    laboratory: str
+    """Name of the laboratory."""
+
+    mode: str
+    """'virtual', or 'hardware' for a real bench."""
+
+    quantity: str
+    """Column of the table of pours."""
+
+    label: str
+    """The quantity in words."""
+
+    unit: str
+    """Unit of the values."""
+
+    check: str
+    """What to look at if it leaves its limits."""
+
+    points: list[DailyMean]
+    """The days, the oldest first."""
+
+    violations: list[ChartViolation]
+    """The oldest first."""
+
+    @property
+    def lasting(self) -> ChartViolation | None:
+        """The violation that lasts; None if the chart is in control."""
+        return self.violations[-1] if self.violations and self.violations[-1].ended is None else None
+
+    @property
+    def text(self) -> str:
+        """'film in the receiver: 6.1 standard deviations above its history since 2030-03-14; check: …', or ''."""
+        violation = self.lasting
+        if violation is None:
+            return ""
+        side = "above" if violation.deviations > 0.0 else "below"
+        since = time.strftime("%Y-%m-%d", time.localtime(violation.begun))
+        off = f"{abs(violation.deviations):.1f} standard deviations {side} its history since {since}"
+        return f"{self.label}: {off}; check: {self.check}"
+
+
+@dataclass
+class _Values:
+    """Values of one quantity in one laboratory: times, days, numbers of groups."""
+
+    times: list[float] = field(default_factory=list)
+    days: list[int] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    groups: list[int] = field(default_factory=list)
+    names: dict[str, int] = field(default_factory=dict)
+    runs: set[tuple[str, str]] = field(default_factory=set)
+
+
+def charts_of(rows: Sequence[Mapping[str, Any]]) -> list[LaboratoryChart]:
+    """The charts of all laboratories, by laboratory and quantity; quantities without values have none.
+
+    Args:
+        rows: weighed pours, the oldest first, with 'laboratory', 'mode', 'path', 'time' and `COLUMNS`.
+    """
+    streams: dict[tuple[str, str], dict[str, _Values]] = {}
+    for row in rows:
+        moment = float(row["time"])
+        local = time.localtime(moment)
+        day = int((moment + local.tm_gmtoff) // 86_400)
+        laboratory = streams.setdefault((str(row["laboratory"] or ""), str(row["mode"])), {})
+        for quantity in QUANTITIES:
+            value = row[quantity.column]
+            if value is None or not math.isfinite(value) or (quantity.logarithmic and value <= 0.0):
+                continue
+            stream = laboratory.setdefault(quantity.column, _Values())
+            about = ", ".join(filter(None, (str(row[name] or "") for name in quantity.groups)))
+            if quantity.once and (row["path"], about) in stream.runs:
+                continue
+            stream.runs.add((row["path"], about))
+            stream.times.append(moment)
+            stream.days.append(day)
+            stream.values.append(math.log(value) if quantity.logarithmic else value)
+            stream.groups.append(stream.names.setdefault(about, len(stream.names)))
+    return [
+        _chart(name, mode, quantity, laboratory[quantity.column])
+        for (name, mode), laboratory in sorted(streams.items())
+        for quantity in QUANTITIES
+        if quantity.column in laboratory
+    ]
+
+
+def _chart(laboratory: str, mode: str, quantity: ChartedQuantity, stream: _Values) -> LaboratoryChart:
+    points, violations = control_chart(stream.days, stream.values, stream.groups, resolution=quantity.resolution)
+    names = list(stream.names)
+    times: dict[tuple[int, int], float] = {}
+    for key, moment in zip(zip(stream.days, stream.groups, strict=True), stream.times, strict=True):
+        times.setdefault(key, moment)
+    shown = math.exp if quantity.logarithmic else float
+    means = [
+        DailyMean(
+            time=times[point.day, point.group],
+            about=names[point.group],
+            pours=point.values,
+            value=shown(point.mean),
+            deviations=point.deviations,
+            low=None if point.limits is None else shown(point.limits[0]),
+            high=None if point.limits is None else shown(point.limits[1]),
+        )
+        for point in points
+    ]
+    periods = [
+        ChartViolation(
+            begun=means[violation.begun].time,
+            noticed=means[violation.noticed].time,
+            ended=None if violation.ended is None else means[violation.ended].time,
+            rule=violation.rule,
+            deviations=float(
+                np.mean([p.deviations for p in points[violation.begun : violation.ended] if p.deviations is not None])
+            ),
+        )
+        for violation in violations
+    ]
+    return LaboratoryChart(
+        laboratory=laboratory,
+        mode=mode,
+        quantity=quantity.column,
+        label=quantity.label,
+        unit=quantity.unit,
+        check=quantity.check,
+        points=means,
+        violations=periods,
+    )

@@ -1,0 +1,79 @@
+"""The picture of a laboratory's control charts: one panel for each quantity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from typing import TYPE_CHECKING
+
+from orchestrator.catalogue.control_charts import LIMIT, LaboratoryChart
+from orchestrator.reports import figure_style as style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLUMNS, PANEL = 2, (5.4, 2.3)
+"""Number of panels side by side, and the size of each [inch]."""
+
+MARGIN = timedelta(days=2)
+
+
+def draw_charts(charts: Sequence[LaboratoryChart]) -> Figure:
+    """Daily means with their limits. Points of a violation are red, from its estimated begin.
+
+    Quantities whose levels depend on vessel or liquid are shown as deviations if there are several of them.
+
+    Args:
+        charts: of one laboratory, at least one.
+    """
+    rows = -(-len(charts) // COLUMNS)
+    columns = min(COLUMNS, len(charts))
+    size = (PANEL[0] * columns, PANEL[1] * rows + 0.5)
+    figure, panels = style.new_figure(rows, columns, size=size, squeeze=False)
+    style.entitle(figure, f"{charts[0].laboratory or 'no laboratory'}: daily means and their limits")
+    for axes, chart in zip(panels.flat, charts, strict=False):
+        _panel(axes, chart)
+    for axes in panels.flat[len(charts) :]:
+        axes.set_axis_off()
+    return figure
+
+
+def _panel(axes: Axes, chart: LaboratoryChart) -> None:
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+    several = len({point.about for point in chart.points}) > 1
+    points = [point for point in chart.points if not several or point.deviations is not None]
+    times = [datetime.fromtimestamp(point.time) for point in points]
+    values = [(point.deviations or 0.0) if several else point.value for point in points]
+    limits = [
+        (when, -LIMIT, LIMIT) if several else (when, point.low, point.high)
+        for when, point in zip(times, points, strict=True)
+        if point.low is not None and point.high is not None
+    ]
+    if limits:
+        since, low, high = zip(*limits, strict=True)
+        axes.fill_between(since, low, high, color=style.PALE, alpha=0.6, step="mid", zorder=1)
+        bottom, top = min(low[-1], *values), max(high[-1], *values)  # the first limits are wide
+        axes.set_ylim(bottom - 0.1 * (top - bottom), top + 0.1 * (top - bottom))
+    out = [
+        any(v.begun <= point.time and (v.ended is None or point.time < v.ended) for v in chart.violations)
+        for point in points
+    ]
+    for state, colour in ((False, style.MEASURED), (True, style.BEST)):
+        chosen = [(x, y) for x, y, is_out in zip(times, values, out, strict=True) if is_out is state]
+        if chosen:
+            axes.plot(*zip(*chosen, strict=True), "o", color=colour, markersize=3.5, zorder=3)
+    unit = "standard deviations" if several or chart.unit == "SD" else chart.unit
+    lasting = chart.lasting
+    title = (
+        chart.label if lasting is None else f"{chart.label}: off since {datetime.fromtimestamp(lasting.begun):%d %b}"
+    )
+    style.dress(axes, title=title, y=f"[{unit}]")
+    if lasting is not None:
+        axes.set_title(title, fontsize=11, loc="left", color=style.BEST, pad=8)
+    if times:  # at least some days, however few were charted
+        axes.set_xlim(times[0] - MARGIN, times[-1] + MARGIN)
+    locator = AutoDateLocator(maxticks=6)  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
