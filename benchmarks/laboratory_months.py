@@ -26,8 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from actors.balance.balance_settings import Placement
-from actors.balance.weighing_plan import PourMasses, measurement, weighing_uncertainty
+from actors.balance.weighing_plan import Placement, PourMasses, measurement, weighing_uncertainty
 from actors.interfaces import DoseSource, DoseTarget
 from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.control_charts import LaboratoryChart

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, computed_field
 
 FEWEST, HISTORY = 5, 30
 """Number of days before the first limits, and the largest number of days that limits come from."""
@@ -33,6 +33,9 @@ SLACK, DECISION = 0.5, 8.0
 """Reference value k and decision interval h of the CUSUM [standard deviations]: a shift of one standard deviation is
 reported after about 17 days, a still process gives one false alarm in about 9,600 (Siegmund's formula). With limits
 from 5 to 30 days it is one in 60 charts of 60 days."""
+
+CALM = 0.5 * DECISION
+"""A violation has ended, and a single bad day is no end of a drift, while the CUSUM is below this."""
 
 LARGEST = 4.0
 """A point counts at most so much in the CUSUM: one bad day is no drift."""
@@ -156,6 +159,7 @@ def control_chart(
         limits = (history.mean - half, history.mean + half)
         points.append(ChartPoint(point.day, point.group, point.values, point.mean, z, limits))
         recent.append(z)
+        before = tuple(sums)
         for side, sign in enumerate((1, -1)):
             if sums[side] == 0.0:
                 since[side] = number
@@ -164,10 +168,11 @@ def control_chart(
         side = int(z < 0.0) if abs(z) > TWICE else int(sums[1] > sums[0])
         rule = _rule(z, recent, sums[side])
         lasting = violations[-1] if violations and violations[-1].ended is None else None
-        if rule is None and lasting is not None and max(sums) < 0.25 * DECISION:
+        if rule is None and lasting is not None and max(sums) < CALM:
             lasting.ended = number
         elif rule is not None and lasting is None:
-            begun = since[side] if sums[side] > 0.0 else number
+            ended = violations[-1].ended or 0 if violations else 0
+            begun = max(since[side], ended) if before[side] > CALM else number
             violations.append(Violation(begun, number, rule, 1 - 2 * side))
         elif rule is None and lasting is None and history.days < HISTORY:
             history.add(point, squares)
@@ -407,6 +412,7 @@ class LaboratoryChart(BaseModel):
         """The violation that lasts; None if the chart is in control."""
         return self.violations[-1] if self.violations and self.violations[-1].ended is None else None
 
+    @computed_field  # type: ignore[prop-decorator]
     @property
     def text(self) -> str:
         """'film in the receiver: 6.1 standard deviations above its history since 2030-03-14; check: …', or ''."""

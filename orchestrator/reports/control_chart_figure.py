@@ -73,7 +73,7 @@ def _panel(axes: Axes, chart: LaboratoryChart) -> None:
     if lasting is not None:
         axes.set_title(title, fontsize=11, loc="left", color=style.BEST, pad=8)
     if times:  # at least some days, however few were charted
-        axes.set_xlim(times[0] - MARGIN, times[-1] + MARGIN)
+        axes.set_xlim(times[0] - MARGIN, times[-1] + MARGIN)  # type: ignore[arg-type]
     locator = AutoDateLocator(maxticks=6)  # type: ignore[no-untyped-call]
     axes.xaxis.set_major_locator(locator)
     axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]

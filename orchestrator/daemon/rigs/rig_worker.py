@@ -60,6 +60,7 @@ class SharedServices:
         workers: the rig workers, by the names of their rigs.
         problems: problems for the operator, by subject.
         stopping: whether nothing starts any more.
+        rested: set when a campaign comes to rest; the charts of the laboratories are then read.
         suspect: whether the simulators may have failed for good: they are restarted when no campaign uses them.
     """
 
@@ -79,6 +80,7 @@ class SharedServices:
         self.notification_counts: dict[str, Counts] = {}
         self.pours = Pours()
         self.stopping = self.suspect = False
+        self.rested = asyncio.Event()
         self.began = time.time()
 
     @property
@@ -567,6 +569,7 @@ class RigWorker:
         store.change(key, state=state, reason=reason, desired_state=str(desired), ended=ended)
         self.running = None  # whoever hears that it rests may have it go on
         self._shared.feed.publish("CampaignRests", {"state": state, "reason": reason, "rig": self.rig.name}, key)
+        self._shared.rested.set()
         with contextlib.suppress(OSError):
             busy = {worker.running.item.run for worker in self._shared.workers.values() if worker.running is not None}
             await asyncio.to_thread(prune_recordings, self._shared.settings, {name for name in busy if name})

@@ -9,6 +9,8 @@ other modules.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import logging
 import shutil
 
 from actors.interfaces import LaboratoryError
@@ -17,10 +19,17 @@ from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
 from orchestrator.daemon.rigs.pour_orders import OrderBook
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.daemon_settings import DaemonSettings
+from orchestrator.daemon.state.run_readout import violated_charts
+from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
 
 LEAVING = 10.0
 """Time for campaigns to stop after Ray has died [s]; then campaigns that don't pour are given up."""
+
+CHARTS_INTERVAL, REPORTED = 3600.0, "charts"
+"""Interval at which control charts are read [s], and the flag with the times of the violations that were reported."""
+
+_log = logging.getLogger(__name__)
 
 
 class Supervisor:
@@ -62,6 +71,7 @@ class Supervisor:
         for name, worker in shared.workers.items():
             self._tasks.append(asyncio.create_task(worker.work(), name=f"rig {name}"))
             self._tasks.append(asyncio.create_task(worker.watch_arm(), name=f"arm of {name}"))
+        self._tasks.append(asyncio.create_task(self._watch_charts(), name="charts"))
         if shared.settings.quick_start:
             self._tasks.append(asyncio.create_task(self._warm_up(), name="simulators"))
         shared.feed.publish("DaemonStarted", {"rigs": [rig.name for rig in shared.settings.rigs]})
@@ -71,6 +81,34 @@ class Supervisor:
         for folder in self.shared.settings.snapshots.iterdir():
             if folder.name not in known:
                 shutil.rmtree(folder, ignore_errors=True)
+
+    async def _watch_charts(self) -> None:
+        """Read the control charts whenever a campaign has ended, and every hour during long ones."""
+        while True:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CHARTS_INTERVAL):
+                    await self.shared.rested.wait()
+            self.shared.rested.clear()
+            try:
+                await self.report_charts()
+            except (RunError, OSError) as error:
+                _log.warning("the control charts can't be read: %s", error)
+
+    async def report_charts(self) -> None:
+        """Publish each violation of a control chart once.
+
+        Raises:
+            RunError, OSError: the catalogue can't be read.
+        """
+        charts = await asyncio.to_thread(violated_charts, self.shared.settings.state)
+        reported = self.shared.store.flag(REPORTED) or {}
+        for chart in charts:
+            key = f"{chart.laboratory} {chart.mode} {chart.quantity}"
+            if chart.lasting is not None and chart.lasting.noticed > reported.get(key, 0.0):
+                reported[key] = chart.lasting.noticed
+                body = {"laboratory": chart.laboratory, "mode": chart.mode, "quantity": chart.quantity}
+                self.shared.feed.publish("ChartViolated", {**body, "text": chart.text})
+        self.shared.store.set_flag(REPORTED, reported)
 
     async def _warm_up(self) -> None:
         shared = self.shared

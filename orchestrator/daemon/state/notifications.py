@@ -1,9 +1,9 @@
 """Notifications by mail, webhook or chat when a campaign needs an operator.
 
-Occasions are open questions, ended and failed campaigns, campaigns without news, and emergency stops. Messages are sent
-through apprise, which supports many services by URL. Each receiver has its own thread and a short queue, so that a slow
-receiver delays neither the daemon nor other receivers. `Notifier` is the main class; `pass_on` connects it to the
-daemon's event feed.
+Occasions are open questions, ended and failed campaigns, campaigns without news, emergency stops, and control charts
+that leave their limits. Messages are sent through apprise, which supports many services by URL. Each receiver has its
+own thread and a short queue, so that a slow receiver delays neither the daemon nor other receivers. `Notifier` is the
+main class; `pass_on` connects it to the daemon's event feed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, get_args
 
 from actors.laboratory_settings import MODE_LABELS
 from sim_engine.settings.model import Settings, Text
@@ -34,9 +34,9 @@ TRIES, PAUSES = 3, (2.0, 10.0)
 
 ENVIRONMENT = "env:"
 
-Occasion = Literal["question", "ended", "failed", "silence", "emergency"]
+Occasion = Literal["question", "ended", "failed", "silence", "emergency", "chart"]
 
-OCCASIONS: tuple[Occasion, ...] = ("question", "ended", "failed", "silence", "emergency")
+OCCASIONS: tuple[Occasion, ...] = get_args(Occasion)
 
 _FOR_PERSON = ("question", "failed", "silence")
 """Occasions that need a person."""
@@ -55,6 +55,7 @@ _EVENTS_WITH_DATA = (
     "QuestionAnswered",
     "QuestionClosed",
     "AuditEntry",
+    "ChartViolated",
 )
 """Events whose data are read; of all other events only the arrival counts."""
 
@@ -71,9 +72,10 @@ class NotifySettings(Settings):
     the environment, for URLs with secrets in them.
     """
 
-    about: list[Literal["question", "ended", "failed", "silence", "emergency"]] | None = None
+    about: list[Occasion] | None = None
     """Occasions for a message; all by default. `question`: an operator must answer; `ended`: a campaign is finished or
-    was stopped; `failed`: it can't continue, or a pour is UNKNOWN; `silence`: no news; `emergency`: an emergency stop.
+    was stopped; `failed`: it can't continue, or a pour is UNKNOWN; `silence`: no news; `emergency`: an emergency stop;
+    `chart`: a quantity of the laboratory has left its limits.
     """
 
     silence: Annotated[float, Quantity("s", "15 min", 1.0, 86_400.0, positive=True)] = 900.0
@@ -194,6 +196,9 @@ class Notifier:
             case "AuditEntry" if data.get("what") == "emergency stop":
                 lines = [f"By {data.get('by')}.", str(data.get("detail") or ""), "Nothing begins before it is cleared."]
                 return self._made("emergency", "", "EMERGENCY STOP", lines)
+            case "ChartViolated":
+                name = f"{MODE_LABELS.get(str(data.get('mode')), '')} {data['laboratory']}".strip()
+                return self._made("chart", "", f"{name} is not what it was", [str(data["text"])])
         return None
 
     def _first(self, news: _CampaignNews | None) -> bool:

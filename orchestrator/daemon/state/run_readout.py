@@ -3,6 +3,7 @@
 - `Pours` and `summary_of` read the pours and the summary of a run.
 - `found_at` reads the arm and the balance after a crash, for the operator who decides the outcome of a pour. Nothing is
   moved or tared.
+- `violated_charts` reads the control charts that are out of control.
 - `prune_recordings` deletes old recordings; journals, figures and summaries are always kept.
 """
 
@@ -22,6 +23,8 @@ from actors.bench.night_consent import MOTIONS
 from actors.interfaces import LaboratoryError
 from actors.laboratory import reached
 from actors.laboratory_settings import LaboratorySettings
+from orchestrator.catalogue.catalogue import Catalogue
+from orchestrator.catalogue.control_charts import LaboratoryChart
 from orchestrator.daemon.state.daemon_settings import DaemonSettings
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.records.codec import CodecError
@@ -32,6 +35,20 @@ from orchestrator.reports.run_summary import PourSummary
 from orchestrator.reports.summarise import pour_summaries
 
 __all__ = ["REPORT", "Pours", "summary_of"]
+
+
+def violated_charts(state: Path) -> list[LaboratoryChart]:
+    """The control charts of all laboratories that have left their limits.
+
+    Args:
+        state: the state directory.
+
+    Raises:
+        RunError, OSError: the catalogue can't be read.
+    """
+    with Catalogue(state) as catalogue:
+        catalogue.refresh()
+        return [chart for chart in catalogue.charts({}) if chart.lasting is not None]
 
 
 class Pours:

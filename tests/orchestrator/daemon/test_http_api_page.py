@@ -25,7 +25,7 @@ from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon.state.access_tokens import Role, token_of
 from orchestrator.daemon.state.daemon_settings import Rig
-from orchestrator.records.run_registry import VARIABLE
+from orchestrator.records.run_registry import VARIABLE, use_state_directory
 from tests.support.browser import OnPort, browser, on_port
 from tests.support.hardware_laboratory import hardware_rig
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
@@ -122,6 +122,29 @@ def test_a_question_is_answered_with_one_press_and_the_pour_goes_on(page: Any, t
         page.get_by_role("button", name="Done").click()
         wait_until(page, lambda: lab.served.laboratories[0].bench.answers[:1] == ["done"])
         wait_until(page, lambda: lab.do(lab.served.get(f"/campaigns/{key}"))["pours_made"][0]["state"] == "weighed")
+
+
+@pytest.mark.slow
+def test_a_chart_out_of_control_is_a_picture_with_what_to_check(
+    page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[3] / "benchmarks"))
+    monkeypatch.setenv(VARIABLE, "")
+    use_state_directory(tmp_path / "state")
+    import laboratory_months as months
+
+    days = [
+        months.Bench(months.np.random.default_rng(day), film=0.002 * (day > 11), balance=0.01 * (day == 13))
+        for day in range(14)
+    ]
+    months.enter([months.write_day(tmp_path / "days", day, bench) for day, bench in enumerate(days)])
+    with on_port(tmp_path) as lab:
+        page.goto(lab.address(Role.VIEWER))
+        section = page.locator("#charts")
+        section.get_by_text("wash and dry the receiver").wait_for()
+        assert section.locator("svg").count() == 9
+        assert section.get_by_role("img", name="zero of the balance: in control").count() == 1
+        assert section.locator("figure", has_text="film in the receiver").locator("circle.out").count() == 2
 
 
 @pytest.mark.slow
@@ -432,8 +455,6 @@ def test_a_night_is_one_timeline_of_pours_masses_faults_and_answers(page: Any, t
         assert "agreed, up to 200 pours" in lines[-1]
         assert "protective stop during carry" in page.locator("#night .fault").inner_text()
         assert "Shall it be made ready again? → 'yes' after 12.0 s" in page.locator("#night .answer").inner_text()
-        if folder := os.environ.get("DECANT_PICTURES"):
-            page.screenshot(path=f"{folder}/night.png", full_page=True)
 
 
 @pytest.mark.slow

@@ -2,7 +2,7 @@
 
 import { Refused, call, knownToken, listen, reach, saveReport, useToken } from "./talk.js";
 import {
-  button, cellLine, clock, draw, el, endedList, previousRuns, modeBadge, nightTimeline, poursTable, questionCard, queueList, rigCard,
+  button, cellLine, chartFigure, clock, draw, el, endedList, previousRuns, modeBadge, nightTimeline, poursTable, questionCard, queueList, rigCard,
   stopCard, vesselsTable,
 } from "./show.js";
 
@@ -35,6 +35,7 @@ async function refresh() {
       .filter((pour) => pour.state !== "asked").sort((one, other) => other.time - one.time).slice(0, 8);
     show();
     link(true);
+    refreshCharts();
   } catch (error) {
     if (error.status === 401) leave(error.message);
     else if (error instanceof Refused) $("told").textContent = `No news: ${error.message}`; // it answers, so a stop may work
@@ -47,6 +48,19 @@ async function refresh() {
 
 /** Whether nobody is signed in: what was known then is not shown. */
 const away = () => !$("login").hidden;
+
+let charted = 0;
+
+/** The control charts that have limits, every ten minutes: they change by the day. */
+async function refreshCharts() {
+  if (Date.now() - charted < 600000) return;
+  charted = Date.now();
+  const charts = await call("runs/charts", undefined, { timeout: 60000 }).catch(() => null);
+  if (!charts || away()) return;
+  const shown = charts.filter((chart) => chart.points.some((point) => point.deviations !== null));
+  $("charts").hidden = !shown.length;
+  draw(body("charts"), shown, (all) => all.map(chartFigure));
+}
 
 let timer = 0, due = Infinity;
 
@@ -64,6 +78,7 @@ function told(type, data) {
   if (type === "Announced") announce("call", `In ${Math.round(data.seconds)} seconds: ${data.text}`);
   if (type === "CampaignRests") announce("say", `${data.campaign}: ${data.state}`);
   if (type === "LogLine" && data.level === "error") alarm(data.text);
+  if (type === "ChartViolated") { announce("say", data.text); charted = 0; }
   if (type === "PourProgressed") { soon(700); return; }
   soon(150);
 }
@@ -307,7 +322,7 @@ function leave(why = "") {
   $("rest").hidden = true;
   showBar(false);
   $("questions").replaceChildren();
-  for (const section of [...["mode", "asked", "cells", "emergency"].map($), ...["rigs", "pours", "night", "queue", "ended"].map(body)]) {
+  for (const section of [...["mode", "asked", "cells", "emergency"].map($), ...["rigs", "pours", "night", "charts", "queue", "ended"].map(body)]) {
     draw(section, null, () => []);
   }
   $("lost").hidden = true;
@@ -317,6 +332,7 @@ function leave(why = "") {
   document.body.classList.remove("real", "stale");
   Object.assign(now, { status: null, campaigns: [], questions: [], pours: [], night: [], vessels: [], up: null, clearing: null });
   latched = "";
+  charted = 0;
   $("link").textContent = "not signed in";
   $("token").focus({ preventScroll: true });
 }

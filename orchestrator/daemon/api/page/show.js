@@ -238,6 +238,24 @@ export function endedList(items, acts) {
     item.report ? button(`report ${item.id}`, "Save report", () => acts.report(item.id), "plain") : null)));
 }
 
+/** The latest days of a control chart, in standard deviations from its history; beyond the limits (4) is red. */
+export function chartFigure(chart) {
+  const days = chart.points.filter((point) => point.deviations !== null).slice(-60), last = chart.points.at(-1);
+  const draw = (name, attributes) => {
+    const drawn = document.createElementNS("http://www.w3.org/2000/svg", name);
+    for (const [key, value] of Object.entries(attributes)) drawn.setAttribute(key, value);
+    return drawn;
+  };
+  const out = ({ time }) => chart.violations.some(({ begun, ended }) => begun <= time && (ended === null || time < ended));
+  const begin = days[0]?.time, span = Math.max(last.time - begin, 86400);
+  const picture = draw("svg", { viewBox: "0 0 240 60", role: "img", "aria-label": chart.text || `${chart.label}: in control` });
+  picture.append(draw("rect", { class: "limits", x: 0, y: 15, width: 240, height: 30 }), ...days.map((point) => draw("circle", {
+    class: out(point) ? "out" : "", r: 2, cx: 5 + 230 * (point.time - begin) / span, cy: 30 - 3.75 * Math.max(-7, Math.min(7, point.deviations)),
+  })));
+  return el("figure", {}, picture, el("figcaption", {}, el("b", {}, chart.label), ` ${+last.value.toPrecision(4)} ${chart.unit}, ${chart.laboratory} `,
+    modeBadge(chart.mode), chart.text ? el("p", { class: "problem" }, sentence(chart.text)) : null));
+}
+
 /** Runs that were found, the newest first: what was poured, how well, what people said of it. */
 export function previousRuns(runs, acts) {
   if (!runs.length) return el("p", { class: "quiet" }, "No run has all of this.");

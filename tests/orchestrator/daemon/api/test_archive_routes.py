@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,6 +38,46 @@ def test_runs_of_the_daemon_are_found_and_noted_by_operators_only(tmp_path: Path
             await served.post(f"/runs/{name}/notes", {"text": "the tray was wet"})
             (found,) = await served.get("/runs", words=["tray"])
             assert found["run"] == name
+
+    run(work())
+
+
+def test_a_chart_out_of_control_is_reported_once_and_again_after_another_violation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[4] / "benchmarks"))
+    import laboratory_months as months
+
+    def days(first: int, last: int, film: float) -> None:
+        """Runs of some days, the last of them with a film that is thicker by so much [kg]."""
+        for day in range(first, last):
+            bench = months.Bench(months.np.random.default_rng(day), film=film if day == last - 1 else 0.0)
+            months.enter([months.write_day(tmp_path / "days", day, bench)])
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+
+            def reported() -> list[dict[str, Any]]:
+                return [json.loads(event.data) for event in served.daemon.feed._ring if event.type == "ChartViolated"]
+
+            await asyncio.to_thread(days, 0, 9, 0.005)
+            await finished(served)
+            async for _ in served.daemon.feed.read(0, beat=0.05):
+                if reported():
+                    break
+            (event,) = reported()
+            assert (event["laboratory"], event["quantity"]) == ("months", "film_g")
+            assert "film in the receiver: " in event["text"]
+            charts = {c["quantity"]: c for c in await served.get("/runs/charts") if c["laboratory"] == "months"}
+            assert (charts["film_g"]["text"], charts["zero_g"]["text"]) == (event["text"], "")
+            await asyncio.to_thread(days, 9, 11, 0.0)  # it is in control again
+            await served.supervisor.report_charts()
+            await served.supervisor.report_charts()
+            assert len(reported()) == 1
+            await asyncio.to_thread(days, 11, 12, 0.005)
+            await served.supervisor.report_charts()
+            await served.supervisor.report_charts()
+            assert len(reported()) == 2
 
     run(work())
 

@@ -108,6 +108,19 @@ def test_people_are_told_of_questions_ends_failures_and_emergencies(web: WebRece
     assert notifier.counts["json (1)"].sent == 4
 
 
+def test_a_chart_out_of_control_is_a_message_with_what_to_check(web: WebReceiver) -> None:
+    event = {"laboratory": "north", "mode": "hardware", "quantity": "film_g", "text": "film: 6 high; check: dry it"}
+    notifier = Notifier([web.url])
+    notifier.note("ChartViolated", event)
+    notifier.close()
+    others = Notifier([web.url], about=["question"])
+    others.note("ChartViolated", event)
+    others.close()
+    assert [(m["title"], m["message"]) for m in web.messages] == [
+        ("Decant: REAL north is not what it was", "film: 6 high; check: dry it")
+    ]
+
+
 def test_what_people_did_themselves_is_not_told_to_them(web: WebReceiver) -> None:
     notifier = Notifier([web.url], about=["failed", "ended"])
     begun(notifier)
