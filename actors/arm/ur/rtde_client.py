@@ -1,19 +1,22 @@
 """RTDE of a controller, for the worker process only. A client is discarded, never reconnected.
 
-`OutputReader` receives the values. `InputWriter` writes the input registers of the program, and no others: client
-libraries claim all outputs, the speed slider and registers of a fieldbus, so that no PLC, gripper or ROS driver could
-be connected at the same time. Their control interfaces upload a program of their own and reconnect by themselves. This
-is not acceptable in a cell where nothing may run without consent.
+`LibraryReader` receives the values with the client library ur-rtde. Its newest release has no wheel for Python 3.13 and
+later; there `OutputReader` receives them. `InputWriter` writes the input registers of the program, and no others:
+client libraries claim all outputs, the speed slider and registers of a fieldbus, so that no PLC, gripper or ROS driver
+could be connected at the same time. Their control interfaces upload a program of their own and reconnect by themselves.
+This is not acceptable in a cell where nothing may run without consent.
 """
 
 from __future__ import annotations
 
 import contextlib
+import faulthandler
+import importlib.util
 import socket
 import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 from actors.arm.ur import rtde
@@ -34,6 +37,9 @@ from actors.arm.ur.worker_messages import (
 
 PORTS = {rtde.PORT: "RTDE", 30001: "primary interface"}
 PROBE_TIME = 2.0
+
+CONSTRUCTION_TIME = 5.0
+"""Time after which a blocked constructor of the library ends the process [s], because it holds the interpreter lock."""
 
 ATTEMPTS, BETWEEN_ATTEMPTS = 3, 0.4
 """Number of connection attempts, and the time between them [s]: a controller may need a moment to notice that the
@@ -87,7 +93,7 @@ class RtdeClient:
             raise TroubleError("lost", f"no robot at {address}: {error}. {_ENABLED}") from None
         for attempt in range(1, ATTEMPTS + 1):
             try:
-                self._outputs = OutputReader(address, rate)
+                self._outputs = (LibraryReader if has_library() else OutputReader)(address, rate)
                 self._inputs = InputWriter(address, registers)
                 self._tilt: InputWriter | None = None
                 break
@@ -188,6 +194,74 @@ class RtdeClient:
             self._tilt.write(TILT_SPEED, speed, float(self._commands))
 
 
+def has_library() -> bool:
+    """Whether the client library ur-rtde is installed."""
+    return importlib.util.find_spec("rtde_receive") is not None
+
+
+class LibraryReader:
+    """Receives the controller's values with the client library ur-rtde.
+
+    Args:
+        address: of the controller.
+        rate: of packages [Hz].
+
+    Raises:
+        TroubleError: the controller does not answer, or lacks a value.
+    """
+
+    def __init__(self, address: str, rate: float) -> None:
+        from rtde_receive import RTDEReceiveInterface  # type: ignore[import-not-found]
+
+        try:
+            with socket.create_connection((address, rtde.PORT), timeout=PROBE_TIME) as connection:
+                known = rtde.Outputs(rtde.Requests(connection), (*_VARIABLES, _FORCE, _WRIST), rate).fields
+            _require_variables(address, known)
+            self._optional = [name for name in (_FORCE, _WRIST) if name in known]
+            with _bounded(CONSTRUCTION_TIME):
+                self._receive: Any = RTDEReceiveInterface(address, rate, [*_VARIABLES, *self._optional])
+        except (OSError, RuntimeError, ValueError, rtde.PackageError) as error:
+            raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
+
+    @property
+    def lost(self) -> str:
+        """Why no more packages come; '' while they may."""
+        return "" if self._receive.isConnected() else "ur-rtde is not connected"
+
+    def latest(self) -> tuple[float, dict[str, tuple[Any, ...]]]:
+        """The time of this call [s of `time.monotonic`], and the values of the latest package by field.
+
+        Raises:
+            TroubleError: packages come faster than their values can be read one by one.
+        """
+        r = self._receive
+        for _ in range(20):
+            time_before = r.getTimestamp()
+            values: dict[str, tuple[Any, ...]] = {
+                "timestamp": (time_before,),
+                "actual_q": tuple(r.getActualQ()),
+                "actual_qd": tuple(r.getActualQd()),
+                "robot_mode": (r.getRobotMode(),),
+                "safety_mode": (r.getSafetyMode(),),
+                "runtime_state": (r.getRuntimeState(),),
+                "target_speed_fraction": (r.getTargetSpeedFraction(),),
+                "speed_scaling": (r.getSpeedScaling(),),
+                "payload": (r.getPayload(),),
+                "payload_cog": tuple(r.getPayloadCog()),
+                "robot_status_bits": (r.getRobotStatus(),),
+                "safety_status_bits": (r.getSafetyStatusBits(),),
+                **{f"output_int_register_{n}": (r.getOutputIntRegister(n),) for n in (NUMBER, STATUS)},
+                **{f"output_double_register_{n}": (r.getOutputDoubleRegister(n),) for n in _DOUBLES},
+            }
+            if _FORCE in self._optional:
+                values[_FORCE] = tuple(r.getActualTCPForce())
+            if _WRIST in self._optional:
+                values[_WRIST] = tuple(r.getFtRawWrench())
+            if r.getTimestamp() == time_before:
+                return time.monotonic(), values
+        raise TroubleError("lost", "packages come faster than they can be read")
+
+
 class OutputReader:
     """Receives the controller's values over a connection of its own, in a thread.
 
@@ -211,8 +285,7 @@ class OutputReader:
             connection.settimeout(None)
         except (OSError, rtde.PackageError) as error:
             raise TroubleError("lost", f"{address}: its RTDE does not answer as it should: {error}") from None
-        if missing := [name for name in _VARIABLES if name not in self._outputs.fields]:
-            raise TroubleError("refused", f"{address}: its software is too old: it has no {', '.join(missing)}")
+        _require_variables(address, self._outputs.fields)
         threading.Thread(target=self._follow, name="outputs", daemon=True).start()
 
     def _follow(self) -> None:
@@ -312,3 +385,23 @@ def _probe(address: str, port: int, name: str) -> None:
 
 
 _ENABLED = "Is the controller on, on this network, and are its services enabled?"
+
+
+def _require_variables(address: str, known: Sequence[str]) -> None:
+    """Check that the controller has all values.
+
+    Raises:
+        TroubleError: it lacks one.
+    """
+    if missing := [name for name in _VARIABLES if name not in known]:
+        raise TroubleError("refused", f"{address}: its software is too old: it has no {', '.join(missing)}")
+
+
+@contextlib.contextmanager
+def _bounded(seconds: float) -> Iterator[None]:
+    """End this process if the body takes longer. The timer is a C thread, which does not need the interpreter lock."""
+    faulthandler.dump_traceback_later(seconds, exit=True)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()

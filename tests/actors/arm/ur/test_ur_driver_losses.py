@@ -385,6 +385,39 @@ def test_values_arrive_whole_between_messages_and_what_an_older_controller_lacks
             outputs.next()
 
 
+BOTH_READERS = """
+import sys
+from actors.arm.ur.rtde_client import LibraryReader, OutputReader, has_library
+assert has_library()
+with_library, own = LibraryReader(sys.argv[1], 125.0), OutputReader(sys.argv[1], 125.0)
+(_, first), (_, second) = with_library.latest(), own.latest()
+assert first.keys() == second.keys(), first.keys() ^ second.keys()
+for name in first.keys() - {"timestamp"}:
+    assert len(first[name]) == len(second[name]), name
+    assert all(abs(a - b) < 1e-6 for a, b in zip(first[name], second[name])), (name, first[name], second[name])
+assert with_library.lost == own.lost == ""
+"""
+
+
+@pytest.mark.ur_rtde
+@pytest.mark.realtime
+def test_the_library_and_the_reader_without_it_read_the_same_values(resting: Rig) -> None:
+    program = [sys.executable, "-c", BOTH_READERS, resting.controller.address]
+    ended = subprocess.run(program, capture_output=True, text=True, timeout=PATIENCE, env=child_environment())
+    assert ended.returncode == 0, ended.stderr
+
+
+@pytest.mark.realtime
+def test_an_arm_is_reached_without_the_client_library(
+    make_rig: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = make_rig(connect=False)
+    (tmp_path / "sitecustomize.py").write_text("import sys; sys.modules['rtde_receive'] = None")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    rig.arm.connect()
+    assert len(rig.arm.joints()) == 6
+
+
 @pytest.mark.realtime
 def test_the_driver_does_not_load_the_client_library() -> None:
     program = (
