@@ -349,7 +349,7 @@ class OperatorQuestion:
     details: Mapping[str, float | str] = field(default_factory=dict)
 
 
-Patience = Annotated[float, Quantity("s", "30 min", 0.0, 7 * 86400.0, positive=True)]
+AnswerTime = Annotated[float, Quantity("s", "30 min", 0.0, 7 * 86400.0, positive=True)]
 
 
 class OperatorSettings(Settings):
@@ -361,10 +361,10 @@ class OperatorSettings(Settings):
     time: Annotated[float, Quantity("s", "85 s", 0.0, 3600.0)] = 85.0
     """Total time of a virtual operator for one pour, in bench time."""
 
-    reminder: Patience = 120.0
+    reminder: AnswerTime = 120.0
     """Time after which an open question is repeated."""
 
-    deadline: Patience = 1800.0
+    deadline: AnswerTime = 1800.0
     """Time after which an open question is abandoned: nothing moves then, and the campaign pauses."""
 
     def check_values(self, problems: Problems) -> None:

@@ -16,7 +16,7 @@ from machine import started
 
 from orchestrator.daemon.api.daemon_client import Client
 
-PATIENCE = 120.0
+EVENT_TIMEOUT = 120.0
 """Longest time to wait for any event [s]."""
 
 
@@ -75,9 +75,9 @@ def serving(folder: Path, *options: str) -> Iterator[Client]:
         end(process)
 
 
-def await_(happened: Callable[[], Any], patience: float = PATIENCE) -> Any:
+def await_(happened: Callable[[], Any], timeout: float = EVENT_TIMEOUT) -> Any:
     """Wait until a function returns a true value, and return it. Raises TimeoutError."""
-    end = time.monotonic() + patience
+    end = time.monotonic() + timeout
     while time.monotonic() < end:
         with contextlib.suppress(Exception):
             if found := happened():

@@ -1,6 +1,6 @@
 """Compare loss against number of pours for D1, D2, D3 and competing methods, on the same benches.
 
-    python benchmarks/learning_curves.py [--arms D1 D2 ...] [--seeds 20] [--first 3000] [--pours 15] [--kept FILE]
+    python benchmarks/learning_curves.py [--strategies D1 D2 ...] [--seeds 20] [--first 3000] [--pours 15] [--kept FILE]
                                          [--write]
 
 Benches are simulated: the valleys with steep walls of `mismatch_worlds.py`, with a simulator of moderate error. No
@@ -104,7 +104,7 @@ def rows(kept: dict[str, Any], seeds: list[str]) -> list[list[str]]:
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", nargs="+", choices=PLAYED, default=list(PLAYED))
+    parser.add_argument("--strategies", nargs="+", choices=PLAYED, default=list(PLAYED))
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=3000)
     parser.add_argument("--kept", type=Path, help="runs of mismatch.py")
@@ -119,7 +119,7 @@ def main() -> None:
             kept["runs"].setdefault("D3", {})[str(made["seed"])] = [round(x, 5) for x in made["poured"]]
     seeds = [str(seed) for seed in range(asked.first, asked.first + asked.seeds)]
     with threadpool_limits(1):
-        for arm in asked.arms:
+        for arm in asked.strategies:
             done = kept["runs"].setdefault(arm, {})
             missing = [seed for seed in seeds if seed not in done]
             done |= {seed: [round(x, 5) for x in run(arm, int(seed))] for seed in missing}

@@ -1,6 +1,6 @@
 """Measure the cost of a wrong simulator: D2, D3 as in the paper, and D3 that averages over simulator errors.
 
-    python benchmarks/mismatch.py [--levels none small ...] [--arms D2 paper adaptive] [--seeds 24] [--first 1000]
+    python benchmarks/mismatch.py [--levels none small ...] [--strategies D2 paper adaptive] [--seeds 24] [--first 1000]
                                   [--pours 15] [--simulations 37] [--settled 0.005] [--out FILE]
                                   [--write] [--write-steep] [--budgets N=FILE ...]
 
@@ -313,8 +313,8 @@ def write_steep(runs: list[dict[str, Any]]) -> None:
 
 def _steep_command(levels: Iterable[str], seeds: str) -> str:
     return (
-        f"python benchmarks/mismatch.py --levels '{next(iter(levels))}' … --arms adaptive {seeds} --settled 0.005 "
-        "--out FILE --write-steep"
+        f"python benchmarks/mismatch.py --levels '{next(iter(levels))}' … --strategies adaptive {seeds} "
+        "--settled 0.005 --out FILE --write-steep"
     )
 
 
@@ -344,7 +344,7 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--levels", nargs="+", choices=list(LEVELS | STEEP), default=list(LEVELS))
-    parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=list(ARMS))
+    parser.add_argument("--strategies", nargs="+", choices=list(ARMS), default=list(ARMS))
     parser.add_argument("--seeds", type=int, default=24)
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--pours", type=int, default=15)
@@ -368,7 +368,7 @@ def main() -> None:
         write_steep([run for run in runs if run["level"] in STEEP])
         return
     for level in () if asked.write else asked.levels:
-        for arm in asked.arms:
+        for arm in asked.strategies:
             for seed in range(asked.first, asked.first + asked.seeds):
                 if (arm, level, seed) in known:
                     continue

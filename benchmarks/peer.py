@@ -56,7 +56,7 @@ FRAME_EVERY = 0.02
 FREEZE_BELOW = -0.06
 """Particles below this height do not return [m]."""
 
-PATIENCE = 3600.0
+RUN_TIMEOUT = 3600.0
 """Time limit of a run [s]."""
 
 
@@ -193,10 +193,10 @@ def _simulate(python: Path, particles: int, seed: int) -> dict[str, Floats]:
                 text=True,
                 env=single_threaded(),
                 cwd=folder,
-                timeout=PATIENCE,
+                timeout=RUN_TIMEOUT,
             )
         except subprocess.TimeoutExpired:
-            raise SystemExit(f"{NAME} with {particles} particles took more than {PATIENCE:g} s") from None
+            raise SystemExit(f"{NAME} with {particles} particles took more than {RUN_TIMEOUT:g} s") from None
         if done.returncode != 0 or not result.exists():
             said = (done.stdout + done.stderr).strip().splitlines()[-12:]
             raise SystemExit(f"{NAME} with {particles} particles ended with {done.returncode}:\n" + "\n".join(said))

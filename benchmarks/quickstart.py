@@ -1,16 +1,18 @@
 """Measure the quickstart: benefit of its calibration, losses of its pours, and number of pours until it stops.
 
-    python benchmarks/quickstart.py [--seeds 10] [--first 401] [--arms shipped ...] [--calibration-only] [--fits 10]
-                                    [--first-pours 10] [--laboratory FILE] [--into build/quickstart] [--write]
+    python benchmarks/quickstart.py [--seeds 10] [--first 401] [--strategies shipped ...] [--calibration-only]
+                                    [--fits 10] [--first-pours 10] [--laboratory FILE] [--into build/quickstart]
+                                    [--write]
 
 The benchmark runs the shipped campaign unchanged, on a simulated bench with the ground truth of its own laboratory. It
 only skips the scores of random θ, on which the deployment does not depend. Each seed runs in its own process, which
-ends with this one. Every simulated pour of a seed is stored under `--into`, keyed by request and solver. The arms of a
-seed thus share their calibration and all other identical pours. Finished runs are stored there too, so an interrupted
-comparison continues.
+ends with this one. Every simulated pour of a seed is stored under `--into`, keyed by request and solver. The strategies
+of a seed thus share their calibration and all other identical pours. Finished runs are stored there too, so an
+interrupted comparison continues.
 
 - `--calibration-only` skips the deployment, and scores only the test pours.
-- `--arms "all pours"` makes 15 pours per seed and does not stop before, for the coverage of the prediction intervals.
+- `--strategies "all pours"` makes 15 pours per seed and does not stop before, for the coverage of the prediction
+  intervals.
 - `--fits` compares calibrations only, for this number of seeds from `--first` on, on two benches: that of the
   laboratory file, and one whose receiver stands 14 mm farther away. θ* of `simulations: auto` is compared with θ* of 30
   simulations, with the uncalibrated θ, and with the best θ of a 10 × 10 grid, which has the same seeds as the first.
@@ -481,11 +483,11 @@ def _run_missing(asked: argparse.Namespace, kept: KeptRows) -> None:
     places = [f"--{name}={path.resolve()}" for name, path in vars(asked).items() if isinstance(path, Path)]
     places += ["--calibration-only"] if asked.calibration_only else []
     for seed in range(asked.first, asked.first + asked.seeds):
-        for arm in asked.arms:
+        for arm in asked.strategies:
             known = [run for run in kept.rows if (run["seed"], run["arm"]) == (seed, arm)]
             if any("pours" in run or asked.calibration_only for run in known):
                 continue
-            run = run_self(__file__, f"--one={seed}", "--arms", arm, *places)
+            run = run_self(__file__, f"--one={seed}", "--strategies", arm, *places)
             kept.add(run)
             losses = [round(100 * pour["loss"], 2) for pour in run.get("pours", ())]
             say(f"seed {seed}, {arm}: test {run['test']}, lost {losses} %; {run['cpu_s']} CPU s")
@@ -548,7 +550,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=401)
-    parser.add_argument("--arms", nargs="+", choices=list(ARMS), default=["shipped"])
+    parser.add_argument("--strategies", nargs="+", choices=list(ARMS), default=["shipped"])
     parser.add_argument("--calibration-only", action="store_true", help="skip the deployment")
     parser.add_argument("--fits", type=int, default=0, help="number of seeds to compare calibrations on")
     parser.add_argument("--first-pours", type=int, default=0, help="number of seeds to compare first pours on")
@@ -567,7 +569,7 @@ def main() -> None:
             print(json.dumps({"rows": fitted(asked.one, asked.bench, asked.laboratory, asked.into)}))
             return
         only = asked.calibration_only
-        print(json.dumps(one(asked.one, asked.arms[0], asked.laboratory, asked.into, calibration_only=only)))
+        print(json.dumps(one(asked.one, asked.strategies[0], asked.laboratory, asked.into, calibration_only=only)))
         return
     if asked.fits or asked.first_pours:
         (_compare_fits if asked.fits else _compare_first_pours)(asked)
@@ -577,7 +579,7 @@ def main() -> None:
         _run_missing(asked, kept)
     runs = {(run["seed"], run["arm"]): run for run in kept.rows}.values()  # the latest of each
     wanted = range(asked.first, asked.first + asked.seeds)
-    for arm in asked.arms:
+    for arm in asked.strategies:
         chosen = sorted(
             (run for run in runs if run["seed"] in wanted and run["arm"] == arm), key=lambda run: run["seed"]
         )
@@ -590,7 +592,10 @@ def main() -> None:
         if asked.write and poured and arm == "all pours":
             settings = f"{bench}; {ALL_POURS} pours per seed"
             write_table(
-                "quickstart-coverage", **coverage_table(poured), command=f"{command} --arms '{arm}'", settings=settings
+                "quickstart-coverage",
+                **coverage_table(poured),
+                command=f"{command} --strategies '{arm}'",
+                settings=settings,
             )
         if asked.write and arm == "shipped":
             shown = f"{command} --calibration-only"

@@ -42,7 +42,7 @@ from typing import Any
 
 import psutil
 from daemon_page import keep
-from daemon_process import PATIENCE, await_daemon, end, end_in_order, launched
+from daemon_process import EVENT_TIMEOUT, await_daemon, end, end_in_order, launched
 from ruamel.yaml import YAML
 from scipy import stats
 
@@ -219,10 +219,10 @@ class Laboratory:
             with self._lock:
                 self._active -= 1
 
-    def calm(self, patience: float) -> bool:
+    def calm(self, timeout: float) -> bool:
         """Pause the clients, and wait until nothing runs; return whether this succeeded in time."""
         self.go.clear()
-        end = time.monotonic() + patience
+        end = time.monotonic() + timeout
         while time.monotonic() < end and self._active:
             time.sleep(0.1)
         return not self._active
@@ -564,7 +564,7 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float) -> None:
                 time.sleep(1.0)
             took = time.monotonic() - begun
             lab.make_room()
-            lab.calm(PATIENCE)
+            lab.calm(EVENT_TIMEOUT)
             promised = (
                 lab.call("get", "/campaigns", limit=1000),
                 lab.call("get", "/pours", limit=1000),
@@ -573,7 +573,7 @@ def soak(folder: Path, minutes: float, campaigns: int, every: float) -> None:
         finally:
             lab.over.set()
             for thread in threads:
-                thread.join(PATIENCE)
+                thread.join(EVENT_TIMEOUT)
             lab.end()
         found = checked(lab, *promised)
         left = [f"{process.pid} {_name(process)}" for process in ours(mark)]

@@ -27,7 +27,7 @@ from actors.runtime.child_process import child_environment
 
 FOLDER = Path(__file__).parent / "images" / "daemon"
 SIZES = {"tablet": (1024, 768), "desk": (1440, 1080)}
-PATIENCE = 900.0
+PAGE_TIMEOUT = 900.0
 
 VESSEL = """\
 name: {name}
@@ -128,7 +128,7 @@ class Lab:
 
     def answer_until(self, met: Callable[[dict[str, Any]], bool]) -> None:
         """Answer what is asked as a good operator would, until a question is met that fits: that one is left open."""
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + PAGE_TIMEOUT
         while time.monotonic() < deadline:
             for question in self.call("questions"):
                 if met(question):
@@ -146,7 +146,7 @@ class Lab:
 
 def until(met: Callable[[], object]) -> None:
     """Wait for something."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + PAGE_TIMEOUT
     while not met():
         if time.monotonic() > deadline:
             raise TimeoutError
@@ -159,7 +159,7 @@ def seen(browser: Browser, lab: Lab, size: str) -> Iterator[Page]:
     width, height = SIZES[size]
     page = browser.new_page(viewport={"width": width, "height": height}, locale="en-GB")
     page.goto(f"{lab.url}/#token={lab.token}")
-    page.locator(".card").first.wait_for(timeout=1e3 * PATIENCE)
+    page.locator(".card").first.wait_for(timeout=1e3 * PAGE_TIMEOUT)
     yield page
     page.close()
 
@@ -211,7 +211,7 @@ def draw(browser: Browser, lab: Lab) -> None:
     with seen(browser, lab, "desk") as page:
         page.get_by_role("button", name="Yes").click()
         until(lambda: lab.checkpoint() == "tilt")
-        page.locator(".step", has_text="tilting").wait_for(timeout=1e3 * PATIENCE)
+        page.locator(".step", has_text="tilting").wait_for(timeout=1e3 * PAGE_TIMEOUT)
         page.screenshot(path=FOLDER / "running-desk.png")
     lab.end(signal.SIGKILL)  # in the middle of the pour
     lab.start("two.yaml")
@@ -222,7 +222,7 @@ def draw(browser: Browser, lab: Lab) -> None:
         page.get_by_label("Spilled").fill("3,2")
         page.get_by_label("Left in the pourer").fill("0,4")
         page.get_by_role("button", name="It was weighed").click()
-        page.locator("#pours").get_by_text("3.2 g").first.wait_for(timeout=1e3 * PATIENCE)
+        page.locator("#pours").get_by_text("3.2 g").first.wait_for(timeout=1e3 * PAGE_TIMEOUT)
     lab.answer_until(lambda question: lab.call(f"campaigns/{first}")["state"] == "finished")
     lab.answer_until(lambda question: question["wants"] == "yes or no")
     number = lab.call("questions")[0]["id"]

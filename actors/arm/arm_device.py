@@ -15,10 +15,10 @@ from actors.arm.planned_pour import PlaceWay
 from actors.interfaces import LaboratoryError
 from actors.runtime.remote_object import Device, DeviceLostError
 
-PATIENCE = 60.0
+CALL_TIMEOUT = 60.0
 """Longest wait for a call that moves nothing [s], such as a process start or controller queries."""
 
-DRIVE_PATIENCE = 10.0
+DRIVE_TIMEOUT = 10.0
 """Longest wait for a command of a dose [s]; without it the arm turns back by itself long before."""
 
 POWER_TIME = 180.0
@@ -52,18 +52,18 @@ class DeviceArm:
         """Connect and return the arm's facts; nothing moves."""
         await self.device.revive()
         try:
-            facts: ArmFacts = await self.device.call("facts", deadline=PATIENCE)
+            facts: ArmFacts = await self.device.call("facts", deadline=CALL_TIMEOUT)
         except ArmError:
-            facts = await self.device.call("connect", deadline=PATIENCE)
+            facts = await self.device.call("connect", deadline=CALL_TIMEOUT)
         return facts
 
     async def hands_in(self) -> None:
         """Make sure that no program runs on the controller and that the arm stands still, and read both back."""
-        await self.device.call("hands_in", deadline=PATIENCE)
+        await self.device.call("hands_in", deadline=CALL_TIMEOUT)
 
     async def release(self) -> None:
         """Allow the arm to move, after an operator's consent."""
-        await self.device.call("release", deadline=PATIENCE, urgent=True)
+        await self.device.call("release", deadline=CALL_TIMEOUT, urgent=True)
 
     async def move_to_start(self, path: PlannedPour, follow: Follow = _ignore) -> None:
         """Move from home to the pour's start. `follow` is called periodically with the arm's state."""
@@ -89,7 +89,7 @@ class DeviceArm:
 
     async def drive(self, speed: float) -> ArmState:
         """Set the speed of the tilt in a running dose [rad/s]. Returns the state."""
-        state: ArmState = await self.device.call("drive", speed, deadline=DRIVE_PATIENCE, urgent=True)
+        state: ArmState = await self.device.call("drive", speed, deadline=DRIVE_TIMEOUT, urgent=True)
         return state
 
     async def retreat(self, path: PlannedPour | PlaceWay, follow: Follow = _ignore) -> None:
@@ -122,20 +122,20 @@ class DeviceArm:
 
     async def stop(self) -> None:
         """Stop any motion; the arm stays locked."""
-        await self.device.call("stop", deadline=PATIENCE, urgent=True)
+        await self.device.call("stop", deadline=CALL_TIMEOUT, urgent=True)
 
     async def state(self) -> ArmState:
         """The arm's present state."""
-        state: ArmState = await self.device.call("state", deadline=PATIENCE, urgent=True)
+        state: ArmState = await self.device.call("state", deadline=CALL_TIMEOUT, urgent=True)
         return state
 
     async def close(self) -> None:
         """Disconnect from the controller."""
-        await self.device.call("close", deadline=PATIENCE)
+        await self.device.call("close", deadline=CALL_TIMEOUT)
 
     def _deadline(self, seconds: float) -> float:
         """The deadline for an action of this duration on the controller [s]: twice as long, to detect a lost arm."""
-        return PATIENCE + 2.0 * self._spec.on_clock(seconds)
+        return CALL_TIMEOUT + 2.0 * self._spec.on_clock(seconds)
 
     @contextlib.asynccontextmanager
     async def _followed(self, follow: Follow) -> AsyncIterator[None]:

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 
 from actors.balance.balance_interface import Weight
 from actors.balance.scale_model import Load
-from actors.balance.simulated_balance import PATIENCE
+from actors.balance.simulated_balance import STABLE_WEIGHT_TIMEOUT
 from actors.runtime.remote_object import Device
 
 ANSWER_DEADLINE = 30.0
@@ -34,11 +34,11 @@ class DeviceBalance:
 
     async def tare(self) -> None:
         """See `BalanceDriver.tare`."""
-        await self.device.call("tare", deadline=self._deadline(PATIENCE))
+        await self.device.call("tare", deadline=self._deadline(STABLE_WEIGHT_TIMEOUT))
 
     async def weigh(self) -> Weight:
         """See `BalanceDriver.weigh`."""
-        weight: Weight = await self.device.call("weigh", deadline=self._deadline(PATIENCE))
+        weight: Weight = await self.device.call("weigh", deadline=self._deadline(STABLE_WEIGHT_TIMEOUT))
         return weight
 
     async def read(self) -> Weight:
@@ -58,12 +58,12 @@ class DeviceBalance:
 
     async def connect(self) -> str:
         """See `BalanceDriver.connect`."""
-        greeting: str = await self.device.call("connect", deadline=self._deadline(PATIENCE))
+        greeting: str = await self.device.call("connect", deadline=self._deadline(STABLE_WEIGHT_TIMEOUT))
         return greeting
 
     async def zero(self) -> None:
         """Set the zero of the empty balance; serial balances only."""
-        await self.device.call("zero", deadline=self._deadline(PATIENCE))
+        await self.device.call("zero", deadline=self._deadline(STABLE_WEIGHT_TIMEOUT))
 
     async def keep_reference(self) -> None:
         """See `BalanceDriver.keep_reference`."""

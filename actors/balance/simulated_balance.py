@@ -28,7 +28,7 @@ INTERVAL = 0.1
 WINDOW = 10
 """Number of readings that must agree for a stable weight."""
 
-PATIENCE = 20.0
+STABLE_WEIGHT_TIMEOUT = 20.0
 """Bench time limit for a stable weight [s]."""
 
 
@@ -83,7 +83,7 @@ class SimulatedBalanceSettings(BalanceSettings):
     @property
     def longest_call(self) -> float:
         """See `BalanceSettings.longest_call`."""
-        return 2.0 * PATIENCE / self.time_scale if self.time_scale > 0.0 else 0.0
+        return 2.0 * STABLE_WEIGHT_TIMEOUT / self.time_scale if self.time_scale > 0.0 else 0.0
 
     @property
     def deviation(self) -> float:
@@ -182,7 +182,7 @@ class VirtualBalance:
         """Take readings until a window of them agrees; return the last one [kg]."""
         self._pace.restart()
         window: deque[float] = deque(maxlen=WINDOW)
-        for count in range(1, round(PATIENCE / INTERVAL) + 1):
+        for count in range(1, round(STABLE_WEIGHT_TIMEOUT / INTERVAL) + 1):
             self._wait(count * INTERVAL)
             self._advance(INTERVAL)
             with self._lock:
@@ -190,8 +190,8 @@ class VirtualBalance:
             if len(window) == WINDOW and max(window) - min(window) <= self._tolerance:
                 return window[-1]
         raise LaboratoryError(
-            f"balance {self._name}: no stable weight within {PATIENCE:g} s (last {1e3 * window[-1]:.1f} g, unstable). "
-            "Is something touching the tray?"
+            f"balance {self._name}: no stable weight within {STABLE_WEIGHT_TIMEOUT:g} s "
+            f"(last {1e3 * window[-1]:.1f} g, unstable). Is something touching the tray?"
         )
 
     def _wait(self, moment: float) -> None:

@@ -36,7 +36,7 @@ from sim_engine.vessel.vessel import Vessel
 
 T = TypeVar("T")
 
-PATIENCE = 60.0
+CALL_TIMEOUT = 60.0
 """Longest wait for a call of the gripper [s]; its process may still be starting."""
 
 LOOK = 0.2
@@ -126,7 +126,7 @@ class HeldVessel:
     # ---- the driver
 
     async def _call(self, method: str, *args: Any, urgent: bool = False) -> Any:
-        return await self._device.call(method, *args, deadline=PATIENCE, urgent=urgent)
+        return await self._device.call(method, *args, deadline=CALL_TIMEOUT, urgent=urgent)
 
     async def state(self) -> GripperState:
         """The gripper's state."""

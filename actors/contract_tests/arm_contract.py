@@ -43,7 +43,7 @@ from actors.arm.arm_interface import (
     Executed,
     PlannedPour,
 )
-from actors.contract_tests.contract_calls import PATIENCE, Call
+from actors.contract_tests.contract_calls import EVENT_TIMEOUT, Call
 from sim_engine.scene import SampledMotion
 
 FloatArray = NDArray[np.float64]
@@ -526,15 +526,15 @@ class ArmContract:
         """Now, by the clock of the witness [s]; 0 without one. Waits for its first measurement."""
         if bench.true_poses is None:
             return 0.0
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + EVENT_TIMEOUT
         while not len(times := bench.true_poses(-math.inf)[0]):
-            assert time.monotonic() < end, f"ArmBench.true_poses has had no measurement for {PATIENCE:g} s"
+            assert time.monotonic() < end, f"ArmBench.true_poses has had no measurement for {EVENT_TIMEOUT:g} s"
         return float(times[-1])
 
     def _rest(self, bench: ArmBench) -> FloatArray:
         """Wait until the arm truly stands; return the pose of the pourer, shape (7,)."""
         assert bench.true_poses is not None
-        since, end = self._true_time(bench), time.monotonic() + PATIENCE
+        since, end = self._true_time(bench), time.monotonic() + EVENT_TIMEOUT
         while True:
             times, poses = bench.true_poses(since)
             if len(times) and times[-1] - since >= REST_TIME:
@@ -544,7 +544,7 @@ class ArmContract:
                     return np.asarray(poses[-1])
                 since = float(times[-1]) - REST_TIME
             assert time.monotonic() < end, (
-                f"by the witness the arm has moved for {PATIENCE:g} s in which it should have come to rest"
+                f"by the witness the arm has moved for {EVENT_TIMEOUT:g} s in which it should have come to rest"
             )
             time.sleep(0.01)
 
@@ -611,7 +611,7 @@ class ArmContract:
 
     @staticmethod
     def _await(bench: ArmBench, condition: Callable[[], bool], otherwise: str) -> None:
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + EVENT_TIMEOUT
         while not condition():
             assert time.monotonic() < end, otherwise
             time.sleep(0.005)

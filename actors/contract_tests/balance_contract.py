@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import pytest
 
 from actors.balance.balance_interface import BalanceDriver, ReferenceLostError, Weight
-from actors.contract_tests.contract_calls import PATIENCE, Call
+from actors.contract_tests.contract_calls import EVENT_TIMEOUT, Call
 from actors.interfaces import LaboratoryError
 
 AT_ONCE = 2.0
@@ -131,7 +131,7 @@ class BalanceContract:
         bench.driver.weigh()
         bench.ignore_tare(True)
         try:
-            self._fails(Call(bench.driver.tare), "tare()", "although the balance still shows the load", PATIENCE)
+            self._fails(Call(bench.driver.tare), "tare()", "although the balance still shows the load", EVENT_TIMEOUT)
         finally:
             bench.ignore_tare(False)
 
@@ -142,7 +142,7 @@ class BalanceContract:
         bench.driver.weigh()
         bench.restless(True)
         try:
-            self._fails(Call(bench.driver.tare), "tare()", "although the display never came to rest", PATIENCE)
+            self._fails(Call(bench.driver.tare), "tare()", "although the display never came to rest", EVENT_TIMEOUT)
         finally:
             bench.restless(False)
 
@@ -300,7 +300,7 @@ class BalanceContract:
 
     @staticmethod
     def _await(condition: Callable[[], bool], otherwise: str, bench: BalanceBench | None = None) -> None:
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + EVENT_TIMEOUT
         while not condition():
             seen = "" if bench is None else f"; it shows {_g(bench.driver.read().mass)}"
             assert time.monotonic() < end, otherwise + seen

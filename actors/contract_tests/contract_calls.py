@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-PATIENCE = 60.0
+EVENT_TIMEOUT = 60.0
 """Time after which an expected event counts as missing [s]."""
 
 
@@ -29,6 +29,6 @@ class Call(threading.Thread):
 
     def ended(self) -> Exception | None:
         """Wait for the end of the call; return the exception that it raised, or None."""
-        self.join(PATIENCE)
-        assert not self.is_alive(), f"the call has not come back after {PATIENCE:g} s"
+        self.join(EVENT_TIMEOUT)
+        assert not self.is_alive(), f"the call has not come back after {EVENT_TIMEOUT:g} s"
         return self.error

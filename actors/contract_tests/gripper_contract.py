@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from actors.contract_tests.contract_calls import PATIENCE
+from actors.contract_tests.contract_calls import EVENT_TIMEOUT
 from actors.grippers.gripper_interface import GripLimits, Gripper, GripperError, GripperSettings, GripperState
 
 
@@ -61,9 +61,9 @@ class GripperRig:
 
     def until(self, expected: Callable[[GripperState], bool]) -> GripperState:
         """The first state that is as expected."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + EVENT_TIMEOUT
         while not expected(state := self.driver.state()):
-            assert time.monotonic() < end, f"not seen within {PATIENCE:g} s; last {state}"
+            assert time.monotonic() < end, f"not seen within {EVENT_TIMEOUT:g} s; last {state}"
             time.sleep(0.02)
         return state
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from actors.contract_tests.contract_calls import PATIENCE, Call
+from actors.contract_tests.contract_calls import EVENT_TIMEOUT, Call
 from actors.interfaces import LaboratoryError
 from actors.liquid_devices import Pump, PumpSettings, PumpStoppedError, SpillSensor
 
@@ -60,7 +60,7 @@ class PumpRig:
 
     def flows(self, since: float) -> bool:
         """Wait until more than `since` [m³] has left the outlet; whether it has."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + EVENT_TIMEOUT
         while self.weigh() <= since and time.monotonic() < end:
             time.sleep(0.01)
         return self.weigh() > since

@@ -29,7 +29,7 @@ from actors.grippers.gripper_interface import REST, Force, GripperError, Gripper
 from sim_engine.settings.model import Example, Problems
 from sim_engine.settings.quantity import Quantity
 
-PATIENCE = 3.0
+REPLY_TIMEOUT = 3.0
 """Longest wait for the controller [s]."""
 
 _GROUPS = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
@@ -144,7 +144,7 @@ class DigitalGripper:
         timeout: longest wait for the controller [s].
     """
 
-    def __init__(self, settings: DigitalSettings, timeout: float = PATIENCE) -> None:
+    def __init__(self, settings: DigitalSettings, timeout: float = REPLY_TIMEOUT) -> None:
         self._settings, self._timeout = settings, timeout
         self._where = f"gripper on digital outputs of {settings.address}"
         self._closing, self._until = Signal.of(settings.close), 0.0

@@ -32,7 +32,7 @@ from sim_engine.settings.quantity import Quantity
 
 PORT = 41414
 
-PATIENCE = 3.0
+REPLY_TIMEOUT = 3.0
 """Longest wait for a reply [s]."""
 
 REACTION = 0.6
@@ -127,7 +127,7 @@ class OnRobotGripper:
         timeout: longest wait for a reply [s].
     """
 
-    def __init__(self, settings: OnRobotSettings, timeout: float = PATIENCE) -> None:
+    def __init__(self, settings: OnRobotSettings, timeout: float = REPLY_TIMEOUT) -> None:
         self._settings, self._model = settings, MODELS[settings.model]
         self._where = f"gripper {settings.model} at {settings.address}:{settings.port}"
         self._url = f"http://{settings.address}:{settings.port}/"

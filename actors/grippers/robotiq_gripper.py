@@ -39,7 +39,7 @@ from sim_engine.settings.quantity import Quantity
 
 PORT = 63352
 
-PATIENCE = 2.0
+REPLY_TIMEOUT = 2.0
 """Longest wait for a reply [s]."""
 
 TRAVEL = 8.0
@@ -208,7 +208,7 @@ class RobotiqGripper:
         timeout: longest wait for a reply [s].
     """
 
-    def __init__(self, settings: RobotiqSettings, timeout: float = PATIENCE) -> None:
+    def __init__(self, settings: RobotiqSettings, timeout: float = REPLY_TIMEOUT) -> None:
         self._settings, self._timeout = settings, timeout
         self._where = f"gripper {settings.model} at {settings.address}:{settings.port}"
         self._socket: socket.socket | None = None

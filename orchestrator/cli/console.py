@@ -131,7 +131,7 @@ def fail(error: DecantError) -> NoReturn:
     raise SystemExit(error.exit_code)
 
 
-PATIENCE = 2.0
+FIRST_MESSAGE_AFTER = 2.0
 """Time before the first progress message [s]."""
 
 EVERY = 10.0
@@ -184,7 +184,7 @@ class WaitingIndicator:
     def __init__(self, out: TextIO | None = None, clock: Callable[[], float] = time.monotonic) -> None:
         self._out = sys.stderr if out is None else out
         self._clock = clock
-        self._next = clock() + (PATIENCE if self._out.isatty() else EVERY)
+        self._next = clock() + (FIRST_MESSAGE_AFTER if self._out.isatty() else EVERY)
         self._shown = False
 
     def __call__(self, text: str) -> None:

@@ -112,7 +112,7 @@ class QueueThread(Generic[Item]):
 CAPACITY = 4_000
 """Largest number of waiting events: minutes of a busy campaign."""
 
-PATIENCE = 30.0
+CLOSE_TIMEOUT = 30.0
 """Longest time to wait until the recording is complete [s]."""
 
 
@@ -169,7 +169,7 @@ class RerunMonitor:
         """Known number of events that couldn't be written; complete only after `close`."""
         return self._worker.failed + int(self._report["failed"])
 
-    def close(self, timeout: float = PATIENCE) -> bool:
+    def close(self, timeout: float = CLOSE_TIMEOUT) -> bool:
         """Write waiting events; return False if the file could not be completed within `timeout` [s]. Never raises."""
         if not self._worker.close(timeout):
             _log.warning("recording %s: could not be completed within %g s", self.path.name, timeout)

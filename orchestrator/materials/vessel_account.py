@@ -63,7 +63,7 @@ create trigger if not exists entry_is_never_deleted before delete on entry begin
 
 LATEST = "id in (select max(id) from stand group by vessel)"
 
-PATIENCE = 1.0
+LOCK_TIMEOUT = 1.0
 """Longest wait for another process that writes [s]."""
 
 
@@ -486,7 +486,7 @@ class VesselAccount:
     @contextlib.contextmanager
     def _connection(self) -> Iterator[sqlite3.Connection]:
         try:
-            with contextlib.closing(sqlite3.connect(self._path, timeout=PATIENCE)) as connection, connection:
+            with contextlib.closing(sqlite3.connect(self._path, timeout=LOCK_TIMEOUT)) as connection, connection:
                 yield connection
         except sqlite3.Error as error:
             raise OSError(f"{self._path}: {error}") from error

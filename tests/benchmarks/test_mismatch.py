@@ -53,7 +53,7 @@ def test_the_table_of_wrong_simulators_is_of_the_runs_that_were_kept(
     mismatch: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     kept, page, data = tmp_path / "runs.jsonl", tmp_path / "page.md", tmp_path / "rows.csv"
-    asked = ["--levels", "small", "--arms", "adaptive", "--first", "0", "--seeds", "1", "--pours", "3"]
+    asked = ["--levels", "small", "--strategies", "adaptive", "--first", "0", "--seeds", "1", "--pours", "3"]
     monkeypatch.setattr(sys, "argv", ["mismatch.py", *asked, "--simulations", "8", "--out", str(kept)])
     mismatch.main()
     made = kept.read_text()

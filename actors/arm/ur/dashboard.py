@@ -12,7 +12,7 @@ from actors.arm.ur.robot_api import RobotApi, RobotApiError
 from actors.arm.ur.rtde import CLOSED
 
 PORT = 29999
-PATIENCE = 1.5
+REPLY_TIMEOUT = 1.5
 """Longest wait for a connection or a response [s]."""
 
 
@@ -33,7 +33,7 @@ class Dashboard:
         DashboardError: the dashboard cannot be reached.
     """
 
-    def __init__(self, address: str, timeout: float = PATIENCE) -> None:
+    def __init__(self, address: str, timeout: float = REPLY_TIMEOUT) -> None:
         self._api: RobotApi | None = None
         self._address, self._timeout = address, timeout
         try:
@@ -108,7 +108,7 @@ class Dashboard:
             self._socket.close()
 
 
-def stop_program(address: str, timeout: float = PATIENCE) -> None:
+def stop_program(address: str, timeout: float = REPLY_TIMEOUT) -> None:
     """Stop the running program, whatever it is: over dashboard or Robot API, else over the primary interface.
 
     The primary interface does not reply: the caller has to watch the program's state over RTDE.

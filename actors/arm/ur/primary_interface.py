@@ -22,7 +22,7 @@ from actors.arm.ur.robot_models import Calibration
 from actors.arm.ur.rtde import CLOSED
 
 PORT = 30001
-PATIENCE = 2.0
+STATE_TIMEOUT = 2.0
 """Longest wait for the first robot state [s]."""
 
 _LONGEST = 1_000_000
@@ -166,7 +166,7 @@ READ_BY_THEN = 0.3
 """Time for which a connection stays open after its command [s]; the controller sends states meanwhile."""
 
 
-def send_command(address: str, command: str, timeout: float = PATIENCE) -> None:
+def send_command(address: str, command: str, timeout: float = STATE_TIMEOUT) -> None:
     """Send a command of the primary interface, such as 'stop program', over a connection of its own.
 
     There is no reply, and a connection in local control ignores it without a word.
@@ -213,8 +213,8 @@ class Primary:
         self.broken = False
         self._rest = b""
         try:
-            self._socket = socket.create_connection((address, PORT), timeout=PATIENCE)
-            end = time.monotonic() + PATIENCE
+            self._socket = socket.create_connection((address, PORT), timeout=STATE_TIMEOUT)
+            end = time.monotonic() + STATE_TIMEOUT
             while not self._take(self._socket.recv(65536)):
                 if time.monotonic() > end:
                     raise PrimaryError("it sends no robot state")

@@ -21,7 +21,7 @@ from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
 from actors.runtime.ray_cleanup import MARK
 
-PATIENCE = 40.0
+REPLY_TIMEOUT = 40.0
 """Longest wait for the process to start, or to reply [s]."""
 
 GRACE = 10.0
@@ -94,9 +94,9 @@ class FarProcess:
 
     def _answer(self) -> dict[str, Any]:
         try:
-            answer: dict[str, Any] = json.loads(self._process.read_line(PATIENCE))
+            answer: dict[str, Any] = json.loads(self._process.read_line(REPLY_TIMEOUT))
         except TimeoutError:
-            raise LaboratoryError(f"virtual balance at {self.port}: no answer within {PATIENCE:g} s") from None
+            raise LaboratoryError(f"virtual balance at {self.port}: no answer within {REPLY_TIMEOUT:g} s") from None
         except (EOFError, OSError, ValueError):
             raise LaboratoryError(f"virtual balance at {self.port}: its process has ended{self._end()}") from None
         if "error" in answer:

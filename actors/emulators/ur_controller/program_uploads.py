@@ -18,7 +18,7 @@ MOST_WAITING = 100
 STOP_PROGRAM = "stop program"
 """Command that is no program: it stops the running one. Source: the manufacturer's client library."""
 
-PATIENCE = 60.0
+TRANSLATION_TIMEOUT = 60.0
 """Longest wait for a translation in a separate process [s of wall time]."""
 
 
@@ -95,7 +95,9 @@ class Uploads:
         request = question(text, self._controller.known_commands)
         try:
             answer = await run_async(
-                python_module("actors.emulators.ur_controller.urscript.translator"), request, timeout=PATIENCE
+                python_module("actors.emulators.ur_controller.urscript.translator"),
+                request,
+                timeout=TRANSLATION_TIMEOUT,
             )
         except TimeoutError:
             answer = b""

@@ -39,7 +39,7 @@ from sim_engine.settings.plugin_registry import DISTRIBUTION
 INTERVAL = 0.5
 """Interval at which the state of the daemon is read [s]."""
 
-PATIENCE = 120.0
+RECONNECT_TIMEOUT = 120.0
 """Time from the first failed call for which an unreachable daemon is called again [s]; a restart takes less."""
 
 LIFETIME = 3600.0
@@ -413,7 +413,7 @@ class PouringStation(sila.Feature):  # type: ignore[misc]
                 return await self._in_thread(call, *arguments)
             except DaemonError as error:
                 failed = failed or time.monotonic()
-                if not error.unreachable or time.monotonic() > failed + PATIENCE:
+                if not error.unreachable or time.monotonic() > failed + RECONNECT_TIMEOUT:
                     _refuse(error)
             await asyncio.sleep(INTERVAL)
 

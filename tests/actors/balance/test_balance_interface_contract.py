@@ -192,13 +192,13 @@ class AlwaysStable(VirtualBalance):
 def test_a_driver_that_cheats_is_found_out(
     cheat: type[VirtualBalance], found_by: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contract, "PATIENCE", 2.0)
+    monkeypatch.setattr(contract, "EVENT_TIMEOUT", 2.0)
     with pytest.raises((AssertionError, pytest.fail.Exception), match=message):
         getattr(BalanceContract(), found_by)(of_numbers(cheat))
 
 
 def test_a_display_that_stands_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(contract, "PATIENCE", 0.5)
+    monkeypatch.setattr(contract, "EVENT_TIMEOUT", 0.5)
     with pytest.raises(AssertionError, match=r"read\(\) never shows a stable 200.0 g.*; it shows -?0.\d g"):
         BalanceContract().test_the_display_follows_what_is_put_on_it(of_numbers(Stands))
 
@@ -276,7 +276,7 @@ class WaitsForItsLine(SerialBalance):
 def test_a_driver_that_hides_a_fault_of_its_line_is_found_out(
     cheat: type[SerialBalance], found_by: str, message: str, virtual: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contract, "PATIENCE", 5.0)
+    monkeypatch.setattr(contract, "EVENT_TIMEOUT", 5.0)
     bench = replace(on_a_line(cheat, virtual("kcp"), "kcp"), lost_within=5.0)
     try:
         with pytest.raises(AssertionError, match=message):

@@ -15,7 +15,7 @@ import numpy as np
 
 from decant.plugins import BalanceKind, BalanceSettings, LaboratoryError, Load, Quantity, Weight
 
-PATIENCE = 20.0
+STABLE_WEIGHT_TIMEOUT = 20.0
 """How long it may take to come to rest [s of bench time]."""
 
 
@@ -106,7 +106,9 @@ class SpringBalance:
 
     def _rest(self) -> None:
         wait = self._still_at - time.monotonic()
-        if self._interrupted.wait(min(max(wait, 0.0), PATIENCE / self._spec.time_scale)):
+        if self._interrupted.wait(min(max(wait, 0.0), STABLE_WEIGHT_TIMEOUT / self._spec.time_scale)):
             raise LaboratoryError(f"balance {self._name}: interrupted")
         if time.monotonic() < self._still_at:
-            raise LaboratoryError(f"balance {self._name}: not at rest within {PATIENCE:g} s; is it shaken?")
+            raise LaboratoryError(
+                f"balance {self._name}: not at rest within {STABLE_WEIGHT_TIMEOUT:g} s; is it shaken?"
+            )
