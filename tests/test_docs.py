@@ -63,6 +63,7 @@ def commands_of(page: Path) -> list[str]:
 
 @pytest.fixture(scope="module")
 def tables() -> ModuleType:
+    sys.path.insert(0, str(ROOT / "docs"))  # as when the script is run
     spec = importlib.util.spec_from_file_location("make_tables", ROOT / "docs" / "make_tables.py")
     assert spec is not None
     assert spec.loader is not None
