@@ -19,7 +19,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import pi, radians
 
-Vector = tuple[float, float, float]
 Joints = tuple[float, float, float, float, float, float]
 
 TWISTS: Joints = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)

@@ -12,7 +12,7 @@ from actors.emulators.ur_controller.commands.command_arguments import (
     rate,
     six,
 )
-from actors.emulators.ur_controller.motion.motion_lines import JointLine
+from actors.emulators.ur_controller.motion.motion_actions import JointLine
 from actors.emulators.ur_controller.motion.mover import ControlledElsewhereError
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.program import Command, Steps

@@ -25,8 +25,7 @@ from math import degrees
 
 from actors.arm.ur.robot_models import Joints, RobotModel
 from actors.arm_geometry import JOINT_NAMES
-from actors.emulators.ur_controller.motion.motion_actions import STILL, JointSpeed, MotionAction, Path, Servo
-from actors.emulators.ur_controller.motion.motion_lines import JointLine
+from actors.emulators.ur_controller.motion.motion_actions import STILL, JointLine, JointSpeed, MotionAction, Path, Servo
 
 PROGRAM_STOP = 5.0
 """Deceleration when a program ends or is stopped while the arm moves [rad/s²]. Plausible, not measured."""

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.emulators.ur_controller.commands.math_commands import COMMANDS
 from actors.emulators.ur_controller.urscript import program
 from actors.emulators.ur_controller.urscript.lexer import KEYWORDS, ScriptError, Splitter
 from actors.emulators.ur_controller.urscript.program import Command, Program, Steps, waiting
+from actors.emulators.ur_controller.urscript.script_values import FUNCTIONS
 from actors.emulators.ur_controller.urscript.translator import translate
 from tests.actors.emulators.ur_controller.conftest import Bench
 from tests.support.counted_calls import counted_calls
@@ -31,7 +31,11 @@ class Run:
         def sync() -> Steps:
             yield
 
-        commands = {**COMMANDS, "out": Command(self.found.append), "sync": Command(sync, waits=True)}
+        commands = {
+            **{name: Command(function) for name, function in FUNCTIONS.items()},
+            "out": Command(self.found.append),
+            "sync": Command(sync, waits=True),
+        }
         if wrap:
             text = "def test():\n" + text + "\nend\n"
         self.program = Program(translate(text, waiting(commands)), commands)
