@@ -42,6 +42,7 @@ hypothesis maps these places to other places of the simulator.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,7 @@ from scipy.special import ndtr
 
 from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
-from actors.optimizer.model_discrepancy import ModelAveragedProcess, clipped_mean, shortfall
+from actors.optimizer.model_discrepancy import RESOLUTION, ModelAveragedProcess, clipped_mean, shortfall
 from actors.optimizer.questions import (
     BenchOffset,
     DiscrepancyFound,
@@ -186,6 +187,40 @@ def least_loss(
     return score
 
 
+def robust_first_pour(
+    process: ModelAveragedProcess,
+    discrepancy: ModelDiscrepancy,
+    score: Score,
+    pour: Array,
+    candidates: Array,
+    region: Region,
+    feasibility: Feasibility | None,
+    rng: np.random.Generator,
+) -> Array:
+    """Return the place (dimension,) of the first pour after a calibration.
+
+    Along a valley many actions are expected to lose nearly the same, and the simulator's small errors choose among
+    them. Of those within `RESOLUTION` of the best, this is the one with the least expected loss without calibration.
+
+    Args:
+        process: of the cost, with the calibration.
+        score: of a pour by the process.
+        pour: (dimension,), the best by that score.
+        candidates: (m, dimension).
+
+    Source: restricted Bayes solution, Hodges & Lehmann, Annals of Mathematical Statistics 1952.
+    """
+    unknown = replace(discrepancy, calibration=None, limit=None)
+    none = np.empty((0, len(pour)))
+    alone = least_loss(ModelAveragedProcess(process.simulated, none, np.empty(0), unknown), unknown, none, feasibility)
+    most = float(score(pour[None, :])[0]) + RESOLUTION
+
+    def robust(points: Array) -> Array:
+        return alone(points) + FORBIDDEN * np.maximum(score(points) - most, 0.0)
+
+    return acquisition.minimise(robust, np.concatenate([pour[None, :], candidates]), region, rng)
+
+
 def _allowed(
     process: ModelAveragedProcess, discrepancy: ModelDiscrepancy, feasibility: Feasibility | None
 ) -> Callable[[Array, Array], Array]:
@@ -295,6 +330,8 @@ def proposals(
     pour = acquisition.minimise(score, candidates, arrays.region, rng)
     pours_left = min(query.discrepancy.pours_left, FORESIGHT)
     allowed = _allowed(process, query.discrepancy, feasibility)
+    if query.discrepancy.calibration is not None and not len(process.points):
+        pour = robust_first_pour(process, query.discrepancy, score, pour, candidates, arrays.region, feasibility, rng)
     if query.discrepancy.lookahead and len(known):
         pour = looked_ahead(process, pour, candidates, known, pours_left, allowed, feasibility)
     if found_good(arrays.simulated_costs) or found_good(arrays.costs):

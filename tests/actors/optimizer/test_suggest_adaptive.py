@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
+from actors.optimizer import knowledge_gradient
 from actors.optimizer.knowledge_gradient import predicted_minimum
 from actors.optimizer.prediction_intervals import highest_density_intervals
 from actors.optimizer.questions import (
@@ -107,6 +108,25 @@ def test_pours_that_the_simulator_missed_widen_what_the_first_pour_may_lose():
     assert width(first_pour(calibrated(missed))) > 2.0 * width(first_pour(calibrated(cup)))
     contradicted = first_pour(calibrated(lambda points: 1.0 - cup(points), power=1.0))
     assert contradicted.discrepancy.uninformative > 0.5
+
+
+def test_of_actions_that_look_alike_the_first_pour_is_the_one_that_is_safest_without_calibration(monkeypatch):
+    def gutter(points):
+        """Next to nothing lost along a valley: a little less towards its far end, where it is narrow."""
+        x, y = np.atleast_2d(points).T
+        outside = np.maximum(np.abs(y - 0.5) - 0.1 * (1.2 - x), 0.0)
+        return 0.02 * (1.0 - x) + 1.0 - np.exp(-((6.0 * outside) ** 1.5))
+
+    points = np.random.default_rng(5).random((12, 2))
+    known = (CalibrationPours(tuple(map(tuple, points)), tuple(gutter(points)), tuple(gutter(points)), 1.0),)
+    discrepancy = ModelDiscrepancy(PRIORS, pours_left=10, calibration=known)
+    question = asked(gutter, [], acquisition="least_loss", discrepancy=discrepancy)
+    chosen, without = propose(question), propose(replace(question, discrepancy=replace(discrepancy, calibration=None)))
+    monkeypatch.setattr(knowledge_gradient, "RESOLUTION", 0.0)
+    greedy = propose(question)
+    assert np.linalg.norm(np.subtract(chosen.points[0], without.points[0])) < 0.15
+    assert np.linalg.norm(np.subtract(greedy.points[0], without.points[0])) > 0.3
+    assert chosen.means[0] < greedy.means[0] + 0.01  # it costs no more than the resolution of a loss
 
 
 @pytest.mark.parametrize("lost", [0.6, 0.98])
