@@ -63,6 +63,7 @@ class SourceContent:
         """Probability that it holds at least an amount [kg]."""
         if self.deviation <= 0.0:
             return float(self.mass >= amount)
+        # P(M ≥ a) = ½ erfc((a − m) / (s √2)) for a content M ~ N(m, s²)
         return 0.5 * math.erfc((amount - self.mass) / (self.deviation * math.sqrt(2.0)))
 
 
@@ -96,6 +97,7 @@ class DoseForecast:
     @property
     def reachable(self) -> float:
         """Half of the interval around the expected amount that contains nine of ten doses as weighed [kg]."""
+        # the scatter of the doses and the error of the weighing are independent: √(h² + w²)
         return math.hypot(0.5 * (self.interval[1] - self.interval[0]), self.weighing)
 
 
@@ -225,6 +227,7 @@ class DoseSeries:
             readings = []
             if ticks % every == 0:
                 if not next(repeated):
+                    # a display of step d shows d · round(m / d)
                     shown = round((base + float(truth.reading[0])) / self._step) * self._step
                 readings = [DoseReading(TICK * ticks, shown)]
         return controller.result, TICK * ticks

@@ -51,6 +51,7 @@ class Region:
             return points
         snapped = points.copy()
         for i, axis in self._integers:
+            # v = round(v(u)), u' = u(v), within the cube: rounding can leave the range of the axis
             snapped[:, i] = np.clip(_units(axis, np.rint(_values(axis, points[:, i]))), 0.0, 1.0)
         return snapped
 
@@ -146,6 +147,7 @@ class Feasibility:
         If there is none, all points that were not refused; if there is none either, all points.
         """
         other = cdist(points, self._refused).min(axis=1) > _SAME
+        # P > 1/2 as ln P > −ln 2
         likely = other & (self.log_probability(points) > -math.log(2.0))
         return likely if likely.any() else (other if other.any() else np.ones(len(points), dtype=np.bool_))
 
@@ -166,6 +168,7 @@ def _labelled(kind: RequestGroup) -> GaussianProcess:
     if len(fulfilled):
         fulfilled = fulfilled[cdist(fulfilled, refused).min(axis=1) > _SAME]
     points = np.concatenate([fulfilled, refused])
+    # y = 1 (fulfilled), −1 (refused), with prior mean 1: far from refusals nothing counts as refused
     labels = np.where(np.arange(len(points)) < len(fulfilled), 1.0, -1.0)
     prior = _CHANCE_PRIOR if kind.by_chance else _LABEL_PRIOR
     return GaussianProcess(labels, Covariance(points, prior), mean=lambda x: np.ones(len(x)), scale=1.0)
@@ -175,6 +178,7 @@ def _values(axis: Axis, units: Array) -> Array:
     """Vectorised `Axis.decode` without rounding."""
     u = np.clip(units, 0.0, 1.0)
     if axis.scale == "log":
+        # v = v₀ (v₁ / v₀)^u
         return np.asarray(np.exp(math.log(axis.lower) + u * (math.log(axis.upper) - math.log(axis.lower))))
     return np.asarray(axis.lower + u * (axis.upper - axis.lower))
 
@@ -182,6 +186,7 @@ def _values(axis: Axis, units: Array) -> Array:
 def _units(axis: Axis, values: Array) -> Array:
     """Vectorised `Axis.encode`."""
     if axis.scale == "log":
+        # u = ln(v / v₀) / ln(v₁ / v₀)
         values = np.maximum(values, 1e-300)
         return np.asarray((np.log(values) - math.log(axis.lower)) / (math.log(axis.upper) - math.log(axis.lower)))
     return np.asarray((values - axis.lower) / (axis.upper - axis.lower))

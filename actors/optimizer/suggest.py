@@ -174,6 +174,7 @@ def mapped(
 ) -> SurrogateMap:
     """The surrogate on the plane through `at`, shape (dimension,), that two axes of the space span."""
     across, up = axes
+    # x(u, v) = at, but with u and v, both 0 … 1, on the axes `across` and `up`
     places = np.linspace(0.0, 1.0, resolution)
     first, second = np.meshgrid(places, places)
     grid = np.tile(at, (first.size, 1))
@@ -288,6 +289,7 @@ def _search(
             chosen.append(fill(1, avoided, arrays.region, rng, feasibility)[0])
             continue
         conclude = _seeks_minimum(query) and index == 0
+        # m(x) − κ s(x); κ = 0 gives the minimiser of the mean, whatever is pending
         score = acquisition.lower_confidence_bound(surrogate, 0.0 if conclude else _kappa(query, model))
         score = acquisition.penalised(score, surrogate, pending[:0] if conclude else pending, candidates, feasibility)
         if isinstance(query, MinimumQuery) and not query.replicates:
@@ -329,6 +331,7 @@ def _kappa(query: ProposalQuery, model: Model) -> float:
     adapts = isinstance(query, RiskQuery) or (
         isinstance(query, MinimumQuery) and query.mean == "constant" and not query.plain
     )
+    # κ/2 if ln p(y | GP) − ln p(y | noise) ≥ STRUCTURE
     return query.kappa * (SETTLED if adapts and model.process.evidence >= STRUCTURE else 1.0)
 
 

@@ -163,6 +163,7 @@ class AbsoluteProcess:
         ratio = mean / deviation
         folded = deviation * math.sqrt(2 / math.pi) * np.exp(-0.5 * ratio**2) + mean * (2 * ndtr(ratio) - 1)
         spread = np.sqrt(np.maximum(mean**2 + deviation**2 - folded**2, 0.0))
+        # m̄ = 1/J Σ_j E|f_j|, s̄ = 1/J Σ_j √Var|f_j|
         return folded.mean(axis=1), np.maximum(spread.mean(axis=1), 1e-9 * self.process.scale)
 
 
@@ -200,6 +201,7 @@ def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
             return Model(averaged, simulated, simulated.lengths, averaged)
         if not len(points):
             return Model(simulated, simulated, simulated.lengths)
+        # y = m_sim(x) + δ(x) + ε: the mean of the simulations is the prior mean of the pours
         process = simulated_mean_process(simulated, points, costs)
         return Model(process, process, simulated.lengths)
     if len(points) < 2:
@@ -212,6 +214,7 @@ def fit(query: SurrogateQuery, arrays: QueryArrays) -> Model | None:
     if isinstance(query, RiskQuery):
         return Model(RiskProcess.of(process, query.risk), process, lengths)
     if isinstance(query, CalibrationQuery):
+        # the process is of r − c_s(θ, a), and 1/J Σ_j |r − c_s(θ, a_j)| is minimised over θ
         context = array(query.contexts, query.context_dimension)
         return Model(AbsoluteProcess(process, context), process, lengths)
     return Model(process, process, process.lengths)
