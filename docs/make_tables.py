@@ -19,7 +19,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from make_validation import kept_records
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
@@ -292,14 +291,19 @@ def seeds() -> str:
     return _table(("pour", "particles", "spilled / poured", "standard deviation of a seed"), rows)
 
 
+def _validated() -> dict[str, Any]:
+    """The records of the solver's validation, by case."""
+    return dict(json.loads((FOLDER / "data" / "validation.json").read_text(encoding="utf-8"))["cases"])
+
+
 def _measured(case: str) -> list[dict[str, Any]]:
-    records = kept_records(FOLDER)
+    records = _validated()
     return list(records[case]["measurements"]) if case in records else []
 
 
 def counted_claims() -> str:
     """Claims that are counts or ratios of measured figures: validation, speed, and D3's intervals."""
-    judged = [one for record in kept_records(FOLDER).values() for one in record["measurements"] if one["judged"]]
+    judged = [one for record in _validated().values() for one in record["measurements"] if one["judged"]]
     performance = json.loads((FOLDER / "data" / "performance.json").read_text(encoding="utf-8")).values()
     ratios = [one["result"] for one in performance if "ratio_per_simulated_second" in one["result"]]
     faster, per_second = (
