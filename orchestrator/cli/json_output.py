@@ -39,7 +39,6 @@ from orchestrator.records.journal_check import JournalCheck
 from orchestrator.reports.run_summary import PLANNED, ReceiverSummary, RunSummary
 from sim_engine.liquids import SimulationParameters
 from sim_engine.settings.model import DescribedSchema, meanings
-from sim_engine.settings.plugin_registry import own_extras
 
 
 class _PlannedParts(CommandOutput):
@@ -209,7 +208,6 @@ OUTPUTS: dict[str, Any] = {
     "study run": StudyOutput | StudyCostOutput,
     "robot check": CheckOutput,
     "balance check": CheckOutput,
-    **own_extras("decant.outputs").get("recording", {}),
     "queue submit": CampaignOut,
     "queue list": QueueOutput | CampaignDetailOut,
     "queue logs": EventOutput,

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import EnableMotion, InProcess, Json, OtherLaboratory
+from orchestrator.cli.command_options import EnableMotion, InProcess, OtherLaboratory
 from orchestrator.cli.console import (
     FAILED,
     RefusalError,
     Refused,
-    print_json,
     print_message,
     print_warning,
     waiting_for,
@@ -54,7 +53,6 @@ def first_day(
     ] = 400,
     enable_motion: EnableMotion = False,
     in_process: InProcess = False,
-    as_json: Json = False,
 ) -> None:
     """Record ten pours and five doses of water, replay them, and find which quantity of the rig is wrong.
 
@@ -104,10 +102,6 @@ def first_day(
         (folder / RESULT).write_text(json.dumps(document, indent=2, default=str) + "\n", encoding="utf-8")
         (folder / PAGE).write_text(_page(folder, diagnosis, replays, words), encoding="utf-8")
     print_message(f"page: {folder / PAGE}")
-    if as_json:
-        from orchestrator.recordings.recording_outputs import FirstDayOutput
-
-        print_json(FirstDayOutput(**document))
 
 
 def _day_of(folder: Path) -> list[PourRecording]:

@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, Parameters, RunFolder, add_group, run_folder
+from orchestrator.cli.command_options import Parameters, RunFolder, add_group, run_folder
 from orchestrator.cli.console import (
     FAILED,
     RefusalError,
     Refused,
-    print_json,
     print_message,
     print_note,
     print_warning,
@@ -38,7 +37,6 @@ def export(
     to: Annotated[
         Path | None, typer.Option(help="Folder for the files; default: 'recordings' in the run's folder.")
     ] = None,
-    as_json: Json = False,
 ) -> None:
     """Write the weighed pours and doses of a run as recorded pours, from its journal.
 
@@ -47,7 +45,6 @@ def export(
     """
     from orchestrator.learning.run_errors import RunError
     from orchestrator.recordings.recording_export import export_recordings
-    from orchestrator.recordings.recording_outputs import RecordingExportOutput
     from orchestrator.records.journal import JOURNAL_NAME
 
     folder = run_folder(run)
@@ -59,8 +56,6 @@ def export(
         print_message(f"not exported: {reason}")
     for path in written:
         print(path)
-    if as_json:
-        print_json(RecordingExportOutput(recordings=written, left_out=left_out))
     if not written:
         raise RefusalError(f"{folder}: no pour of this run can be exported", FAILED)
 
@@ -76,7 +71,6 @@ def replay(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Seed of simulation and estimator.")] = 0,
     png: Annotated[Path | None, typer.Option(help="Folder for a picture of each pour: NAME.png.")] = None,
-    as_json: Json = False,
 ) -> None:
     """Replay recorded pours: simulate the recorded tilt, run the dosing estimator over the readings, and compare.
 
@@ -98,7 +92,6 @@ def replay(
     loaded = _loaded(recordings)
     theta = (theta or SimulationParameters()).model_copy(update={"particles": max(particles, 200)})
     simulator = PourSimulator() if particles else None
-    documents = []
     try:
         for recording in loaded:
             at, text = f"{recording.path.name}: ", f"replaying {recording.name}"
@@ -107,17 +100,12 @@ def replay(
                     recording, settings, parameters=theta, seed=seed, particles=particles > 0, simulator=simulator
                 )
             print(replay_text(report))
-            documents.append(report.document())
             if png is not None:
                 with Refused(OSError, at="--png: "):
                     print_note(f"picture  {save(replay_figure(report), png / f'{recording.name}.png')}")
     finally:
         if simulator is not None:
             simulator.close()
-    if as_json:
-        from orchestrator.recordings.recording_outputs import RecordingReplaysOutput
-
-        print_json(RecordingReplaysOutput.model_validate({"replays": documents}))
 
 
 def fit(
@@ -137,7 +125,6 @@ def fit(
         typer.Option("--judge", help="Recorded pour (or folder) to predict with the fit. Repeatable."),
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Write the values to this JSON file.")] = None,
-    as_json: Json = False,
 ) -> None:
     """Fit unknown quantities that recorded pours share, with 90 % intervals, and judge the fit on other readings.
 
@@ -160,14 +147,10 @@ def fit(
         fitted = fit_recordings(loaded, tuple(unknown or ("grip", "lag")), until=seconds)
         judgements = [judge_recording(fitted, pour) for pour in (*(loaded if seconds is not None else ()), *others)]
     print(fit_text(fitted, judgements))
-    document = fitted.document() | {"judged": [recording.document() for recording in judgements]}
     if output is not None:
+        document = fitted.document() | {"judged": [recording.document() for recording in judgements]}
         with Refused(OSError, at="--output: "):
             output.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
-    if as_json:
-        from orchestrator.recordings.recording_outputs import RecordingFitOutput
-
-        print_json(RecordingFitOutput(**document))
 
 
 def _loaded(paths: Sequence[Path]) -> list[PourRecording]:

@@ -138,21 +138,6 @@ def opened(study: StudyPlan) -> Iterator[Path]:
         yield folder
 
 
-def file_of(folder: Path) -> Path:
-    """Path of the study's file in its last run.
-
-    Raises:
-        StudyError: the path is not recorded, or the file no longer exists.
-    """
-    try:
-        path = Path((folder / SOURCE).read_text(encoding="utf-8").strip())
-    except OSError:
-        raise StudyError(f"{folder}: nothing says here which file the study is of; name the file (YAML)") from None
-    if not path.is_file():
-        raise StudyError(f"{folder}: its file was {path}, which is not there any more; name the file (YAML)")
-    return path
-
-
 def check_settings(study: StudyPlan) -> None:
     """Check that the contents of the study's folder were made with the same settings; repetitions may be added.
 

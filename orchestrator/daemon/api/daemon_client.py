@@ -102,10 +102,6 @@ class Client:
         """Request JSON with GET."""
         return self._call("GET", path, params=_given(query)).json()
 
-    def fetch(self, path: str, **query: Any) -> bytes:
-        """Download a file."""
-        return self._call("GET", path, params=_given(query)).content
-
     def post(self, path: str, body: Any = None) -> Any:
         """Send a command with POST."""
         return self._call("POST", path, json=body).json()

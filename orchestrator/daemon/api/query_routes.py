@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import importlib.metadata
-import os
-import resource
 import threading
 import time
 from collections.abc import AsyncIterator, Iterable
@@ -19,7 +17,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, HTTPException, Query, Response
 from fastapi.responses import FileResponse, StreamingResponse
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
@@ -273,9 +271,6 @@ class _Collector:
             "decant_problems": ("Problems that people should solve.", len(daemon.problems)),
             "decant_disk_free_bytes": ("Room on the state directory's disk.", free_space(daemon.settings.state)),
             "decant_threads": ("Threads of the daemon's process.", threading.active_count()),
-            "decant_open_files": ("Open files of the daemon's process.", _open_files()),
-            "decant_resident_bytes": ("Memory of the daemon's process.", _resident()),
-            "decant_cpu_seconds_total": ("CPU time of the daemon's process.", _cpu()),
         }
         for name, (text, value) in single.items():
             yield GaugeMetricFamily(name, text, value=float(value))
@@ -285,20 +280,5 @@ def measures(daemon: SharedServices, stops: EmergencyStops) -> bytes:
     """Return all metrics in Prometheus' text format."""
     registry = CollectorRegistry()
     registry.register(_Collector(daemon, stops))
+    ProcessCollector(registry=registry)
     return generate_latest(registry)
-
-
-def _open_files() -> int:
-    return len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").is_dir() else 0  # noqa: PTH208  no Path is made
-
-
-def _resident() -> int:
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    except OSError:
-        return 0
-
-
-def _cpu() -> float:
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime

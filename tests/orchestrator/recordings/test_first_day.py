@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 from dataclasses import replace
@@ -24,7 +25,6 @@ from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
-from tests.support.output_schema import validated
 
 BEAKER = cylinder("beaker", inner_radius=0.040, inner_height=0.100)
 SAMPLES = shipped("recordings/dose-1.yaml").parent
@@ -92,10 +92,10 @@ def test_a_practice_day_finds_a_higher_rim_and_writes_a_page(tmp_path: Path, mon
     monkeypatch.setattr(rig_diagnosis, "TIME_STEP", 0.1)
     monkeypatch.setattr(rig_diagnosis, "FACTORS", (30.0,))
     day = tmp_path / "day"
-    arguments = [str(day), "--practise", "--wrong", "height", "--seed", "51003", "--particles", "0", "--json"]
+    arguments = [str(day), "--practise", "--wrong", "height", "--seed", "51003", "--particles", "0"]
     result = CliRunner().invoke(app, ["recording", "first-day", *arguments])
     assert result.exit_code == 0, result.output
-    document = validated("recording first-day", result.stdout)
+    document = json.loads((day / "first-day.json").read_text(encoding="utf-8"))
     assert document["main"] == "height"
     assert float(document["explanations"][0]["text"].split(" mm")[0]) == pytest.approx(2.0, abs=0.7)
     (dose,) = document["doses"]
