@@ -7,13 +7,11 @@ Everything slow is imported when a command is called, so that
 from __future__ import annotations
 
 import contextlib
-import functools
 import getpass
-import inspect
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, make_dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,7 +20,7 @@ import typer
 
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.catalogue.queries import CONDITIONS
-from orchestrator.cli.command_options import Json, call, examples
+from orchestrator.cli.command_options import Json, add_command, call, examples, grouped
 from orchestrator.cli.console import FAILED, RefusalError, check_output, print_json, print_message, print_note
 
 if TYPE_CHECKING:
@@ -31,8 +29,6 @@ if TYPE_CHECKING:
     from orchestrator.records.run_record import Row
 
 NEWEST = 20
-
-KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
 runs = typer.Typer(
     name="runs",
@@ -75,57 +71,35 @@ Which = Annotated[
     typer.Argument(help="A run: its folder's name, a prefix of the name, or its path."),
 ]
 
-_LIMIT = Annotated[int | None, typer.Option("--limit", min=1, help="Show at most this many, the newest.")]
-_WORDS = Annotated[list[str] | None, typer.Argument(metavar="[WORDS]", help="Words in a run's names or notes.")]
 _OTHERS: dict[str, Any] = {
-    "words": _WORDS,
+    "words": Annotated[list[str] | None, typer.Argument(metavar="[WORDS]", help="Words in a run's names or notes.")],
     "run": Annotated[str | None, typer.Option("--run", help="Folder name or path of one run.")],
-    "limit": _LIMIT,
-}
-_CONDITIONS: dict[str, Any] = {
-    name: Annotated[
-        str | None,
-        typer.Option(
-            "--in-state" if name == "state" else f"--{name}",
-            help=text,
-        ),
-    ]
-    for name, text in CONDITIONS.items()
+    "limit": Annotated[int | None, typer.Option("--limit", min=1, help="Show at most this many, the newest.")],
 }
 
 
-def _command(
-    *lines: str, name: str | None = None, conditions: Sequence[str] | None = None
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Make a decorator that registers a command.
+def _asked(*others: str) -> Any:
+    """A group of options: some of `_OTHERS`, and the conditions of the catalogue. 'state' is `in_state` here."""
+    options = {name: _OTHERS[name] for name in others}
+    for name, text in CONDITIONS.items():
+        option = "in-state" if name == "state" else name
+        options[option.replace("-", "_")] = Annotated[str | None, typer.Option(f"--{option}", help=text)]
+    return make_dataclass("Asked", [(name, hint, None) for name, hint in options.items()])
 
-    Args:
-        lines: examples for the help.
-        name: name of the command, if it isn't that of the function.
-        conditions: names in `_OTHERS`; these and the catalogue's conditions become options, and the function gets their
-            values as one mapping.
-    """
-    options = {} if conditions is None else {option: _OTHERS[option] for option in conditions} | _CONDITIONS
-    # The state directory is an option as well, so the options have other names up to the call.
-    names = {f"asked_{option}": option for option in options}
 
-    def register(command: Callable[..., None]) -> Callable[..., None]:
-        @functools.wraps(command)
-        def call_it(**arguments: Any) -> None:
-            if names:
-                arguments["conditions"] = {option: arguments.pop(key) for key, option in names.items()}
-            call(command, **arguments)
+RunsAsked, PoursAsked, ChartsAsked = _asked("words", "limit"), _asked("words", "run", "limit"), _asked()
 
-        if names:
-            signature = inspect.signature(command, eval_str=True).parameters.values()
-            parameters = [
-                *(inspect.Parameter(key, KEYWORD, default=None, annotation=options[o]) for key, o in names.items()),
-                *(p.replace(kind=KEYWORD) for p in signature if p.name != "conditions"),
-            ]
-            call_it.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-            call_it.__annotations__ = {p.name: p.annotation for p in parameters}
-        runs.command(name, epilog=examples(*lines))(call_it)
-        return command
+
+def _conditions(asked: Any) -> dict[str, Any]:
+    return {"state" if name == "in_state" else name: value for name, value in asdict(asked).items()}
+
+
+def _command(*lines: str, name: str | None = None) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a decorator that adds a command, with examples for its help."""
+
+    def register(work: Callable[..., None]) -> Callable[..., None]:
+        add_command(runs, work, *lines, name=name)
+        return work
 
     return register
 
@@ -134,21 +108,21 @@ def _command(
 def newest(context: typer.Context, state: State = None) -> None:
     """Run `decant runs` without a command."""
     if context.invoked_subcommand is None:
-        call(list_runs, {"limit": NEWEST})
+        call(list_runs, limit=NEWEST)
 
 
 @_command(
     "decant runs list --receiver beaker --mode real --since 2030-03",
     "decant runs list water spring-clean   # both words, anywhere: names, vessels, notes",
     name="list",
-    conditions=("words", "limit"),
 )
-def list_runs(conditions: dict[str, Any], state: State = None, as_json: Json = False) -> None:
+@grouped
+def list_runs(asked: RunsAsked, state: State = None, as_json: Json = False) -> None:  # type: ignore[valid-type]
     """List runs, newest first; all given conditions must hold."""
     from orchestrator.reports.console_view import print_table
 
     with _catalogue() as catalogue, _refusing():
-        listed = catalogue.runs(conditions)
+        listed = catalogue.runs(_conditions(asked))
     if as_json:
         print_json({"runs": listed})
         return
@@ -178,12 +152,12 @@ def list_runs(conditions: dict[str, Any], state: State = None, as_json: Json = F
 @_command(
     "decant runs pours --receiver beaker --since 2030-03-01 --until 2030-03-31",
     "decant runs pours --liquid glycerol --mode real --json",
-    conditions=("words", "run", "limit"),
 )
-def pours(conditions: dict[str, Any], state: State = None, as_json: Json = False) -> None:
+@grouped
+def pours(asked: PoursAsked, state: State = None, as_json: Json = False) -> None:  # type: ignore[valid-type]
     """List pours with their actions, weighed spillage and predictions."""
     with _catalogue() as catalogue, _refusing():
-        listed = catalogue.pours(conditions)
+        listed = catalogue.pours(_conditions(asked))
     if as_json:
         print_json({"pours": listed})
     elif listed:
@@ -196,10 +170,10 @@ def pours(conditions: dict[str, Any], state: State = None, as_json: Json = False
     "decant runs chart",
     "decant runs chart north --mode real --since 2030-03 --png north.png",
     name="chart",
-    conditions=(),
 )
+@grouped
 def chart_command(
-    conditions: dict[str, Any],
+    asked: ChartsAsked,  # type: ignore[valid-type]
     laboratory: Annotated[str | None, typer.Argument(help="Name of a laboratory, if there are several.")] = None,
     png: Annotated[
         Path | None, typer.Option(help="File of the picture; default: charts-LABORATORY-MODE.png in this folder.")
@@ -219,7 +193,7 @@ def chart_command(
 
     check_output(png, "--png", ".png")
     with _catalogue() as catalogue, _refusing():
-        charts = catalogue.charts(conditions)
+        charts = catalogue.charts(_conditions(asked))
     if laboratory is not None and laboratory not in (known := {chart.laboratory for chart in charts}):
         raise RefusalError(
             f"{laboratory}: no weighed pour of this laboratory; known: {', '.join(sorted(known)) or 'none'}"

@@ -11,14 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from fastapi import APIRouter, Depends, HTTPException, Query
+from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field
 
 from orchestrator.catalogue.annotations import Note
 from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.control_charts import LaboratoryChart
-from orchestrator.catalogue.queries import CONDITIONS
 from orchestrator.catalogue.run_reading import PreviousRun
 from orchestrator.daemon.api.access_control import Daemon, Operator, Viewer
 from orchestrator.daemon.rigs.rig_worker import SharedServices
@@ -28,30 +27,6 @@ from orchestrator.learning.run_errors import RunError
 T = TypeVar("T")
 
 router = APIRouter(tags=["previous runs"])
-
-
-def _filters() -> Callable[..., dict[str, Any]]:
-    """Make a dependency that returns the filters in a request's query."""
-    text = Annotated[str | None, Field(max_length=200)]
-    fields: dict[str, Any] = {
-        name: (text, Field(default=None, description=about)) for name, about in CONDITIONS.items()
-    }
-    fields["words"] = (
-        list[Annotated[str, Field(max_length=200)]],
-        Field(default=[], max_length=20, description="Words that must all occur in a run's names or notes."),
-    )
-    fields["limit"] = (int, Field(default=200, ge=1, le=1000, description="Return at most this many, the newest."))
-    model = create_model("RunsAsked", __config__=ConfigDict(extra="forbid"), **fields)
-
-    def asked(query: Any) -> dict[str, Any]:
-        conditions: dict[str, Any] = query.model_dump()
-        return conditions
-
-    asked.__annotations__["query"] = Annotated[model, Query()]
-    return asked
-
-
-RunsAsked = Annotated[dict[str, Any], Depends(_filters())]
 
 
 class NoteIn(BaseModel):
@@ -88,13 +63,17 @@ async def _in_catalogue(daemon: SharedServices, query: Callable[[Catalogue], T])
 
 
 @router.get("/runs", operation_id="runs", response_model=list[PreviousRun])  # type: ignore[valid-type]
-async def runs(daemon: Daemon, person: Viewer, conditions: RunsAsked) -> Any:
-    """List the runs of this machine, newest first.
-
-    The list includes runs of the command line if it uses the same state directory. All given conditions must hold;
-    names may contain the wildcards * and ?.
-    """
-    return await _in_catalogue(daemon, lambda catalogue: catalogue.runs(conditions))
+async def runs(
+    daemon: Daemon,
+    person: Viewer,
+    words: Annotated[
+        list[Annotated[str, Field(max_length=200)]],
+        Query(max_length=20, description="Words that must all occur in a run's names or notes."),
+    ] = [],  # noqa: B006  FastAPI copies it
+    limit: Annotated[int, Query(ge=1, le=1000, description="Return at most this many, the newest.")] = 200,
+) -> Any:
+    """List the runs of this machine, newest first; also those of the command line that uses the state directory."""
+    return await _in_catalogue(daemon, lambda catalogue: catalogue.runs({"words": words, "limit": limit}))
 
 
 @router.get("/runs/charts", operation_id="run_charts")
