@@ -172,6 +172,9 @@ class ResolvedPrior(Settings):
     left_out: list[Text] = Field(default_factory=list)
     """Posteriors and parameters that are not used, with reasons."""
 
+    stale: list[Text] = Field(default_factory=list)
+    """Posteriors that are used although later pours disagree with them."""
+
     @classmethod
     def of(cls, memory: CampaignMemory) -> ResolvedPrior:
         """The settings of a resolved prior."""
@@ -179,7 +182,7 @@ class ResolvedPrior(Settings):
             row.name: {"mean": row.mean, "deviation": row.deviation, "runs": list(row.runs)}
             for row in memory.parameters
         }
-        return cls.model_validate({"parameters": rows, "left_out": list(memory.left_out)})
+        return cls.model_validate({"parameters": rows, "left_out": list(memory.left_out), "stale": list(memory.stale)})
 
     @property
     def memory(self) -> CampaignMemory:
@@ -190,7 +193,7 @@ class ResolvedPrior(Settings):
             for name, estimate in estimates.items()
             if estimate is not None
         ]
-        return CampaignMemory(tuple(rows), tuple(self.left_out))
+        return CampaignMemory(tuple(rows), tuple(self.left_out), tuple(self.stale))
 
 
 def _form(value: Any) -> str:
@@ -235,11 +238,13 @@ class PosteriorSource:
         simulator: version of the solver here.
         every: returns all posteriors of the catalogue.
         of_run: returns that of one run; raises RunError.
+        stale: returns since when and how much later pours disagree with it, as text; '' if they do not.
     """
 
     simulator: str
     every: Callable[[], Sequence[KnownPosterior]]
     of_run: Callable[[str], KnownPosterior]
+    stale: Callable[[KnownPosterior], str] = lambda known: ""
 
 
 def no_posteriors() -> PosteriorSource:
@@ -371,7 +376,9 @@ def _combined(posteriors: Sequence[KnownPosterior], needs: PriorNeeds, source: P
             left_out.append(f"{parameter} is outside the searched range; widen the range")
             continue
         remembered.append(parameter)
-    return CampaignMemory(tuple(remembered), tuple(left_out))
+    used = {run for parameter in remembered for run in parameter.runs}
+    stale = [(known.posterior, source.stale(known)) for known in usable if known.posterior in used]
+    return CampaignMemory(tuple(remembered), tuple(left_out), tuple(f"{name}: {text}" for name, text in stale if text))
 
 
 def _liquid_differs(known: KnownPosterior, scene: Scene) -> str:

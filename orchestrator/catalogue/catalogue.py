@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -34,6 +34,7 @@ from sim_engine.settings.plugin_registry import DISTRIBUTION
 if TYPE_CHECKING:
     from orchestrator.campaigns.campaign_prior import KnownPosterior, PosteriorSource
     from orchestrator.catalogue.control_charts import LaboratoryChart
+    from orchestrator.catalogue.known_posteriors import PosteriorAge
 
 INDEX_NAME = "catalogue.sqlite"
 
@@ -64,7 +65,12 @@ def posterior_source() -> PosteriorSource:
             catalogue.refresh()
             return catalogue.posterior(name)
 
-    return PosteriorSource(simulator_version(), every, of_run)
+    def stale(known: KnownPosterior) -> str:
+        with Catalogue() as catalogue:
+            age = catalogue.posterior_ages([known]).get(known.posterior)
+        return "" if age is None else age.text
+
+    return PosteriorSource(simulator_version(), every, of_run, stale)
 
 
 @dataclass
@@ -225,6 +231,14 @@ class Catalogue:
                 if known.posterior == name:
                     return known
             raise
+
+    def posterior_ages(self, posteriors: Iterable[KnownPosterior]) -> dict[str, PosteriorAge]:
+        """The ages of posteriors by name; imported ones have none."""
+        from orchestrator.catalogue.known_posteriors import age_of  # slow import
+
+        made = {run["run"]: run["ended"] for run in self.runs({})}
+        charts = self.charts({})
+        return {p.posterior: age_of(p, made[p.posterior], charts) for p in posteriors if made.get(p.posterior)}
 
     def _find(self, name: str) -> Row:
         path = str(Path(name).absolute())

@@ -11,12 +11,16 @@ from __future__ import annotations
 
 import io
 import math
+import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic import BaseModel, ConfigDict
+
 from orchestrator.campaigns.campaign_prior import KnownPosterior, arm_of, shape_digest
 from orchestrator.campaigns.run_snapshot import written
+from orchestrator.catalogue.control_charts import LaboratoryChart
 from orchestrator.learning.calibration.campaign_memory import PLACEMENT, estimates, group_of
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.codec import from_json
@@ -121,6 +125,61 @@ def _without_range(
         return None
     precision = 1.0 / deviation**2 - 1.0 / spread**2
     return (mean / deviation**2 - centre / spread**2) / precision, 1.0 / math.sqrt(precision)
+
+
+class PosteriorAge(BaseModel):
+    """Age of a posterior, and whether later pours still agree with what was predicted from it."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True)
+
+    made: float
+    """When its run ended, seconds since 1970."""
+
+    later_pours: int
+    """Number of predicted pours since then in its laboratory, from its pourer and of its liquid."""
+
+    since: float | None = None
+    """Begin of the disagreement, as the control chart of the prediction error estimates it; null if there is none."""
+
+    deviations: float | None = None
+    """Mean distance of the pours since then from the earlier prediction errors, in standard deviations."""
+
+    renewing_pours: int
+    """Number of pours that would renew it: as many as it comes from."""
+
+    @property
+    def text(self) -> str:
+        """'since 2030-03-14 later pours disagree by +4.2 standard deviations; 12 pours would renew it', or ''."""
+        if self.since is None or self.deviations is None:
+            return ""
+        day = time.strftime("%Y-%m-%d", time.localtime(self.since))
+        off = f"since {day} later pours disagree by {self.deviations:+.1f} standard deviations"
+        return f"{off}; a calibration with {self.renewing_pours} pours would renew it"
+
+
+def age_of(known: KnownPosterior, made: float, charts: Iterable[LaboratoryChart]) -> PosteriorAge:
+    """The age of a posterior: later pours disagree if the prediction error has left its limits since it was made.
+
+    Args:
+        known: the posterior.
+        made: when its run ended [s since 1970].
+        charts: of all laboratories.
+    """
+    age = PosteriorAge(made=made, later_pours=0, renewing_pours=known.pours)
+    bench = (known.laboratory, known.mode, "prediction_error")
+    chart = next((chart for chart in charts if (chart.laboratory, chart.mode, chart.quantity) == bench), None)
+    if chart is None:
+        return age
+    # The day on which it was made may have pours from before it, and its own deployment.
+    vessels = {", ".join((known.pourer, receiver, known.liquid.name)) for receiver in known.receivers}
+    later = [point for point in chart.points if point.time > made and point.about in vessels]
+    age.later_pours = sum(point.pours for point in later)
+    lasting = chart.lasting
+    if lasting is not None and lasting.noticed > made:
+        off = [p.deviations for p in later if p.time >= lasting.begun and p.deviations is not None]
+        if off:
+            age.since, age.deviations = max(lasting.begun, made), sum(off) / len(off)
+    return age
 
 
 def imported(state: Path | None = None) -> Iterable[KnownPosterior]:

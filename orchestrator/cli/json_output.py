@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from orchestrator.campaigns.campaign_prior import KnownPosterior
 from orchestrator.catalogue.control_charts import LaboratoryChart
+from orchestrator.catalogue.known_posteriors import PosteriorAge
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
 from orchestrator.cli.command_results import (
     CalibrateOutput,
@@ -124,6 +125,9 @@ class KnownOutput(CommandOutput):
     """What calibrations have found, by run."""
 
     posteriors: list[KnownPosterior]
+
+    ages: dict[str, PosteriorAge]
+    """Age of each posterior that was made here, and whether later pours disagree with it."""
 
 
 class ChartsOutput(CommandOutput):

@@ -269,8 +269,10 @@ def known(
 
     with _catalogue() as catalogue, _refusing():
         posteriors = [p for p in catalogue.posteriors() if cup in (None, p.pourer, *p.receivers)]
+        ages = catalogue.posterior_ages(posteriors)
     if as_json:
-        print_json({"posteriors": [posterior_table(p) for p in posteriors]})
+        shown = {name: age.model_dump() for name, age in ages.items()}
+        print_json({"posteriors": [posterior_table(p) for p in posteriors], "ages": shown})
         return
     if not posteriors:
         print_note(f"no posterior{'' if cup is None else f' about {cup}'}; a finished calibration with C4 has one")
@@ -278,6 +280,7 @@ def known(
     rows = [
         {
             "run": p.posterior,
+            "made": _date(ages[p.posterior].made)[:10] if p.posterior in ages else "",
             "laboratory": f"{p.laboratory}, arm {p.arm}",
             "mode": _mode(p.mode),
             "liquid": p.liquid.name,
@@ -289,6 +292,9 @@ def known(
         for p in posteriors
     ]
     print_table(rows, right=["pours"])
+    for name, age in ages.items():
+        if age.text:
+            print(f"{name}: stale: {age.text}")
 
 
 @_command("decant runs posterior quickstart-20300301-1 > beaker.yaml")

@@ -129,10 +129,12 @@ class CampaignMemory:
     Attributes:
         parameters: may be empty, if nothing fits.
         left_out: reasons why posteriors or parameters are not used, one text each.
+        stale: posteriors that later pours disagree with, one text each.
     """
 
     parameters: tuple[RememberedParameter, ...]
     left_out: Annotated[tuple[str, ...], NOT_IN_FINGERPRINT] = ()
+    stale: Annotated[tuple[str, ...], NOT_IN_FINGERPRINT] = ()
 
     @property
     def runs(self) -> tuple[str, ...]:
@@ -160,8 +162,9 @@ class CampaignMemory:
 
     @property
     def lines(self) -> list[str]:
-        """The text, and one line for each reason why something is not used."""
-        return [self.text, *(f"not used: {reason}" for reason in self.left_out)]
+        """The text, and one line for each posterior that is stale, and for each reason why something is not used."""
+        stale = [f"stale, and used: {text}" for text in self.stale]
+        return [self.text, *stale, *(f"not used: {reason}" for reason in self.left_out)]
 
     def thetas(self, base: SimulationParameters, count: int) -> list[SimulationParameters]:
         """Equally likely θ (count) by the memory, evenly spread; other values as in `base`."""

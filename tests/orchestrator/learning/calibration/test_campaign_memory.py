@@ -302,6 +302,40 @@ def test_after_a_move_the_placement_comes_from_the_runs_since_then(state: Path, 
     assert "first-1: its placement is not transferred, the pours of second-1 contradict it" in memory.left_out
 
 
+def test_a_campaign_is_told_since_when_later_pours_disagree_with_its_prior(
+    state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[4] / "benchmarks"))
+    import laboratory_months as months
+
+    def days(first: int, last: int, placement: float) -> None:
+        benches = {day: months.Bench(months.np.random.default_rng(day), placement) for day in range(first, last)}
+        months.enter([months.write_day(tmp_path / "days", day, b, "virtual") for day, b in benches.items()])
+
+    import_posterior(known("day-00", receivers=["cup"]))
+    import_posterior(known("day-08", receivers=["other"]))
+    days(0, 9, 0.0)
+    path = with_prior(tmp_path, "catalogue")
+    assert load_campaign(path).memory.stale == ()  # type: ignore[union-attr]
+    days(9, 11, 20.0)
+    plan = load_campaign(path)
+    assert plan.memory is not None
+    assert plan.memory.runs == ("day-00", "day-08")
+    (text,) = plan.memory.stale  # the other one is about other cups
+    assert text.startswith("day-00: since 2030-03-2")
+    assert "standard deviations; a calibration with 12 pours would renew it" in text
+    assert f"stale, and used: {text}" in plan.memory.lines
+    from decant.running import build_campaign
+
+    assert build_campaign(plan.resolved, tmp_path).memory == plan.memory  # a run's record keeps it
+    told = CliRunner().invoke(app, ["runs", "known", "--json"])
+    ages = KnownOutput.model_validate_json(told.stdout).ages
+    assert ages["day-00"].later_pours > 20
+    assert ages["day-00"].deviations == pytest.approx(7.0, abs=3.0)
+    assert (ages["day-08"].later_pours, ages["day-08"].since) == (0, None)
+    assert "day-00: stale: since 2030-03-2" in CliRunner().invoke(app, ["runs", "known"]).stdout
+
+
 @pytest.mark.parametrize(("remembered", "contradicts"), [(-0.012, ["earlier-1"]), (0.0075, [])])
 def test_a_posterior_names_the_runs_whose_placement_its_pours_contradict(
     tmp_path: Path, remembered: float, contradicts: list[str]
