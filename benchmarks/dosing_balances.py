@@ -241,7 +241,11 @@ def main() -> None:
             found = figures([one for poured in pool.map(pour_series, [name] * len(seeds), seeds) for one in poured])
             print(f"{name}: {json.dumps(found)}", flush=True)
             if options.json:
-                data["rows"][name] = {"now": found, "seeds": [seeds[0], seeds[-1]]}
+                # the first measurement stays: with what is measured after a change it is a comparison
+                measured = {"now": found, "seeds": [seeds[0], seeds[-1]]}
+                row = data["rows"].setdefault(name, measured)
+                if row["seeds"][0] != seeds[0]:
+                    row["later"] = measured
                 DATA.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
 
 

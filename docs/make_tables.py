@@ -538,13 +538,14 @@ def _dosing_balances(*, pairs: bool) -> str:
     data = {name: row for name, row in data.items() if (" + " in name) == pairs}
     if not data:
         return "not measured\n"
-    head = ("balance", "mean error g", "95 % g", "worst g", "interval covers", "weighed after s", "false stops")
-    rows, others = [], []
+    figures = ("mean error g", "95 % g", "worst g", "interval covers", "weighed after s", "false stops")
+    rows, others, again = [], [], []
     for name, row in data.items():
-        now = row["now"]
+        now, later = row["now"], row.get("later", {})
         easy = now["mean"] <= HARD_G[pairs] and now["coverage"] >= LEAST_COVERAGE and not now["false_stops"]
         if easy:
             others.append(now)
+            again.append(later)
             continue
         low, high = now["mean_interval"]
         rows.append(
@@ -556,6 +557,7 @@ def _dosing_balances(*, pairs: bool) -> str:
                 f"{100 * now['coverage']:.0f} %",
                 f"{now['time']:.1f}",
                 str(now["false_stops"]),
+                *_covered_later([later]),
             )
         )
     if others:
@@ -570,11 +572,22 @@ def _dosing_balances(*, pairs: bool) -> str:
         for key, form, factor in ranges:
             low, high = (factor * end(row[key] for row in others) for end in (min, max))
             cells.append(f"{low:{form}} to {high:{form}}{' %' if key == 'coverage' else ''}")
-        rows.append((f"{len(others)} others", *cells, "0"))
+        rows.append((f"{len(others)} others", *cells, "0", *_covered_later(again)))
     one = next(iter(data.values()))
-    how = f"{one['now']['doses']} doses a row, seeds {one['seeds'][0]} to {one['seeds'][1]}"
+    how = f"{one['now']['doses']} doses a row, seeds {one['seeds'][0]} to {one['seeds'][1]}; today: seeds from 15000"
     how += "; all rows: [dosing-balances.json](../data/dosing-balances.json)"
+    head = ("balance", *figures, "today: covers (doses)", "today: false stops")
     return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing_balances.py --final --json`; {how}.</sub>\n"
+
+
+def _covered_later(measured: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    """Coverage and false stops of what was measured again after the weighing was changed."""
+    figures = [row["now"] for row in measured if row]
+    doses = sum(one["doses"] for one in figures)
+    if not doses:
+        return "–", "–"
+    covered = sum(one["coverage"] * one["doses"] for one in figures) / doses
+    return f"{100 * covered:.0f} % ({doses})", str(sum(one["false_stops"] for one in figures))
 
 
 def dosing_faults() -> str:

@@ -214,7 +214,7 @@ LATE_TIME = 0.9
 REST_BAND = (0.1e-3, 0.3)
 """Standard deviation of what a reading still rises: [kg], and display steps."""
 
-LARGEST_RISE = (0.05e-3, 0.4)
+LARGEST_RISE = (0.03e-3, 0.2)
 """Largest such rise of a weighed reading: [kg], or display steps."""
 
 UNKNOWN_RISE = 1.25
