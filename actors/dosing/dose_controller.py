@@ -217,7 +217,7 @@ REST_BAND = (0.1e-3, 0.3)
 LARGEST_RISE = (0.03e-3, 0.2)
 """Largest such rise of a weighed reading: [kg], or display steps."""
 
-UNKNOWN_RISE = 1.25
+UNKNOWN_RISE = 1.75
 """Standard deviation of what a reading still rises because the time of the rise is unknown, as a part of the rise."""
 
 LATE_DROPS = (0.05e-3, 1.0, 3.0)
