@@ -564,7 +564,7 @@ class DoseController:
     def _new(self) -> float:
         """Share of new readings at rest."""
         repeated = float(self._estimator.repeats.weights(1) @ REPEATS)
-        return max(1.0 - repeated, min(self._interval / RECORDED_HOLD, 1.0))
+        return max(1.0 - repeated, self._interval / (self._interval + RECORDED_HOLD))
 
     def _patience(self, limit: tuple[float, float]) -> float:
         """The larger one of a time and of a number of readings [s]."""
