@@ -102,6 +102,10 @@ class Client:
         """Request JSON with GET."""
         return self._call("GET", path, params=_given(query)).json()
 
+    def fetch(self, path: str) -> bytes:
+        """Download a file."""
+        return self._call("GET", path).content
+
     def post(self, path: str, body: Any = None) -> Any:
         """Send a command with POST."""
         return self._call("POST", path, json=body).json()
