@@ -39,13 +39,12 @@ from actors.laboratory import open_laboratory
 from actors.laboratory_settings import LaboratorySettings
 from decant.run_results import Run, html_table
 from decant.running import checked
-from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan, receiver_names
 from orchestrator.learning.requests import Pour, Prediction
 from orchestrator.learning.stage_result import displayed_action
 from orchestrator.records.events import Subscriber as Watch
 from orchestrator.records.run_record import read_record
 from orchestrator.reports.publishing import publish_run
-from orchestrator.reports.stage_views import receiver_names
 from orchestrator.runs.added_pours import weighed_by_hand
 from orchestrator.runs.resume import LOST
 from orchestrator.runs.run_service import RunHandle, RunResources, RunService, RunTaskError

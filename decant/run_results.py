@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
 from orchestrator.learning.calibration.calibration_scores import CalibrationGain
-from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan, receiver_names
 from orchestrator.learning.deployment.deployment_result import Recommended
 from orchestrator.learning.requests import Failed, Simulate, Simulated
 from orchestrator.learning.stage_result import UNIT_SUFFIXES, displayed_action
@@ -26,14 +26,7 @@ from orchestrator.reports.loss_units import loss_of_pour
 from orchestrator.reports.publishing import Published, report_on, summary_of
 from orchestrator.reports.publishing import publish as write
 from orchestrator.reports.run_summary import RunSummary
-from orchestrator.reports.stage_views import (
-    deployments_of,
-    gain_of,
-    predictions_of,
-    receiver_names,
-    recommended_theta_of,
-    theta_of,
-)
+from orchestrator.reports.stage_views import deployments_of, gain_of, predictions_of, recommended_theta_of, theta_of
 from sim_engine.action import described
 from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import SampleStatistics

@@ -69,7 +69,6 @@ def tables() -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
-    sys.path.insert(0, str(ROOT / "docs"))  # as a script has it
     spec.loader.exec_module(module)
     return module
 

@@ -597,3 +597,28 @@ class Draw:
     error: PoseError | None
     parameters: SimulationParameters
     z: Point
+
+
+def receiver_names(plan: CampaignPlan) -> dict[str, str]:
+    """Names for displays, by scenes' own names, which are the keys in the journal and for programs: the receiver's
+    name, or the scene's own if two deployment scenes have receivers with the same name.
+    """
+    names: dict[str, str] = {}
+    if plan.deployment is not None:
+        scenes = plan.deployment.scenes
+        distinct = len({scene.receiver.name for scene in scenes}) == len(scenes)
+        names = {scene.name: scene.receiver.name if distinct else scene.name for scene in scenes}
+    if plan.calibration is not None:
+        for known in (plan.calibration.records, plan.calibration.transfer):
+            if known is not None:
+                names.setdefault(known.scene.name, known.scene.receiver.name)
+        for scene in plan.calibration.poured:
+            names.setdefault(scene.name, scene.receiver.name)
+    for scene in () if plan.dispense is None else plan.dispense.scenes:
+        names.setdefault(scene.name, scene.receiver.name)
+    return names
+
+
+def receiver_name(plan: CampaignPlan, scene: str) -> str:
+    """Display name of a scene; its own name if the plan does not contain it."""
+    return receiver_names(plan).get(scene, scene)

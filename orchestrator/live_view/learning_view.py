@@ -23,7 +23,7 @@ from actors.optimizer.questions import (
 )
 from actors.optimizer.suggest import slices
 from orchestrator.learning.calibration.calibration_base import Calibrated, CalibratedTheta
-from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan, receiver_names
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import Believed
 from orchestrator.learning.requests import Suggest, Suggested
@@ -43,7 +43,6 @@ from orchestrator.reports.loss_units import (
     unit_of_pour,
 )
 from orchestrator.reports.progress_state import Best
-from orchestrator.reports.stage_views import receiver_names
 from orchestrator.reports.summarise import pour_summary
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.outcome import PourMeasurement

@@ -11,6 +11,7 @@ import re
 import rerun as rr
 
 from actors.laboratory_settings import MODE_LABELS
+from orchestrator.learning.campaign_plan import receiver_name
 from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.recording_sink import RecordingSink
 from orchestrator.records.run_record import RunState
@@ -18,7 +19,6 @@ from orchestrator.records.states import RESTING, State
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.figure_style import safe_name
 from orchestrator.reports.progress_state import CHECKPOINT_WORDS, ProgressState
-from orchestrator.reports.stage_views import receiver_name
 
 PLACE = "/machine"
 

@@ -16,7 +16,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from actors.laboratory_settings import MODE_LABELS
-from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan, receiver_names
 from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
 from orchestrator.live_view.balance_view import BalanceStage
 from orchestrator.live_view.blueprints import Moment, campaign_blueprint
@@ -42,7 +42,6 @@ from orchestrator.records.events import (
 from orchestrator.records.run_clock import run_time
 from orchestrator.reports.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
 from orchestrator.reports.progress_state import ProgressState
-from orchestrator.reports.stage_views import receiver_names
 from orchestrator.runs.stages import scenes_of
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED, Scores
-from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.campaign_plan import CampaignPlan, receiver_name
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.dispense import Dispensed, Dose
 from orchestrator.learning.requests import Prediction
@@ -34,7 +34,6 @@ from orchestrator.reports.stage_views import (
     calibration_of,
     deployments_of,
     evaluation_of,
-    receiver_name,
     theta_of,
 )
 from orchestrator.reports.surrogate_figures import (

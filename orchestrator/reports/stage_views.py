@@ -1,7 +1,6 @@
 """Views of stage results for figures and tables.
 
 Stages are found by the kind of their result, not by their name, so that any composition of stages can be reported.
-Scenes are displayed by the names of their receivers; a scene's own name is the key in the journal and for programs.
 """
 
 from __future__ import annotations
@@ -15,37 +14,11 @@ from orchestrator.learning.calibration.calibration_scores import (
     Scores,
     recommended_theta,
 )
-from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.single_action import Confirmed, PredictedPour
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.records.codec import Results
 from sim_engine.liquids import SimulationParameters
-
-
-def receiver_names(plan: CampaignPlan) -> dict[str, str]:
-    """Scene name → the receiver's name; the scenes' own names if two deployment scenes have receivers with the same
-    name."""
-    names: dict[str, str] = {}
-    if plan.deployment is not None:
-        scenes = plan.deployment.scenes
-        distinct = len({scene.receiver.name for scene in scenes}) == len(scenes)
-        names = {scene.name: scene.receiver.name if distinct else scene.name for scene in scenes}
-    if plan.calibration is not None:
-        for known in (plan.calibration.records, plan.calibration.transfer):
-            if known is not None:
-                names.setdefault(known.scene.name, known.scene.receiver.name)
-        for scene in plan.calibration.poured:
-            names.setdefault(scene.name, scene.receiver.name)
-    for scene in () if plan.dispense is None else plan.dispense.scenes:
-        names.setdefault(scene.name, scene.receiver.name)
-    return names
-
-
-def receiver_name(plan: CampaignPlan, scene: str) -> str:
-    """Display name of a scene; its own name if the plan does not contain it."""
-    return receiver_names(plan).get(scene, scene)
-
 
 L = TypeVar("L", bound=StageResult)
 

@@ -10,7 +10,7 @@ from actors.laboratory_settings import MODE_LABELS
 from orchestrator.learning.calibration.calibration_base import CalibratedTheta
 from orchestrator.learning.calibration.calibration_scores import Scores
 from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
-from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, DeploymentPlan, receiver_names
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.single_action import Confirmed, PredictedPour
 from orchestrator.learning.stage_result import weighed_masses
@@ -55,7 +55,6 @@ from orchestrator.reports.stage_views import (
     evaluation_of,
     gain_of,
     predictions_of,
-    receiver_names,
     recommended_theta_of,
     rival_scores,
     theta_of,

@@ -11,11 +11,11 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import TypeVar
 
-from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
+from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan, receiver_names
 from orchestrator.records.codec import Results
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.run_summary import NotSimulated
-from orchestrator.reports.stage_views import deployments_of, receiver_names, recommended_theta_of
+from orchestrator.reports.stage_views import deployments_of, recommended_theta_of
 from sim_engine.action import Action
 from sim_engine.model_validity import ModelValidity, NotCovered, regimes
 from sim_engine.scene import Scene
