@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from orchestrator.daemon.state.daemon_store import AT_REST
+from sim_engine.engine_package import engine_name
 from tests.end_to_end.combinations import CELLS, PAGE, ROOT, RUNS, Run, page, pairs, shown, verdict, write_campaign
 from tests.end_to_end.test_daemon_killed import opened
 from tests.support.waiting import PATIENCE
@@ -74,7 +75,7 @@ def assert_complete(run: Run, folder: Path) -> None:
     assert summary["state"] == "finished"
     assert [pour["state"] for pour in pours] == ["weighed"] * run.pours()
     versions = json.loads((directory / "versions.json").read_text(encoding="utf-8"))
-    assert versions["engine"].startswith("quadrants" if "Quadrants" in run.ways else "taichi")
+    assert versions["engine"].startswith("quadrants" if "Quadrants" in run.ways else engine_name())
     if "recordings" in run.features:
         assert len(list((directory / "recordings").glob("*.yaml"))) == len(pours)
 

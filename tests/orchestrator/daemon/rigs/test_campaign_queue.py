@@ -294,7 +294,7 @@ def test_draws_of_theta_travel_to_a_daemon_with_the_campaign_that_is_planned(tmp
 def test_warnings_of_the_check_and_a_missing_recording_are_reported_as_the_run_begins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("orchestrator.live_view.live_server.installed", lambda module: False)
+    monkeypatch.setattr("orchestrator.live_view.rerun_subscriber.installed", lambda module: False)
     far = CAMPAIGN.replace("[60 mm, 100 mm]", "[60 mm, 500 mm]").replace("recording: false", "recording: true")
 
     async def work() -> None:
