@@ -1,7 +1,7 @@
 """A laboratory over 60 days: do the control charts point to the quantity that a creeping fault changes?
 
     python benchmarks/laboratory_months.py            # seeds 51000 to 51019: 10 with a fault, 10 still ones
-    python benchmarks/laboratory_months.py --first 50000 --png faults.png
+    python benchmarks/laboratory_months.py --first 50000 --png charts.png   # the docs show charts-50003.png
 
 Every day has one run with two to six pours and one or two doses. The liquid is an analytic surrogate of a bench (no
 particles), whose numbers are below. Everything after it is the product: weighings become masses by the rules of the
@@ -29,7 +29,6 @@ import numpy as np
 from actors.balance.weighing_plan import Placement, PourMasses, measurement, weighing_uncertainty
 from actors.interfaces import DoseSource, DoseTarget
 from orchestrator.catalogue.catalogue import Catalogue
-from orchestrator.catalogue.control_charts import LaboratoryChart
 from orchestrator.learning.requests import Pour, Poured, Prediction
 from orchestrator.learning.stage_result import DOSE
 from orchestrator.records.events import Requested, RequestFinished, RequestStarted
@@ -203,14 +202,6 @@ def judged(seed: int, fault: str, png: Path | None = None) -> dict[str, Any]:
 
 def _day(moment: float) -> int:
     return int((moment - FIRST_DAY) // 86_400)
-
-
-def charts_of_days(days: int, seed: int, fault: str, folder: Path) -> list[LaboratoryChart]:
-    """The charts after some days, for pictures and tests; the runs stay in the folder."""
-    write_laboratory(folder, seed, fault, days)
-    with Catalogue() as catalogue:
-        catalogue.refresh()
-        return catalogue.charts({})
 
 
 def main() -> None:
