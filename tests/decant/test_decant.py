@@ -67,7 +67,7 @@ def test_every_example_of_the_page_runs_as_it_stands(tmp_path: Path) -> None:
         "curves",
         "outflows",
     }
-    for name in ("pour.png", "spillage.png"):
+    for name in ("pour.png", "losses.png"):
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
 
 
