@@ -255,6 +255,7 @@ def _answer(query: SurrogateQuery) -> Suggestion:
 def _feasibilities(feasibility: Feasibility | None, points: Array) -> tuple[float, ...]:
     if feasibility is None or not len(points):
         return ()
+    # P = exp Σ_k ln P_k over the kinds of requests, as in `Feasibility`
     return tuple(map(float, np.exp(feasibility.log_probability(points))))
 
 
@@ -264,6 +265,7 @@ def _candidates(arrays: QueryArrays, model: Model, rng: np.random.Generator) -> 
     if isinstance(model.surrogate, RiskProcess):
         seen = np.clip(seen, 0.0, 1.0)  # executed points may lie outside the box
     means = model.surrogate.predict(seen)[0]
+    # the seen places with the four smallest m(x)
     around = [seen[i] for i in np.argsort(means, kind="stable")[:4]]
     return acquisition.search_candidates(arrays.region, seen.shape[1], around, rng)
 
