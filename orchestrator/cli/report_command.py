@@ -79,7 +79,7 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
             return write_reduced_report(output or folder / REPORT_NAME, folder, reason), []
         print_note("drawing the figures …")
         if publish_if_missing(plan, result):
-            print_note("summary.json and theta.json were missing, and are written now")
+            print_note("summary.json and theta.json were not those of the finished run, and are written now")
         page, figures = report_on(plan, result, output, formats)
     except RunError as error:
         raise RefusalError(str(error), FAILED) from None

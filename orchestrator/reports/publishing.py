@@ -133,14 +133,22 @@ def publish_so_far(request: RunRequest) -> Published | None:
 def publish_if_missing(plan: CampaignPlan, result: CampaignResult) -> bool:
     """Publish a finished run whose process ended before `summary.json` or `theta.json` was written.
 
+    A `summary.json` that was written while the run was interrupted, or that can't be read, counts as missing.
+
     Returns:
         Whether anything was missing.
 
     Raises:
         OSError: a file can't be written.
     """
-    expected = [SUMMARY_NAME, *([] if theta_of(result.results) is None else [THETA_FILE])]
-    if result.state is not State.FINISHED or all((result.directory / name).is_file() for name in expected):
+    if result.state is not State.FINISHED:
+        return False
+    try:
+        summary = json.loads((result.directory / SUMMARY_NAME).read_text(encoding="utf-8"))
+        current = summary["state"] == result.state
+    except (FileNotFoundError, ValueError, LookupError, TypeError):
+        current = False
+    if current and (theta_of(result.results) is None or (result.directory / THETA_FILE).is_file()):
         return False
     publish(plan, result)
     return True

@@ -5,8 +5,10 @@ or not known.
 from __future__ import annotations
 
 import asyncio
+import json
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -315,6 +317,17 @@ def test_the_verb_writes_where_it_is_told_and_figures_for_latex(made: Made, tmp_
     assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
     for file in made.published.figures.values():
         assert file.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_summary_of_the_time_before_the_run_was_finished_is_written_again(made: Made, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(made.result.directory, folder)
+    finished = (folder / "summary.json").read_text(encoding="utf-8")
+    interrupted = json.loads(finished) | {"state": "interrupted"}
+    (folder / "summary.json").write_text(json.dumps(interrupted), encoding="utf-8")
+    assert decant(f"report {shlex.quote(str(folder))}").exit_code == 0
+    again = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    assert again["state"] == "finished"
 
 
 @pytest.mark.parametrize(
