@@ -27,7 +27,6 @@ HELP = {
         "'angular_velocity=0.7 rad/s'",
         "in_flight",
         "--seeds",
-        "--from pours.csv",
     ],
     "validate": ["decant validate configs/campaigns/*.yaml", "units, bounds"],
     "schema": ["decant schema result > result.json"],
