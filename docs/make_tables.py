@@ -574,7 +574,8 @@ def _dosing_balances(*, pairs: bool) -> str:
             cells.append(f"{low:{form}} to {high:{form}}{' %' if key == 'coverage' else ''}")
         rows.append((f"{len(others)} others", *cells, "0", *_covered_later(again)))
     one = next(iter(data.values()))
-    how = f"{one['now']['doses']} doses a row, seeds {one['seeds'][0]} to {one['seeds'][1]}; today: seeds from 15000"
+    seeds = f"seeds {one['seeds'][0]} to {one['seeds'][1]}; today: seeds from 15000, 300 doses from 16000"
+    how = f"{one['now']['doses']} doses a row, {seeds}"
     how += "; all rows: [dosing-balances.json](../data/dosing-balances.json)"
     head = ("balance", *figures, "today: covers (doses)", "today: false stops")
     return f"{_table(head, rows)}\n<sub>`python benchmarks/dosing_balances.py --final --json`; {how}.</sub>\n"
