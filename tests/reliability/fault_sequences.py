@@ -41,7 +41,7 @@ from tests.reliability.afterwards import state, unknown_pours
 from tests.reliability.case import AHEAD, BACK, CUT, FULL, KILLED, KILLED_AFTER, STOPPED
 from tests.reliability.page import BEGIN, END, PAGE, ROOT, commit
 from tests.reliability.program import ProgramRig
-from tests.reliability.rig import POUR_ASKED_ABOUT, Life, Moments, Rig, cpu
+from tests.reliability.rig import NOTHING_STRUCK, POUR_ASKED_ABOUT, Life, Moments, Rig, cpu
 from tests.reliability.served import SUBMITTED, DaemonRig, ServedLife
 from tests.reliability.wired import BalanceRig, ControllerRig, WiredRig, WorkerRig
 
@@ -164,7 +164,10 @@ class SequenceRig(Rig):
             else:
                 strikes.kill([os.getpid()])
             return
+        missed = len(life.noted("missed"))
         DEVICES[fault.target].strike(self._of(fault.target), fault.fault, life)
+        if len(life.noted("missed")) > missed:
+            life.note("not struck", f"{fault.target} {fault.fault}")
 
     def _of(self, target: str) -> Any:
         """This rig, which strikes the processes of a device instead of those of the program."""
@@ -185,7 +188,8 @@ class SequenceRig(Rig):
         """Strike, continue until the campaign is finished, and compare with the undisturbed run.
 
         Returns:
-            How the lives ended, the number of questions, and `wrong`: what should not be.
+            How the lives ended, the number of questions, the faults that were met, those of them that found no process
+            or connection to strike, as between two pours, and `wrong`: what should not be.
         """
         place, begun = self._place(), cpu()
         life = self.struck(place, tuple(faults))
@@ -199,8 +203,11 @@ class SequenceRig(Rig):
                 if disk is not None:
                     strikes.tidy(disk)
             wrong = [*self._wrong(life, unknown), *self._left(place)]
-            questions, met_faults = len(life.noted("asked")), life.noted("met")
-        return {"ended": ended, "asked": questions, "met": met_faults, "wrong": wrong, "cpu_s": round(cpu() - begun, 2)}
+            outcome = {
+                **{"ended": ended, "asked": len(life.noted("asked")), "met": life.noted("met")},
+                **{"not_struck": life.noted("not struck"), "wrong": [text for text in wrong if text != NOTHING_STRUCK]},
+            }
+        return {**outcome, "cpu_s": round(cpu() - begun, 2)}
 
     def questions(self, life: Life) -> int:
         """Number of pours that a person was asked about."""
@@ -336,6 +343,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         of_bench = [row for row in rows if row["bench"] == bench]
         if of_bench:
             met = Counter(text for row in of_bench for text in row["met"])
+            met -= Counter(text for row in of_bench for text in row.get("not_struck", ()))
             good = sum(not row["wrong"] for row in of_bench)
             kinds = ", ".join(f"{text} ({count})" for text, count in sorted(met.items()))
             lives, asked = sum(len(row["ended"]) for row in of_bench), sum(row["asked"] for row in of_bench)

@@ -58,6 +58,8 @@ LIVES = 4
 LEAVING = 20.0
 """Within so long nothing is left of a program that was killed [s]."""
 
+NOTHING_STRUCK = "there was nothing to be struck"
+
 POUR_ASKED_ABOUT = re.compile(r"pour (\d+) of stage (\S+)")
 
 
@@ -307,7 +309,7 @@ class Rig:
             yield "it was never struck"
         yield from life.noted("hung")
         if life.noted("missed"):
-            yield "there was nothing to be struck"
+            yield NOTHING_STRUCK
         if (found := state(life.directory)) is not State.FINISHED:
             yield f"the campaign is not finished but {found}: {life.noted('told')[-1:]}"
             return
