@@ -160,7 +160,7 @@ class SequenceRig(Rig):
             elif fault.fault in (AHEAD, BACK):
                 strikes.shift_clock(strikes.DAY if fault.fault == AHEAD else -strikes.HOUR)
             elif fault.fault == STOPPED:
-                strikes.stop_this()
+                strikes.stop([os.getpid()])
             else:
                 strikes.kill([os.getpid()])
             return

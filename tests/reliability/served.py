@@ -95,7 +95,7 @@ class DaemonRig(Rig):
 
     def strike(self, fault: str, life: Life) -> None:
         if fault == STOPPED:
-            strikes.stop_this()
+            strikes.stop([os.getpid()])
         else:
             super().strike(fault, life)
 

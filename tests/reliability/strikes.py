@@ -9,7 +9,6 @@ import signal
 import socket
 import struct
 import subprocess
-import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -37,26 +36,14 @@ def kill(pids: Iterable[int]) -> None:
 
 
 def stop(pids: Iterable[int], pause: float = PAUSE) -> None:
-    """SIGSTOP, and SIGCONT after a pause."""
+    """SIGSTOP, and SIGCONT after a pause, from another process: this one may be stopped or killed."""
     struck = tuple(pids)
+    names = " ".join(map(str, struck))
+    subprocess.Popen(
+        ["sh", "-c", f"sleep {pause}; kill -CONT {names} 2>/dev/null"], start_new_session=True, env=child_environment()
+    )
     for pid in struck:
         os.kill(pid, signal.SIGSTOP)
-
-    def go_on() -> None:
-        time.sleep(pause)
-        for pid in struck:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGCONT)
-
-    threading.Thread(target=go_on).start()
-
-
-def stop_this() -> None:
-    """The same for this process: another one lets it go on."""
-    subprocess.Popen(
-        ["sh", "-c", f"sleep {PAUSE}; kill -CONT {os.getpid()}"], start_new_session=True, env=child_environment()
-    )
-    os.kill(os.getpid(), signal.SIGSTOP)
 
 
 def cut(pids: Iterable[int]) -> int:
