@@ -261,7 +261,9 @@ class DoseProcedure(BenchProcedure):
             self._executed = await motion  # without commands the cup turns back, and the program ends
         finally:
             if not motion.done():
-                await asyncio.gather(asyncio.wait_for(motion, 1.0), return_exceptions=True)
+                with contextlib.suppress(Exception):
+                    async with asyncio.timeout(1.0):
+                        await motion
         self._duration = self._now() - begin
         self._tilts.append((self._duration, 0.0))
         if controller.result is None:

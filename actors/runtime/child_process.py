@@ -326,7 +326,8 @@ async def run_async(command: Sequence[str], data: bytes, *, timeout: float) -> b
         env=child_environment(),
     )
     try:
-        return (await asyncio.wait_for(process.communicate(data), timeout))[0]
+        async with asyncio.timeout(timeout):
+            return (await process.communicate(data))[0]
     finally:
         with contextlib.suppress(ProcessLookupError):
             process.kill()

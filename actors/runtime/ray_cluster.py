@@ -123,7 +123,6 @@ class PinnedNode:
         Ray itself needs fifteen seconds to detect this; a dead node's raylet refuses connections at once. If a
         connection times out, a packet may have been lost: then Ray decides."""
         try:
-            # not `wait_for`, which in Python 3.11 loses a cancellation that comes together with the refusal
             async with asyncio.timeout(_PATIENCE):
                 _, writer = await asyncio.open_connection(self.node.address, self.node.port)
             writer.close()
@@ -411,7 +410,8 @@ class JoinedCluster:
             from ray.util.placement_group import remove_placement_group
 
             with contextlib.suppress(Exception):  # Ray releases it in any case when this program ends
-                await asyncio.wait_for(asyncio.to_thread(remove_placement_group, self._bundle), CLOSE_DEADLINE)
+                async with asyncio.timeout(CLOSE_DEADLINE):
+                    await asyncio.to_thread(remove_placement_group, self._bundle)
 
     async def _reserve(self) -> tuple[str, dict[str, Any]]:
         """Reserve all of the bench's resource on one node, so that a second program cannot move the same arm.

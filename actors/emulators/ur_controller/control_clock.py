@@ -271,6 +271,7 @@ async def until_orphaned(parent: int, interval: float = 0.5, hung: float = HUNG)
     while not gone.is_set() and os.getppid() == parent:
         signal.setitimer(signal.ITIMER_REAL, hung)
         try:
-            await asyncio.wait_for(gone.wait(), interval)
+            async with asyncio.timeout(interval):
+                await gone.wait()
         except TimeoutError:
             continue
