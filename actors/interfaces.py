@@ -180,6 +180,8 @@ class DoseSource:
         constants: number from which a simulated bench draws what stays the same over a series.
         knowledge: of earlier doses, or of a calibration; None if there is none.
         before: content before this filling [kg]; None if it is not known, or nothing is filled.
+        vessel: its identity in a laboratory with places: the name of the place where it belongs ('source/ethanol').
+            '': the only vessel from which that laboratory pours.
     """
 
     name: str
@@ -189,6 +191,7 @@ class DoseSource:
     constants: int
     knowledge: DoseKnowledge | None = None
     before: float | None = field(default=None, metadata={"written": "if set"})
+    vessel: str = field(default="", metadata={"written": "if set"})
 
     @property
     def unused(self) -> bool:
@@ -200,17 +203,29 @@ class DoseSource:
 class DoseTarget:
     """A wanted amount in the receiver; the tilt is then decided while the liquid flows.
 
+    In a laboratory with places the arm carries the vessels of the dose. A vessel's identity is the name of the place
+    where it belongs; all vessels of a series are in `LaboratorySettings.vessels`. The arm puts the cup on the balance
+    unless it stands there, weighs it, takes the source, doses, puts the source back and weighs the cup again. What is
+    in the cup already belongs to its tare. A cup that has some of this liquid already is refused, and so is one whose
+    content is UNKNOWN. Without places the identities are not used.
+
     Attributes:
         amount: [kg].
         limit: excess that may be exceeded with a probability of 1 % only [kg].
         position: name of the receiver's place, for the operator.
         source: of the dose; None: a full pourer, about which nothing is known.
+        cup: identity of the receiver ('rack/A1'); '': the only one, exchanged for an empty one before each dose.
+        stays: the next dose is poured into this cup, too: it stays on the balance.
+        emptied: the cup is emptied at the waste place first.
     """
 
     amount: float
     limit: float = 1e-3
     position: str = ""
     source: DoseSource | None = None
+    cup: str = field(default="", metadata={"written": "if set"})
+    stays: bool = field(default=False, metadata={"written": "if set"})
+    emptied: bool = field(default=False, metadata={"written": "if set"})
 
 
 class Bench(Protocol):

@@ -26,7 +26,7 @@ from actors.liquid_devices import (
     SpillSensorSettings,
     check_devices,
 )
-from actors.places import PlaceSettings, UnattendedSettings, check_places
+from actors.places import CellVessel, PlaceSettings, UnattendedSettings, all_places, check_places
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseErrorSettings, PoseNoise
 from sim_engine.settings.model import (
@@ -175,6 +175,9 @@ class LaboratorySettings(Settings):
     unattended: Annotated[UnattendedSettings | None, SET_BY_PROGRAM] = None
     """What the campaign asks for."""
 
+    vessels: Annotated[tuple[CellVessel, ...], SET_BY_PROGRAM] = ()
+    """All vessels of the campaign's doses, of a laboratory with places; empty: the only source and the only cup."""
+
     balance: Annotated[BalanceSettings, OneOf(kinds)] | None = None
     """The balance next to the arm."""
 
@@ -296,8 +299,9 @@ class LaboratorySettings(Settings):
         check_places(problems, self.places, getattr(self.arm, "tool", None))
         arm = self.arm.in_laboratory(self.cell, 1.0)
         if problems.valid("places", "arm", "cell"):
-            for number, text in arm_kind(arm).place_problems(self.places, {}):
-                problems.add(text, "places", number, more=True)
+            owners = [number for number, place in enumerate(self.places) for _ in place.each]
+            for number, text in arm_kind(arm).place_problems(all_places(self.places), {}):
+                problems.add(text, "places", owners[number], more=True)
 
     def _check_without_arm(self, problems: Problems) -> None:
         for key in ("cell", "gripper", "places", "balance", "operator", "source", "spill_sensor"):

@@ -1,6 +1,8 @@
 """Places of a laboratory where the arm puts vessels down and takes them from: settings, and what stands where.
 
-- `PlaceSettings` is one entry of a laboratory's section `places`; `Layout` names the places that a pour uses.
+- `PlaceSettings` is one entry of a laboratory's section `places`: one place, or a rack of them (`RackSettings`).
+  `all_places` has each position of a rack as a place of its own, such as 'rack/A1'.
+- `CellVessel` is a vessel by its identity; `Layout` names the places of pourer and receiver in calibration pours.
 - `PlaceRecord` is the account of what stands where. The orchestrator keeps it on disk
   (`orchestrator.materials.vessel_account`), so that it outlasts the program.
 
@@ -9,6 +11,7 @@ The ways to the places are planned in `actors.arm.planning.place_ways`, and driv
 
 from __future__ import annotations
 
+import cmath
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -20,20 +23,120 @@ from pydantic_core import PydanticCustomError
 
 from actors.arm_geometry import Pose
 from actors.interfaces import InvalidActionError
-from sim_engine.settings.model import Example, Name, PositiveCount, Problems, Settings
+from sim_engine.settings.model import Example, PositiveCount, Problems, Settings
 from sim_engine.settings.quantity import Quantity
+from sim_engine.vessel.shapes import VesselSpec
 
 Role = Literal["pourer", "receiver"]
 
 ROLES: tuple[Role, Role] = ("pourer", "receiver")
-"""Names of the vessels that the arm handles."""
+"""Names of the vessels that the arm handles in calibration pours; in doses, the roles of source and cup."""
+
+PlaceName = Annotated[
+    str, Strict(), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9][A-Za-z0-9._-]*)?$", max_length=60)
+]
+
+LIFT = 10e-3
+"""Height above a rack to which a vessel is lifted at least before it moves sideways [m]."""
+
+
+PITCH = Quantity("m", "90 mm", 5e-3, 0.5)
+
+RESIDUAL = 3e-3
+"""Largest distance of a taught corner of a rack from where its pitch puts it [m]."""
+
+LEVEL = math.radians(2.0)
+"""Largest slope of a rack."""
+
+
+class RackSettings(Settings):
+    """Rows A, B … and columns 1, 2 … of a rack, seen from above with A1 at the top left."""
+
+    rows: Annotated[PositiveCount, Field(le=26)]
+    """Number of rows."""
+
+    columns: Annotated[PositiveCount, Field(le=99)]
+    """Number of columns."""
+
+    row_pitch: Annotated[float, PITCH]
+    """Distance of two rows."""
+
+    column_pitch: Annotated[float, PITCH]
+    """Distance of two columns."""
+
+    depth: Annotated[float, Quantity("m", "40 mm", 0.0, 0.3)] = 0.0
+    """How deep a vessel stands in the rack; it is lifted by more before it is moved sideways."""
+
+    direction: Annotated[float, Quantity("rad", "0 deg", -math.pi, math.pi)] = 0.0
+    """Direction from A1 to A2 around the base's z, from its x; used while only A1 is taught."""
+
+    last_row: Pose | None = None
+    """Tool centre point at the first position of the last row, such as D1."""
+
+    last_column: Pose | None = None
+    """Tool centre point at the last position of row A, such as A6."""
+
+    @property
+    def corners(self) -> dict[str, tuple[int, int]]:
+        """Positions at which it is taught, A1 first: their row and column from 0."""
+        last = {position_name(self.rows - 1, 0): (self.rows - 1, 0)} if self.rows > 1 else {}
+        if self.columns > 1:
+            last[position_name(0, self.columns - 1)] = (0, self.columns - 1)
+        return {"A1": (0, 0), **last}
+
+    def positions(self, first: Pose) -> tuple[dict[str, Pose], float]:
+        """The poses of all positions by name, and the residual of the taught ones.
+
+        Horizontally the grid is turned and shifted for the smallest sum of squares; the height follows the plane of
+        the taught positions. All have the orientation of A1.
+
+        Args:
+            first: pose of A1.
+
+        Returns:
+            The poses, and the largest distance of a taught position from its place in the grid [m].
+        """
+        taught = {(0, 0): first}
+        if self.last_row is not None:
+            taught[self.rows - 1, 0] = self.last_row
+        if self.last_column is not None:
+            taught[0, self.columns - 1] = self.last_column
+        grid = {key: complex(key[1] * self.column_pitch, -key[0] * self.row_pitch) for key in taught}
+        measured = {key: complex(*pose.as_list[:2]) for key, pose in taught.items()}
+        middle, centre = (sum(points.values()) / len(taught) for points in (grid, measured))
+        # the rotation e^{iφ} that minimises Σ |m_k − m̄ − e^{iφ} (g_k − ḡ)|² has the angle of Σ (m_k − m̄) (g_k − ḡ)*
+        product = sum((measured[key] - centre) * (grid[key] - middle).conjugate() for key in taught)
+        turn = product / abs(product) if abs(product) > 0.0 else cmath.rect(1.0, self.direction)
+        residual = max(abs(measured[key] - centre - turn * (grid[key] - middle)) for key in taught)
+        down, across = self.slopes(first)
+        poses = {}
+        for row in range(self.rows):
+            for column in range(self.columns):
+                at = centre + turn * (complex(column * self.column_pitch, -row * self.row_pitch) - middle)
+                z = first.as_list[2] + down * row * self.row_pitch + across * column * self.column_pitch
+                poses[position_name(row, column)] = Pose.of(at.real, at.imag, z, *first.as_list[3:])
+        return poses, residual
+
+    def slopes(self, first: Pose) -> tuple[float, float]:
+        """Rise per length from row to row, and from column to column; 0 in a direction that is not taught."""
+        ends = ((self.last_row, self.rows, self.row_pitch), (self.last_column, self.columns, self.column_pitch))
+        down, across = (
+            0.0 if end is None or count < 2 else (end.as_list[2] - first.as_list[2]) / ((count - 1) * pitch)
+            for end, count, pitch in ends
+        )
+        return down, across
+
+
+def position_name(row: int, column: int) -> str:
+    """The usual name of a position: 'A1' for row 0 and column 0."""
+    return f"{chr(ord('A') + row)}{column + 1}"
 
 
 class PlaceSettings(Settings):
     """A place where a vessel stands, taught by hand with 'decant robot teach'."""
 
-    name: Annotated[Name, Example("left")]
-    """Name of the place."""
+    name: Annotated[PlaceName, Example("left")]
+    """Name of the place, and of the vessel that belongs there; a slash may group some, such as 'source/water'."""
 
     pose: Annotated[Pose, Example("{x: 600 mm, y: -300 mm, z: 120 mm, rx: 1.571 rad}")]
     """Tool centre point in the base's frame, with the fingers at a vessel that stands there."""
@@ -55,6 +158,44 @@ class PlaceSettings(Settings):
 
     tray: Annotated[float, Quantity("m^3", "500 mL", 1e-6, 0.1)] | None = None
     """Liquid that the spill tray around the balance holds. What is spilled is added up; before it may overflow, the operator is asked to empty it. Not watched unless given."""  # noqa: E501
+
+    rack: RackSettings | None = None
+    """It is a rack: its pose is that of A1, and each position is a place, such as 'rack/A1'."""
+
+    @property
+    def each(self) -> tuple[PlaceSettings, ...]:
+        """The places: of a rack, one for each position."""
+        if self.rack is None:
+            return (self,)
+        poses, _ = self.rack.positions(self.pose)
+        lift = max(self.approach, self.rack.depth + LIFT)
+        return tuple(
+            self.with_values(name=f"{self.name}/{name}", pose=pose, approach=lift, rack=None)
+            for name, pose in poses.items()
+        )
+
+
+def all_places(places: Sequence[PlaceSettings]) -> tuple[PlaceSettings, ...]:
+    """The places of a laboratory, with each position of a rack as a place of its own."""
+    return tuple(position for place in places for position in place.each)
+
+
+@dataclass(frozen=True)
+class CellVessel:
+    """A vessel of a series of doses.
+
+    Attributes:
+        name: its identity: the name of the place where it belongs.
+        spec: its shape, with `grip: {mass: …}`.
+        liquid: of a source, its liquid; '' for a cup.
+        mass, volume: largest load with which it is carried [kg], [m³].
+    """
+
+    name: str
+    spec: VesselSpec
+    liquid: str
+    mass: float
+    volume: float
 
 
 TIME_OF_DAY = r"^([01]\d|2[0-3]):[0-5]\d$"
@@ -116,14 +257,16 @@ def check_places(problems: Problems, places: Sequence[PlaceSettings], tool: Pose
 
     Args:
         problems: of the laboratory, whose key `places` is.
-        places: all places.
+        places: as in the file.
         tool: tool centre point of the arm; None if the arm has none.
     """
     names: set[str] = set()
     for number, place in enumerate(places):
-        if place.name in names:
-            problems.add(f"two places are named '{place.name}'", "places", number, "name")
-        names.add(place.name)
+        if twice := names.intersection(position.name for position in place.each):
+            problems.add(f"two places are named '{min(twice)}'", "places", number, "name")
+        names.update(position.name for position in place.each)
+        if place.rack is not None:
+            _check_rack(problems, place, number)
         if place.tray is not None and place.use != "balance":
             problems.add("belongs to the place with 'use: balance', over which is poured", "places", number, "tray")
         if tool is not None and _differ(place.tool, tool):
@@ -134,6 +277,33 @@ def check_places(problems: Problems, places: Sequence[PlaceSettings], tool: Pose
                 number,
                 "tool",
             )
+
+
+def _check_rack(problems: Problems, place: PlaceSettings, number: int) -> None:
+    rack = place.rack
+    assert rack is not None
+    if place.use != "stand":
+        problems.add("a rack is a place with 'use: stand'; teach the other one by itself", "places", number, "use")
+    for key, count in (("last_row", rack.rows), ("last_column", rack.columns)):
+        if getattr(rack, key) is not None and count == 1:
+            problems.add("is A1 itself, as there is only one; remove it", "places", number, "rack", key)
+    if text := rack_problem(place):
+        problems.add(text, "places", number, "rack")
+
+
+def rack_problem(place: PlaceSettings) -> str:
+    """Why the taught positions of a rack do not fit its pitch; '' if they do."""
+    assert place.rack is not None
+    _, residual = place.rack.positions(place.pose)
+    if residual > RESIDUAL:
+        return (
+            f"the taught positions of '{place.name}' are up to {1e3 * residual:.1f} mm away from a grid with its "
+            f"pitch, and {1e3 * RESIDUAL:.0f} mm are allowed; teach A1 and the corners again, and check rows, columns "
+            "and pitch. Seen from above, rows go down from A and columns to the right"
+        )
+    if (slope := math.atan(math.hypot(*place.rack.slopes(place.pose)))) > LEVEL:
+        return f"'{place.name}' slopes by {math.degrees(slope):.1f} deg; level it, and teach it again"
+    return ""
 
 
 def _differ(first_pose: Pose, other: Pose) -> bool:

@@ -44,7 +44,7 @@ from actors.interfaces import (
 )
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from actors.liquid_devices import SourceSettings, SpillSensorSettings
-from actors.places import PlaceRecord
+from actors.places import PlaceRecord, all_places
 from actors.runtime.remote_object import Device
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
@@ -368,7 +368,7 @@ async def _open_devices(
         if record is None:
             raise LaboratoryError(f"laboratory {spec.name} has places, and no account of what stands where was given")
         handling = VesselHandling(
-            spec.places, arm, arm_spec, held, balance, balance_spec, record, supply, ground_truth, tell
+            all_places(spec.places), arm, arm_spec, held, balance, balance_spec, record, supply, ground_truth, tell
         )
     setup = Setup(
         spec.mode,

@@ -148,10 +148,10 @@ def check_handling(
             raise InvalidActionError(str(error)) from error
     if problems := [text for _, text in kind.place_problems(places, vessels)]:
         raise InvalidActionError("; ".join(problems))
-    volumes = {False: None, True: scene.liquid.volume}
+    layout, volumes = Layout.of(places), {False: None, True: scene.liquid.volume}
     return {
         (place.name, full): kind.way(place, places, vessels, volume)
-        for place in places
+        for place in (layout.balance, *layout.rest.values())
         for full, volume in volumes.items()
     }
 

@@ -23,7 +23,7 @@ from actors.bench.pour_feasibility import vessel as built
 from actors.grippers.gripper_interface import GripperSettings
 from actors.interfaces import InvalidActionError, LaboratoryError, UnreachablePlaceError
 from actors.laboratory_settings import LaboratorySettings
-from actors.places import PlaceSettings
+from actors.places import PlaceSettings, all_places
 from orchestrator.campaigns.yaml.file_access import why_not_writable
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Loc
@@ -520,7 +520,7 @@ def check_campaign(
     except ConfigError:
         document = None  # a plan without a file
     lab = plan.laboratory
-    checker = _Checker(plan.source, lab.arm, lab.gripper, lab.places, document, warn, doing)
+    checker = _Checker(plan.source, lab.arm, lab.gripper, all_places(lab.places), document, warn, doing)
     at: Loc
     if (problem := why_not_writable(plan.outputs.folder)) is not None:
         checker.add((("outputs", "directory"),), problem)

@@ -288,16 +288,18 @@ def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMoti
     home with 'decant robot home' then.
     """
     from actors.arm.arm_settings import arm_kind
+    from actors.places import all_places
     from orchestrator.cli.motion_control import stoppable, typed_line
 
     spec = read_laboratory(laboratory)
-    place = next((p for p in spec.places if p.name == name), None)
+    places = all_places(spec.places)
+    place = next((p for p in places if p.name == name), None)
     if place is None:
         known = ", ".join(f"'{p.name}'" for p in spec.places) or "none"
         raise RefusalError(f"{laboratory}: there is no place '{name}'; there are {known}")
     lines = f"from home to the place '{name}' and back, at a quarter of the usual speed"
     with _session(laboratory, "try", lines, enable_motion) as (driver, arm):
-        way = arm_kind(arm).way(place, spec.places, {}).slowed(TRIED)
+        way = arm_kind(arm).way(place, places, {}).slowed(TRIED)
         print_message(f"{way.approach_time:.0f} s for each way. The fingers must be open, and hands out of the cell.")
         for homewards, text in ((False, f"down to '{name}'"), (True, "back home")):
             if typed_line(f"type 'yes' to move {text} > ").strip() != "yes":

@@ -24,7 +24,7 @@ from actors.bench.pour_feasibility import vessel
 from actors.bench.vessel_handling import check_handling, plan_back
 from actors.grippers.gripper_interface import GRIPPERS
 from actors.interfaces import InvalidActionError
-from actors.places import UnattendedSettings, check_places
+from actors.places import UnattendedSettings, all_places, check_places
 from orchestrator.campaigns.campaign_checks import check_campaign
 from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.campaigns.place_writing import write_place
@@ -131,6 +131,50 @@ def test_a_taught_place_is_written_and_comments_stay(tmp_path: Path) -> None:
     assert [place.name for place in places] == ["pan", "left", "right", "rear"]
     assert places[1].pose.y == pytest.approx(-0.43)
     assert places[3].use == "source"
+
+
+def racked(**rack: Any) -> Change:
+    """Place 'right' of the night as a rack of 2 × 2 positions with a pitch of 100 mm."""
+    values = {"rows": 2, "columns": 2, "row_pitch": "100 mm", "column_pitch": "100 mm", **rack}
+    return at(2, name="rack", rack=values)
+
+
+def corner(x: float, y: float, z: float = 80.0) -> dict[str, str]:
+    turn = dict.fromkeys(("rx", "ry", "rz"), "1.2092 rad")
+    return {"x": f"{x} mm", "y": f"{y} mm", "z": f"{z} mm", **turn}
+
+
+def test_each_position_of_a_rack_is_a_place_between_its_taught_corners(tmp_path: Path) -> None:
+    # A1 at (620, 240), B1 to its left and A2 below it in the base's plane: the rack is turned by -90 deg, less 1 mm
+    change = racked(last_row=corner(521, 240), last_column=corner(620, 139))
+    places = all_places(load_laboratory(changed(tmp_path, change)).places)
+    assert [place.name for place in places[2:]] == ["rack/A1", "rack/A2", "rack/B1", "rack/B2"]
+    b2 = places[-1].pose.as_list
+    assert b2[:3] == pytest.approx([0.5200, 0.1400, 0.080], abs=1.5e-3)
+    assert b2[3:] == places[2].pose.as_list[3:]
+    assert {place.holds for place in places[2:]} == {("receiver",)}
+    alone = all_places(load_laboratory(changed(tmp_path, racked(direction="90 deg", depth="150 mm"))).places)
+    assert alone[3].pose.as_list[:2] == pytest.approx([0.62, 0.34])
+    assert alone[3].approach == pytest.approx(0.16)  # out of the rack before it moves sideways
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (racked(last_row=corner(512, 240), last_column=corner(620, 140)), "up to 4.8 mm"),
+        (racked(last_row=corner(720, 240), last_column=corner(620, 140)), "are up to"),  # a mirror image
+        (racked(last_row=corner(520, 240, 90), last_column=corner(620, 140)), "'rack' slopes by 5.7 deg"),
+        (racked(columns=1, last_column=corner(620, 140)), "is A1 itself"),
+        (lambda document: (racked()(document), at(1, name="rack/A2")(document)), "two places are named 'rack/A2'"),
+        (lambda document: (racked()(document), at(2, use="source")(document)), "a rack is a place with 'use: stand'"),
+        (racked(row_pitch="10 mm"), "places 'rack/A1' and 'rack/B1' overlap"),
+        (racked(direction="90 deg", column_pitch="400 mm"), "the foot of a vessel at 'rack/A2' is outside the box"),
+    ],
+)
+def test_racks_that_cannot_be_as_taught_are_refused(change: Change, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_laboratory(changed(tmp_path, change))
+    assert message in str(refused.value)
 
 
 def test_the_shipped_night_can_be_poured() -> None:
