@@ -409,6 +409,22 @@ class _Checker:
             return f"{action.display(*actions.names)}: {error}"
         return ""
 
+    def pour(self, scene: Scene) -> None:
+        """The pour must be possible without contact, and the arm must be able to make it."""
+        role = _Role(f"pour into '{scene.receiver.name}'")
+        self._payload(scene)
+        if (vessels := self.scene(scene, role)) is None:
+            return
+        self._carried(scene, role)
+        try:
+            problem = touch(scene, action := scene.action({}), *vessels)
+            if problem is None and self.arm is not None:
+                arm_kind(self.arm).plan(scene, action)
+        except (InvalidActionError, ValueError) as error:
+            problem = str(error)
+        if problem is not None:
+            self.add(role.places(("motion",)), f"{role.text}: {problem}")
+
     def doses(self, plan: DispensePlan, *, simulated: bool) -> None:
         """Every dose must fit into its receiver and come out of a full source."""
         for scene in plan.scenes:
@@ -552,6 +568,8 @@ def check_campaign(
             receiver = (("deployment", "receiver"), ("deployment", "receivers", i), ("receivers", i))
             role = _Role(f"deployment into '{scene.receiver.name}'", ("deployment",), receiver)
             checker.reachable(plan.deployment, scene, role)
+    if plan.pour is not None:
+        checker.pour(plan.pour)
     if plan.dispense is not None and lab.places:
         text = (
             f"laboratory '{lab.name}' has places, between which the arm carries the vessels; those of doses can't "

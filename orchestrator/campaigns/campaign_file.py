@@ -385,6 +385,9 @@ class CampaignFile(Settings):
     dispense: DispenseSettings | None = None
     """A series of wanted amounts."""
 
+    pour: Switch | None = None
+    """A single pour with the values of `motion`."""
+
     prior: AnyPrior | None = None
     """Prior of the parameters from earlier campaigns: 'catalogue' for all that fit, or a list of runs and files of
     posteriors. A run's record has the resolved one."""
@@ -404,8 +407,8 @@ class CampaignFile(Settings):
 
     def check_values(self, problems: Problems) -> None:
         """Check that there is something to do, and that calibration searches the ranges of parameters."""
-        calibration, stages = self.calibration, problems.valid("calibration", "deployment", "dispense")
-        if calibration is None and self.deployment is None and self.dispense is None and stages:
+        calibration, valid = self.calibration, problems.valid("calibration", "deployment", "dispense", "pour")
+        if valid and not self.pour and calibration is None and self.deployment is None and self.dispense is None:
             problems.add("there is nothing to do; add a 'calibration', a 'deployment' or a 'dispense' section")
         ranges = {} if self.simulator.parameters is None else self.simulator.parameters.ranges()
         at = ("simulator", "parameters")

@@ -265,13 +265,18 @@ DOSE_MOTION = {"angular_velocity": math.radians(115.0), "max_angle": math.radian
 """Fastest tilt and range of a dose, where the motion does not limit them."""
 
 
+def require_bench(laboratory: LaboratorySettings | None, place: Place, report: Report) -> None:
+    """Report a section that pours in a laboratory without bench."""
+    if laboratory is not None and not laboratory.pours:
+        report.add(place, f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench", key=True)
+
+
 def resolve_dispense(
     section: DispenseSettings, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
 ) -> DispensePlan | None:
     """The plan of a series of doses. Problems are added to the report; the plan may then be None."""
     report = builder.report
-    if laboratory is not None and not laboratory.pours:
-        report.add(place, f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench", key=True)
+    require_bench(laboratory, place, report)
     pourers: list[VesselSpec | None] = (
         [builder.pourer(None, place)]
         if section.sources is None
@@ -360,6 +365,11 @@ def resolve_campaign(
     dispense = None
     if file.dispense is not None:
         dispense = resolve_dispense(file.dispense, builder, root.at("dispense"), laboratory)
+    pour = None
+    if file.pour:
+        require_bench(laboratory, root.at("pour"), report)
+        vessels = builder.pourer(None, root), builder.receiver(None, root)
+        pour = builder.scene("pour", *vessels, (), (), root)
     memory = None
     in_force = default if parameters is None else default | parameters.in_force()
     if file.prior is not None and laboratory is not None and not report.problems:
@@ -404,6 +414,7 @@ def resolve_campaign(
         resolved=as_file(file.model_copy(update=record), root, references),
         laboratory_source=(resolved(root.directory / file.laboratory) if isinstance(file.laboratory, str) else None),
         dispense=dispense,
+        pour=pour,
     )
 
 

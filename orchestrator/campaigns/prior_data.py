@@ -99,6 +99,7 @@ def scenes_in(header: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
         if records:
             yield records["scene"]
     yield from deployment.get("scenes", ())
+    yield from filter(None, [header.get("pour")])
 
 
 def pours_in(run: PreviousRun, scene: Scene) -> tuple[list[RecordedPour], str]:

@@ -244,7 +244,8 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool)
     from orchestrator.cli.foreground_run import resources_with_operator, run_at_terminal
     from orchestrator.learning.single_action import OnePoured
     from orchestrator.records.codec import result_of
-    from orchestrator.runs.run_tasks import POUR, pour_task
+    from orchestrator.runs.run_tasks import pour_task
+    from orchestrator.runs.stages import POUR
 
     request = pour_task(chosen.plan, chosen.scene, chosen.action)
     motion = "pours          1", None if chosen.path is None else chosen.path.report

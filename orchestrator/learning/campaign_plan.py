@@ -562,6 +562,7 @@ class CampaignPlan:
         on_unknown: treatment, on resume, of a pour that had started and has no outcome.
         resolved: the YAML file with all defaults filled in, ready for JSON, as stored with the run.
         dispense: the series of doses; None without one.
+        pour: scene of a single pour, whose motion is complete; None without one.
     """
 
     name: str
@@ -577,6 +578,7 @@ class CampaignPlan:
     resolved: Annotated[dict[str, Any], NOT_IN_FINGERPRINT] = field(default_factory=dict)
     laboratory_source: Annotated[Path | None, NOT_IN_FINGERPRINT] = field(default=None, compare=False)
     dispense: DispensePlan | None = field(default=None, metadata=WRITTEN_IF_SET)
+    pour: Scene | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property
     def memory(self) -> CampaignMemory | None:
@@ -614,7 +616,7 @@ def receiver_names(plan: CampaignPlan) -> dict[str, str]:
                 names.setdefault(known.scene.name, known.scene.receiver.name)
         for scene in plan.calibration.poured:
             names.setdefault(scene.name, scene.receiver.name)
-    for scene in () if plan.dispense is None else plan.dispense.scenes:
+    for scene in (*(() if plan.dispense is None else plan.dispense.scenes), *filter(None, [plan.pour])):
         names.setdefault(scene.name, scene.receiver.name)
     return names
 

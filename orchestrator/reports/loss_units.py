@@ -117,7 +117,9 @@ DOSE = LossUnit("|received − wanted| [g]", "g", 1e3)
 
 def is_calibration(plan: CampaignPlan, pour: Pour) -> bool:
     """Whether a pour of a campaign serves calibration, see `Pour.calibrates`."""
-    return pour.calibrates(() if plan.deployment is None else [scene.name for scene in plan.deployment.scenes])
+    return plan.pour is None and pour.calibrates(
+        () if plan.deployment is None else [scene.name for scene in plan.deployment.scenes]
+    )
 
 
 def unit_of_pour(plan: CampaignPlan, pour: Pour) -> LossUnit:

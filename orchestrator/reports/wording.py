@@ -474,7 +474,7 @@ def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
         list(plan.deployment.scenes) if plan.deployment is not None else []
     )
-    scenes += [] if plan.dispense is None else plan.dispense.scenes
+    scenes += [*([] if plan.dispense is None else plan.dispense.scenes), *filter(None, [plan.pour])]
     if scenes:
         liquid = scenes[0].liquid
         volume = liquid.millilitres(liquid.mass)

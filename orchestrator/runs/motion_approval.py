@@ -189,7 +189,7 @@ def campaign_pours(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> lis
             cases += _from_all_over(scene, plan.deployment.actions, plan.deployment.constraints)
     if plan.dispense is not None and any(stage.name == DOSES for stage in stages):
         cases += [(scene, scene.action({})) for scene in plan.dispense.scenes]
-    return cases
+    return cases + [(scene, scene.action({})) for scene in filter(None, [plan.pour])]
 
 
 def _from_all_over(scene: Scene, actions: Space, constraints: Sequence[Linear]) -> list[tuple[Scene, Action]]:
@@ -208,6 +208,7 @@ def pour_count(plan: CampaignPlan, stages: Sequence[StageDefinition]) -> int:
     count = plan.calibration.pour_count if plan.calibration is not None and calibrating else 0
     if plan.dispense is not None and any(stage.name == DOSES for stage in stages):
         count += len(plan.dispense.doses)
+    count += plan.pour is not None
     if plan.deployment is None:
         return count
     confirming = sum(stage.name.startswith(CONFIRMATION) for stage in stages)

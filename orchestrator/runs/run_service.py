@@ -63,7 +63,6 @@ class RunRequest:
         folder: of the run; None: a new one, which is entered in the catalogue.
         resume: continue the run in `folder`; `RunService.with_folder` sets it if a run was begun there.
         as_written: the vessels are those of the campaign's file.
-        problems: finds what prevents these pours; None: the checks of the campaign do.
     """
 
     campaign: CampaignPlan
@@ -71,7 +70,6 @@ class RunRequest:
     folder: Path | None = None
     resume: bool = False
     as_written: bool = True
-    problems: Callable[[], Sequence[str]] | None = None
 
     @property
     def pours(self) -> bool:
@@ -174,8 +172,6 @@ class RunService:
         """
         from orchestrator.campaigns.campaign_checks import check_campaign
 
-        if request.problems is not None:
-            return CheckReport(tuple(request.problems()), ())
         warned: list[Problem] = []
         checked = check_campaign(request.campaign, as_written=request.as_written, warn=warned.append, doing=doing)
         problems = [str(fault) for fault in checked]

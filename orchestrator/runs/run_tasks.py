@@ -19,6 +19,7 @@ from orchestrator.materials.vessel_account import VesselAccount
 from orchestrator.runs.run_service import RunRequest, RunTaskError
 from orchestrator.runs.stages import (
     POSTERIOR_DRAWS,
+    POUR,
     StageDefinition,
     calibration_stages,
     deployment_stages,
@@ -42,9 +43,6 @@ PREDICTION_SEEDS = 5
 
 PLANNED = "-plan"
 """Suffix of the name of a campaign that is only planned."""
-
-POUR = "pour"
-"""Name of the stage of a single pour."""
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,7 @@ from orchestrator.learning.deployment.model_monitoring import displacement
 from orchestrator.learning.dispense import Dispense, KnownSource, ReadSources, SourcesRead
 from orchestrator.learning.requests import Simulate
 from orchestrator.learning.run_errors import RunError
-from orchestrator.learning.single_action import Confirmation, RepeatedSimulation
+from orchestrator.learning.single_action import Confirmation, OnePour, RepeatedSimulation
 from orchestrator.learning.strategy import Strategy
 from orchestrator.records.codec import Results, result_of
 from sim_engine.liquids import SimulationParameters
@@ -59,6 +59,9 @@ DEPLOYMENT, CONFIRMATION, PREDICTION = "deployment:", "confirmation:", "predicti
 
 SOURCES, DOSES = "sources", "doses"
 """Names of the stages of a series of doses."""
+
+POUR = "pour"
+"""Name of the stage of a single pour."""
 
 POSTERIOR_DRAWS = 64
 """Number of draws from the posterior of θ that a deployment's simulations use."""
@@ -114,6 +117,7 @@ def scenes_of(plan: CampaignPlan) -> dict[str, Scene]:
         every += plan.deployment.scenes
     if plan.dispense is not None:
         every += plan.dispense.scenes
+    every += filter(None, [plan.pour])
     scenes: dict[str, Scene] = {}
     for scene in every:
         if scenes.setdefault(scene.name, scene) != scene:
@@ -139,6 +143,8 @@ def stages_of(plan: CampaignPlan, sources: KnownSources = lambda plan: {}) -> tu
         stages += deployment_stages(plan, plan.deployment)
     if plan.dispense is not None:
         stages += dispense_stages(plan.dispense, sources, plan.calibration)
+    if (scene := plan.pour) is not None:
+        stages.append(StageDefinition(POUR, lambda results, seed: OnePour(scene, scene.action({}), seed), pours=True))
     return tuple(stages)
 
 

@@ -16,7 +16,7 @@ from orchestrator.daemon.rigs.emergency_stop import EmergencyStops
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.daemon_store import ENDED, PAUSED, STOPPED, WITHDRAWN, DesiredState, QueueItem
 from orchestrator.learning.run_errors import RunError
-from orchestrator.runs.run_tasks import POUR
+from orchestrator.runs.stages import POUR
 
 
 class RequestRefusedError(RunError):

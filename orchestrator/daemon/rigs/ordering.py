@@ -24,7 +24,7 @@ from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.rigs.submissions import Submission, planned_order, prepare
 from orchestrator.daemon.state.daemon_store import QueueItem
 from orchestrator.learning.run_errors import RunError
-from orchestrator.runs.run_tasks import POUR
+from orchestrator.runs.stages import POUR
 
 WAIT = 0.1
 """Interval at which a waiting call reads the state of its pour [s]."""

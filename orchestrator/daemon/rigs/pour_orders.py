@@ -24,29 +24,20 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from actors.arm.arm_settings import arm_kind
-from actors.dosing.dose_series import check_dose
-from actors.dosing.simulated_dose import check_straight
-from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, SimulatorPool
+from actors.interfaces import DoseSource, DoseTarget, SimulatorPool
 from actors.laboratory import predicted_dose
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.action_assignments import AssignmentError, assigned_action
-from orchestrator.campaigns.campaign_checks import check_vessels, touch
-from orchestrator.campaigns.file_loading import laboratory_record, load_laboratory, vessel_from
+from orchestrator.campaigns.campaign_checks import touch
+from orchestrator.campaigns.file_loading import campaign_from, laboratory_record, load_laboratory, vessel_from
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.campaigns.yaml.yaml_source import Document
 from orchestrator.daemon.rigs.materials import Materials, liquid_of, mass_of
 from orchestrator.daemon.rigs.pour_request import PourIn
 from orchestrator.daemon.state.daemon_settings import Rig
 from orchestrator.daemon.state.daemon_store import QueueItem, Store
-from orchestrator.learning.campaign_plan import (
-    CampaignPlan,
-    DeploymentPlan,
-    DispensePlan,
-    OutputSettings,
-    PlannedDose,
-)
+from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.costing import Costing
-from orchestrator.learning.deployment.d2 import D2Settings
 from orchestrator.learning.dispense import Dispense, KnownSource
 from orchestrator.learning.requests import Failed, Simulated, Slots
 from orchestrator.learning.run_errors import RunError
@@ -55,13 +46,12 @@ from orchestrator.learning.stage_result import DOSE, weighed_masses
 from orchestrator.materials.vessel_account import MIXTURE, Transfer
 from orchestrator.records.run_record import RunPour, read_record
 from orchestrator.runs.run_service import RunRequest
-from orchestrator.runs.run_tasks import POUR, single_task
+from orchestrator.runs.run_tasks import single_task
+from orchestrator.runs.stages import POUR, scenes_of
 from sim_engine.action import ACTION_DIMENSIONS, Action
-from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import plan_motion
 from sim_engine.outcome import Loss, PourMeasurement
 from sim_engine.scene import PourTask, Scene
-from sim_engine.search_space import Axis, Space
 from sim_engine.vessel.vessel import build_vessel
 
 ORDER = "pour.json"
@@ -202,11 +192,10 @@ class PlannedOrder:
     plan: CampaignPlan
     order: PourOrder
     scene: Scene
-    action: Action
 
     @classmethod
     def of(cls, order: PourOrder, rig: Rig, folder: Path) -> PlannedOrder:
-        """Plan an order.
+        """Plan an order: a campaign of one pour or one dose.
 
         Args:
             order: the order.
@@ -220,36 +209,36 @@ class PlannedOrder:
         pourer, receiver = (vessel_from(Document.parse(json.dumps(vessel), Path("vessel.json")))
                             for vessel in (order.pourer, order.vessel))  # fmt: skip
         liquid = liquid_of(order.liquid, order.properties, round(order.load, 9))
-        scene = Scene(f"deployment-{receiver.name}", pourer, receiver, liquid, fixed=_USUAL)
-        action = _action(order.action, _USUAL) if "x_offset" in order.action else _placed(scene, order)
-        scene = replace(scene, fixed=action.values())
-        laboratory, deployment, series = rig.source or shipped(VIRTUAL), None, None
-        speed = Axis("angular_velocity", action.angular_velocity, math.nextafter(action.angular_velocity, math.inf))
-        if order.amount is None:
-            # nothing is searched; a space needs an axis
-            deployment = DeploymentPlan(D2Settings(pours=1), (scene,), Space((speed,)), Loss())
-        else:
-            dose = PlannedDose(order.amount, order.tolerance, receiver.name)
+        action = _action(order.action, _USUAL) if "x_offset" in order.action else _placed(
+            Scene(POUR, pourer, receiver, liquid), order)  # fmt: skip
+        motion = {
+            name: dimension.switched_off if value is None else f"{value!r} {dimension.unit}"
+            for name, dimension in ACTION_DIMENSIONS.items()
+            if (value := action.values()[name]) is not None or dimension.switched_off
+        }
+        wanted = {"amount": f"{order.amount!r} kg", "tolerance": f"{order.tolerance!r} kg"}
+        record = {
+            **{"name": POUR, "seed": order.seed, "laboratory": laboratory_record(rig.source or shipped(VIRTUAL))},
+            "liquid": {"name": "water", **order.properties, "mass": f"{liquid.mass!r} kg"},
+            **{"pourer": order.pourer, "receiver": order.vessel, "motion": motion},
+            **({"pour": True} if order.amount is None else {"dispense": {"doses": [wanted]}}),
+            "outputs": {"recording": False, "figures": False},
+        }
+        plan = campaign_from(Document.parse(json.dumps(record), folder / ORDER))
+        if plan.dispense is not None:
             # `OrderBook.settle` enters the outcome in the account of both vessels, once
-            series = DispensePlan((scene,), (dose,), 0.0, False, laboratory="")
-        plan = CampaignPlan(
-            name=POUR,
-            seed=order.seed,
-            source=folder / ORDER,
-            laboratory=load_laboratory(laboratory),
-            parameters=SimulationParameters(),
-            calibration=None,
-            deployment=deployment,
-            outputs=OutputSettings(recording=False, figures=False),
-            resolved=_record(order, laboratory_record(laboratory), action, speed),
-            dispense=series,
-        )
-        return cls(plan, order, scene, action)
+            plan = replace(plan, dispense=replace(plan.dispense, laboratory=""))
+        (scene,) = scenes_of(plan).values()
+        return cls(plan, order, scene)
+
+    @property
+    def action(self) -> Action:
+        """The whole action; for an amount, its place and fastest tilt."""
+        return self.scene.action({})
 
     def request(self) -> RunRequest:
         """The run of the order."""
-        task = single_task(self.plan, POUR, self.strategy, pours=True)
-        return replace(task, problems=self.problems, as_written=False)
+        return replace(single_task(self.plan, POUR, self.strategy, pours=True), as_written=False)
 
     @property
     def target(self) -> DoseTarget | None:
@@ -263,32 +252,10 @@ class PlannedOrder:
 
     def strategy(self, seed: int) -> Dispense | OnePour:
         """Build the strategy."""
-        if self.target is None:
+        if self.plan.dispense is None:
             return OnePour(self.scene, self.action, seed)
-        assert self.plan.dispense is not None
         content = KnownSource(mass=self.scene.liquid.mass, deviation=self.order.deviation)
         return Dispense(self.plan.dispense, seed, {self.scene.pourer.name: content})
-
-    def problems(self) -> list[str]:
-        """Return what prevents this pour; nothing moves."""
-        target, laboratory = self.target, self.plan.laboratory
-        if not laboratory.pours:
-            return [f"laboratory {laboratory.name} has no bench"]
-        if misfits := check_vessels(self.scene, self.plan.source, None if target is None else 0.0):
-            return [problem.message for problem in misfits]
-        try:
-            if target is not None:
-                check_dose(self.scene, target)
-                if laboratory.arm is None:
-                    check_straight(self.scene)
-                return []
-            vessels = build_vessel(self.scene.pourer), build_vessel(self.scene.receiver)
-            contact = touch(self.scene, self.action, *vessels)
-            if contact is None and laboratory.arm is not None:
-                arm_kind(laboratory.arm).plan(self.scene, self.action)
-        except (InvalidActionError, ValueError) as error:
-            return [str(error)]
-        return [] if contact is None else [contact]
 
     def duration(self) -> float:
         """Return the expected time until the pour is weighed, without waiting for a person [s of bench time]."""
@@ -337,8 +304,7 @@ class PlannedOrder:
         }
 
     async def _simulated(self, pool: SimulatorPool) -> dict[str, Any]:
-        assert self.plan.deployment is not None
-        costing = Costing.of(self.plan.deployment, self.scene, self.plan.parameters)
+        costing = Costing(Loss(), self.scene, self.plan.parameters)
         strategy = RepeatedSimulation(costing, self.action, SEEDS, self.order.seed)
         requests = strategy.ask(Slots(SEEDS, 0))
         tasks = [PourTask(self.scene, r.action, r.parameters, r.seed) for r in requests]  # type: ignore[union-attr]
@@ -380,26 +346,6 @@ def _placed(scene: Scene, order: PourOrder) -> Action:
             return _action(order.action, {**_USUAL, "x_offset": offset + MARGIN})
         offset += STEP
     raise OrderError("action: the vessels touch at every distance; give 'x_offset' and 'height'")
-
-
-def _record(order: PourOrder, laboratory: Mapping[str, Any], action: Action, speed: Axis) -> dict[str, Any]:
-    """The pour in the format of campaign files, for reports and for campaigns that learn from it."""
-    motion = {
-        name: dimension.switched_off if value is None else f"{value!r} {dimension.unit}"
-        for name, dimension in ACTION_DIMENSIONS.items()
-        if (value := action.values()[name]) is not None or dimension.switched_off
-    }
-    del motion[speed.name]
-    outputs: dict[str, Any] = {"recording": False, "figures": False}
-    return {
-        **{"name": POUR, "seed": order.seed, "laboratory": laboratory},
-        "liquid": {"name": "water", **order.properties, "mass": f"{order.load!r} kg"},
-        **{"pourer": order.pourer, "motion": motion, "outputs": outputs},
-        "deployment": {
-            **{"strategy": "D2", "receiver": order.vessel, "pours": 1},
-            "actions": {speed.name: [f"{end!r} rad/s" for end in (speed.lower, speed.upper)]},
-        },
-    }
 
 
 # ---- results

@@ -43,8 +43,7 @@ from orchestrator.reports.validity_warnings import not_simulated
 from orchestrator.runs.request_executor import PourUnknownError, RequestExecutorError
 from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
-from orchestrator.runs.run_tasks import POUR
-from orchestrator.runs.stages import scenes_of
+from orchestrator.runs.stages import POUR, scenes_of
 
 _log = logging.getLogger(__name__)
 

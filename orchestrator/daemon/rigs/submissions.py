@@ -32,7 +32,8 @@ from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.journal_file import whole_copy
 from orchestrator.runs.run_service import RunRequest, RunResources, RunService, RunTaskError
-from orchestrator.runs.run_tasks import POUR, TASKS, plan_task, read_theta
+from orchestrator.runs.run_tasks import TASKS, plan_task, read_theta
+from orchestrator.runs.stages import POUR
 
 CAMPAIGN, THETA = "campaign.yaml", "theta.yaml"
 """Names of the campaign's file, and of the file with the θ for planning (`orchestrator.runs.run_tasks.read_theta`)."""

@@ -81,6 +81,14 @@ def test_tilts_faster_than_the_laboratory_allows_are_told_with_the_limit(tmp_pat
     assert warnings(write(tmp_path, "good.yaml", slow)) == []
 
 
+def test_a_single_pour_whose_vessels_touch_is_refused_at_its_motion(folder: Path) -> None:
+    text = CAMPAIGN[: CAMPAIGN.index("simulator:")].replace("max_angle: ", "angular_velocity: 60 deg/s, max_angle: ")
+    assert check_campaign(load_campaign(write(folder, "good.yaml", text + "pour: true\n"))) == []
+    touching = write(folder, "bad.yaml", text.replace("x_offset: 84 mm", "x_offset: 10 mm") + "pour: true\n")
+    (problem,) = check_campaign(load_campaign(touching))
+    assert str(problem).splitlines()[0].removeprefix(f"{folder}/").startswith("bad.yaml:6:9: motion: pour into 'cup': ")
+
+
 def test_a_bench_without_an_arm_that_should_record_pours_is_told_of_before_they_are_made(folder: Path) -> None:
     recorded = "outputs: {pour_recordings: true}\n"
     (told,) = warnings(write(folder, "bad.yaml", CAMPAIGN + recorded))

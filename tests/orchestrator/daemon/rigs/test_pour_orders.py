@@ -40,8 +40,9 @@ def test_an_ordered_pour_is_weighed_and_entered_in_the_account(tmp_path: Path) -
             assert source["deviation_g"] > 0.1  # of its weighing
             assert [one["id"] for one in await served.get("/pours")] == ["order-1"]
             record = load_campaign(tmp_path / "state/runs" / found["run"] / RESOLVED)  # as 'decant report' reads it
-            assert record.deployment is not None
-            (scene,) = record.deployment.scenes
+            scene = record.pour
+            assert scene is not None
+            assert record.deployment is None
             assert (scene.pourer.name, scene.receiver.name, scene.liquid.mass) == ("beaker", "vial-1", 0.1)
             assert scene.fixed["x_offset"] == 0.07
             assert record.laboratory.name == "numbers"
