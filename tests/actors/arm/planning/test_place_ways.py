@@ -161,7 +161,7 @@ def test_each_position_of_a_rack_is_a_place_between_its_taught_corners(tmp_path:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (racked(last_row=corner(512, 240), last_column=corner(620, 140)), "up to 4.8 mm"),
+        (racked(last_row=corner(512, 240), last_column=corner(620, 140)), "up to 4.9 mm"),
         (racked(last_row=corner(720, 240), last_column=corner(620, 140)), "are up to"),  # a mirror image
         (racked(last_row=corner(520, 240, 90), last_column=corner(620, 140)), "'rack' slopes by 5.7 deg"),
         (racked(columns=1, last_column=corner(620, 140)), "is A1 itself"),
