@@ -27,7 +27,7 @@ from actors.grippers.gripper_interface import GripperEmulator
 from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import DeviceCheck, LaboratoryError
-from actors.places import PlaceSettings, Role
+from actors.places import PlaceSettings
 from sim_engine.action import Action
 from sim_engine.scene import Scene
 from sim_engine.settings.model import Problems
@@ -130,18 +130,18 @@ class UrArmKind(ArmKind[UrArmSettings]):
         return plan_path(plan_pour(scene, action), self.spec, vessel(scene.pourer), vessel(scene.receiver))
 
     def place_problems(
-        self, places: Sequence[PlaceSettings], vessels: Mapping[Role, Vessel]
+        self, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel], opened: float = 0.0
     ) -> Iterable[tuple[int, str]]:
         """See `ArmKind.place_problems`."""
         from actors.arm.planning.place_ways import place_problems
 
-        return place_problems(places, self.spec, vessels)
+        return place_problems(places, self.spec, vessels, opened)
 
     def way(
         self,
         place: PlaceSettings,
         places: Sequence[PlaceSettings],
-        vessels: Mapping[Role, Vessel],
+        vessels: Mapping[str, Vessel],
         volume: float | None = None,
     ) -> PlaceWay:
         """See `ArmKind.way`."""
@@ -150,7 +150,7 @@ class UrArmKind(ArmKind[UrArmSettings]):
         return way_to(place, places, self.spec, vessels, volume)
 
     def in_the_way(
-        self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[Role, Vessel]
+        self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel]
     ) -> list[str]:
         """See `ArmKind.in_the_way`."""
         from actors.arm.planning.place_ways import in_the_way

@@ -36,6 +36,9 @@ PlaceName = Annotated[
     str, Strict(), Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*(/[A-Za-z0-9][A-Za-z0-9._-]*)?$", max_length=60)
 ]
 
+OUTSIDE = ""
+"""Place of a vessel that is not in the cell."""
+
 LIFT = 10e-3
 """Height above a rack to which a vessel is lifted at least before it moves sideways [m]."""
 
@@ -325,7 +328,7 @@ class PlaceRecord(Protocol):
     """What stands where, kept on disk before anything moves."""
 
     def stands(self) -> dict[str, str | None]:
-        """The place of every vessel that was entered: its name; None if it is UNKNOWN."""
+        """The place of every vessel that was entered: its name, or `OUTSIDE`; None if it is UNKNOWN."""
         ...
 
     def put(self, vessel: str, place: str | None, note: str = "") -> None:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Protocol, S
 
 from actors.arm_geometry import RobotCell
 from actors.interfaces import DeviceCheck, InvalidActionError, LaboratoryError
-from actors.places import PlaceSettings, Role
+from actors.places import PlaceSettings
 from sim_engine.action import Action
 from sim_engine.scene import Scene
 from sim_engine.settings.model import SET_BY_PROGRAM, Problems, Settings
@@ -248,11 +248,14 @@ class ArmKind(ABC, Generic[S]):
         """
 
     def place_problems(
-        self, places: Sequence[PlaceSettings], vessels: Mapping[Role, Vessel]
+        self, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel], opened: float = 0.0
     ) -> Iterable[tuple[int, str]]:
         """Problems of a laboratory's places, each with the number of its place.
 
-        Without vessels, only what does not depend on them is checked.
+        Args:
+            places: all places; `holds` names the vessels that may stand there.
+            vessels: by name; without them, only what does not depend on them is checked.
+            opened: width of the open fingers [m].
         """
         return [(0, f"an arm of the kind '{self.spec.kind}' carries no vessels between places; remove 'places'")]
 
@@ -260,7 +263,7 @@ class ArmKind(ABC, Generic[S]):
         self,
         place: PlaceSettings,
         places: Sequence[PlaceSettings],
-        vessels: Mapping[Role, Vessel],
+        vessels: Mapping[str, Vessel],
         volume: float | None = None,
     ) -> PlaceWay:
         """Plan the way from home to a place; `volume` is that of a carried liquid [m³], None for empty vessels.
@@ -271,7 +274,7 @@ class ArmKind(ABC, Generic[S]):
         raise InvalidActionError(f"an arm of the kind '{self.spec.kind}' carries no vessels")
 
     def in_the_way(
-        self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[Role, Vessel]
+        self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel]
     ) -> list[str]:
         """Problems of a planned pour with the vessels that may stand at other places."""
         return []

@@ -21,6 +21,7 @@ from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings, balance_kind
 from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
+from actors.bench.cell_liquids import CellLiquids
 from actors.bench.consent import Setup
 from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.ground_truth import GroundTruth
@@ -29,6 +30,7 @@ from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.bench.night_consent import NightConsent
 from actors.bench.pour_procedure import PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
+from actors.bench.vessel_carrying import VesselCarrier
 from actors.bench.vessel_handling import VesselHandling
 from actors.bench.virtual_bench import BenchEmulators, DeviceEmulators, FollowedBench, VirtualBench
 from actors.dosing_settings import DosingSettings
@@ -44,7 +46,7 @@ from actors.interfaces import (
 )
 from actors.laboratory_settings import BenchSettings, LaboratorySettings
 from actors.liquid_devices import SourceSettings, SpillSensorSettings
-from actors.places import PlaceRecord, all_places
+from actors.places import Layout, PlaceRecord, all_places
 from actors.runtime.remote_object import Device
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
@@ -367,9 +369,11 @@ async def _open_devices(
         assert balance is not None
         if record is None:
             raise LaboratoryError(f"laboratory {spec.name} has places, and no account of what stands where was given")
-        handling = VesselHandling(
-            all_places(spec.places), arm, arm_spec, held, balance, balance_spec, record, supply, ground_truth, tell
-        )
+        places = all_places(spec.places)
+        pan = Layout.of(places).balance
+        carrier = VesselCarrier(pan.name, arm, arm_spec, held, balance, record, ground_truth)
+        liquids = CellLiquids(record, carrier, pan.tray)
+        handling = VesselHandling(places, carrier, liquids, balance_spec, supply, ground_truth, tell)
     setup = Setup(
         spec.mode,
         arm_spec,

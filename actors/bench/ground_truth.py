@@ -20,7 +20,6 @@ from actors.arm.arm_interface import Executed, PlannedPour
 from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, ProgressCallback, SimulatorPool
 from actors.laboratory_settings import BenchSettings
-from actors.places import Role
 from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement, PourOutcome, RecordedFrames, SimulatedPour
 from sim_engine.scene import PoseError, PourTask, Scene
@@ -219,13 +218,13 @@ class GroundTruth:
             LaboratoryError: the masses are unknown.
         """
 
-    async def between(self, vessel: Role, place: str, width: float) -> None:
+    async def between(self, vessel: str, place: str, width: float) -> None:
         """Called when open fingers stand around a place, before they close on a vessel of this width [m]."""
 
-    async def lifted(self, vessel: Role) -> None:
+    async def lifted(self, vessel: str) -> None:
         """Called when a gripped vessel leaves its place."""
 
-    async def placed(self, vessel: Role, place: str, *, on_balance: bool) -> None:
+    async def placed(self, vessel: str, place: str, *, on_balance: bool) -> None:
         """Called when the fingers have let go of a vessel at a place."""
 
     async def poured_back(self, seed: int) -> None:

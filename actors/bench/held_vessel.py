@@ -106,7 +106,7 @@ class HeldVessel:
         spec: settings of the gripper.
         holds: the grasp of the vessel was checked, and it was not lost or let go since.
         lost: why the vessel may have been lost; '' if it was not.
-        role: of the vessel, for messages.
+        role: the vessel in messages, such as 'the pourer'.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class HeldVessel:
         self._limits: GripLimits | None = None
         self._stood = 0.0
         self._blind = 0
-        self.holds, self.lost, self.role = False, "", "pourer"
+        self.holds, self.lost, self.role = False, "", "the pourer"
 
     # ---- the driver
 
@@ -232,7 +232,7 @@ class HeldVessel:
                 problem = str(error)
             if not problem:
                 break
-        self.holds, self.lost, self._blind, self.role = True, "", 0, "pourer"
+        self.holds, self.lost, self._blind, self.role = True, "", 0, "the pourer"
         self._tell(Notice("note", f"'{limits.vessel}' is in the gripper: {state}"))
 
     async def activated(self, ask: Ask) -> None:
@@ -386,7 +386,7 @@ class HoldingArm(DeviceArm):
 
     async def _lost(self, loss: str, executed: Executed | None) -> VesselLostError:
         role = self._held.role
-        text = f"the gripper may have lost the {role}: {loss}. The arm was stopped. Look for the {role} and the liquid"
+        text = f"the gripper may have lost {role}: {loss}. The arm was stopped. Look for {role} and the liquid"
         state = await self.state()
         return VesselLostError(text, "vessel lost", state.phase, state.time, state.tilt, executed)
 

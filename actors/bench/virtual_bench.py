@@ -33,7 +33,6 @@ from actors.dosing.simulated_dose import true_cup
 from actors.grippers.gripper_interface import GripperEmulator, GripperSettings
 from actors.interfaces import DoseTarget, LaboratoryError, SimulatorPool
 from actors.laboratory_settings import BenchSettings
-from actors.places import Role
 from actors.runtime.remote_object import Device
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PoseError, PourTask, SampledMotion, Scene
@@ -350,16 +349,16 @@ class VirtualBench(GroundTruth):
         await self.emulators.prepare(stream(pour.seed, "balance"))
         await self.emulators.put(self.contents.carried)
 
-    async def between(self, vessel: Role, place: str, width: float) -> None:
+    async def between(self, vessel: str, place: str, width: float) -> None:
         """See `GroundTruth.between`: the vessel is there only if it was put there."""
         await self.emulators.hold(width if self.contents.stands.get(vessel) == place else None)
 
-    async def lifted(self, vessel: Role) -> None:
+    async def lifted(self, vessel: str) -> None:
         """See `GroundTruth.lifted`."""
         self.contents.move(vessel, "", on_balance=False)
         await self.emulators.put(self.contents.carried)
 
-    async def placed(self, vessel: Role, place: str, *, on_balance: bool) -> None:
+    async def placed(self, vessel: str, place: str, *, on_balance: bool) -> None:
         """See `GroundTruth.placed`."""
         self.contents.move(vessel, place, on_balance=on_balance)
         await self.emulators.hold(None)

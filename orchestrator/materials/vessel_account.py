@@ -388,7 +388,7 @@ class VesselAccount:
 
         Args:
             vessel: 'LABORATORY/VESSEL'; places belong to the laboratory.
-            place: name of the place.
+            place: name of the place; '' outside the cell.
             by: who corrected it; '' for a run.
             note: for people.
 
@@ -400,7 +400,7 @@ class VesselAccount:
         with self._writing() as connection:
             rows = connection.execute(f"select vessel, place from stand where {LATEST} and vessel != ?", (vessel,))
             for other, taken in rows.fetchall():
-                if place is not None and taken == place and str(other).partition("/")[0] == laboratory:
+                if place and taken == place and str(other).partition("/")[0] == laboratory:
                     raise InvalidArgumentError(
                         f"{vessel}: {other} stands at '{place}' already; a place holds one vessel"
                     )

@@ -121,7 +121,7 @@ class Watched(LaboratoryPlaces):
 
     def put(self, vessel: str, place: str | None, note: str = "") -> None:
         super().put(vessel, place, note)
-        if place is not None and self.stage is not None:
+        if place and self.stage is not None:
             assert self.stage.contents.stands.get(vessel) == place, f"{vessel} is not at '{place}'"
         if (hook := self.once.pop(f"{vessel}: {note}", None)) is not None:
             self.tasks.append(asyncio.ensure_future(hook()))

@@ -37,7 +37,7 @@ from actors.arm.planning.trajectory import (
 )
 from actors.arm.ur_settings import UrArmSettings
 from actors.interfaces import InvalidActionError
-from actors.places import PlaceSettings, Role
+from actors.places import PlaceSettings
 from sim_engine.hydrostatics import GRAVITY, level
 from sim_engine.vessel.vessel import Vessel
 
@@ -54,6 +54,9 @@ Sloshing Dynamics, Cambridge 2005, chapter 5, without its damping."""
 
 LEAST_ACCELERATION = 0.05
 """Acceleration below which a vessel is too full to be carried [m/s²]."""
+
+FINGER = 15e-3
+"""Thickness of a finger outside the vessel that it grips [m]."""
 
 OFF_CENTRE = 5e-3
 """Largest distance of the place on the balance from `cell.receiver` [m]."""
@@ -95,7 +98,7 @@ def vessel_at(place: PlaceSettings, spec: UrArmSettings) -> Transforms:
     return cell_transforms(spec).base @ transform_of(place.pose) @ transform_of(spec.grip)
 
 
-def standing_at(place: PlaceSettings, vessels: Mapping[Role, Vessel], spec: UrArmSettings) -> Standing:
+def standing_at(place: PlaceSettings, vessels: Mapping[str, Vessel], spec: UrArmSettings) -> Standing:
     """The largest of the vessels that may stand at a place."""
     standing = [vessels[role] for role in place.holds if role in vessels]
     x, y, z = map(float, vessel_at(place, spec).position)
@@ -163,7 +166,7 @@ def way_to(
     place: PlaceSettings,
     places: Sequence[PlaceSettings],
     spec: UrArmSettings,
-    vessels: Mapping[Role, Vessel],
+    vessels: Mapping[str, Vessel],
     volume: float | None,
 ) -> PlaceWay:
     """The way to a place of a laboratory, among the vessels of a campaign.
@@ -195,7 +198,7 @@ def way_to(
 
 
 def in_the_way(
-    path: PourPath, pourer: Vessel, places: Sequence[PlaceSettings], spec: UrArmSettings, vessels: Mapping[Role, Vessel]
+    path: PourPath, pourer: Vessel, places: Sequence[PlaceSettings], spec: UrArmSettings, vessels: Mapping[str, Vessel]
 ) -> list[str]:
     """Problems of a pour over the balance with vessels that may stand at the other places.
 
@@ -273,7 +276,7 @@ def _too_near(thing: str, apart: float, each: Standing, when: str) -> str:
 
 
 def place_problems(
-    places: Sequence[PlaceSettings], spec: UrArmSettings, vessels: Mapping[Role, Vessel]
+    places: Sequence[PlaceSettings], spec: UrArmSettings, vessels: Mapping[str, Vessel], opened: float = 0.0
 ) -> Iterator[tuple[int, str]]:
     """Problems of a laboratory's places: number of the place, and the message.
 
@@ -281,6 +284,7 @@ def place_problems(
         places: all places.
         spec: of the arm and its cell.
         vessels: of a campaign; without them, only what does not depend on them is checked.
+        opened: width of the open fingers [m]; they keep the clearance of a neighbour in any direction.
     """
     standing = [standing_at(place, vessels, spec) for place in places]
     for (_, first), (i, other) in combinations(enumerate(standing), 2):
@@ -291,6 +295,16 @@ def place_problems(
                 f"places '{first.place}' and '{other.place}' overlap: what stands there is {1e3 * apart:.0f} mm apart, "
                 f"{1e3 * max(first.clearance, other.clearance):.0f} mm have to stay free",
             )
+        elif first.radius > 0.0 and other.radius > 0.0 and opened > 0.0:
+            # a full circle: the fingers of a taught pose may stand in any direction
+            free = apart + min(first.radius, other.radius) - 0.5 * opened - FINGER
+            if free < max(first.clearance, other.clearance):
+                yield (
+                    i,
+                    f"places '{first.place}' and '{other.place}' overlap when the gripper is open: its fingers stand "
+                    f"{1e3 * opened:.0f} mm apart and would come within {1e3 * free:.0f} mm of the neighbour, "
+                    f"{1e3 * max(first.clearance, other.clearance):.0f} mm have to stay free",
+                )
     for i, (place, foot) in enumerate(zip(places, standing, strict=True)):
         axis = vessel_at(place, spec).rotation[:, 2]
         lean = math.acos(float(np.clip(axis[2], -1.0, 1.0)))

@@ -55,6 +55,17 @@ def moved(place: int, **pose: str) -> Change:
     return lambda document: document["places"][place]["pose"].update(pose)
 
 
+def racked(**rack: Any) -> Change:
+    """Place 'right' of the night as a rack of 2 × 2 positions with a pitch of 100 mm."""
+    values = {"rows": 2, "columns": 2, "row_pitch": "100 mm", "column_pitch": "100 mm", **rack}
+    return at(2, name="rack", rack=values)
+
+
+def corner(x: float, y: float, z: float = 80.0) -> dict[str, str]:
+    turn = dict.fromkeys(("rx", "ry", "rz"), "1.2092 rad")
+    return {"x": f"{x} mm", "y": f"{y} mm", "z": f"{z} mm", **turn}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -85,6 +96,8 @@ def test_places_that_cannot_be_used_are_refused(change: Change, message: str, tm
         (lambda document: document["gripper"].update(model="2F-85"), "the gripper opens to 85.0 mm"),
         (moved(2, x="700 mm", y="60 mm"), "places 'pan' and 'right' overlap"),
         (moved(2, x="750 mm", y="-420 mm"), "a vessel at 'left'"),
+        (racked(column_pitch="95 mm"), "'rack/A1' and 'rack/A2' overlap when the gripper is open: its fingers"),
+        (racked(column_pitch="80 mm"), "places 'rack/A1' and 'rack/A2' overlap: what stands there is 8 mm apart"),
     ],
 )
 def test_campaigns_that_a_cell_cannot_pour_alone_are_refused(change: Change, message: str, tmp_path: Path) -> None:
@@ -131,17 +144,6 @@ def test_a_taught_place_is_written_and_comments_stay(tmp_path: Path) -> None:
     assert [place.name for place in places] == ["pan", "left", "right", "rear"]
     assert places[1].pose.y == pytest.approx(-0.43)
     assert places[3].use == "source"
-
-
-def racked(**rack: Any) -> Change:
-    """Place 'right' of the night as a rack of 2 × 2 positions with a pitch of 100 mm."""
-    values = {"rows": 2, "columns": 2, "row_pitch": "100 mm", "column_pitch": "100 mm", **rack}
-    return at(2, name="rack", rack=values)
-
-
-def corner(x: float, y: float, z: float = 80.0) -> dict[str, str]:
-    turn = dict.fromkeys(("rx", "ry", "rz"), "1.2092 rad")
-    return {"x": f"{x} mm", "y": f"{y} mm", "z": f"{z} mm", **turn}
 
 
 def test_each_position_of_a_rack_is_a_place_between_its_taught_corners(tmp_path: Path) -> None:
