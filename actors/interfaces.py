@@ -217,6 +217,7 @@ class DoseTarget:
         cup: identity of the receiver ('rack/A1'); '': the only one, exchanged for an empty one before each dose.
         stays: the next dose is poured into this cup, too: it stays on the balance.
         emptied: the cup is emptied at the waste place first.
+        held: what earlier doses of the same mixture have left in the receiver [kg]; None: it is empty.
     """
 
     amount: float
@@ -226,6 +227,7 @@ class DoseTarget:
     cup: str = field(default="", metadata={"written": "if set"})
     stays: bool = field(default=False, metadata={"written": "if set"})
     emptied: bool = field(default=False, metadata={"written": "if set"})
+    held: float | None = field(default=None, metadata={"written": "if set"})
 
 
 class Bench(Protocol):

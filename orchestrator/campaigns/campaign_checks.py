@@ -427,10 +427,14 @@ class _Checker:
 
     def doses(self, plan: DispensePlan, *, simulated: bool) -> None:
         """Every dose must fit into its receiver and come out of a full source."""
+        section = dose_section(plan)
         for scene in plan.scenes:
-            doses = [planned for planned in plan.doses if planned.receiver == scene.receiver.name]
+            doses = [
+                d for d in plan.doses if d.receiver == scene.receiver.name and d.liquid in (None, scene.liquid.name)
+            ]
             largest = max((planned.amount + planned.limit for planned in doses), default=0.0)
-            role = _Role(f"doses from '{scene.pourer.name}' into '{scene.receiver.name}'", ("dispense",))
+            role = _Role(f"doses from '{scene.pourer.name}' into '{scene.receiver.name}'", section)
+            self._payload(scene)
             if self.scene(scene, role, largest / scene.liquid.density, dosed=True) is None:
                 continue
             if simulated:
@@ -448,6 +452,8 @@ class _Checker:
                     arm_kind(self.arm).plan(scene, scene.action({}))
                 except InvalidActionError as error:
                     self.add(role.places(("motion",)), f"{role.text}: the arm can't make the tilt: {error}")
+        if plan.mixtures is not None:
+            return  # whose amounts are compared with their own sources when they are read
         full = min(scene.liquid.mass for scene in plan.scenes)
         for i, dose in enumerate(plan.doses):
             if dose.amount + dose.limit + plan.refill_below >= full:
@@ -469,8 +475,25 @@ class _Checker:
             try:
                 check_display(display, dose.limit, laboratory.dosing)
             except InvalidActionError as error:
-                self.add((("dispense", "doses", i), ("dispense",)), str(error))
+                self.add((("dispense", "doses", i), ("mixtures", "tolerance"), dose_section(plan)), str(error))
                 return  # mostly all doses have one tolerance
+
+    def mixtures(self, plan: CampaignPlan, tell: Callable[[str], None]) -> None:
+        """Balance and sources must support every amount of the mixtures, and no cup may be open for too long."""
+        from orchestrator.campaigns.mixture_forecast import forecast_mixtures
+
+        self.doing("predicting the doses of the mixtures")
+        forecast = forecast_mixtures(plan)
+        for line in forecast.lines:
+            tell(line)
+        for cups, liquid, text in forecast.problems:
+            name = cups[0].partition("/")[2]
+            places = (("mixtures", "wanted", name, liquid), ("mixtures", "from"), ("mixtures", "wanted"))
+            self.add(places, f"{liquid} into {', '.join(cups)}: {text}")
+        longest = None if plan.dispense is None or plan.dispense.mixtures is None else plan.dispense.mixtures.max_open
+        if longest is not None and forecast.open_time > longest:
+            text = f"a cup is open for up to {forecast.open_time / 60.0:.1f} min; pour fewer liquids, or raise it"
+            self.add((("mixtures", "max_open"),), text)
 
     def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
         """Recorded pours were possible: if their vessels touch, the description of the scene is wrong."""
@@ -511,6 +534,7 @@ def check_campaign(
     as_written: bool = True,
     warn: Callable[[Problem], None] = _ignore,
     doing: Callable[[str], None] = _ignore,
+    tell: Callable[[str], None] = _ignore,
 ) -> list[Problem]:
     """Build the vessels of a campaign and try its actions.
 
@@ -527,6 +551,7 @@ def check_campaign(
         as_written: whether its vessels are those of its file; otherwise places in the file would be misleading.
         warn: called with settings that can run but make little sense.
         doing: called with a description of each slow step.
+        tell: called with each line of a prediction.
 
     Returns:
         Problems, with their places if the campaign's file has them; empty if the campaign can start.
@@ -575,7 +600,7 @@ def check_campaign(
             f"laboratory '{lab.name}' has places, between which the arm carries the vessels; those of doses can't "
             "be carried yet. Name a laboratory without 'places', in which a person puts them under the arm"
         )
-        checker.add((("dispense",),), text)
+        checker.add((dose_section(plan.dispense),), text)
     if plan.dispense is not None:
         balance = plan.laboratory.balance
         if plan.laboratory.arm is not None and (balance is None or balance.placement not in ("receiver", "everything")):
@@ -583,10 +608,17 @@ def check_campaign(
                 f"laboratory '{plan.laboratory.name}': wanted amounts need a connected balance under the receiver; "
                 "write 'balance: {placement: receiver}' and set it up so"
             )
-            checker.add((("dispense",), ("laboratory",)), text)
+            checker.add((dose_section(plan.dispense), ("laboratory",)), text)
         checker.doses(plan.dispense, simulated=plan.laboratory.arm is None)
         checker.display(plan.dispense, lab)
+        if plan.dispense.mixtures is not None and not checker.problems:
+            checker.mixtures(plan, tell)
     return list(dict.fromkeys(checker.problems))
+
+
+def dose_section(plan: DispensePlan) -> Loc:
+    """The section of a campaign's file that a series of doses comes from."""
+    return ("dispense",) if plan.mixtures is None else ("mixtures",)
 
 
 def check_vessels(

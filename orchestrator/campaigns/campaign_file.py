@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import Field, create_model
+from pydantic import BeforeValidator, ConfigDict, Field, WithJsonSchema, create_model
+from pydantic_core import PydanticCustomError
 
 from actors.laboratory_settings import LaboratorySettings
-from actors.places import UnattendedSettings
+from actors.places import PlaceName, UnattendedSettings
 from orchestrator.campaigns.campaign_prior import AnyPrior
 from orchestrator.campaigns.file_references import VesselFile
 from orchestrator.campaigns.search_ranges import Actions, Motion, Parameters
@@ -46,7 +47,7 @@ from sim_engine.settings.model import (
     Text,
     tagged,
 )
-from sim_engine.settings.quantity import Quantity
+from sim_engine.settings.quantity import Quantity, QuantityError, parse_quantity, plain_number
 
 
 class PoursFromFile(Settings):
@@ -303,17 +304,11 @@ class DoseSettings(Settings):
     """Receiver; the campaign's unless given."""
 
 
-class DispenseSettings(Settings):
-    """A series of wanted amounts: the tilt of each dose is decided from the balance while the liquid flows."""
-
-    doses: Annotated[list[DoseSettings], Example("[{amount: 50 g, position: A1}]")]
-    """The amounts, with their receivers."""
+class DoseSeriesSettings(Settings):
+    """Keys of every series of doses: the tilt of each dose is decided from the balance while the liquid flows."""
 
     tolerance: DoseAmount = 1e-3
     """Excess to avoid: the cup turns back as soon as more has an estimated probability of 1 %."""
-
-    sources: list[PathOr[VesselFile]] | None = None
-    """Source vessels, in the order of use, each with the campaign's liquid; the campaign's pourer unless given."""
 
     refill_below: Annotated[float, Quantity("kg", "80 g", 0.0, 10.0)] = 0.0
     """A source that would hold less than this after a dose is filled before."""
@@ -323,6 +318,16 @@ class DispenseSettings(Settings):
 
     motion: Motion | None = None
     """Values that differ from the campaign's `motion`."""
+
+
+class DispenseSettings(DoseSeriesSettings):
+    """A series of wanted amounts: the tilt of each dose is decided from the balance while the liquid flows."""
+
+    doses: Annotated[list[DoseSettings], Example("[{amount: 50 g, position: A1}]")]
+    """The amounts, with their receivers."""
+
+    sources: list[PathOr[VesselFile]] | None = None
+    """Source vessels, in the order of use, each with the campaign's liquid; the campaign's pourer unless given."""
 
     def check_values(self, problems: Problems) -> None:
         """Check that there are doses, and that each is larger than its tolerance."""
@@ -336,6 +341,128 @@ class DispenseSettings(Settings):
             problems.add("is empty; name at least one vessel, or remove it", "sources")
 
 
+def parse_amount(value: Any) -> tuple[float, Literal["kg", "m^3", "1"]]:
+    """Magnitude and SI unit of an amount in a mixture: a mass, a volume, or a percentage.
+
+    Raises:
+        QuantityError: it is none of them, is negative, or has no unit.
+    """
+    text = str(value).strip()
+    if isinstance(value, int | float) or plain_number(text):
+        raise QuantityError(f"{text} has no unit; write '{text} g', '{text} mL' or '{text} %'")
+    if text.endswith("%"):
+        amount = parse_quantity(text, "1", "25 %"), "1"
+    else:
+        try:
+            amount = parse_quantity(text, "m^3", "15 mL"), "m^3"
+        except QuantityError:
+            amount = parse_quantity(text, "kg", "15 g"), "kg"
+    if amount[0] < 0.0:
+        raise QuantityError(f"{text} is negative")
+    return amount  # type: ignore[return-value]
+
+
+def _amount_text(value: Any) -> str:
+    try:
+        parse_amount(value)
+    except QuantityError as error:
+        raise PydanticCustomError("amount", "{text}", {"text": str(error)}) from None
+    return str(value)
+
+
+MixedAmount = Annotated[str, BeforeValidator(_amount_text), WithJsonSchema({"type": "string", "examples": ["15 g"]})]
+
+
+class MixedLiquidSettings(Settings):
+    """A liquid of mixtures, and the vessels that it is poured from."""
+
+    name: Annotated[Name, Example("water")]
+    """Its name in the table of amounts and in the account of vessels."""
+
+    liquid: Annotated[PathOr[LiquidSettings], Example("{name: water, mass: 350 g}")]
+    """The liquid, with the content of a full source."""
+
+    source: PathOr[VesselFile] | None = None
+    """Source vessel; the campaign's pourer unless given."""
+
+    stands: list[PlaceName] | None = None
+    """Names of the sources with this liquid, in the order of use, such as 'source/water'; 'source/' and the name of the
+    liquid unless given."""
+
+    tolerance: DoseAmount | None = None
+    """Tolerance of its doses; that of all mixtures unless given."""
+
+
+class CupsSettings(Settings):
+    """The cups that mixtures are poured into."""
+
+    vessel: PathOr[VesselFile] | None = None
+    """Their vessel; the campaign's receiver unless given."""
+
+    rack: Name = "rack"
+    """Name of their rack: cup A1 stands at 'rack/A1'."""
+
+    spares: list[Text] | None = None
+    """Positions of empty cups for `on_miss: repeat`, such as [D5, D6]."""
+
+
+class MixturesSettings(DoseSeriesSettings):
+    """Mixtures: several liquids in each cup. All doses of a cup follow each other, the smallest amount first."""
+
+    liquids: Annotated[list[MixedLiquidSettings], Example("[{name: water, liquid: {name: water, mass: 350 g}}]")]
+    """The liquids, with their sources."""
+
+    cups: CupsSettings = CupsSettings()
+    """The cups."""
+
+    wanted: dict[Text, dict[Text, MixedAmount]] | None = None
+    """Wanted amounts by cup and liquid, each with its unit: a mass, a volume, or a percentage of `total` by mass; for
+    example 'A1: {water: 40 g, oil: 5 mL}'. Or give `from`."""
+
+    source: FilePath | None = Field(default=None, alias="from")
+    """Table of the wanted amounts (CSV or .xlsx): a column `cup`, and one for each liquid with its unit, such as
+    'water_g', 'water [mL]' or 'water [%]'; an empty cell is none of it. Or give `wanted`."""
+
+    total: DoseAmount | None = None
+    """Mass of each mixture, if amounts are percentages of it."""
+
+    on_miss: Literal["accept", "repeat"] = "accept"
+    """What follows a dose beyond its tolerance. accept: the amounts that the cup still lacks are corrected so that the
+    ratios hold, if there is room; repeat: the mixture is poured again, into a spare cup."""
+
+    order: list[Text] | None = None
+    """Order of the liquids in every cup; the smallest amount first unless given."""
+
+    max_open: Annotated[float, Quantity("s", "30 min", 0.0, 86400.0, positive=True)] | None = None
+    """Longest expected time from the first dose into a cup until its last one."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check that the table is given once, and that there are spare cups if mixtures are poured again."""
+        if self.wanted is not None and self.source is not None:
+            problems.add("stands beside 'from'; keep one of them", "wanted", key=True)
+        elif self.wanted is None and self.source is None and problems.valid("wanted", "from"):
+            problems.add("needs 'wanted' (amounts by cup and liquid), or 'from' (a table of them)", key=True)
+        for key in ("wanted", "liquids"):
+            if problems.valid(key) and self.value(key) is not None and not self.value(key):
+                problems.add("is empty; name at least one", key)
+        names = [liquid.name for liquid in self.liquids or ()]
+        for i, name in enumerate(names):
+            if name in names[:i] and problems.within("liquids", i).valid("name"):
+                problems.add(f"another liquid is called '{name}'; each needs a name of its own", "liquids", i, "name")
+        for i, name in enumerate(self.order or ()):
+            if name not in names and problems.valid("liquids"):
+                problems.add(f"'{name}' is no liquid of the mixtures: {', '.join(names)}", "order", i)
+            elif name in (self.order or [])[:i]:
+                problems.add(f"'{name}' stands twice", "order", i)
+        if self.order is not None and problems.valid("order", "liquids") and len(self.order) < len(names):
+            missing = ", ".join(name for name in names if name not in self.order)
+            problems.add(f"lacks {missing}; name every liquid, or remove it", "order")
+        if self.on_miss == "repeat" and not self.cups.spares and problems.valid("cups"):
+            problems.add("needs spare cups; add for example 'spares: [D5, D6]' to 'cups'", "on_miss")
+        if self.on_miss != "repeat" and self.cups.spares:
+            problems.add("belongs to 'on_miss: repeat'", "cups", "spares", key=True)
+
+
 class SimulatorSettings(Settings):
     """The simulator."""
 
@@ -346,6 +473,8 @@ class SimulatorSettings(Settings):
 class CampaignFile(Settings):
     """A campaign: calibrate the simulator, deploy with the calibrated parameters, pour wanted amounts, or several."""
 
+    model_config = ConfigDict(json_schema_extra={"anyOf": [{"required": ["liquid"]}, {"required": ["mixtures"]}]})
+
     name: Annotated[Name, Example("narrow-cup")]
     """Its name in run directories and figures."""
 
@@ -355,8 +484,8 @@ class CampaignFile(Settings):
     laboratory: Annotated[PathOr[LaboratorySettings], Example("../laboratories/virtual.yaml")]
     """Laboratory in which it runs."""
 
-    liquid: Annotated[PathOr[LiquidSettings], Example("{name: water, mass: 200 g}")]
-    """Liquid that is poured."""
+    liquid: Annotated[PathOr[LiquidSettings] | None, Example("{name: water, mass: 200 g}")] = None
+    """Liquid that is poured; required unless the campaign has only `mixtures`, which name their own."""
 
     pourer: PathOr[VesselFile] | None = None
     """The vessel that the robot holds."""
@@ -385,6 +514,9 @@ class CampaignFile(Settings):
     dispense: DispenseSettings | None = None
     """A series of wanted amounts."""
 
+    mixtures: MixturesSettings | None = None
+    """Mixtures of several liquids, in cups."""
+
     pour: Switch | None = None
     """A single pour with the values of `motion`."""
 
@@ -407,9 +539,16 @@ class CampaignFile(Settings):
 
     def check_values(self, problems: Problems) -> None:
         """Check that there is something to do, and that calibration searches the ranges of parameters."""
-        calibration, valid = self.calibration, problems.valid("calibration", "deployment", "dispense", "pour")
-        if valid and not self.pour and calibration is None and self.deployment is None and self.dispense is None:
-            problems.add("there is nothing to do; add a 'calibration', a 'deployment' or a 'dispense' section")
+        calibration, sections = self.calibration, ("calibration", "deployment", "dispense", "mixtures", "pour")
+        if problems.valid(*sections) and not any(self.value(section) for section in sections):
+            problems.add("there is nothing to do; add a 'calibration', 'deployment', 'dispense' or 'mixtures' section")
+        if self.mixtures is not None and self.dispense is not None:
+            problems.add("stands beside 'dispense'; give each a campaign of its own", "mixtures", key=True)
+        alone = self.mixtures is not None and calibration is None and self.deployment is None and not self.pour
+        if self.liquid is None and not alone and problems.valid("liquid"):
+            problems.add("key 'liquid' is missing; add for example 'liquid: {name: water, mass: 200 g}'", key=True)
+        elif self.liquid is not None and alone:
+            problems.add("has no effect: each liquid of 'mixtures' is described there; remove it", "liquid", key=True)
         ranges = {} if self.simulator.parameters is None else self.simulator.parameters.ranges()
         at = ("simulator", "parameters")
         inner = problems.within(*at)

@@ -9,8 +9,6 @@ Sections are validated before (`orchestrator.campaigns.yaml.section_validation`)
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,13 +19,13 @@ from orchestrator.campaigns.campaign_file import (
     CalibrationSection,
     CampaignFile,
     DeploymentSection,
-    DispenseSettings,
     LearningSettings,
     PoursSettings,
     StageSettings,
     owners_of_priors,
 )
 from orchestrator.campaigns.campaign_prior import PosteriorSource, PriorNeeds, ResolvedPrior, resolve_prior
+from orchestrator.campaigns.dose_resolution import cell_vessels, require_bench, resolve_dispense, resolve_mixtures
 from orchestrator.campaigns.file_references import References
 from orchestrator.campaigns.run_snapshot import as_file
 from orchestrator.campaigns.scene_builder import SceneBuilder
@@ -42,9 +40,7 @@ from orchestrator.learning.campaign_plan import (
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
-    DispensePlan,
     NormalPrior,
-    PlannedDose,
     Premises,
 )
 from orchestrator.learning.deployment.objectives import STOPS, Objectives
@@ -261,60 +257,6 @@ def resolve_calibration(
     )
 
 
-DOSE_MOTION = {"angular_velocity": math.radians(115.0), "max_angle": math.radians(110.0)}
-"""Fastest tilt and range of a dose, where the motion does not limit them."""
-
-
-def require_bench(laboratory: LaboratorySettings | None, place: Place, report: Report) -> None:
-    """Report a section that pours in a laboratory without bench."""
-    if laboratory is not None and not laboratory.pours:
-        report.add(place, f"laboratory '{laboratory.name}' has no bench to pour on; name one with a bench", key=True)
-
-
-def resolve_dispense(
-    section: DispenseSettings, builder: SceneBuilder, place: Place, laboratory: LaboratorySettings | None
-) -> DispensePlan | None:
-    """The plan of a series of doses. Problems are added to the report; the plan may then be None."""
-    report = builder.report
-    require_bench(laboratory, place, report)
-    pourers: list[VesselSpec | None] = (
-        [builder.pourer(None, place)]
-        if section.sources is None
-        else [builder.references.vessel(source, place.at("sources", i)) for i, source in enumerate(section.sources)]
-    )
-    receivers: dict[str, VesselSpec | None] = {}
-    doses = []
-    for i, dose in enumerate(section.doses or ()):
-        vessel = builder.receiver(dose.receiver, place.at("doses", i))
-        if vessel is None or dose.amount is None:
-            continue
-        if receivers.setdefault(vessel.name, vessel) != vessel:
-            report.add(place.at("doses", i), f"two different receivers are both called '{vessel.name}'")
-        limit = section.tolerance if dose.tolerance is None else dose.tolerance
-        doses.append(PlannedDose(dose.amount, limit, vessel.name, dose.position or ""))
-    names = [source.name for source in pourers if source is not None]
-    if len(set(names)) < len(names):
-        report.add(place.at("sources"), "two sources have the same name; give each vessel its own")
-    if report.problems or laboratory is None:
-        return None
-    fixed_names: set[str] = set()
-    for motion in (builder.file.motion, section.motion):
-        fixed_names |= set() if motion is None else set(motion.fixed())
-    constants = {name: value for name, value in DOSE_MOTION.items() if name not in fixed_names}
-    scenes = []
-    for pourer, (name, receiver) in itertools.product(pourers, receivers.items()):
-        assert pourer is not None
-        motions = ((section.motion, place.at("motion")),)
-        scene = builder.scene(
-            f"dispense-{pourer.name}-{name}", pourer, receiver, motions, (), place, constants=constants
-        )
-        if scene is None:
-            return None
-        scenes.append(scene)
-    as_left = section.start == "as_left"
-    return DispensePlan(tuple(scenes), tuple(doses), section.refill_below, as_left, laboratory.name)
-
-
 def _prior(
     section: CalibrationSection,
     builder: SceneBuilder,
@@ -362,9 +304,11 @@ def resolve_campaign(
         )
     if file.deployment is not None:
         deployment = resolve_deployment(file.deployment, builder, root.at("deployment"), laboratory)
-    dispense = None
+    dispense, mixtures = None, file.mixtures
     if file.dispense is not None:
         dispense = resolve_dispense(file.dispense, builder, root.at("dispense"), laboratory)
+    elif mixtures is not None:
+        dispense, mixtures = resolve_mixtures(mixtures, builder, root.at("mixtures"), laboratory)
     pour = None
     if file.pour:
         require_bench(laboratory, root.at("pour"), report)
@@ -397,14 +341,19 @@ def resolve_campaign(
         laboratory = laboratory.with_values(unattended=file.unattended)
     if report.problems or laboratory is None:
         return None
+    if dispense is not None:
+        laboratory = laboratory.in_real_time()
+        if laboratory.places:
+            laboratory = laboratory.with_values(vessels=cell_vessels(dispense))
     directory = file.outputs.folder if file.outputs.directory is None else root.directory / file.outputs.directory
     outputs = file.outputs.model_copy(update={"directory": str(resolved(directory))})
-    record = {"outputs": outputs} | ({} if memory is None else {"prior": ResolvedPrior.of(memory)})
+    record: dict[str, Any] = {"outputs": outputs} | ({} if memory is None else {"prior": ResolvedPrior.of(memory)})
+    record |= {} if mixtures is None else {"mixtures": mixtures}
     return CampaignPlan(
         name=file.name,
         seed=file.seed,
         source=root.document.path,
-        laboratory=laboratory if dispense is None else laboratory.in_real_time(),
+        laboratory=laboratory,
         parameters=SimulationParameters.from_values(in_force),
         calibration=calibration,
         deployment=deployment,

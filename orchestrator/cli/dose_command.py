@@ -129,12 +129,13 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
     """Predict one dose after the other; each leaves the source with its expected content."""
     from actors.interfaces import DoseTarget
     from actors.laboratory import predicted_dose
-    from orchestrator.learning.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, Dispense, KnownSource
+    from orchestrator.learning.dispense import FILL_DEVIATION, WEIGHED_DEVIATION, KnownSource
+    from orchestrator.learning.mixtures import dose_strategy
     from orchestrator.learning.trials import SeedStream
 
     assert plan.dispense is not None
     series, known = plan.dispense, _known(plan.dispense)
-    strategy, seeds = Dispense(series, plan.seed, known), SeedStream(plan.seed, "predict doses")
+    strategy, seeds = dose_strategy(series, plan.seed, known), SeedStream(plan.seed, "predict doses")
     count = 20 if len(series.doses) == 1 else 8
     rows: list[dict[str, Any]] = []
     total, filled = 0.0, 0

@@ -89,7 +89,9 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
             for line in () if plan.memory is None else plan.memory.lines:
                 print_note(line)
             warned: list[str] = []
-            problems = check_campaign(plan, warn=lambda problem: warned.append(str(problem)), doing=doing)
+            problems = check_campaign(
+                plan, warn=lambda problem: warned.append(str(problem)), doing=doing, tell=print_note
+            )
             for text in dict.fromkeys(warned):
                 print_warning(text)
             return f"campaign, seed {plan.seed}", [str(problem) for problem in problems]

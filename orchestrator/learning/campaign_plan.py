@@ -475,12 +475,35 @@ class PlannedDose:
         amount, limit: see `actors.interfaces.DoseTarget` [kg].
         receiver: name of the receiver's vessel.
         position: name of the receiver's place; '' if there is only one.
+        liquid: poured from the sources that hold it; None: from any source.
     """
 
     amount: float
     limit: float
     receiver: str
     position: str = ""
+    liquid: str | None = field(default=None, metadata=WRITTEN_IF_SET)
+
+
+MissPolicy = Literal["accept", "repeat"]
+"""What follows a dose beyond its tolerance: the next components are corrected, or the mixture is poured again."""
+
+
+@dataclass(frozen=True)
+class MixturePlan:
+    """What makes a series of doses a series of mixtures: the doses of one cup follow each other.
+
+    Attributes:
+        cups: the doses of each cup by liquid, in the order of pouring; by the names of the cups' positions.
+        on_miss: see `MissPolicy`.
+        spares: positions of empty cups that replace one whose mixture is poured again.
+        max_open: longest time from the first dose into a cup to its last one [s]; None: unlimited.
+    """
+
+    cups: dict[str, dict[str, PlannedDose]]
+    on_miss: MissPolicy = "accept"
+    spares: tuple[str, ...] = ()
+    max_open: float | None = None
 
 
 @dataclass(frozen=True)
@@ -495,6 +518,7 @@ class DispensePlan:
         as_left: whether the series begins with what earlier runs left in the sources; otherwise they are filled.
         laboratory: part of the names under which the content of the sources is tracked; '': the run does not track it.
         vessels: sources that are vessels of the station, with their ids.
+        mixtures: cups of the doses; None: each dose has a receiver of its own.
     """
 
     scenes: tuple[Scene, ...]
@@ -503,11 +527,16 @@ class DispensePlan:
     as_left: bool
     laboratory: str
     vessels: Annotated[Mapping[str, str], NOT_IN_FINGERPRINT] = field(default_factory=dict)
+    mixtures: MixturePlan | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of the sources, in the order of use."""
         return tuple(dict.fromkeys(scene.pourer.name for scene in self.scenes))
+
+    def sources_of(self, dose: PlannedDose) -> tuple[str, ...]:
+        """Names of the sources that a dose may be poured from, in the order of use."""
+        return tuple(name for name in self.sources if dose.liquid in (None, self.liquid(name)))
 
     def scene(self, source: str, receiver: str) -> Scene:
         """The scene of a source and a receiver."""

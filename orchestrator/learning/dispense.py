@@ -133,6 +133,9 @@ class Dose(ResultPart):
     source: str = ""
     """Name of the source vessel."""
 
+    liquid: str = ""
+    """Name of the liquid in a mixture."""
+
     filled: bool = False
     """Whether the source was filled before the dose."""
 
@@ -151,6 +154,63 @@ class Dose(ResultPart):
         return None if self.deviation_g is None else NINETY_PERCENT * self.deviation_g
 
 
+CupState = Literal["waiting", "filling", "full", "rejected", "refused", "unknown"]
+
+
+class MixedCup(ResultPart):
+    """A cup of mixtures. What it contains follows from the doses with its position."""
+
+    position: str
+    """Name of its position."""
+
+    wanted_g: dict[str, float]
+    """Amounts of the table by liquid [g], in the order of pouring."""
+
+    state: CupState = "waiting"
+    """'rejected': a dose missed its tolerance, and the mixture was poured again; 'refused': a dose was impossible;
+    'unknown': the amount of a dose is not known."""
+
+    replaces: str = ""
+    """Position of the rejected cup whose mixture it has."""
+
+
+class Component(ResultPart):
+    """A liquid in a cup of mixtures."""
+
+    cup: str
+    """Position of the cup."""
+
+    liquid: str
+    """Name of the liquid."""
+
+    wanted_g: float
+    """Amount of the table [g]."""
+
+    received_g: float | None
+    """Weighed amount [g]; None if it was not poured, or is unknown."""
+
+    half_interval_g: float | None
+    """Half of the interval that contains the true amount with a probability of 90 % [g]."""
+
+    share: float | None
+    """Share of the cup's content by mass; None unless all of the cup is known."""
+
+    wanted_share: float
+    """The share that the table states."""
+
+    share_half_interval: float | None
+    """Half of its interval with a probability of 90 %."""
+
+    dose: int | None
+    """Number of the dose; None if it was not poured."""
+
+    source: str
+    """Name of the source."""
+
+    state: CupState
+    """State of the cup."""
+
+
 class Dispensed(StageResult):
     """Results of a series of doses."""
 
@@ -161,6 +221,56 @@ class Dispensed(StageResult):
 
     doses: tuple[Dose, ...]
     """Completed doses, in the order made."""
+
+    cups: tuple[MixedCup, ...] = ()
+    """Cups of mixtures, in the order of filling."""
+
+    def components(self) -> list[Component]:
+        """Wanted and reached amounts of all cups, in the order of pouring."""
+        return [component for cup in self.cups for component in self._of_cup(cup)]
+
+    def _of_cup(self, cup: MixedCup) -> list[Component]:
+        doses = {dose.liquid: dose for dose in self.doses if dose.position == cup.position}
+        masses = {liquid: dose.received_g for liquid, dose in doses.items()}
+        known = cup.state == "full" and all(mass is not None for mass in masses.values())
+        total = sum(mass or 0.0 for mass in masses.values())
+        errors = {liquid: dose.deviation_g or 0.0 for liquid, dose in doses.items()}
+        components = []
+        for liquid, wanted in cup.wanted_g.items():
+            dose = doses.get(liquid)
+            share = (masses[liquid] or 0.0) / total if known and total > 0.0 else None
+            components.append(
+                Component(
+                    cup=cup.position,
+                    liquid=liquid,
+                    wanted_g=wanted,
+                    received_g=masses.get(liquid),
+                    half_interval_g=None if dose is None else dose.half_interval_g,
+                    share=share,
+                    wanted_share=wanted / sum(cup.wanted_g.values()),
+                    share_half_interval=None
+                    if share is None
+                    else NINETY_PERCENT * share_deviation(liquid, share, errors, total),
+                    dose=None if dose is None else dose.number,
+                    source="" if dose is None else dose.source,
+                    state=cup.state,
+                )
+            )
+        return components
+
+
+def share_deviation(liquid: str, share: float, deviations: Mapping[str, float], total: float) -> float:
+    """Standard deviation of a liquid's share of a mixture, whose amounts have independent errors.
+
+    Args:
+        liquid: name of the liquid.
+        share: its share of the mass.
+        deviations: standard deviations of all amounts, by liquid, in the unit of `total`.
+        total: mass of the mixture.
+    """
+    # x = m / M, so dx = ((1 − x) dm − x Σ dm_others) / M
+    others = math.fsum(deviation**2 for name, deviation in deviations.items() if name != liquid)
+    return math.sqrt(((1.0 - share) * deviations.get(liquid, 0.0)) ** 2 + share**2 * others) / total
 
 
 class Dispense:
@@ -191,21 +301,34 @@ class Dispense:
     @property
     def finished(self) -> bool:
         """Whether all doses are completed."""
-        return len(self._doses) == len(self._plan.doses)
+        return self._pouring is None and self._next() is None
+
+    def _next(self) -> PlannedDose | None:
+        """The dose after the completed ones; None if there is none."""
+        return self._plan.doses[len(self._doses)] if len(self._doses) < len(self._plan.doses) else None
+
+    def _in_cup(self, target: DoseTarget) -> DoseTarget:
+        """The target with its cup, if it has one."""
+        return target
+
+    @property
+    def _count(self) -> int:
+        """Number of doses, completed and to be poured."""
+        return len(self._plan.doses)
 
     def ask(self, slots: Slots) -> list[Request]:
         """Return the next dose, if none is running."""
-        if self.finished or self._pouring is not None or slots.pours < 1:
+        planned = self._next()
+        if planned is None or self._pouring is not None or slots.pours < 1:
             return []
         number = len(self._doses) + 1
-        planned = self._plan.doses[number - 1]
         source = self.next_source(planned)
         scene = self._plan.scene(source.name, planned.receiver)
-        target = DoseTarget(planned.amount, planned.limit, planned.position, source)
+        target = self._in_cup(DoseTarget(planned.amount, planned.limit, planned.position, source))
         self._pouring = Pour(scene.name, scene.action({}), number, self._seeds.next(), purpose=DOSE, dose=target)
         into = f" into {planned.position}" if planned.position else ""
         filled = ", filled before" if source.fill else f", which holds {1e3 * source.mass:.0f} g"
-        text = f"dose {number}/{len(self._plan.doses)}: {1e3 * planned.amount:g} g{into} from {source.name}{filled}"
+        text = f"dose {number}/{self._count}: {1e3 * planned.amount:g} g{into} from {source.name}{filled}"
         if source.knowledge is not None and source.unused:
             mean, deviation = source.knowledge.onset_flow[0], math.sqrt(source.knowledge.covariance[0])
             text += f"; onset from the calibration: {math.degrees(mean):+.1f}° ± {math.degrees(deviation):.1f}°"
@@ -214,7 +337,7 @@ class Dispense:
 
     def next_source(self, planned: PlannedDose) -> DoseSource:
         """The source of a dose: the first one that holds enough; if there is none, the fullest is filled."""
-        names = self._plan.sources
+        names = self._plan.sources_of(planned)
         for name in names:
             known = self._sources.get(name)
             if known is not None and self._holds(known, planned):
@@ -270,27 +393,31 @@ class Dispense:
                 end = f"{kind}: {reason}"
             case _:
                 raise ValueError(f"a dose can't be answered by {type(outcome).__name__}")
-        self._doses.append(
-            Dose(
-                number=pour.number,
-                wanted_g=1e3 * pour.dose.amount,
-                received_g=masses.delivered_g,
-                deviation_g=None if "deviation" not in about else 1e3 * about["deviation"],
-                spilled_g=masses.spilled_g,
-                duration_s=about.get("duration"),
-                end=end,
-                position=pour.dose.position,
-                source=pour.dose.source.name,
-                filled=pour.dose.source.fill,
-                left_g=None if left is None else 1e3 * left.mass,
-                left_deviation_g=None if left is None else 1e3 * left.deviation,
-                signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
-            )
+        dose = Dose(
+            number=pour.number,
+            wanted_g=1e3 * pour.dose.amount,
+            received_g=masses.delivered_g,
+            deviation_g=None if "deviation" not in about else 1e3 * about["deviation"],
+            spilled_g=masses.spilled_g,
+            duration_s=about.get("duration"),
+            end=end,
+            position=pour.dose.position,
+            source=pour.dose.source.name,
+            liquid="" if self._plan.mixtures is None else self._plan.liquid(pour.dose.source.name),
+            filled=pour.dose.source.fill,
+            left_g=None if left is None else 1e3 * left.mass,
+            left_deviation_g=None if left is None else 1e3 * left.deviation,
+            signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
         )
+        self._doses.append(dose)
+        self._settle(dose, outcome)
+
+    def _settle(self, dose: Dose, outcome: Outcome) -> None:
+        """Decide what follows from a completed dose."""
 
     def progress(self) -> Progress:
         """Doses made, and their total number."""
-        return Progress(pours=len(self._doses), of_pours=len(self._plan.doses))
+        return Progress(pours=len(self._doses), of_pours=self._count)
 
     def result(self) -> Dispensed:
         """The doses so far."""

@@ -43,7 +43,8 @@ from orchestrator.learning.deployment.calibration_evidence import calibration_ev
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import displacement
-from orchestrator.learning.dispense import Dispense, KnownSource, ReadSources, SourcesRead
+from orchestrator.learning.dispense import KnownSource, ReadSources, SourcesRead
+from orchestrator.learning.mixtures import dose_strategy
 from orchestrator.learning.requests import Simulate
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.single_action import Confirmation, OnePour, RepeatedSimulation
@@ -167,7 +168,7 @@ def dispense_stages(
 
     def doses(results: Results, seed: int) -> Strategy:
         known = result_of(results, SOURCES, SourcesRead).sources
-        return Dispense(plan, seed, known, calibrated_sources(plan, calibration, results))
+        return dose_strategy(plan, seed, known, calibrated_sources(plan, calibration, results))
 
     return [StageDefinition(SOURCES, sources), StageDefinition(DOSES, doses, pours=True)]
 

@@ -1,0 +1,194 @@
+"""`mixtures`: cups are filled one after the other, each dose once; what follows from a dose that missed or failed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from actors.interfaces import DoseTarget
+from orchestrator.learning.campaign_plan import DispensePlan, MixturePlan, PlannedDose
+from orchestrator.learning.dispense import Component, Dispensed
+from orchestrator.learning.mixtures import Mix, pouring_order
+from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Slots
+from orchestrator.records.codec import decode_request, decode_result, encode_request, encode_result
+from sim_engine.action import Action
+from sim_engine.liquids import Liquid
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
+from sim_engine.vessel.shapes import cylinder
+
+ACTION = Action(1.0, 0.09, 0.06)
+CUP = cylinder("cup", inner_radius=0.025, inner_height=0.06)  # 118 mL
+DENSITIES = {"water": 998.0, "oil": 920.0}
+
+
+def scene(liquid: str) -> Scene:
+    source = cylinder(f"source/{liquid}", inner_radius=0.04, inner_height=0.1)
+    return Scene(
+        f"mixtures-{liquid}",
+        source,
+        CUP,
+        Liquid(name=liquid, mass=0.3, density=DENSITIES[liquid]),
+        fixed=ACTION.values(),
+    )
+
+
+def plan(*rows: dict[str, float], **settings: Any) -> DispensePlan:
+    cups = {
+        f"rack/A{i}": {
+            liquid: PlannedDose(1e-3 * row[liquid], 1e-3, "cup", f"rack/A{i}", liquid) for liquid in pouring_order(row)
+        }
+        for i, row in enumerate(rows, start=1)
+    }
+    doses = tuple(dose for row in cups.values() for dose in row.values())
+    return DispensePlan(
+        (scene("water"), scene("oil")), doses, 0.0, False, "bench", mixtures=MixturePlan(cups, **settings)
+    )
+
+
+def asked(strategy: Mix) -> tuple[Pour, DoseTarget]:
+    (request,) = strategy.ask(Slots(0))
+    assert isinstance(request, Pour)
+    assert request.dose is not None
+    return request, request.dose
+
+
+def poured(pour: Pour, grams: float) -> Poured:
+    assert pour.dose is not None
+    assert pour.dose.source is not None
+    held = pour.dose.source.mass
+    knowledge = {"onset_flow": [0.01, 0.0], "covariance": [1e-4, 0.0, 0.0, 0.04], "lag": None, "aim": 0.0, "doses": 1}
+    about = {"received": 1e-3 * grams, "left": [held - 1e-3 * grams, 1e-3], "knowledge": knowledge, "deviation": 2e-4}
+    return Poured(PourMeasurement(held, 0.0, held - 1e-3 * grams, {"dose": about}))
+
+
+def run(strategy: Mix, errors: dict[int, float | Failed] | None = None) -> list[DoseTarget]:
+    """Pour to the end; doses are exact except for these errors [g], by the number of the dose."""
+    doses = []
+    while not strategy.finished:
+        pour, dose = asked(strategy)
+        error = (errors or {}).get(pour.number, 0.0)
+        outcome: Outcome = error if isinstance(error, Failed) else poured(pour, 1e3 * dose.amount + error)
+        strategy.tell(pour, outcome)
+        doses.append(dose)
+    return doses
+
+
+def steps(doses: list[DoseTarget]) -> list[tuple[str, str, float]]:
+    return [(d.cup, d.source.name if d.source else "", round(1e3 * d.amount, 3)) for d in doses]
+
+
+def states(result: Dispensed) -> dict[str, str]:
+    return {cup.position: cup.state for cup in result.cups}
+
+
+TWO = ({"water": 40.0, "oil": 10.0}, {"water": 20.0, "oil": 30.0})
+
+
+def test_all_doses_of_a_cup_follow_each_other_the_smallest_first() -> None:
+    strategy = Mix(plan(*TWO), 5)
+    assert steps(run(strategy)) == [
+        ("rack/A1", "source/oil", 10.0), ("rack/A1", "source/water", 40.0),
+        ("rack/A2", "source/water", 20.0), ("rack/A2", "source/oil", 30.0),
+    ]  # fmt: skip
+    assert states(strategy.result()) == {"rack/A1": "full", "rack/A2": "full"}
+
+
+def test_a_dose_names_its_cup_its_source_and_what_the_cup_holds() -> None:
+    doses = run(Mix(plan(*TWO), 5))
+    assert [dose.held for dose in doses] == [None, pytest.approx(0.01), None, pytest.approx(0.02)]
+    assert [dose.stays for dose in doses] == [True, False, True, False]
+    assert [dose.source.vessel for dose in doses if dose.source] == [dose.source.name for dose in doses if dose.source]
+
+
+def test_a_source_knows_its_flow_after_another_one_was_used() -> None:
+    doses = run(Mix(plan(*TWO), 5))
+    known = {(dose.cup, dose.source.name): dose.source.knowledge for dose in doses if dose.source}
+    assert known["rack/A1", "source/oil"] is None
+    later = known["rack/A2", "source/oil"]
+    assert later is not None
+    assert later.onset_flow == (0.01, 0.0)
+
+
+def test_a_missed_dose_scales_what_the_cup_still_lacks() -> None:
+    strategy = Mix(plan(*TWO), 5)
+    doses = run(strategy, {1: 2.0})  # 12 g of oil instead of 10 g
+    assert steps(doses)[1] == ("rack/A1", "source/water", 48.0)
+    assert steps(doses)[2:] == [("rack/A2", "source/water", 20.0), ("rack/A2", "source/oil", 30.0)]
+    shares = {c.liquid: (c.share, c.wanted_share) for c in strategy.result().components() if c.cup == "rack/A1"}
+    assert shares["oil"] == (pytest.approx(0.2), pytest.approx(0.2))
+    assert "multiplied by 1.200: water 48 g" in strategy.decisions[1].text
+
+
+def test_a_dose_within_its_tolerance_changes_nothing() -> None:
+    assert steps(run(Mix(plan(*TWO), 5), {1: 0.9}))[1] == ("rack/A1", "source/water", 40.0)
+
+
+def test_a_cup_without_room_is_not_corrected() -> None:
+    strategy = Mix(plan({"water": 85.0, "oil": 20.0}), 5)
+    assert steps(run(strategy, {1: 2.0}))[1] == ("rack/A1", "source/water", 85.0)
+    assert "stay as they are: the cup has no room" in strategy.decisions[1].text
+
+
+def test_a_missed_mixture_is_poured_again_into_a_spare_cup() -> None:
+    strategy = Mix(plan(*TWO, on_miss="repeat", spares=("rack/D6",)), 5)
+    assert [step[:2] for step in steps(run(strategy, {2: -3.0, 5: 4.0}))] == [
+        ("rack/A1", "source/oil"), ("rack/A1", "source/water"),
+        ("rack/D6", "source/oil"), ("rack/D6", "source/water"),
+        ("rack/A2", "source/water"), ("rack/A2", "source/oil"),
+    ]  # fmt: skip
+    result = strategy.result()
+    assert states(result) == {"rack/A1": "rejected", "rack/D6": "full", "rack/A2": "full"}
+    assert result.cups[1].replaces == "rack/A1"
+    assert any("no spare cup is left" in decision.text for decision in strategy.decisions)
+
+
+@pytest.mark.parametrize(("kind", "state"), [("pour_unknown", "unknown"), ("invalid_action", "refused")])
+def test_nothing_more_is_poured_into_a_cup_with_a_failed_dose(kind: str, state: str) -> None:
+    strategy = Mix(plan(*TWO), 5)
+    assert [step[0] for step in steps(run(strategy, {1: Failed(kind, "the cup fell")}))] == ["rack/A1"] + 2 * [
+        "rack/A2"
+    ]
+    assert states(strategy.result()) == {"rack/A1": state, "rack/A2": "full"}
+
+
+def test_no_dose_is_poured_twice_whatever_misses_or_fails() -> None:
+    for number in range(1, 7):
+        for error in (5.0, -5.0, Failed("pour_unknown", "")):
+            strategy = Mix(plan(*TWO, on_miss="repeat", spares=("rack/D6",)), 5)
+            poured_into = [step[:2] for step in steps(run(strategy, {number: error}))]
+            assert len(set(poured_into)) == len(poured_into)
+
+
+def test_the_shares_have_the_errors_of_all_their_doses() -> None:
+    strategy = Mix(plan({"water": 40.0, "oil": 10.0}), 5)
+    run(strategy)
+    oil: Component = next(c for c in strategy.result().components() if c.liquid == "oil")
+    # x = m / M: σ_x = √((0.8 σ)² + (0.2 σ)²) / 50 g with σ = 0.2 g
+    assert oil.share_half_interval == pytest.approx(1.645 * 0.2 * (0.8**2 + 0.2**2) ** 0.5 / 50.0)
+
+
+def test_a_resumed_run_corrects_as_it_did() -> None:
+    first, again = Mix(plan(*TWO), 5), Mix(plan(*TWO), 5)
+    pour, dose = asked(first)
+    first.tell(pour, poured(pour, 1e3 * dose.amount + 2.0))
+    replayed, _ = asked(again)
+    assert decode_request(encode_request(pour)) == replayed == pour
+    again.tell(replayed, poured(replayed, 1e3 * dose.amount + 2.0))
+    assert asked(again)[0] == asked(first)[0]
+    assert decode_result(encode_result(first.result())) == first.result() == again.result()
+
+
+def test_a_fixed_order_of_liquids_is_kept() -> None:
+    assert pouring_order({"water": 40.0, "oil": 10.0}, ["water", "oil"]) == ["water", "oil"]
+    assert pouring_order({"oil": 10.0}, ["water", "oil"]) == ["oil"]
+
+
+def test_a_sources_rest_decides_which_of_several_is_used() -> None:
+    two = plan({"water": 40.0}, {"water": 270.0})
+    second = scene("water")
+    second = replace(second, pourer=second.pourer.model_copy(update={"name": "source/water-2"}), name="second")
+    strategy = Mix(replace(two, scenes=(*two.scenes, second)), 5)
+    assert [name for _, name, _ in steps(run(strategy))] == ["source/water", "source/water-2"]
