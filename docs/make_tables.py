@@ -52,7 +52,6 @@ from orchestrator.learning.deployment.model_monitoring import (
     StopSettings,
 )
 from orchestrator.learning.deployment.objectives import Objective
-from orchestrator.learning.deployment.safe_window import WindowSettings
 from orchestrator.learning.strategy_registry import OBJECTIVES, STRATEGIES
 from orchestrator.recordings import recording_file as recording
 from orchestrator.records.states import State
@@ -77,7 +76,6 @@ SECTIONS: dict[str, type[Settings]] = {
     "transfer": campaign.TransferSettings,
     "deployment": campaign.DeploymentSection,
     "risk": RiskSettings,
-    "window": WindowSettings,
     "risk_limit": RiskLimitSettings,
     "stop": StopSettings,
     "data": campaign.DataSettings,
@@ -170,7 +168,6 @@ OF_SECTIONS = {
     "Objective": "[objective](#objectives)",
     **{model.__name__: "[objective](#objectives)" for model in OBJECTIVES.all.values()},
     "RiskSettings": "[risk](#risk)",
-    "WindowSettings": "[window](#window)",
     "RiskLimitSettings": "[risk limit](#risk-limit)",
     "StopSettings": "[stop](#stop)",
     "DataSettings": "[data](#data)",

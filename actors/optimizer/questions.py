@@ -319,12 +319,10 @@ class RiskAnswer:
     Attributes:
         expected: means over the disturbances.
         spreads: standard deviations over them.
-        worst: indices of the worst disturbances, the worst first; empty tuples for a mean.
     """
 
     expected: tuple[float, ...]
     spreads: tuple[float, ...]
-    worst: tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)

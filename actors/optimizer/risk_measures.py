@@ -85,22 +85,11 @@ class RiskProcess:
         mean, deviation = zip(*pieces, strict=True)
         return np.concatenate(mean), np.concatenate(deviation)
 
-    def answer(self, points: Array, count: int) -> RiskAnswer:
-        """Mean and standard deviation over the disturbances at points (m, dimension), and the worst ones.
-
-        Args:
-            points: (m, dimension).
-            count: number of the worst disturbances for each point, by index, the worst first; with level 0: none.
-        """
+    def answer(self, points: Array) -> RiskAnswer:
+        """Mean and standard deviation over the disturbances at points (m, dimension)."""
         losses = [self._losses(piece)[0] for piece in self._pieces(points)]
         every = np.concatenate(losses) if losses else np.empty((0, len(self.disturbances)))
-        count = min(count, len(self.disturbances)) if self.level > 0.0 else 0
-        worst = np.argsort(-every, axis=1, kind="stable")[:, :count]
-        return RiskAnswer(
-            tuple(map(float, every.mean(axis=1))),
-            tuple(map(float, every.std(axis=1))),
-            tuple(tuple(map(int, row)) for row in worst),
-        )
+        return RiskAnswer(tuple(map(float, every.mean(axis=1))), tuple(map(float, every.std(axis=1))))
 
     def _moments(self, points: Array) -> tuple[Array, Array]:
         losses, cross = self._losses(points)

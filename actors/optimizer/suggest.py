@@ -53,9 +53,6 @@ from sim_engine.prediction_band import LEVEL
 
 Array = NDArray[np.float64]
 
-WORST = 8
-"""Number of worst disturbances of a request in an answer."""
-
 MOST_AVERAGED = 100
 """Largest number of observations with intervals averaged over hyperparameters; more determine them well."""
 
@@ -107,7 +104,7 @@ def describe(
         description["predictions"] = tuple(map(float, predictions))
         description["prediction_deviations"] = tuple(map(float, spreads))
         if isinstance(model.surrogate, RiskProcess):
-            description["risk"] = model.surrogate.answer(known, WORST)
+            description["risk"] = model.surrogate.answer(known)
     if query.map_resolution and query.space.dimension >= 2:
         sought = _seeks_minimum(query) and len(points) > 0
         at = np.array(query.map_at) if query.map_at else points[0] if sought else known[best]

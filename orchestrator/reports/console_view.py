@@ -42,7 +42,7 @@ def summary_table(summary: RunSummary) -> RenderableType:
 
 def _advice(row: Advice) -> list[RenderableType]:
     action = ", ".join(f"{name} {value}" for name, value in row.action.items())
-    lines = [f"  into {row.receiver}: {action}" if action else f"  into {row.receiver}", *row.sentences, row.window]
+    lines = [f"  into {row.receiver}: {action}" if action else f"  into {row.receiver}", *row.sentences]
     shown: list[RenderableType] = [Text(line if i == 0 else f"    {line}") for i, line in enumerate(lines) if line]
     return shown + [Text(f"    {line}", style="yellow") for line in row.open]
 

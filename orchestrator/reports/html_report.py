@@ -80,11 +80,6 @@ _FIGURES: dict[str, tuple[str, str]] = {
         "One simulation of the recommended pour. Blue: in the pourer, light blue: falling, green: received, red: "
         "spilled.",
     ),
-    "safe window": (
-        "Loss along each dimension of the action, with the recommended action, the tolerance and the range inside "
-        "which it is kept.",
-        "Tolerance of the recommended action: the ranges in which its loss stays within the limit.",
-    ),
 }
 """Alt text and caption of a figure, by the beginning of its name."""
 

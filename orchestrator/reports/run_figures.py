@@ -41,7 +41,6 @@ from orchestrator.reports.surrogate_figures import (
     draw_posterior,
     draw_surrogate,
     draw_trials,
-    draw_window,
 )
 from orchestrator.runs.run_folder import film_file, read_film
 from orchestrator.runs.stages import recommended_pours, scenes_of
@@ -121,8 +120,6 @@ def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = Non
             drawings[f"loss map {name}"] = partial(draw_surrogate, replace(picture, deviation=None))
         if picture is not None and picture.deviation is not None:
             drawings[f"uncertainty of the loss {name}"] = partial(draw_surrogate, replace(picture, mean=None))
-        if result.window is not None:
-            drawings[f"safe window {name}"] = partial(draw_window, result, picture, unit=unit, receiver=name)
     if directory is not None:
         scenes = scenes_of(plan)
         for name, pour in recommended_pours(plan, results).items():

@@ -19,7 +19,6 @@ from orchestrator.learning.calibration.posterior_summary import PosteriorSummary
 from orchestrator.learning.deployment.deployment_result import Recommended, RiskFound
 from orchestrator.learning.deployment.model_monitoring import Believed
 from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
-from orchestrator.learning.deployment.safe_window import WindowFound
 from orchestrator.learning.single_action import Confirmed
 from orchestrator.learning.stage_result import ResultPart, StageResult, WeighedMasses
 from orchestrator.learning.strategy_registry import result_kinds
@@ -182,9 +181,6 @@ class Advice(ResultPart):
     sentences: tuple[str, ...]
     """Recommendation and expected result."""
 
-    window: str
-    """Allowed deviation from the action, or a statement that it is unknown."""
-
     open: tuple[str, ...]
     """Warnings and open questions."""
 
@@ -243,7 +239,6 @@ class ReceiverSummary(ResultPart):
     gave_up: str | None
     ended: str | None
     risk: RiskFound | None
-    window: WindowFound | None
     prediction: dict[str, SampleStatistics] | None
     """Result of repeated simulations of the recommended action with new seeds, by quantity."""
 
@@ -272,7 +267,7 @@ class ReceiverSummary(ResultPart):
 
 PLANNED = (
     *("prediction", "prediction_interval", "at_bounds", "predicted_delivered_g", "predicted_delivered_ml"),
-    *("risk", "window", "not_covered"),
+    *("risk", "not_covered"),
 )
 """Fields of a receiver's summary that a plan for it gives beside the action."""
 

@@ -400,7 +400,6 @@ def _receiver(
         gave_up=result.gave_up,
         ended=result.ended,
         risk=result.risk,
-        window=result.window,
         prediction=prediction,
         prediction_interval=None if predicted is None else predicted.interval,
         at_bounds=() if plan is None or advised is None else tuple(style.at_ends(advised.action_si, plan.actions.axes)),

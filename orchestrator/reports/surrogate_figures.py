@@ -1,7 +1,6 @@
-"""Figures of surrogates, safe windows and posteriors.
+"""Figures of surrogates and posteriors.
 
 - `draw_surrogate` and `draw_trials`: the discrepancy over θ, or the predicted loss over actions.
-- `draw_window`: the safe window in the loss map, and the loss along each dimension.
 - `draw_posterior`: the posterior of θ as a corner plot.
 """
 
@@ -16,10 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orchestrator.learning.calibration.posterior_summary import PosteriorFound
-from orchestrator.learning.deployment.deployment_result import Deployed, RiskFound
-from orchestrator.learning.deployment.safe_window import WindowFound
 from orchestrator.reports import figure_style as style
-from orchestrator.reports.loss_units import LossUnit, at_least_nothing
 from sim_engine.search_space import Axis, Space
 
 if TYPE_CHECKING:
@@ -316,91 +312,6 @@ def _limits(values: NDArray[np.float64]) -> tuple[float, float]:
     """Colour range of the values, never empty."""
     low, high = float(np.min(values)), float(np.max(values))
     return (low, high) if high - low > 1e-12 else (low - 0.5, low + 0.5)
-
-
-def draw_window(result: Deployed, picture: SurrogatePicture | None, *, unit: LossUnit, receiver: str) -> Figure:
-    """A loss map with action and window, and a panel for each dimension.
-
-    The map is omitted if there is none. Each panel shows the surrogate's mean, the results of the checks and the
-    tolerance.
-
-    Args:
-        result: result of a deployment, with its window and its recommendation.
-        picture: its loss map.
-        unit: unit of the loss.
-        receiver: for the title.
-
-    Raises:
-        ValueError: there is no window or no recommendation.
-    """
-    if result.window is None or result.recommended is None:
-        raise ValueError("safe window: none was looked for")
-    window, action = result.window, result.recommended.action_si
-    names, mapped = list(window.outline), picture is not None and picture.mean is not None
-    count = len(names) + mapped
-    figure, axes = style.new_figure(1, count, size=(4.3 * count, 4.1), squeeze=False)
-    measure = _measure(result.risk)
-    style.entitle(figure, f"Safe window: {receiver}, {measure}")
-    if picture is not None and mapped:
-        _window_map_panel(axes[0, 0], picture, window, unit)
-    for panel, name in zip(axes[0, count - len(names) :], names, strict=True):
-        _profile(panel, name, window, action[name], unit)
-        style.dress(panel, x=style.label(name), y=unit.label)
-    handles, labels = axes[0, -1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8.5, frameon=False)
-    return figure
-
-
-def _measure(risk: RiskFound | None) -> str:
-    if risk is None:
-        return "executed exactly but for one dimension"
-    if risk.measure == "cvar":
-        return f"CVaR {100 * risk.level:g} % under errors of execution"
-    return "expected under errors of execution"
-
-
-def _window_map_panel(axes: Axes, picture: SurrogatePicture, window: WindowFound, unit: LossUnit) -> None:
-    across, up = picture.plane.axes
-    assert picture.mean is not None
-    mean, places = np.asarray(picture.mean), np.linspace(0.0, 1.0, len(picture.mean))
-    xs, ys = (np.array([axis.decode(u) for u in places]) / style.display_factor(axis.name) for axis in (across, up))
-    mesh = axes.contourf(xs, ys, mean, levels=20, cmap="viridis")
-    axes.figure.colorbar(mesh, ax=axes, fraction=0.05, pad=0.02).ax.tick_params(labelsize=8)
-    axes.contour(xs, ys, mean, levels=[unit.factor * window.tolerance], colors="white", linewidths=1.3)
-    if picture.best is not None:
-        x, y = (float(picture.best[a.name] or 0.0) / style.display_factor(a.name) for a in (across, up))
-        for name, ends in window.axes.items():
-            low, high = (end / style.display_factor(name) for end in (ends.low, ends.high))
-            if name == across.name:
-                axes.plot([low, high], [y, y], color=style.BEST, linewidth=3.0, solid_capstyle="butt", clip_on=False)
-            elif name == up.name:
-                axes.plot([x, x], [low, high], color=style.BEST, linewidth=3.0, solid_capstyle="butt", clip_on=False)
-        axes.scatter(
-            [x], [y], marker="*", s=230, color=style.BEST, edgecolors="white", linewidths=1.2, zorder=5, clip_on=False
-        )
-    style.dress(axes, title=f"{unit.label}, contour at the tolerance", x=style.label(across.name), grid=None)
-    axes.set_ylabel(style.label(up.name), fontsize=9.5, color=style.INK)
-
-
-def _profile(axes: Axes, name: str, window: WindowFound, best: float, unit: LossUnit) -> None:
-    factor, tolerance = style.display_factor(name), unit.factor * window.tolerance
-    along = window.outline[name]
-    expected = [unit.factor * at_least_nothing(loss) for loss in along.expected]
-    axes.plot(np.array(along.values) / factor, expected, color=style.PREDICTED, label="surrogate", zorder=2)
-    axes.axhline(tolerance, color=style.GREY, linewidth=1.0, linestyle="--", label="tolerance")
-    axes.axvline(best / factor, color=style.BEST, linewidth=1.4, label="action")
-    if name in window.axes:
-        ends = window.axes[name]
-        axes.axvspan(ends.low / factor, ends.high / factor, color=style.GOOD, alpha=0.16, label="safe window")
-    top = 4.0 * tolerance
-    for inside, colour, marker in ((True, style.GOOD, "o"), (False, style.SPILLED, "X")):
-        checks = [c for c in window.checks if c.inside is inside and c.axis in (None, name)]
-        losses = [top if c.loss is None else unit.factor * c.loss for c in checks]
-        top = max([top, *losses]) if losses else top
-        label = "simulated, inside" if inside else "simulated, outside"
-        places = [c.action_si[name] / factor for c in checks]
-        axes.plot(places, losses, marker, color=colour, markeredgecolor="white", markersize=8, label=label, zorder=4)
-    axes.set_ylim(0.0, 1.08 * min(top, max([*expected, 4.0 * tolerance])))
 
 
 BINS = 18

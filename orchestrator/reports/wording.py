@@ -1,7 +1,7 @@
 """Sentences and tables about a run, each made once.
 
 Sentences are written when the result document is made (`orchestrator.reports.summarise`): `advice`, `standing`,
-`open_questions`, `what_was_asked`, `cost`, `theta_sentences`, and one line each for a risk, a window, a prediction
+`open_questions`, `what_was_asked`, `cost`, `theta_sentences`, and one line each for a risk, a prediction
 interval and the use of the pool. The tables arrange the document's values; the console and the page render them.
 """
 
@@ -17,7 +17,6 @@ from orchestrator.learning.campaign_plan import CalibrationPlan, CampaignPlan
 from orchestrator.learning.deployment.deployment_result import RiskFound
 from orchestrator.learning.deployment.model_monitoring import DOUBT, Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck
-from orchestrator.learning.deployment.safe_window import WindowFound
 from orchestrator.learning.dispense import Dispensed
 from orchestrator.records.run_record import RunState
 from orchestrator.records.states import State
@@ -70,20 +69,6 @@ def risk_line(risk: RiskFound, unit: LossUnit) -> str:
     )
 
 
-def window_line(window: WindowFound, unit: LossUnit) -> str:
-    """'safe window: x offset 118 … 131 mm, angular velocity 34 … 71 deg/s at ≤ 2.00 %, checked by 12 simulations'."""
-    checked = f"checked by {window.simulations} simulations"
-    tolerance = unit.text(window.tolerance)
-    if not window.axes:
-        return f"safe window: none; the loss of the action itself exceeds {tolerance}, {checked}"
-    parts = []
-    for name, ends in window.axes.items():
-        low, high = (end / style.display_factor(name) for end in (ends.low, ends.high))
-        beyond = {(): "", ("low",): " or less", ("high",): " or more"}.get(ends.cut_off, " or farther")
-        parts.append(f"{name.replace('_', ' ')} {low:.4g} … {high:.4g} {style.display_unit(name)}{beyond}")
-    return f"safe window: {', '.join(parts)} at ≤ {tolerance}, one dimension varied at a time, {checked}"
-
-
 FEW = 5
 """Number of pours of an action below which their mean is not reliable."""
 
@@ -98,24 +83,16 @@ def advice(plan: CampaignPlan, receivers: Mapping[str, ReceiverSummary]) -> tupl
 
 
 def _advice(scene: Scene | None, row: ReceiverSummary, unit: LossUnit) -> Advice:
-    window, open_points = "", tuple(_open(row))
+    open_points = tuple(_open(row))
     if row.recommended is None:
         why = row.gave_up or "there is no result from which to choose an action"
         lines = (f"No action is recommended: {why}.",)
-        return Advice(receiver=row.receiver, action={}, fixed={}, sentences=lines, window="", open=open_points)
-    if row.window is not None:
-        window = _sentence(window_line(row.window, unit))
-    else:
-        window = (
-            "No safe window was computed: the tolerance of this action to execution errors is unknown. D1 computes "
-            "one if the campaign contains 'window: {tolerance: …}'."
-        )
+        return Advice(receiver=row.receiver, action={}, fixed={}, sentences=lines, open=open_points)
     return Advice(
         receiver=row.receiver,
         action=_shown(row.recommended.action_si),
         fixed={} if scene is None else _shown(scene.fixed),
         sentences=tuple(_sentences(scene, row, unit)),
-        window=window,
         open=open_points,
     )
 

@@ -127,7 +127,6 @@ FEATURES = {
         _under("deployment", objectives=[{"name": "spilled"}, {"name": "time"}]),
         ("D2", "D1", "D3"),
     ),
-    "window": Feature("`deployment: {window: {…}}`", _under("deployment", window={"tolerance": "20 %"}), ("D1",)),
     "risk limit": Feature("`deployment: {risk_limit: {…}}`", _under("deployment", risk_limit={}), ("D3",)),
     "prior": Feature("`prior: catalogue`", lambda file: file.update(prior="catalogue"), ("D3", "D1")),
     "recordings": Feature("`outputs: {pour_recordings: true}`", _records, ("D2", "D3", "D1")),
@@ -206,7 +205,7 @@ class Run:
 
 TOGETHER = (
     ("calibration", "D3", "doses", "risk limit", "prior"),
-    ("calibration", "D1", "doses", "window", "prior"),
+    ("calibration", "D1", "doses", "prior"),
     ("D2", "objectives", "recordings", "places", "unattended"),
 )
 """Campaigns that have every feature between them: each is run in every way."""
@@ -226,7 +225,7 @@ RUNS = [
     Run(features, ("in process", "library"))
     for features in (
         ("calibration", "D3", "objectives", "risk limit", "prior", "recordings", "places", "unattended"),
-        ("calibration", "D1", "window", "prior", "recordings", "places", "unattended"),
+        ("calibration", "D1", "prior", "recordings", "places", "unattended"),
         ("calibration", "D2", "objectives", "recordings", "places", "unattended"),
         ("D1", "objectives", "recordings", "places", "unattended"),
         ("calibration", "D2", "doses", "objectives"),

@@ -173,10 +173,9 @@ def _words(query: SuggestionQuery) -> tuple[str, str]:
 
 
 def _risk(query: RiskQuery) -> RiskAnswer:
-    asked, draws = len(query.predict_at), len(query.risk.disturbances)
-    worst = tuple(tuple(range(min(3, draws))) for _ in range(asked)) if query.risk.level > 0.0 else ((),) * asked
+    asked = len(query.predict_at)
     expected = tuple(0.05 + 0.01 * noise("expected", query.seed, i) for i in range(asked))
-    return RiskAnswer(expected, (0.01,) * asked, worst)
+    return RiskAnswer(expected, (0.01,) * asked)
 
 
 def _discrepancy(query: PourQuery, dimension: int) -> DiscrepancyFound:

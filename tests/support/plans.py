@@ -12,7 +12,6 @@ from orchestrator.learning.calibration.calibration_base import Calibrated, Calib
 from orchestrator.learning.calibration.posterior_summary import PosteriorFound, RemainingDiscrepancy
 from orchestrator.learning.campaign_plan import CalibrationPlan, DeploymentPlan
 from orchestrator.learning.deployment.disturbances import PoseNoise, RiskSettings
-from orchestrator.learning.deployment.safe_window import WindowSettings
 from orchestrator.learning.strategy_registry import STRATEGIES
 from orchestrator.runs.strategy_harness import ACTIONS, CALIBRATION_ACTIONS, PARAMETERS, SCENE
 from sim_engine.action import Action
@@ -101,11 +100,6 @@ def calibrated(
         posterior=posterior if rows else None,
     )
     return Calibrated(strategy="C4", simulations=0, lost=0, undefined=0, training_pours=2, trials=(), found=found)
-
-
-def window(tolerance: float | None) -> WindowSettings | None:
-    """The window within a tolerance, if there is one."""
-    return None if tolerance is None else WindowSettings(tolerance=tolerance)
 
 
 def _settings(strategy: str, values: dict[str, Any]) -> tuple[Any, dict[str, Any]]:

@@ -15,7 +15,7 @@ from itertools import islice
 from statistics import NormalDist
 from typing import Any
 
-from actors.optimizer.questions import Data, MinimumQuery, Point, RegressionQuery, Risk, RiskQuery, Suggestion
+from actors.optimizer.questions import Data, MinimumQuery, Point, RegressionQuery, RiskQuery, Suggestion
 from orchestrator.learning.campaign_plan import Draw
 from orchestrator.learning.deployment.deployment_base import observed_scatter
 from orchestrator.learning.deployment.deployment_ledger import MAX_REFUSED, DeploymentRequests
@@ -25,10 +25,6 @@ from orchestrator.learning.requests import Failed, Outcome, Prediction, Simulate
 from sim_engine.action import Action
 from sim_engine.prediction_band import lacking_shift, shift_of
 
-FEWEST_CHECKS = 2
-"""Minimum number of simulations of an action in the safe window; `simulations_per_iteration` is used if it is
-larger."""
-
 
 class SeedMean:
     """Evaluates an action by its mean loss over seeds.
@@ -37,14 +33,12 @@ class SeedMean:
         repeats: simulations per action.
 
     Attributes:
-        checks: number of simulations per place of the safe window.
         gave_up: reason why no action can be recommended; None if one can, or before the end.
     """
 
     def __init__(self, requests: DeploymentRequests, repeats: int) -> None:
         self._requests, self._ledger, self._plan = requests, requests.ledger, requests.ledger.plan
         self._repeats = repeats
-        self.checks = max(repeats, FEWEST_CHECKS)
         self.gave_up: str | None = None
 
     # -- simulations -----------------------------------------------------------------------------------------------
@@ -52,10 +46,6 @@ class SeedMean:
     def simulations(self, action: Action, purpose: str) -> tuple[Simulate, ...]:
         """Simulations of an action during the search."""
         return self._requests.simulations(action, purpose, self._repeats)
-
-    def checking(self, action: Action, worst: Sequence[int]) -> tuple[Simulate, ...]:
-        """Simulations that check whether an action is inside the window; `worst`: see `RiskAnswer`."""
-        return self._requests.simulations(action, "window", self.checks)
 
     def record(self, request: Simulate, outcome: Outcome) -> None:
         """Record the outcome of a simulation, in addition to its cost in the ledger."""
@@ -75,10 +65,6 @@ class SeedMean:
     def _data(self, *, everything: bool) -> Data:
         """Observations of the simulated cost."""
         return self._ledger.simulated(everything=everything)
-
-    def of_checks(self, query: RegressionQuery | RiskQuery) -> RiskQuery | None:
-        """The same query about the expectation over the disturbances of the window's checks; None if not needed."""
-        return None
 
     # -- recommendation --------------------------------------------------------------------------------------------
 
@@ -117,13 +103,6 @@ class SeedMean:
         return None
 
 
-FRESH = 2
-"""Stream of the draws for window checks, different from those of the surrogate and of the simulations."""
-
-FEWEST_DRAWS = 4
-"""Minimum number of draws per place in the safe window; m1 is used if it is larger."""
-
-
 class RiskMeasure(SeedMean):
     """Evaluates an action by the mean or the CVaR of the loss over errors of execution and θ.
 
@@ -147,7 +126,6 @@ class RiskMeasure(SeedMean):
     def __init__(self, requests: DeploymentRequests, repeats: int, disturbances: Disturbances, iterations: int) -> None:
         super().__init__(requests, repeats)
         self._disturbances = disturbances
-        self.checks = max(repeats, FEWEST_DRAWS)
         self._sequence = iter(disturbances.draws((iterations + MAX_REFUSED) * repeats))
         self._draws: dict[Simulate, Draw] = {}
         self._touching: set[Action] = set()
@@ -157,15 +135,6 @@ class RiskMeasure(SeedMean):
     def simulations(self, action: Action, purpose: str) -> tuple[Simulate, ...]:
         """One simulation as planned, and the others under the sequence's next draws."""
         return self._under(action, purpose, [self._disturbances.nominal, *islice(self._sequence, self._repeats - 1)])
-
-    def checking(self, action: Action, worst: Sequence[int]) -> tuple[Simulate, ...]:
-        """For the mean, the same few draws at every place. For CVaR, draws that are the worst according to the
-        surrogate: the mean over any subset of this share of all draws is at most CVaR."""
-        if not worst:
-            return self._under(action, "window", self._disturbances.draws(self.checks, FRESH))
-        tried = self._disturbances.tried(max(worst) + 1)
-        chosen = [tried[worst[i * len(worst) // self.checks]] for i in range(self.checks)]
-        return self._under(action, "window", chosen)
 
     def _under(self, action: Action, purpose: str, draws: Sequence[Draw]) -> tuple[Simulate, ...]:
         requests = self._requests.simulations_under(action, purpose, draws)
@@ -206,13 +175,6 @@ class RiskMeasure(SeedMean):
                 if (cost := trial.costs[index]) is not None:
                     data = data.added(self._disturbances.executed(trial.point, self._draws[request]), cost)
         return data
-
-    def of_checks(self, query: RegressionQuery | RiskQuery) -> RiskQuery | None:
-        """For the mean, the surrogate's expectation over the draws of the checks is needed, too."""
-        if not isinstance(query, RiskQuery) or query.risk.level > 0.0:
-            return None
-        draws = self._disturbances.draws(self.checks, FRESH)
-        return replace(query, risk=Risk(tuple(self._disturbances.disturbance(draw) for draw in draws)))
 
     # -- recommendation --------------------------------------------------------------------------------------------
 

@@ -8,22 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from typing import ClassVar, Literal
 
-from actors.optimizer.questions import Point, RegressionQuery, RiskQuery, Suggestion
+from actors.optimizer.questions import Point, Suggestion
 from orchestrator.learning.campaign_plan import DeploymentPlan, Draw, Premises
 from orchestrator.learning.deployment.action_evaluation import RiskMeasure, SeedMean
 from orchestrator.learning.deployment.deployment_base import MAP_RESOLUTION, Deployment
 from orchestrator.learning.deployment.deployment_ledger import SearchSettings
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.disturbances import Disturbances, RiskSettings
-from orchestrator.learning.deployment.safe_window import SafeWindow, WindowSettings
-from orchestrator.learning.requests import Decision, Outcome, Request, Simulate, Simulated, Slots
+from orchestrator.learning.requests import Outcome, Request, Simulate, Simulated
 from orchestrator.learning.strategy import Progress, Strategy, is_sound
-from orchestrator.learning.trials import Trial
-from sim_engine.action import Action, described
+from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import SampleStatistics
 from sim_engine.scene import Scene
@@ -50,9 +47,6 @@ class D1Settings(SearchSettings):
     risk: RiskSettings | None = None
     """Errors of execution and of θ under which the loss is minimised."""
 
-    window: WindowSettings | None = None
-    """Search for the safe window around the action, and check it by simulations."""
-
     @property
     def rounds(self) -> int:
         """Iterations of the optimiser."""
@@ -74,12 +68,11 @@ class D1Settings(SearchSettings):
         return f"{self.rounds} iterations of {self.simulations_per_iteration} simulations, one pour"
 
     def check(self, premises: Premises, complaints: Problems) -> None:
-        """Check that risk and window are combined with a loss, and that risk names at least one error."""
-        for key, value in (("risk", self.risk), ("window", self.window)):
-            if value is not None and premises.objectives:
-                complaints.add("is about a loss; it can't be combined with 'objectives'", key, key=True)
+        """Check that risk is combined with a loss, and that it names at least one error."""
         if self.risk is None:
             return
+        if premises.objectives:
+            complaints.add("is about a loss; it can't be combined with 'objectives'", "risk", key=True)
         self.risk.check(complaints)
         if self.simulations_per_iteration == 1:
             text = "one simulation of each action is made as planned, so that with 'risk' at least 2 are needed"
@@ -117,14 +110,6 @@ class OneShotPlanning(Deployment[D1Settings]):
             disturbances = Disturbances(risk, plan.actions, parameters, self._seeds.next(), plan.thetas)
             self._evaluation = RiskMeasure(self._requests, repeats, disturbances, self._settings.rounds)
         self._spillages: dict[Simulate, float | None] = {}
-        self._window: SafeWindow | None = None
-        self._searched: list[Trial] = []
-
-    def ask(self, slots: Slots) -> list[Request]:
-        """As in the base class, except that window checks and the following pour are requested at once: they do not
-        depend on an answer of the optimiser."""
-        requests = super().ask(slots)
-        return requests if requests or self._window is None else super().ask(slots)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
         """As in the base class; the spillage of each simulation is recorded as well, whatever the loss is."""
@@ -144,10 +129,7 @@ class OneShotPlanning(Deployment[D1Settings]):
         if self._width_known and trials.all == []:
             # slots count simulations; a trial takes m1 of them
             trials.width = math.ceil(trials.width / self._settings.simulations_per_iteration)
-        if self._window is not None and not self._window.closed:
-            if trials.idle:
-                self._check_window(self._window)
-        elif self._report.final is not None:
+        if self._report.final is not None:
             if self._pouring is not None:
                 return
             if self._ledger.counted == 0 and self._ledger.pours_left:  # the pour was refused
@@ -177,64 +159,11 @@ class OneShotPlanning(Deployment[D1Settings]):
         self._questions.put(query, "conclude", self._recommend)
 
     def _recommend(self, suggestion: Suggestion) -> None:
-        suggestion = self._evaluation.allowed(suggestion)
-        self._report.final, self._searched = suggestion, list(self._trials.all)
-        if suggestion.best_point is None:
-            self._finished = True  # too few simulations succeeded; the result reports how many were lost
-        elif self._settings.window is None:
-            self._use(suggestion)
-        else:
-            tolerated = self._settings.window.tolerated * self._ledger.costing.everything_spilled
-            window = SafeWindow(self._plan.actions, suggestion.best_point, tolerated)
-            query = replace(self._evaluation.regression(), predict_at=window.places)
-            self._questions.put(query, "window", lambda outline: self._outlined(window, query, outline))
-
-    def _use(self, suggestion: Suggestion) -> None:
-        """Pour the recommended action, or finish if no pour is planned."""
-        if self._plan.pours < 1 or suggestion.best_point is None:
-            self._finished = True
+        suggestion = self._report.final = self._evaluation.allowed(suggestion)
+        if suggestion.best_point is None or self._plan.pours < 1:
+            self._finished = True  # without a point, too few simulations succeeded; the result reports how many
         else:
             self._pour(suggestion.best_point, self._evaluation.prediction(suggestion))
-
-    # -- the safe window -------------------------------------------------------------------------------------------
-
-    def _outlined(self, window: SafeWindow, query: RegressionQuery | RiskQuery, outline: Suggestion) -> None:
-        """Begin the checks when the surrogate's answers for the window's places have arrived."""
-
-        def begin() -> None:
-            window.outline(outline.predictions, () if outline.risk is None else outline.risk.worst)
-            self._window = window
-            self._check_window(window)
-
-        def known(expected: Suggestion) -> None:
-            window.allow_for(outline.predictions, expected.predictions)
-            begin()
-
-        of_checks = self._evaluation.of_checks(query)
-        if of_checks is None:
-            begin()
-        else:
-            self._questions.put(of_checks, "window", known)
-
-    def _check_window(self, window: SafeWindow) -> None:
-        """Evaluate the simulated checks; queue the remaining ones, or conclude."""
-        if window.waiting:
-            tried = self._trials.all[-len(window.waiting) :]
-            for check, trial in zip(tuple(window.waiting), tried, strict=True):
-                window.judge(check, trial.cost)
-        for check in window.next_checks():
-            values = self._plan.actions.decode(check.point)
-            requests = self._evaluation.checking(self._scene.action(values), window.worst(check))
-            self._trials.add(Trial(check.point, requests))
-            self.decisions.append(Decision(f"check {check.what}  {described(values)}"))
-        if window.closed:
-            assert self._report.final is not None
-            self._use(self._report.final)
-
-    @property
-    def _simulated_checks(self) -> int:
-        """Number of simulations that check the window."""
-        return sum(len(trial.requests) for trial in self._trials.all[len(self._searched) :])
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -243,24 +172,22 @@ class OneShotPlanning(Deployment[D1Settings]):
         repeats = self._settings.simulations_per_iteration
         pours = 1 if self._plan.pours else 0
         answered = self._trials.answered - repeats * self._ledger.unspent
-        checks = 0 if self._window is None else self._simulated_checks
-        return Progress(answered, self._settings.rounds * repeats + checks, self._ledger.counted, pours)
+        return Progress(answered, self._settings.rounds * repeats, self._ledger.counted, pours)
 
     def result(self) -> Deployed:
-        """The result so far, with risk and window."""
-        final, window = self._report.final, self._window
+        """The result so far, with the risk."""
+        final = self._report.final
         return self._report.result(
             gave_up=self._evaluation.gave_up,
             scatter=self._evaluation.scatter,
             spillage=None if final is None or final.best_point is None else self._spillage(final.best_point),
             risk=None if final is None else self._evaluation.risk_found(final),
-            window=None if window is None or not window.closed else window.result(self._simulated_checks),
         )
 
     def _spillage(self, point: Point) -> SampleStatistics | None:
         """Statistics over seeds that took part in the selection; `orchestrator.learning.single_action` uses new
         ones."""
-        tried = [trial for trial in self._searched if trial.point == point]
+        tried = [trial for trial in self._trials.all if trial.point == point]
         return SampleStatistics.of(
             [r for trial in tried for q in trial.requests if (r := self._spillages.get(q)) is not None]
         )

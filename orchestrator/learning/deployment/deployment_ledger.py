@@ -160,7 +160,7 @@ class DeploymentLedger:
     def unspent(self) -> int:
         """Refused trials among them that are free."""
         counting = self.trials.counting(everything=self.trials.idle)
-        return min(sum(t.refused and t.requests[0].purpose not in ("refine", "window") for t in counting), MAX_REFUSED)
+        return min(sum(t.refused and t.requests[0].purpose != "refine" for t in counting), MAX_REFUSED)
 
     # -- data for surrogates ---------------------------------------------------------------------------------------
 

@@ -8,7 +8,6 @@ from typing import Literal
 from actors.optimizer.questions import Suggestion
 from orchestrator.learning.deployment.model_monitoring import Believed, BenchFound
 from orchestrator.learning.deployment.real_pours import PourRow, PredictionCheck
-from orchestrator.learning.deployment.safe_window import WindowFound
 from orchestrator.learning.stage_result import DisplayedMap, ResultPart, StageResult, displayed_action
 from sim_engine.prediction_band import SampleStatistics
 from sim_engine.search_space import Space
@@ -162,9 +161,6 @@ class Deployed(StageResult):
 
     risk: RiskFound | None = None
     """The risk measure, if the action was planned under errors."""
-
-    window: WindowFound | None = None
-    """The safe window around the recommended action, if it was searched."""
 
     @property
     def weighed(self) -> Sequence[PourRow]:

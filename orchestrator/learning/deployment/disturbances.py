@@ -153,11 +153,7 @@ class Disturbances:
         """Disturbances of a query; they are the same for every action."""
         wanted = IN_TAIL / (1.0 - self._tail)
         count = min(max(2 ** math.ceil(math.log2(wanted)), FEWEST), MOST)
-        return Risk(tuple(self.disturbance(draw) for draw in self.tried(count)), self._tail)
-
-    def tried(self, count: int) -> list[Draw]:
-        """The draws of `risk`, in the same order."""
-        return self.draws(count, stream=1)
+        return Risk(tuple(self.disturbance(draw) for draw in self.draws(count, stream=1)), self._tail)
 
     def disturbance(self, draw: Draw) -> Disturbance:
         """Change of an action in its unit cube caused by a draw."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from actors.optimizer.questions import RiskQuery
+from actors.optimizer.questions import RiskQuery, Suggestion, SuggestionQuery
+from actors.optimizer.suggest import propose
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.d1 import OneShotPlanning
 from orchestrator.learning.deployment.disturbances import Disturbances, RiskSettings
@@ -23,8 +27,10 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import Loss
 from sim_engine.scene import PoseError
 from sim_engine.search_space import Axis, Space
-from tests.support import plans
+from tests.support import plans, toy_campaign
+from tests.support.killed_runs import die_at
 from tests.support.plans import deployment_plan
+from tests.support.toy_campaign import ToyLaboratory, logical_record, toy_plan
 from tests.support.toy_spillage import quiet_valleys, two_valleys
 
 ERRORS = PoseError(x=8e-3, speed_factor=0.03)
@@ -93,9 +99,7 @@ def test_all_actions_are_compared_under_the_same_errors() -> None:
 
 def test_the_same_seed_asks_the_same_and_a_replay_repeats_it() -> None:
     def play(order: str = "first") -> StrategyHarness:
-        return StrategyHarness(two_valleys, order=order, slots=3).run(
-            risky(3, iterations=6, pours=1, window=plans.window(0.3))
-        )
+        return StrategyHarness(two_valleys, order=order, slots=3).run(risky(3, iterations=6, pours=1))
 
     first = play()
     assert first.pours
@@ -103,7 +107,7 @@ def test_the_same_seed_asks_the_same_and_a_replay_repeats_it() -> None:
     late = play("last")
     assert (late.simulations, late.pours) == (first.simulations, first.pours)
     assert [r for r in late.asked if isinstance(r, Suggest)] == [r for r in first.asked if isinstance(r, Suggest)]
-    assert replay(risky(3, iterations=6, pours=1, window=plans.window(0.3)), first) == first.asked
+    assert replay(risky(3, iterations=6, pours=1), first) == first.asked
     written = [json.loads(json.dumps(encode_request(request))) for request in first.asked]
     assert [decode_request(one) for one in written] == first.asked
 
@@ -150,7 +154,7 @@ def test_cups_that_touch_under_an_error_are_a_risk_and_those_that_touch_as_plann
 @pytest.mark.slow
 @pytest.mark.parametrize("errors", [ERRORS, PoseError(x=8e-3, tilt=1 * DEG, speed_factor=0.0)])
 def test_where_every_action_touches_nothing_is_recommended(errors: PoseError) -> None:
-    strategy = risky(iterations=4, pours=1, window=plans.window(0.1), risk=plans.risk("expected", pose_error=errors))
+    strategy = risky(iterations=4, pours=1, risk=plans.risk("expected", pose_error=errors))
     played = StrategyHarness(touching_below(1.0)).run(strategy)
     assert not played.pours
     assert strategy.best_values is None
@@ -161,7 +165,7 @@ def test_lost_simulations_are_left_out() -> None:
     def flaky(action: Any, theta: Any, rng: np.random.Generator) -> float:
         return float("nan") if rng.random() < 0.3 else two_valleys(action, theta, rng)
 
-    strategy = risky(4, window=plans.window(0.5))
+    strategy = risky(4)
     StrategyHarness(flaky).run(strategy)
     assert strategy.best_values is not None
 
@@ -263,3 +267,47 @@ def test_a_simulation_that_was_asked_for_with_an_error_is_made_with_it() -> None
     import asyncio
 
     assert asyncio.run(run()) == [None, PoseError(x=1e-3)]
+
+
+class ProposingOptimizer(toy_campaign.ToyOptimizer):
+    """The real optimiser, without an actor."""
+
+    async def suggest(self, query: SuggestionQuery) -> Suggestion:
+        self.asked += 1
+        return propose(query)
+
+
+def run_risk(directory: Path, *, resume: bool = False) -> Any:
+    risk = plans.risk("cvar", 0.8, ERRORS)
+    deployment = plans.deployment(
+        "D1",
+        scenes=(toy_campaign.SCENE,),
+        actions=toy_campaign.SPACE,
+        loss=Loss(),
+        pours=1,
+        iterations=4,
+        risk=risk,
+    )
+    plan = toy_plan(directory, deployment=deployment, on_unknown="repeat")
+    laboratory = ToyLaboratory(optimizer=ProposingOptimizer())
+    return asyncio.run(toy_campaign.run_toy(directory, laboratory, plan=plan, stages=None, resume=resume))
+
+
+@pytest.mark.slow
+def test_killed_on_the_way_it_makes_the_requests_it_would_have_made(tmp_path: Path) -> None:
+    result = run_risk(tmp_path / "undisturbed").results["deployment:cup"]
+    assert result.risk.measure == "cvar"
+    expected = logical_record(tmp_path / "undisturbed")
+    for point in (10, 20, 30, 40):
+        directory = tmp_path / str(point)
+        child = os.fork()
+        if child == 0:
+            try:
+                die_at(point, after_commit=True)
+                run_risk(directory)
+            finally:
+                os._exit(1)
+        _, status = os.waitpid(child, 0)
+        assert os.WIFSIGNALED(status), f"it ended before write {point}"
+        assert run_risk(directory, resume=True).state == "finished"
+        assert logical_record(directory) == expected, f"killed at write {point}"
