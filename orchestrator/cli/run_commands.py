@@ -254,6 +254,19 @@ def show(run: Which, state: State = None, as_json: Json = False) -> None:
     if entry["list_of_pours"]:
         print()
         _print_pours(entry["list_of_pours"], of_one_run=True)
+    _print_mixtures(Path(entry["path"]))
+
+
+def _print_mixtures(folder: Path) -> None:
+    """The cups of a run that poured mixtures, if its results can be read."""
+    from orchestrator.learning.run_errors import RunError
+    from orchestrator.records.run_record import read_result
+    from orchestrator.reports.mixture_report import mixture_lines, mixtures_of
+
+    with contextlib.suppress(RunError, OSError):
+        mixtures = mixtures_of(read_result(folder).results)
+        for line in [] if mixtures is None else ["", *mixture_lines(mixtures)]:
+            print(line)
 
 
 @_command("decant runs known", "decant runs known beaker")

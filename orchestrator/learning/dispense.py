@@ -164,7 +164,7 @@ class MixedCup(ResultPart):
     """Name of its position."""
 
     wanted_g: dict[str, float]
-    """Amounts of the table by liquid [g], in the order of pouring."""
+    """Amounts of the table by liquid [g]."""
 
     state: CupState = "waiting"
     """'rejected': a dose missed its tolerance, and the mixture was poured again; 'refused': a dose was impossible;
@@ -174,7 +174,7 @@ class MixedCup(ResultPart):
     """Position of the rejected cup whose mixture it has."""
 
 
-class Component(ResultPart):
+class MixedComponent(ResultPart):
     """A liquid in a cup of mixtures."""
 
     cup: str
@@ -225,22 +225,25 @@ class Dispensed(StageResult):
     cups: tuple[MixedCup, ...] = ()
     """Cups of mixtures, in the order of filling."""
 
-    def components(self) -> list[Component]:
+    def components(self) -> list[MixedComponent]:
         """Wanted and reached amounts of all cups, in the order of pouring."""
         return [component for cup in self.cups for component in self._of_cup(cup)]
 
-    def _of_cup(self, cup: MixedCup) -> list[Component]:
+    def _of_cup(self, cup: MixedCup) -> list[MixedComponent]:
         doses = {dose.liquid: dose for dose in self.doses if dose.position == cup.position}
+        order = {liquid: dose.number for liquid, dose in doses.items()}
         masses = {liquid: dose.received_g for liquid, dose in doses.items()}
         known = cup.state == "full" and all(mass is not None for mass in masses.values())
         total = sum(mass or 0.0 for mass in masses.values())
         errors = {liquid: dose.deviation_g or 0.0 for liquid, dose in doses.items()}
         components = []
-        for liquid, wanted in cup.wanted_g.items():
+        for liquid, wanted in sorted(
+            cup.wanted_g.items(), key=lambda item: (order.get(item[0], len(self.doses)), item)
+        ):
             dose = doses.get(liquid)
             share = (masses[liquid] or 0.0) / total if known and total > 0.0 else None
             components.append(
-                Component(
+                MixedComponent(
                     cup=cup.position,
                     liquid=liquid,
                     wanted_g=wanted,

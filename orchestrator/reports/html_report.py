@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.records.states import State
 from orchestrator.reports import wording
+from orchestrator.reports.mixture_report import mixture_table, mixtures_of
 from orchestrator.reports.run_summary import RunSummary
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ LARGEST_VECTOR = 1_500_000
 
 _THETA_FIGURES = ("discrepancy", "posterior", "test discrepancy")
 
-_FIRST_FIGURES = ("recommended pour", "loss against pours", "loss map")
+_FIRST_FIGURES = ("rack", "recommended pour", "loss against pours", "loss map")
 """Figures at the top of the page, in this order."""
 
 _NARROW = ("test discrepancy", "loss", "uncertainty", "posterior")
@@ -61,6 +62,11 @@ _FIGURES: dict[str, tuple[str, str]] = {
     "loss against pours": (
         "Loss of every pour in the order made, with its prediction and the best so far.",
         "Loss of every pour (dots), its prediction (bars: nine in ten lie inside), and the best so far (line).",
+    ),
+    "rack": (
+        "The cups of the rack from above, each with a ring of its liquids and the differences from the wanted amounts.",
+        "Rings show the wanted shares, numbers the differences from the wanted amounts in g. Those "
+        "beyond the tolerance are bold.",
     ),
     "dose ": (
         "Readings of the balance and tilt of the pourer over the time of a dose.",
@@ -98,6 +104,7 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         OSError: a figure can't be read.
     """
     pictures = {name: _picture(name, path) for name, path in summary.files.figures.items() if path.is_file()}
+    mixtures = mixtures_of(summary.results)
     seed = "" if summary.seed is None else f" Seed {summary.seed}."
     # The paths of the machine are left out.
     settings = {key: value for key, value in (resolved or {}).items() if key != "outputs"}
@@ -121,7 +128,10 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         receivers=wording.receiver_table(summary.outcome),
         first=[pic for start in _FIRST_FIGURES for name, pic in pictures.items() if name.startswith(start)],
         figures=[pic for name, pic in pictures.items() if not name.startswith((*_THETA_FIGURES, *_FIRST_FIGURES))],
-        pours=wording.pour_tables(summary),
+        pours=[
+            *([] if mixtures is None else [mixture_table(mixtures)]),
+            *wording.pour_tables(summary),
+        ],
         not_simulated=wording.validity_table(summary.outcome),
         notes=[(_date(note.time), note.text) for note in summary.log.notes],
         resolved=json.dumps(settings, indent=2, ensure_ascii=False) if settings else "",

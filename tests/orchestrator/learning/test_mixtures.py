@@ -9,7 +9,7 @@ import pytest
 
 from actors.interfaces import DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, MixturePlan, PlannedDose
-from orchestrator.learning.dispense import Component, Dispensed
+from orchestrator.learning.dispense import Dispensed, MixedComponent
 from orchestrator.learning.mixtures import Mix, pouring_order
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Slots
 from orchestrator.records.codec import decode_request, decode_result, encode_request, encode_result
@@ -165,7 +165,7 @@ def test_no_dose_is_poured_twice_whatever_misses_or_fails() -> None:
 def test_the_shares_have_the_errors_of_all_their_doses() -> None:
     strategy = Mix(plan({"water": 40.0, "oil": 10.0}), 5)
     run(strategy)
-    oil: Component = next(c for c in strategy.result().components() if c.liquid == "oil")
+    oil: MixedComponent = next(c for c in strategy.result().components() if c.liquid == "oil")
     # x = m / M: σ_x = √((0.8 σ)² + (0.2 σ)²) / 50 g with σ = 0.2 g
     assert oil.share_half_interval == pytest.approx(1.645 * 0.2 * (0.8**2 + 0.2**2) ** 0.5 / 50.0)
 

@@ -1,0 +1,119 @@
+"""`mixture_report`: a poured rack as table, files and picture, out of a run and out of results alone."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+
+import pytest
+from typer.testing import CliRunner
+
+import decant
+from orchestrator.cli.app import app
+from orchestrator.learning.dispense import Dispensed, Dose, MixedCup
+from orchestrator.reports.mixture_report import draw_rack, mixture_lines, mixture_table
+from tests.support import small_campaign
+
+MIXTURES = """\
+name: mix
+seed: 3
+laboratory: {name: small, bench: {liquid: {particles: 400}, time_scale: 0}}
+pourer: beaker.yaml
+receiver: narrow.yaml
+motion: {x_offset: 70 mm, height: 60 mm}
+mixtures:
+  tolerance: 2 g
+  liquids:
+    - {name: water, liquid: {name: water, mass: 100 g}}
+    - {name: ethanol, liquid: {name: ethanol, mass: 90 g}}
+  wanted:
+    B2: {water: 30 g, ethanol: 20 g}
+    A1: {water: 25 g}
+outputs: {directory: runs, recording: false}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> decant.Run:
+    folder = tmp_path_factory.mktemp("mix")
+    path = small_campaign.write_campaign(folder, MIXTURES)
+    result = CliRunner().invoke(app, ["run", str(path), "--in-process"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return decant.open_run(next((folder / "runs").iterdir()))
+
+
+def test_the_table_has_every_component_with_what_was_weighed(run: decant.Run) -> None:
+    with (run.directory / "mixtures.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["cup"], row["liquid"], row["dose"]) for row in rows] == [
+        ("rack/B2", "ethanol", "1"), ("rack/B2", "water", "2"), ("rack/A1", "water", "3")
+    ]  # fmt: skip
+    for row in rows:
+        assert float(row["received_g"]) == pytest.approx(float(row["wanted_g"]), abs=2.0)
+        assert 0.0 < float(row["half_interval_g"]) < 1.0
+        assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4}", row["time"])
+        assert (row["source"], row["state"]) == (f"source/{row['liquid']}", "full")
+    assert sum(float(row["share"]) for row in rows[:2]) == pytest.approx(1.0)
+
+
+def test_json_workbook_and_library_have_the_same_table(run: decant.Run) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    written = json.loads((run.directory / "mixtures.json").read_text(encoding="utf-8"))
+    header, *lines = openpyxl.load_workbook(run.directory / "mixtures.xlsx").active.iter_rows(values_only=True)
+    assert list(header) == list(written[0])
+    for line, row in zip(lines, written, strict=True):
+        assert ["" if cell is None else cell for cell in line] == [
+            pytest.approx(v) if isinstance(v, float) else v for v in row.values()
+        ]
+    frame = run.mixtures
+    assert list(frame["received_g"]) == [row["received_g"] for row in written]
+    assert frame.attrs["units"]["wanted_g"] == "g"
+
+
+def test_the_report_begins_with_the_rack_and_runs_show_lists_it(run: decant.Run) -> None:
+    page = (run.directory / "report.html").read_text(encoding="utf-8")
+    assert page.index('alt="rack: ') < page.index("<h2>Summary</h2>")
+    assert "2 mixtures" in page
+    shown = CliRunner().invoke(app, ["runs", "show", run.directory.name], catch_exceptions=False).output
+    assert re.search(r"rack/B2  full: ethanol [\d.]+ of 20 g, water [\d.]+ of 30 g", shown)
+
+
+DOSES = (
+    Dose(number=1, wanted_g=10.0, received_g=13.0, deviation_g=0.1, spilled_g=0.0, duration_s=9.0, end="reached",
+         position="rack/A1", source="source/oil", liquid="oil"),
+    Dose(number=2, wanted_g=10.0, received_g=9.9, deviation_g=0.1, spilled_g=0.0, duration_s=9.0, end="reached",
+         position="rack/C4", source="source/oil", liquid="oil"),
+)  # fmt: skip
+PARTLY = Dispensed(
+    scene="mixtures-source/oil-cup",
+    doses=DOSES,
+    cups=(
+        MixedCup(position="rack/A1", wanted_g={"oil": 10.0}, state="rejected"),
+        MixedCup(position="rack/C4", wanted_g={"oil": 10.0}, state="full", replaces="rack/A1"),
+        MixedCup(position="rack/A2", wanted_g={"oil": 10.0}, state="waiting"),
+    ),
+)
+
+
+def texts(dispensed: Dispensed) -> dict[str, tuple[float, float]]:
+    axes = draw_rack(dispensed, {"oil": 1.0}).axes[0]
+    return {text.get_text(): text.get_position() for text in axes.texts}
+
+
+def test_the_picture_shows_the_cups_where_they_stand_and_their_differences() -> None:
+    shown = texts(PARTLY)
+    assert {"A1", "C4", "A2", "+3.00", "-0.10", "rejected"} <= set(shown)
+    assert shown["C4"][0] > shown["A2"][0] > shown["A1"][0]
+    assert shown["C4"][1] < shown["A1"][1] == shown["A2"][1]
+    bold = {
+        text.get_text() for text in draw_rack(PARTLY, {"oil": 1.0}).axes[0].texts if text.get_fontweight() == "bold"
+    }
+    assert bold == {"+3.00"}
+
+
+def test_a_cup_that_is_not_filled_has_no_share_and_a_replaced_one_is_marked() -> None:
+    rejected, full, waiting = PARTLY.components()
+    assert (rejected.share, full.share, waiting.share) == (None, 1.0, None)
+    assert mixture_lines(PARTLY)[1] == "rack/C4  full, instead of rack/A1: oil 9.9 of 10 g"
+    assert [row.look for row in mixture_table(PARTLY).rows] == ["bad", "", ""]
