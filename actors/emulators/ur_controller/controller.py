@@ -19,7 +19,7 @@ from actors.emulators.ur_controller.safety_system import Safety, SafetyConfigura
 from actors.emulators.ur_controller.servers.primary_messages import ControllerMessage, Listener
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 from actors.emulators.ur_controller.urscript.program import Program, waiting
-from actors.emulators.ur_controller.urscript.translator import Translated, translate
+from actors.emulators.ur_controller.urscript.translator import translate
 
 
 class RuntimeState(IntEnum):
@@ -58,7 +58,6 @@ class Controller:
 
     Attributes:
         now: controller time [s].
-        known_commands: the translator's view of the commands that programs may call.
         switches: number of switches between remote and local control.
         freedrive: the freedrive button is pressed.
     """
@@ -100,7 +99,6 @@ class Controller:
         self.safety_popup = False
         self._resumes = False
         self._commands = commands_of(self)
-        self.known_commands = waiting(self._commands)
 
     # ---- messages
 
@@ -122,27 +120,12 @@ class Controller:
         error.
         """
         try:
-            translated = translate(text, self.known_commands)
+            program = Program(translate(text, waiting(self._commands)), self._commands)
         except Exception as error:
-            self.refuse(error)
-        else:
-            self.begin(translated)
-
-    def refuse(self, error: Exception) -> None:
-        """Report why a program cannot be run. An error other than `ScriptError` is a defect of the emulator, and is
-        logged as one.
-        """
-        if not isinstance(error, ScriptError):
-            traceback.print_exception(error)
-            error = ScriptError(f"internal error of the controller: {error}")
-        self.tell("exception", f"compile error: {error.text}", error.line)
-
-    def begin(self, translated: Translated) -> None:
-        """Run a translated program; see `upload`."""
-        try:
-            program = Program(translated, self._commands)
-        except Exception as error:
-            self.refuse(error)
+            if not isinstance(error, ScriptError):  # a defect of the emulator
+                traceback.print_exception(error)
+                error = ScriptError(f"internal error of the controller: {error}")
+            self.tell("exception", f"compile error: {error.text}", error.line)
             return
         if program.secondary:
             if len(self.secondary) >= MOST_SECONDARY:

@@ -40,12 +40,12 @@ OPENERS = frozenset({"def", "thread", "sec", "if", "while"})
 
 _WORD = re.compile(
     r"""(?P<space>[ \t\r\f\v]+)
-      | (?P<newline>\n)
+      | (?P<newline>[\n;])
       | (?P<comment>\#[^\n]*)
       | (?P<number>(?:0[xX][0-9A-Fa-f]+)|(?:\d+\.?\d*(?:[eE][+-]?\d+)?)|(?:\.\d+(?:[eE][+-]?\d+)?))
       | (?P<name>[A-Za-z_][A-Za-z_0-9]*)
       | (?P<string>"[^"\n]*"|'[^'\n]*')
-      | (?P<op><=|>=|==|!=|[-+*/%<>=()\[\]{},:.;])
+      | (?P<op><=|>=|==|!=|[-+*/%<>=()\[\],:])
       """,
     re.VERBOSE,
 )
@@ -59,7 +59,7 @@ class ScriptToken:
         kind: 'number', 'name', 'keyword', 'string', 'op', or 'end of text'.
         text: as written; of a string, without its quotes.
         line: from 1.
-        fresh: whether it is the first of its line.
+        fresh: whether it is the first of its line, or after a semicolon.
     """
 
     kind: str
@@ -83,7 +83,7 @@ def words(text: str) -> list[ScriptToken]:
         place = match.end()
         kind, word = match.lastgroup or "", match.group()
         if kind == "newline":
-            line, fresh = line + 1, True
+            line, fresh = line + (word == "\n"), True
         elif kind not in ("space", "comment"):
             if kind == "name" and word in KEYWORDS:
                 kind = "keyword"

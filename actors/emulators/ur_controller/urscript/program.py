@@ -1,14 +1,13 @@
 """A running program: its threads, each advanced once per control cycle until it yields.
 
-`Program` runs the translated code with limits on time and memory. A `Command` is a function that programs can call.
+`Program` runs the translated code with a limit on its work in a cycle. A `Command` is a function that programs call.
 """
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Generator, Mapping
 from typing import Any
-
-import psutil
 
 from actors.emulators.ur_controller.urscript import script_values as values
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
@@ -19,17 +18,9 @@ WORK_PER_CYCLE = 100_000
 an expression, which takes about 0.3 µs."""
 
 COMMAND_WORK = 30
-"""Work of a command call, in addition to the entries of its list arguments and list result."""
-
-LOOK_AT_MEMORY = 1_000_000
-"""Work between two checks of the process's memory."""
-
-MOST_MEMORY = 300_000_000
-"""Limit of the process's memory growth while a program runs [bytes]."""
+"""Work of a command call, in addition to the entries of its list arguments."""
 
 MOST_THREADS = 50
-
-_PROCESS = psutil.Process()
 
 Steps = Generator[None, None, Any]
 
@@ -44,13 +35,11 @@ class Command:
     Args:
         function: a generator function if it `waits`.
         waits: whether it yields.
-        work: work of a call in addition to its lists, in nodes of expressions.
     """
 
-    def __init__(self, function: Callable[..., Any], *, waits: bool = False, work: int = COMMAND_WORK) -> None:
+    def __init__(self, function: Callable[..., Any], *, waits: bool = False) -> None:
         self.function = function
         self.waits = waits
-        self.work = work
 
 
 def waiting(commands: Mapping[str, Command]) -> frozenset[tuple[str, bool]]:
@@ -74,10 +63,7 @@ class Program:
     def __init__(self, translated: Translated, commands: Mapping[str, Command]) -> None:
         self.name = translated.name
         self.secondary = translated.secondary
-        self._lines = translated.lines
         self._work = 0
-        self._unseen = 0
-        self._memory = _PROCESS.memory_info().rss
         self._threads: dict[int, Steps] = {}
         self._started = 0
         self._critical: int | None = None
@@ -89,18 +75,13 @@ class Program:
             "_mul": values.multiply,
             "_div": values.divide,
             "_mod": values.modulo,
-            "_xor": values.exclusive_or,
             "_neg": values.negate,
             "_copy": self._copy,
-            "_list": self._list,
-            "_entry": self._list,
-            "_same": self._same,
             "_index": values.index,
             "_pose": values.pose,
             "_spend": self._spend,
             "_run": self._run,
             "_kill": self._kill,
-            "_join": self._join,
             "_halt": self._halt,
             "_enter_critical": self._enter_critical,
             "_exit_critical": self._exit_critical,
@@ -151,32 +132,18 @@ class Program:
         while steps is not None:
             frame = getattr(steps, "gi_frame", None)
             if frame is not None and frame.f_code.co_filename == "<program>":
-                line = self._text_line(frame.f_lineno)
+                line = frame.f_lineno
             steps = getattr(steps, "gi_yieldfrom", None)
         return line
 
     def _line_of_error(self, error: BaseException) -> int:
-        line, trace = 0, error.__traceback__
-        while trace is not None:
-            if trace.tb_frame.f_code.co_filename == "<program>":
-                line = self._text_line(trace.tb_lineno)
-            trace = trace.tb_next
-        return line
-
-    def _text_line(self, code_line: int) -> int:
-        return self._lines[min(code_line, len(self._lines)) - 1]
-
-    # ---- limits of time and memory
+        frames = traceback.extract_tb(error.__traceback__)
+        return next((frame.lineno or 0 for frame in reversed(frames) if frame.filename == "<program>"), 0)
 
     def _spend(self, work: int) -> None:
         self._work -= work
         if self._work < 0:
             raise ScriptError("too much in one cycle without sync(): the runtime is too much behind")
-        self._unseen += work
-        if self._unseen > LOOK_AT_MEMORY:
-            self._unseen = 0
-            if _PROCESS.memory_info().rss - self._memory > MOST_MEMORY:
-                raise ScriptError(f"the program holds more than {MOST_MEMORY // 1_000_000} MB")
 
     def _copy(self, value: Any) -> Any:
         if not isinstance(value, list):
@@ -184,20 +151,10 @@ class Program:
         self._spend(values.size(value))
         return values.copy(value)
 
-    def _list(self, value: Any) -> Any:
-        if isinstance(value, list):
-            self._spend(values.size(value))
-        return value
-
-    def _same(self, a: Any, b: Any) -> bool:
-        if isinstance(a, list) and isinstance(b, list):
-            self._spend(values.size(a))
-        return bool(a == b)
-
     def _counted(self, command: Command) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
-            self._spend(command.work + sum(len(a) for a in arguments if isinstance(a, list)))
-            return self._list(command.function(*arguments, **named))
+            self._spend(COMMAND_WORK + sum(len(a) for a in arguments if isinstance(a, list)))
+            return command.function(*arguments, **named)
 
         return call
 
@@ -217,10 +174,6 @@ class Program:
         if number == self._current:
             raise ScriptError("a thread can't kill itself")
         self._threads.pop(number).close()
-
-    def _join(self, number: Any) -> Steps:
-        while number in self._threads and number != self._current:
-            yield
 
     def _halt(self) -> None:
         raise _HaltedError

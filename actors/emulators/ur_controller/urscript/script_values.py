@@ -1,7 +1,6 @@
 """The values of a program: numbers, strings, lists and poses, with a controller's arithmetic and functions.
 
-Integers have 32 bits, and strings and lists have maximum lengths. A hostile program can therefore not fill memory with
-one long list or number.
+Integers have 32 bits, and lists a maximum length. A program can therefore not fill memory with one long list or number.
 """
 
 from __future__ import annotations
@@ -13,14 +12,11 @@ from typing import Any
 
 from actors.emulators.ur_controller.urscript.lexer import ScriptError
 
-LONGEST_STRING = 1023
-"""Maximum length of a string [characters], as on a controller."""
+LONGEST_SHOWN = 1023
+"""Maximum length of a shown text [characters], as on a controller."""
 
 MOST_ENTRIES = 10_000
 """Maximum number of entries of a list, including those of nested lists."""
-
-DEEPEST_LIST = 20
-"""Maximum nesting depth of lists."""
 
 
 class UrPose(list[float]):
@@ -64,22 +60,13 @@ def copy(value: Any) -> Any:
     return value
 
 
-def size(value: Any, depth: int = 0) -> int:
+def size(value: Any) -> int:
     """Number of entries of a value, including those of nested lists; 0 for anything but a list.
 
     Raises:
-        ScriptError: there are too many, or the lists are nested too deeply.
+        ScriptError: there are too many.
     """
-    if not isinstance(value, list):
-        return 0
-    if depth >= DEEPEST_LIST:
-        raise ScriptError(f"lists within lists, more than {DEEPEST_LIST} levels deep")
-    count = len(value)
-    for item in value:
-        if isinstance(item, list):
-            count += size(item, depth + 1)
-            if count > MOST_ENTRIES:
-                break
+    count = len(value) + sum(size(item) for item in value if isinstance(item, list)) if isinstance(value, list) else 0
     if count > MOST_ENTRIES:
         raise ScriptError(f"a list of more than {MOST_ENTRIES} entries")
     return count
@@ -103,7 +90,7 @@ def show(value: Any) -> str:
         return "p" + text if isinstance(value, UrPose) else text
     if isinstance(value, float):
         return f"{value:.7g}"
-    return str(value)[:LONGEST_STRING]
+    return str(value)[:LONGEST_SHOWN]
 
 
 def _whole(value: Any) -> Any:
@@ -160,11 +147,6 @@ def negate(a: Any) -> Any:
     return _whole(-a)
 
 
-def exclusive_or(a: Any, b: Any) -> bool:
-    """a xor b."""
-    return bool(a) != bool(b)
-
-
 def norm(a: Any) -> float:
     """Return the length of a list, or the absolute value of a number."""
     if isinstance(a, list):
@@ -179,34 +161,14 @@ def length(v: Any) -> int:
     return len(v)
 
 
-def str_cat(a: Any, b: Any) -> str:
-    """Concatenate two strings."""
-    joined = show(a) + show(b)
-    if len(joined) > LONGEST_STRING:
-        raise ScriptError(f"a string of more than {LONGEST_STRING} characters")
-    return joined
-
-
-def make_list(count: Any, value: Any, capacity: Any = 0) -> list[Any]:
-    """Return a list of equal entries."""
-    entries = int(number(count))
-    if not 0 <= entries <= 10_000:
-        raise ScriptError("a list has 0 … 10000 entries")
-    return [value] * entries
-
-
 def _unary(function: Callable[[float], float]) -> Callable[[Any], Any]:
     return lambda f: function(number(f))
 
 
 FUNCTIONS: dict[str, Callable[..., Any]] = {
-    **{name: _unary(getattr(math, name)) for name in ("sin", "cos", "tan", "sqrt", "floor", "ceil")},
+    **{name: _unary(getattr(math, name)) for name in ("sin", "cos", "sqrt")},
     "abs": lambda f: abs(number(f)),
-    "pow": lambda base, exponent: math.pow(number(base), number(exponent)),
     "norm": norm,
     "length": length,
-    "make_list": make_list,
-    "str_cat": str_cat,
-    "to_str": show,
 }
 """Commands that only compute, by name; they are the same for every controller."""

@@ -1,363 +1,377 @@
-"""The translator of URScript: from a syntax tree to Python generators, which yield once per control cycle.
+"""The translator of URScript: to Python generators, which yield once per control cycle.
 
-Every name gets a prefix, every constant is written by repr, and the code runs without Python's built-in functions. A
-program can therefore use nothing but its commands. Only functions that may wait (directly or by a function that they
+URScript differs from Python in its blocks, its declarations, and in lists, which are values. `_PythonText` therefore
+rewrites the tokens of a program as lines of Python, Python's own parser makes a syntax tree of them, and `_Translation`
+changes the tree where the meaning differs: it copies lists, and calls the functions of `script_values` for arithmetic.
+
+Every name gets a prefix, only some kinds of nodes are accepted, and the code runs without Python's built-in functions.
+A program can therefore use nothing but its commands. Only functions that may wait (directly or by a function that they
 call) become generators; the others stay plain functions, because they are called hundreds of times per second.
 
 Scopes follow the manual: a name declared `global` anywhere is global, except where it is declared `local` or a
-parameter. Any other name is local to the function that assigns it. Lists and poses are values: they are copied when
-they are passed on.
+parameter. Any other name is local to the function that assigns it.
 
-`translate` runs in this process. Long programs are translated in a process of their own, with limits on time and memory
-(`main`, `read_answer`).
+Limitations: no `xor` and `join`, no chains of comparisons. Programs that use them are refused.
 """
 
 from __future__ import annotations
 
-import json
-import marshal
-import sys
+import ast
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from math import isfinite
 from types import CodeType
 from typing import Any
 
-from actors.emulators.ur_controller.urscript.lexer import ScriptError
-from actors.emulators.ur_controller.urscript.parser import (
-    Assign,
-    Branch,
-    CallNode,
-    Evaluate,
-    Expression,
-    Function,
-    Index,
-    Items,
-    Literal,
-    Loop,
-    NameNode,
-    Operation,
-    Simple,
-    Statement,
-    parse,
+from actors.emulators.ur_controller.urscript.lexer import ScriptError, ScriptToken, words
+
+_HEADERS = frozenset({"def", "thread", "sec", "if", "elif", "else", "while"})
+_TRUTH = frozenset({"True", "true", "TRUE", "False", "false", "FALSE"})
+_IN_EXPRESSIONS = _TRUTH | {"and", "or", "not", "xor", "run"}
+_WORDS = {"halt": "_halt()", "enter_critical": "_enter_critical()", "exit_critical": "_exit_critical()"}
+"""Statements of one word that are calls in Python."""
+
+_ARITHMETIC: dict[type[ast.operator], str] = {
+    ast.Add: "_add",
+    ast.Sub: "_sub",
+    ast.Mult: "_mul",
+    ast.Div: "_div",
+    ast.Mod: "_mod",
+}
+_ACCEPTED = (
+    *(ast.Module, ast.FunctionDef, ast.arguments, ast.arg, ast.Assign, ast.AnnAssign, ast.Expr, ast.If, ast.While),
+    *(ast.Return, ast.Break, ast.Continue, ast.Pass, ast.Call, ast.keyword, ast.Name, ast.Constant, ast.List),
+    *(ast.Subscript, ast.BinOp, ast.UnaryOp, ast.BoolOp, ast.Compare, ast.expr_context, ast.operator, ast.unaryop),
+    *(ast.boolop, ast.cmpop),
 )
 
-_OPERATORS = {"and": "and", "or": "or", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
-_HELPERS = {"+": "_add", "-": "_sub", "*": "_mul", "/": "_div", "%": "_mod", "xor": "_xor", "==": "_same"}
 
+class _PythonText:
+    """The Python text of a program, before the tree of it is changed.
 
-_CHUNK = 20
-"""Number of consecutive statements whose work is counted at once."""
-
-
-class Translation:
-    """The Python code of one program.
+    Variables are `v_x`, functions `f_x` and threads `t_x`; `run x(…)` is `r_x(…)`, and declarations are annotations:
+    `v_x: _global = …`.
 
     Args:
-        program: the syntax tree.
-        commands: the commands that a program can call; True for those that wait.
+        tokens: of the program.
 
     Attributes:
-        source: Python, defining `main`.
-        lines: for each line of the source, from 0, the program's.
-
-    Raises:
-        ScriptError: an unknown function, a wrong use of one, or a name that is not a function.
+        lines: of Python.
+        numbers: of the program's lines, for each line of Python.
     """
 
-    def __init__(self, program: Function, commands: Mapping[str, bool]) -> None:
+    def __init__(self, tokens: list[ScriptToken]) -> None:
+        self.lines: list[str] = []
+        self.numbers: list[int] = []
+        self._depth = 0
+        self._brackets = 0
+        self._statement: list[str] = []
+        self._keyword = ""
+        self._line = 1
+        self._ends_value = False
+        for token in tokens:
+            self._add(token)
+        if self._depth:
+            raise ScriptError("expected 'end', found the end of the text", tokens[-1].line)
+
+    def _add(self, token: ScriptToken) -> None:
+        word = token.text if token.kind == "keyword" else ""
+        operator = token.text if token.kind == "op" else ""
+        begins = bool(word) and word not in _IN_EXPRESSIONS
+        if begins and self._brackets:
+            raise ScriptError(f"expected ')' or ']', found '{word}'", token.line)
+        is_value = token.kind in ("number", "string", "name") or word in _TRUTH or word == "run"
+        follows = token.fresh or (is_value and self._statement != ["return"])
+        if token.kind == "end of text" or begins or (self._ends_value and follows and not self._brackets):
+            self._finish(token)
+        if begins:
+            self._begin(token)
+        elif token.kind != "end of text":
+            self._line = self._line if self._statement else token.line
+            self._statement.append(self._python(token))
+            self._ends_value = (is_value and word != "run") or operator in (")", "]")
+            if operator == ":":
+                self._write()
+                self._depth += 1
+
+    def _begin(self, token: ScriptToken) -> None:
+        """Begin a statement with a keyword."""
+        text, self._line = token.text, token.line
+        if text == "join":
+            raise ScriptError("join is not supported by this virtual controller", token.line)
+        if text in ("end", "elif", "else"):
+            if not self._depth:
+                raise ScriptError(f"'{text}' without a block", token.line)
+            self._statement = ["pass"]  # a block may be empty
+            self._write()
+            self._depth -= 1
+        if text != "end":
+            self._keyword = text
+            self._statement = {
+                "kill": ["_kill("], "global": [], "local": [], "def": ["def"], "sec": ["def"], "thread": ["def"]
+            }.get(text, [_WORDS.get(text, text)])  # fmt: skip
+        self._ends_value = text in ("return", "break", "continue", "pass", *_WORDS)
+
+    def _python(self, token: ScriptToken) -> str:
+        text = token.text
+        match token.kind:
+            case "number":
+                return repr(_number(token))
+            case "string":
+                return repr(text)
+            case "name":
+                if self._statement == ["def"]:
+                    return f"{'t' if self._keyword == 'thread' else 'f'}_{text}"
+                if self._statement and self._statement[-1] == "run":
+                    self._statement.pop()
+                    return f"r_{text}"
+                declared = self._keyword in ("global", "local") and not self._statement
+                return f"v_{text}: _{self._keyword}" if declared else f"v_{text}"
+        if text == "xor":
+            raise ScriptError("xor is not supported by this virtual controller", token.line)
+        self._brackets += (text in ("(", "[")) - (text in (")", "]"))
+        if self._brackets < 0:
+            raise ScriptError(f"'{text}' closes nothing", token.line)
+        if text == ":" and (self._brackets or self._keyword not in _HEADERS):
+            raise ScriptError("':' means nothing here", token.line)
+        return text.capitalize() if text in _TRUTH else text
+
+    def _finish(self, token: ScriptToken) -> None:
+        if self._statement and self._keyword in _HEADERS:
+            raise ScriptError(f"expected ':', found '{token.text}'", token.line)
+        if self._keyword == "kill":
+            self._statement.append(")")
+        self._write()
+
+    def _write(self) -> None:
+        if self._statement:
+            self.lines.append(" " * self._depth + " ".join(self._statement))
+            self.numbers.append(self._line)
+        self._statement, self._keyword, self._ends_value = [], "", False
+
+
+def _number(token: ScriptToken) -> int | float:
+    hexadecimal = token.text[:2] in ("0x", "0X")
+    if hexadecimal or token.text.isdigit():
+        if len(token.text) > 18:
+            raise ScriptError("a number with too many digits", token.line)
+        return int(token.text, 16 if hexadecimal else 10)
+    value = float(token.text)
+    if not isfinite(value):
+        raise ScriptError("a number that is too large", token.line)
+    return value
+
+
+class _Translation(ast.NodeTransformer):
+    """Changes the tree of a program where the meaning of Python differs.
+
+    Args:
+        program: its function.
+        nodes: of the tree.
+        commands: the commands that the program can call, and whether they wait.
+    """
+
+    def __init__(self, program: ast.FunctionDef, nodes: Iterable[ast.AST], commands: dict[str, bool]) -> None:
+        self._main = program
         self._commands = commands
-        self._functions = {f.name: f for f in _functions(program.body)}
-        self._globals = _names(s for s in _assignments(program) if s.scope == "global")
-        self._waiting = self._find_waiting()
-        self._out: list[str] = []
-        self.lines: list[int] = []
-        self._line = program.line
-        self._define(program, "main", 0, main=True)
-        self.source = "\n".join(self._out) + "\n"
-
-    # ---- functions that wait
-
-    def _find_waiting(self) -> set[str]:
+        functions = (node for node in nodes if isinstance(node, ast.FunctionDef) and node is not program)
+        self._functions = {node.name[2:]: node for node in functions}
+        self._globals = {_declared(node) for node in nodes if isinstance(node, ast.AnnAssign)}
         callers: dict[str, set[str]] = {}
         for name, function in self._functions.items():
-            for called in _calls(function.body):
-                callers.setdefault(called, set()).add(name)
-        waiting = {name for name, f in self._functions.items() if f.kind == "thread" or _pauses(f.body)}
-        waiting |= {name for name, waits in self._commands.items() if waits and name not in self._functions}
-        fresh = list(waiting)
+            for node in ast.walk(function):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id[:2] == "v_":
+                    callers.setdefault(node.func.id[2:], set()).add(name)
+        self._waiting = {name for name, waits in commands.items() if waits and name not in self._functions}
+        self._waiting |= {name for name, function in self._functions.items() if function.name[:2] == "t_"}
+        fresh = list(self._waiting)
         while fresh:
-            more = callers.get(fresh.pop(), set()) - waiting
-            waiting |= more
+            more = callers.get(fresh.pop(), set()) - self._waiting
+            self._waiting |= more
             fresh += more
-        return waiting
+
+    def visit(self, node: ast.AST) -> Any:
+        """Refuse what URScript lacks."""
+        if not isinstance(node, _ACCEPTED):
+            raise ScriptError("this means nothing in URScript", getattr(node, "lineno", 0))
+        return super().visit(node)
 
     # ---- statements
 
-    def _emit(self, depth: int, text: str) -> None:
-        self._out.append("    " * depth + text)
-        self.lines.append(self._line)
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.FunctionDef:
+        """Functions come first, since they can be called before they are written."""
+        if node.args.posonlyargs or node.args.kwonlyargs or node.args.vararg or node.args.kwarg:
+            raise ScriptError("a parameter is a name", node.lineno)
+        parameters = {parameter.arg for parameter in node.args.args}
+        statements = list(_statements(node.body))
+        targets = [_target(statement) for statement in statements if isinstance(statement, ast.Assign | ast.AnnAssign)]
+        assigned = {target.id for target in targets if isinstance(target, ast.Name)}
+        local = parameters | {_declared(node, "_local") for node in statements if isinstance(node, ast.AnnAssign)}
+        changed = {_base(target) for target in targets if isinstance(target, ast.Subscript)}
+        inner = [statement for statement in statements if isinstance(statement, ast.FunctionDef)]
+        for function in inner:
+            self.visit(function)
+        self.generic_visit(node.args)
+        first: list[ast.stmt] = [ast.Global(sorted(shared))] if (shared := (assigned & self._globals) - local) else []
+        for name in sorted(parameters & changed):
+            first.append(ast.Assign([_name(name, ast.Store())], _called("_copy", _name(name))))
+        node.body = [*first, *inner, *self._block(node.body, counted=node is not self._main)]
+        if node is self._main or node.name[2:] in self._waiting:
+            node.body += [ast.Return(None), ast.Expr(ast.Yield(None))]
+        return node
 
-    def _define(self, function: Function, python_name: str, depth: int, *, main: bool = False) -> None:
-        self._line = function.line
-        parameters = ", ".join(
-            f"v_{name}" + ("" if default is None else f"={self._value(default)}")
-            for name, default in function.parameters
-        )
-        if len({name for name, _ in function.parameters}) < len(function.parameters):
-            raise ScriptError(f"two parameters of '{function.name}' have the same name", function.line)
-        self._emit(depth, f"def {python_name}({parameters}):")
-        own = {name for name, _ in function.parameters}
-        own |= _names(s for s in _assignments(function, nested=False) if s.scope == "local")
-        assigned = _names(_assignments(function, nested=False))
-        shared = sorted((assigned & self._globals) - own)
-        if shared:
-            self._emit(depth + 1, "global " + ", ".join(f"v_{name}" for name in shared))
-        changed = _changed_entries(function)
-        for name, _ in function.parameters:
-            if name in changed:
-                self._emit(depth + 1, f"v_{name} = _copy(v_{name})")
-        for inner in _own_functions(function.body):
-            self._define(inner, f"f_{inner.name}", depth + 1)
-        self._body(function.body, depth + 1)
-        if main or function.name in self._waiting:
-            self._emit(depth + 1, "return")
-            self._emit(depth + 1, "yield")
+    def _block(self, statements: Iterable[ast.stmt], *, counted: bool = True, more: int = 1) -> list[ast.stmt]:
+        """Translate a block, which begins with the count of its work; `more` is added."""
+        own = [statement for statement in statements if not isinstance(statement, ast.FunctionDef)]
+        parts = (statement.test if isinstance(statement, ast.If | ast.While) else statement for statement in own)
+        count = ast.Expr(_called("_spend", ast.Constant(more + sum(map(_nodes, parts))))) if counted else ast.Pass()
+        block: list[ast.stmt] = [self.visit(statement) for statement in own]
+        return [ast.copy_location(count, block[0]), *block] if block else block
 
-    def _body(self, statements: tuple[Statement, ...], depth: int, more: int = 1) -> None:
-        """Write a block; it begins with the work of its statements, plus `more`."""
-        own = [s for s in statements if not isinstance(s, Function)]
-        for first in range(0, max(len(own), 1), _CHUNK):
-            chunk = own[first : first + _CHUNK]
-            self._line = chunk[0].line if chunk else self._line
-            self._emit(depth, f"_spend({more + sum(_work(s) for s in chunk)})")
-            more = 0
-            for statement in chunk:
-                self._line = statement.line
-                self._statement(statement, depth)
+    def visit_If(self, node: ast.If) -> ast.If:
+        """Blocks of their own."""
+        node.test = self.visit(node.test)
+        node.body = self._block(node.body)
+        is_elif = len(node.orelse) == 1 and isinstance(node.orelse[0], ast.If)
+        node.orelse = self._block(node.orelse, counted=not is_elif) if node.orelse else []
+        return node
 
-    def _statement(self, statement: Statement, depth: int) -> None:
-        match statement:
-            case Assign(NameNode(name), None):
-                if statement.scope == "local":
-                    self._emit(depth, f"v_{name} = 0")
-            case Assign(target, value) if value is not None:
-                given = self._value(value)
-                if isinstance(value, NameNode | Index):
-                    given = f"_copy({given})"
-                if isinstance(target, Index):
-                    given = f"_entry({given})"
-                self._emit(depth, f"{self._target(target)} = {given}")
-            case Evaluate(value):
-                self._emit(depth, self._value(value))
-            case Branch(cases):
-                for number, (condition, body) in enumerate(cases):
-                    if condition is None:
-                        self._emit(depth, "else:")
-                    else:
-                        self._emit(depth, f"{'if' if number == 0 else 'elif'} {self._value(condition)}:")
-                    self._body(body, depth + 1)
-            case Loop(condition, body):
-                self._emit(depth, f"while {self._value(condition)}:")
-                self._body(body, depth + 1, 1 + _nodes(condition))
-            case Simple():
-                self._simple(statement, depth)
+    def visit_While(self, node: ast.While) -> ast.While:
+        """A block of its own, which counts its condition."""
+        node.body = self._block(node.body, more=1 + _nodes(node.test))
+        node.test = self.visit(node.test)
+        return node
 
-    def _simple(self, statement: Simple, depth: int) -> None:
-        value = "" if statement.value is None else self._value(statement.value)
-        match statement.word:
-            case "return":
-                returned = f"_copy({value})" if isinstance(statement.value, NameNode | Index) else value
-                self._emit(depth, f"return {returned}")
-            case "kill":
-                self._emit(depth, f"_kill({value})")
-            case "join":
-                self._emit(depth, f"yield from _join({value})")
-            case "halt":
-                self._emit(depth, "_halt()")
-            case "enter_critical" | "exit_critical":
-                self._emit(depth, f"_{statement.word}()")
-            case word:
-                self._emit(depth, word)
+    def visit_Assign(self, node: ast.Assign) -> ast.Assign:
+        """Lists are values."""
+        return self._assignment(node.targets, node.value, node)
 
-    def _target(self, target: NameNode | Index) -> str:
-        if isinstance(target, NameNode):
-            return f"v_{target.name}"
-        return self._entry(target)
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.stmt:
+        """A declaration; a local variable without a value is 0."""
+        if node.value is None and _declared(node):
+            return ast.copy_location(ast.Pass(), node)
+        if not (_declared(node) or _declared(node, "_local")):
+            raise ScriptError("only a variable can be declared", node.lineno)
+        return self._assignment([node.target], node.value or ast.Constant(0), node)
+
+    def _assignment(self, targets: list[ast.expr], value: ast.expr, node: ast.stmt) -> ast.Assign:
+        if len(targets) > 1 or not isinstance(targets[0], ast.Name | ast.Subscript):
+            raise ScriptError("only a variable or its entry can be assigned to", node.lineno)
+        return ast.copy_location(ast.Assign([self.visit(targets[0])], self._copied(value)), node)
+
+    def visit_Return(self, node: ast.Return) -> ast.Return:
+        """Lists are values."""
+        node.value = None if node.value is None else self._copied(node.value)
+        return node
 
     # ---- expressions
 
-    def _value(self, expression: Expression) -> str:
-        match expression:
-            case Literal(value):
-                return f"({value!r})" if isinstance(value, int | float) and not isinstance(value, bool) else repr(value)
-            case NameNode(name):
-                return f"v_{name}"
-            case Items(items, pose):
-                inner = ", ".join(
-                    f"_copy({self._value(i)})" if isinstance(i, NameNode) else self._value(i) for i in items
-                )
-                return f"_pose([{inner}])" if pose else f"_list([{inner}])"
-            case Index():
-                return self._entry(expression)
-            case Operation(operator, operands):
-                return self._operation(operator, [self._value(o) for o in operands])
-            case CallNode():
-                return self._call(expression)
+    def _copied(self, node: ast.expr) -> ast.expr:
+        value: ast.expr = self.visit(node)
+        return _called("_copy", value) if isinstance(node, ast.Name | ast.Subscript) else value
 
-    def _entry(self, index: Index) -> str:
-        text = self._value(index.value)
-        for at in index.at:
-            if isinstance(at, Literal) and type(at.value) is int and at.value >= 0:
-                text += f"[{at.value}]"
-            else:
-                text += f"[_index({self._value(at)})]"
-        return text
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        """Arithmetic of 32 bits."""
+        return _called(_ARITHMETIC[type(node.op)], self.visit(node.left), self.visit(node.right))
 
-    def _operation(self, operator: str, operands: list[str]) -> str:
-        if len(operands) == 1:
-            return f"(not {operands[0]})" if operator == "not" else f"_neg({operands[0]})"
-        if operator == "!=":
-            return f"(not _same({operands[0]}, {operands[1]}))"
-        if operator in _HELPERS:
-            return f"{_HELPERS[operator]}({operands[0]}, {operands[1]})"
-        return f"({operands[0]} {_OPERATORS[operator]} {operands[1]})"
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> ast.expr:
+        """A negative number is a constant."""
+        operand: ast.expr = self.visit(node.operand)
+        if isinstance(node.op, ast.Not):
+            return ast.UnaryOp(node.op, operand)
+        if isinstance(node.op, ast.UAdd):
+            return operand
+        if isinstance(operand, ast.Constant) and type(operand.value) in (int, float):
+            return ast.Constant(-operand.value)  # type: ignore[operator]
+        return _called("_neg", operand)
 
-    def _call(self, call: CallNode) -> str:
-        function = self._functions.get(call.name)
-        given = [self._value(a) for a in call.arguments]
-        given += [f"{'' if function is None else 'v_'}{name}={self._value(value)}" for name, value in call.named]
-        if call.thread:
-            if function is None or function.kind != "thread":
-                raise ScriptError(f"'{call.name}' is not a thread", call.line)
-            return f"_run({', '.join([f'f_{call.name}', *given])})"
-        if function is None and call.name not in self._commands:
-            raise ScriptError(f"name '{call.name}' is not defined", call.line)
-        if function is not None and function.kind == "thread":
-            raise ScriptError(f"'{call.name}' is a thread: start it with run", call.line)
-        name = f"f_{call.name}" if function is not None else f"c_{call.name}"
-        text = f"{name}({', '.join(given)})"
-        return f"(yield from {text})" if call.name in self._waiting else text
+    def visit_Compare(self, node: ast.Compare) -> ast.AST:
+        """One operator."""
+        if len(node.ops) > 1:
+            raise ScriptError("comparisons in a chain are not supported by this virtual controller", node.lineno)
+        return self.generic_visit(node)
 
+    def visit_List(self, node: ast.List) -> ast.List:
+        """Lists are values."""
+        node.elts = [self._copied(item) if isinstance(item, ast.Name) else self.visit(item) for item in node.elts]
+        return node
 
-# ---- queries on a syntax tree
+    def visit_Subscript(self, node: ast.Subscript) -> ast.expr:
+        """An entry x[i] or x[i, j], or a pose: p[…] with six entries."""
+        at = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
+        is_p = isinstance(node.value, ast.Name) and node.value.id == "v_p"
+        if is_p and len(at) == 6 and isinstance(node.ctx, ast.Load):
+            return _called("_pose", self.visit(ast.List(at, ast.Load())))
+        if len(at) > 2:
+            raise ScriptError("a pose has six entries" if is_p else "an entry has one index or two", node.lineno)
+        value: ast.expr = self.visit(node.value)
+        index: ast.expr
+        for item in at:
+            plain = isinstance(item, ast.Constant) and type(item.value) is int
+            index = item if plain else _called("_index", self.visit(item))
+            value = ast.Subscript(value, index, node.ctx if item is at[-1] else ast.Load())
+        return value
 
-
-def _work(statement: Statement) -> int:
-    """Return the work of a statement, without blocks within it."""
-    return 1 + sum(_nodes(e) for e in _expressions(statement))
-
-
-def _nodes(expression: Expression) -> int:
-    return 1 + sum(_nodes(e) for e in _parts(expression))
-
-
-def _parts(expression: Expression) -> tuple[Expression, ...]:
-    match expression:
-        case CallNode(_, arguments, named):
-            return (*arguments, *(value for _, value in named))
-        case Items(items):
-            return items
-        case Index(value, at):
-            return (value, *at)
-        case Operation(_, operands):
-            return operands
-    return ()
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        """A function, a thread that starts, or a command."""
+        if not isinstance(node.func, ast.Name):
+            raise ScriptError("only a function can be called", node.lineno)
+        kind, name = node.func.id[:2], node.func.id[2:]
+        function = self._functions.get(name)
+        given = [self.visit(argument) for argument in node.args]
+        named = [ast.keyword((key.arg or "")[0 if function else 2 :], self.visit(key.value)) for key in node.keywords]
+        call = ast.Call(node.func, given, named)
+        if kind.startswith("_"):
+            return call
+        if kind == "r_":
+            if function is None or function.name[:2] != "t_":
+                raise ScriptError(f"'{name}' is not a thread", node.lineno)
+            call.func, call.args = _name("_run"), [_name(function.name), *given]
+            return call
+        if function is None and name not in self._commands:
+            raise ScriptError(f"name '{name}' is not defined in this virtual controller", node.lineno)
+        if function is not None and function.name[:2] == "t_":
+            raise ScriptError(f"'{name}' is a thread: start it with run", node.lineno)
+        call.func = _name(f"c_{name}" if function is None else function.name)
+        return ast.YieldFrom(call) if name in self._waiting else call
 
 
-def _names(assignments: Iterable[Assign]) -> set[str]:
-    return {s.target.name for s in assignments if isinstance(s.target, NameNode)}
+def _name(name: str, context: ast.expr_context | None = None) -> ast.Name:
+    return ast.Name(name, context or ast.Load())
 
 
-def _inner(statement: Statement) -> Iterator[tuple[Statement, ...]]:
-    match statement:
-        case Branch(cases):
-            for _, body in cases:
-                yield body
-        case Loop(_, body):
-            yield body
+def _called(function: str, *arguments: ast.expr) -> ast.Call:
+    return ast.Call(_name(function), list(arguments), [])
 
 
-def _walk(body: tuple[Statement, ...], *, nested: bool = True) -> Iterator[Statement]:
-    for statement in body:
+def _nodes(node: ast.AST) -> int:
+    return sum(isinstance(inner, ast.expr | ast.stmt) for inner in ast.walk(node))
+
+
+def _statements(block: Iterable[ast.stmt]) -> Iterator[ast.stmt]:
+    """All statements of a function, without those of functions within it."""
+    for statement in block:
         yield statement
-        if isinstance(statement, Function):
-            if nested:
-                yield from _walk(statement.body)
-        else:
-            for inner in _inner(statement):
-                yield from _walk(inner, nested=nested)
+        if isinstance(statement, ast.If | ast.While):
+            yield from _statements([*statement.body, *statement.orelse])
 
 
-def _functions(body: tuple[Statement, ...]) -> Iterator[Function]:
-    return (s for s in _walk(body) if isinstance(s, Function))
+def _target(statement: ast.Assign | ast.AnnAssign) -> ast.expr:
+    return statement.targets[0] if isinstance(statement, ast.Assign) else statement.target
 
 
-def _own_functions(body: tuple[Statement, ...]) -> Iterator[Function]:
-    return (s for s in _walk(body, nested=False) if isinstance(s, Function))
+def _base(target: ast.expr) -> str:
+    while isinstance(target, ast.Subscript):
+        target = target.value
+    return target.id if isinstance(target, ast.Name) else ""
 
 
-def _assignments(function: Function, *, nested: bool = True) -> Iterator[Assign]:
-    return (s for s in _walk(function.body, nested=nested) if isinstance(s, Assign))
-
-
-def _changed_entries(function: Function) -> set[str]:
-    changed = set()
-    for assignment in _assignments(function, nested=False):
-        target: Expression = assignment.target
-        while isinstance(target, Index):
-            target = target.value
-            if isinstance(target, NameNode):
-                changed.add(target.name)
-    return changed
-
-
-def _pauses(body: tuple[Statement, ...]) -> bool:
-    return any(isinstance(s, Simple) and s.word == "join" for s in _walk(body, nested=False))
-
-
-def _calls(body: tuple[Statement, ...]) -> Iterator[str]:
-    for statement in _walk(body, nested=False):
-        for expression in _expressions(statement):
-            yield from _called(expression)
-
-
-def _expressions(statement: Statement) -> Iterator[Expression]:
-    match statement:
-        case Assign(target, value):
-            yield target
-            if value is not None:
-                yield value
-        case Evaluate(value):
-            yield value
-        case Branch(cases):
-            yield from (condition for condition, _ in cases if condition is not None)
-        case Loop(condition):
-            yield condition
-        case Simple(_, value) if value is not None:
-            yield value
-
-
-def _called(expression: Expression) -> Iterator[str]:
-    if isinstance(expression, CallNode) and not expression.thread:
-        yield expression.name
-    for part in _parts(expression):
-        yield from _called(part)
-
-
-LONGEST_HERE = 60_000
-"""Longest program that is translated between two control cycles [characters]. The 42,000 of a client's control program
-take about 25 ms, and the clock catches up. Longer ones are translated in a separate process (`Uploads`)."""
-
-_MEMORY = 2_000_000_000
-"""Memory limit of a translation in a separate process [bytes]."""
-
-_SECONDS = 20
-"""Processor time limit of a translation in a separate process [s]."""
-
-_NICENESS = 10
-"""Niceness of a translation in a separate process, relative to the controller's clock."""
+def _declared(statement: ast.AnnAssign, scope: str = "_global") -> str:
+    """The name that a declaration declares, if it is in this scope; otherwise ''."""
+    annotation = statement.annotation
+    return _base(statement.target) if isinstance(annotation, ast.Name) and annotation.id == scope else ""
 
 
 @dataclass(frozen=True)
@@ -367,13 +381,11 @@ class Translated:
     Attributes:
         name: from its first line.
         secondary: whether it was sent as `sec`.
-        lines: for each line of the code, from 0, the program's.
-        code: defines `main`.
+        code: defines `main`; its lines are those of the program.
     """
 
     name: str
     secondary: bool
-    lines: list[int]
     code: CodeType
 
 
@@ -382,63 +394,44 @@ def translate(text: str, commands: frozenset[tuple[str, bool]]) -> Translated:
     """Translate a program.
 
     Args:
-        text: the program.
+        text: a complete `def` or `sec`, or loose statements, which become a program of their own.
         commands: the commands that it can call, and whether they yield (`waiting`).
 
     Raises:
         ScriptError: it cannot be translated.
     """
+    tokens = words(text)
+    python = _PythonText(tokens)
     try:
-        tree = parse(text)
-        translation = Translation(tree, dict(commands))
+        module = ast.parse("\n".join(python.lines) + "\n")
+        nodes = list(ast.walk(module))
+        for node in nodes:
+            if isinstance(node, ast.stmt | ast.expr | ast.arg | ast.keyword):
+                node.lineno = node.end_lineno = python.numbers[node.lineno - 1]
+        program = _program(module, tokens[0])
+        module.body = [_Translation(program, nodes, dict(commands)).visit(program)]
+        name, program.name = program.name[2:], "main"
         with warnings.catch_warnings(action="ignore"):  # warnings about the generated code, e.g. `1[0]`
-            code = compile(translation.source, "<program>", "exec")
+            code = compile(ast.fix_missing_locations(module), "<program>", "exec")
     except RecursionError:
         raise ScriptError("nested too deeply") from None
-    except (SyntaxError, ValueError, MemoryError) as error:
+    except SyntaxError as error:
+        at = min(error.lineno or 1, len(python.numbers)) - 1
+        raise ScriptError(f"syntax error: {error.msg}".replace("v_", ""), python.numbers[at]) from None
+    except (ValueError, MemoryError) as error:
         raise ScriptError(f"can't be translated: {error}") from error
-    return Translated(tree.name, tree.kind == "sec", translation.lines, code)
+    return Translated(name, tokens[0].text == "sec", code)
 
 
-# ---- separate process
-
-
-def question(text: str, commands: Iterable[tuple[str, bool]]) -> bytes:
-    """Return the input for the translating process."""
-    return json.dumps({"text": text, "commands": sorted(commands)}).encode()
-
-
-def read_answer(data: bytes) -> Translated:
-    """Decode the output of the translating process.
-
-    Raises:
-        ScriptError: the program is invalid, or its translation exceeded a limit.
-    """
-    try:
-        answer = marshal.loads(data)
-    except (EOFError, ValueError, TypeError):
-        raise ScriptError("the program is too much to be translated") from None
-    if len(answer) == 2:
-        raise ScriptError(*answer)
-    return Translated(*answer)
-
-
-def main() -> None:
-    """Translate the program on standard input: `python -m actors.emulators.ur_controller.urscript.translator`."""
-    import os
-    import resource
-
-    os.nice(_NICENESS)
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
-    resource.setrlimit(resource.RLIMIT_CPU, (_SECONDS, _SECONDS))
-    asked = json.loads(sys.stdin.buffer.read())
-    try:
-        done = translate(asked["text"], frozenset((name, waits) for name, waits in asked["commands"]))
-        answer: tuple[Any, ...] = (done.name, done.secondary, done.lines, done.code)
-    except ScriptError as error:
-        answer = (error.text, error.line)
-    sys.stdout.buffer.write(marshal.dumps(answer))
-
-
-if __name__ == "__main__":
-    main()
+def _program(module: ast.Module, first: ScriptToken) -> ast.FunctionDef:
+    """The function of a program; loose statements become one."""
+    if first.kind != "keyword" or first.text not in ("def", "sec"):
+        empty = ast.arguments([], [], None, [], [], None, [])
+        return ast.FunctionDef("f_unnamed", empty, module.body, [], lineno=first.line, end_lineno=first.line)
+    program, *others = module.body
+    assert isinstance(program, ast.FunctionDef)
+    if others:
+        raise ScriptError("expected nothing after the program's end", others[0].lineno)
+    if program.args.args:
+        raise ScriptError(f"program '{program.name[2:]}' must not have parameters", program.lineno)
+    return program
