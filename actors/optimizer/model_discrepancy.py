@@ -242,6 +242,7 @@ class _CalibratedScene:
         corrections: simulated costs less those of the surrogate, in the cost's unit.
         centre: (dimension,), the simulated best there.
         power: exponent of the likelihood.
+        misled: ε of this calibration.
     """
 
     points: Array
@@ -250,6 +251,7 @@ class _CalibratedScene:
     corrections: Array
     centre: Array
     power: float
+    misled: float
 
     @classmethod
     def of(cls, pours: CalibrationPours, worst: float) -> _CalibratedScene:
@@ -258,7 +260,8 @@ class _CalibratedScene:
         surrogate = constant_mean_process(points, simulated)
         corrections = simulated - surrogate.predict(points)[0]
         costs = np.clip(np.array(pours.costs) / worst, 0.0, 1.0)
-        return cls(points, costs, surrogate, corrections, _least(surrogate), pours.power)
+        misled = MISLED if pours.misled is None else pours.misled
+        return cls(points, costs, surrogate, corrections, _least(surrogate), pours.power, misled)
 
 
 class ModelAveragedProcess:
@@ -287,12 +290,14 @@ class ModelAveragedProcess:
         latent = ndtri(np.concatenate([rows, rows[:CONTRARY]]))  # the same for the same question, and even
         contrary = np.arange(J) >= HYPOTHESES
         self._all = Hypotheses.of(discrepancy, centre, latent, contrary)
-        self._calibration = [_CalibratedScene.of(pours, discrepancy.worst) for pours in discrepancy.calibration or ()]
+        scenes = [_CalibratedScene.of(pours, discrepancy.worst) for pours in discrepancy.calibration or ()]
+        by_misled = dict.fromkeys(scene.misled for scene in scenes)
+        self._calibrations = {misled: [scene for scene in scenes if scene.misled == misled] for misled in by_misled}
         numbers = HYPOTHESES, CONTRARY, len(UNINFORMATIVE_LENGTHS)
         shares = 1.0 - distrust, CONTRARY_SHARE * distrust, (1.0 - CONTRARY_SHARE) * distrust
         prior = np.log(np.repeat(np.divide(shares, numbers), numbers))
-        calibrated = np.concatenate([self._calibrated(self._all), self._calibrated(None)])
-        self._calibrated_total = _log_sum(prior + calibrated)
+        calibrated = np.concatenate([self._calibrated(self._all), self._calibrated(None)], axis=1)
+        self._calibrated_totals = [_log_sum(prior + logs) for logs in calibrated]
         segments = self._segments(prior, prior + self._reliance(calibrated))
         self.since, weights = segments.since, segments.weights
         informed, uninformative = weights[:, :J], weights[:, J:]
@@ -355,24 +360,26 @@ class ModelAveragedProcess:
     # -- posterior weights -----------------------------------------------------------------------------------------
 
     def _calibrated(self, hypotheses: Hypotheses | None) -> Array:
-        """Logarithms (J,) of L_j, the likelihoods of the calibration's pours to their powers; None: of the
-        uninformative group."""
-        logs = np.zeros(len(UNINFORMATIVE_LENGTHS) if hypotheses is None else len(hypotheses.gains))
-        for scene in self._calibration:
-            if hypotheses is None:
-                prior, lengths = self._uninformative(scene.points, scene.costs), UNINFORMATIVE_LENGTHS
-            else:
-                prior, lengths = self._informed(hypotheses, scene.points, scene), hypotheses.lengths
-            logs += scene.power * _sequential(prior, lengths, scene.points, scene.costs)[0].sum(axis=1)
+        """Logarithms (calibrations, J) of L_j, the likelihoods of each calibration's pours to their powers; None: of
+        the uninformative group."""
+        J = len(UNINFORMATIVE_LENGTHS) if hypotheses is None else len(hypotheses.gains)
+        logs = np.zeros((len(self._calibrations), J))
+        for i, scenes in enumerate(self._calibrations.values()):
+            for scene in scenes:
+                if hypotheses is None:
+                    prior, lengths = self._uninformative(scene.points, scene.costs), UNINFORMATIVE_LENGTHS
+                else:
+                    prior, lengths = self._informed(hypotheses, scene.points, scene), hypotheses.lengths
+                logs[i] += scene.power * _sequential(prior, lengths, scene.points, scene.costs)[0].sum(axis=1)
         return logs
 
     def _reliance(self, calibrated: Array) -> Array:
-        """Logarithms (J,) of the factors on prior weights by the calibration, whose log-likelihoods are given."""
-        if not self._calibration:
-            return np.zeros(len(calibrated))
-        # (1 − ε) L_j / Σ_k w_k L_k + ε: with the probability ε = MISLED, the weights are those without a calibration
-        relative = calibrated - self._calibrated_total
-        return np.asarray(np.logaddexp(np.log1p(-MISLED) + relative, np.log(MISLED)))
+        """Logarithms (J,) of the factors on prior weights by the calibrations, whose log-likelihoods are given."""
+        # (1 − ε) L_j / Σ_k w_k L_k + ε: with the probability ε, the weights are those without this calibration
+        factors = np.zeros(calibrated.shape[1])
+        for misled, logs, total in zip(self._calibrations, calibrated, self._calibrated_totals, strict=True):
+            factors += np.logaddexp(np.log1p(-misled) + logs - total, np.log(misled))
+        return factors
 
     def _resampled(self, latent: Array, sample: Hypotheses, counting: NDArray[np.bool_], make: Remake) -> Hypotheses:
         """Move drawn hypotheses (k) by Markov chains that keep the posterior: the drawn ones are few, and coarse.

@@ -75,12 +75,15 @@ class CalibrationPours:
         costs: weighed.
         simulated: costs that the simulator predicts without the pour itself.
         power: exponent of the likelihood of these pours, 0 < power ≤ 1: how much they say about another scene.
+        misled: probability that they say nothing about the bench; pours with the same one are right or wrong together.
+            None: of a calibration just before the observations.
     """
 
     points: tuple[Point, ...]
     costs: Numbers
     simulated: Numbers
     power: float
+    misled: float | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ class ModelDiscrepancy:
         pours_left: number of real observations after the proposed one.
         limit: kept by proposals, if any action keeps it.
         lookahead: whether the next observation may be chosen for its information about other places.
-        calibration: pours of a calibration, which weigh the hypotheses before the first observation; None without any.
+        calibration: pours of calibrations, which weigh the hypotheses before the first observation; None without any.
     """
 
     offset_priors: tuple[OffsetPrior, ...]

@@ -467,6 +467,8 @@ def _check_discrepancy(discrepancy: ModelDiscrepancy, dimension: int) -> None:
             raise ValueError("calibration: two pours at least, two costs of each and 0 < power ≤ 1 are required")
         if not all(math.isfinite(cost) for cost in (*pours.costs, *pours.simulated)):
             raise ValueError("calibration: a cost is not finite")
+        if pours.misled is not None and not 0.0 < pours.misled < 1.0:
+            raise ValueError(f"calibration: misled = {pours.misled} is outside (0, 1)")
 
 
 def _check_posterior(query: CalibrationQuery) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import Discriminator, Field, Tag, create_model
@@ -25,12 +25,14 @@ from orchestrator.learning.calibration.campaign_memory import (
     WALLS,
     CampaignMemory,
     RememberedParameter,
+    WeighedPair,
     group_of,
     predicted,
     usual_spread,
 )
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.codec import digest
+from sim_engine.action import ACTION_DIMENSIONS, Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import Scene
 from sim_engine.settings.model import Count, Example, Problems, Settings, Text
@@ -93,6 +95,52 @@ class KnownLiquidSettings(Settings):
     viscosity: Annotated[float, Quantity("Pa*s", "1 mPa*s", 0.0)]
     """Dynamic viscosity."""
 
+    mass: Annotated[float, Quantity("kg", "200 g", 0.0, positive=True)] | None = None
+    """Load of a pour."""
+
+
+class WeighedPairSettings(Settings):
+    """A weighed pour and its simulation by a θ* that was fitted without it."""
+
+    into: Annotated[Text, Example("tumbler")]
+    """Receiver, in a resolved prior with its run."""
+
+    action: Annotated[dict[Text, float], Example("{angular_velocity: 1.2, x_offset: 0.1, height: 0.1}")]
+    """The action [SI]; dimensions that are switched off are left out."""
+
+    poured: Annotated[float, Example("0.98")]
+    """Fraction of the load that left the pourer."""
+
+    measured: Annotated[float, Example("0.12")]
+    """Spilled / poured, weighed."""
+
+    simulated: Annotated[float, Example("0.14")]
+    """Spilled / poured, simulated."""
+
+    def check_values(self, problems: Problems) -> None:
+        """Check the action, and that the others are fractions."""
+        if problems.valid("action"):
+            try:
+                self.pair()
+            except (TypeError, ValueError) as error:
+                problems.add(str(error), "action")
+        for name in ("poured", "measured", "simulated"):
+            if problems.valid(name) and not 0.0 <= getattr(self, name) <= 1.0:
+                problems.add(f"{getattr(self, name):g} is not between 0 and 1", name)
+
+    @classmethod
+    def of(cls, pair: WeighedPair) -> WeighedPairSettings:
+        """The settings of a pair."""
+        action = {name: value for name, value in asdict(pair.action).items() if value is not None}
+        values = {"poured": pair.poured, "measured": pair.measured, "simulated": pair.simulated}
+        return cls.model_validate({"into": pair.into, "action": action, **values})
+
+    def pair(self, run: str = "") -> WeighedPair:
+        """The pair, of an earlier run if one is given. Raises ValueError and TypeError for an impossible action."""
+        switched_off = {name: None for name, dimension in ACTION_DIMENSIONS.items() if dimension.optional}
+        action, into = Action.compose(switched_off, self.action), f"{run} into {self.into}" if run else self.into
+        return WeighedPair(into, action, self.poured, self.measured, self.simulated)
+
 
 class KnownPosterior(Settings):
     """What the weighed pours of one calibration alone tell about its parameters."""
@@ -136,6 +184,9 @@ class KnownPosterior(Settings):
     contradicts: list[Text] = Field(default_factory=list)
     """Earlier runs whose placement its pours contradict: the receiver or the arm was moved since."""
 
+    weighed: list[WeighedPairSettings] = Field(default_factory=list)
+    """The weighed pours with their simulations: what they show about the simulator."""
+
     @property
     def estimates(self) -> dict[str, tuple[float, float]]:
         """Mean and standard deviation [SI] by parameter."""
@@ -175,6 +226,9 @@ class ResolvedPrior(Settings):
     stale: list[Text] = Field(default_factory=list)
     """Posteriors that are used although later pours disagree with them."""
 
+    pours: list[WeighedPairSettings] = Field(default_factory=list)
+    """Weighed pours of these runs, with their simulations."""
+
     @classmethod
     def of(cls, memory: CampaignMemory) -> ResolvedPrior:
         """The settings of a resolved prior."""
@@ -182,7 +236,9 @@ class ResolvedPrior(Settings):
             row.name: {"mean": row.mean, "deviation": row.deviation, "runs": list(row.runs)}
             for row in memory.parameters
         }
-        return cls.model_validate({"parameters": rows, "left_out": list(memory.left_out), "stale": list(memory.stale)})
+        pours = [WeighedPairSettings.of(pair) for pair in memory.pours or ()]
+        lists = {"left_out": list(memory.left_out), "stale": list(memory.stale), "pours": pours}
+        return cls.model_validate({"parameters": rows, **lists})
 
     @property
     def memory(self) -> CampaignMemory:
@@ -193,7 +249,8 @@ class ResolvedPrior(Settings):
             for name, estimate in estimates.items()
             if estimate is not None
         ]
-        return CampaignMemory(tuple(rows), tuple(self.left_out), tuple(self.stale))
+        pours = tuple(settings.pair() for settings in self.pours)
+        return CampaignMemory(tuple(rows), tuple(self.left_out), tuple(self.stale), pours or None)
 
 
 def _form(value: Any) -> str:
@@ -377,8 +434,37 @@ def _combined(posteriors: Sequence[KnownPosterior], needs: PriorNeeds, source: P
             continue
         remembered.append(parameter)
     used = {run for parameter in remembered for run in parameter.runs}
+    pours: list[WeighedPair] = []
+    for known in usable:
+        lost = [n for n in known.estimates if not any(n == p.name and known.posterior in p.runs for p in remembered)]
+        if reason := _pours_unfit(known, needs, lost, shape):
+            left_out.append(f"{known.posterior}: its weighed pours are not transferred, {reason}")
+        else:
+            pours += [settings.pair(known.posterior) for settings in known.weighed]
     stale = [(known.posterior, source.stale(known)) for known in usable if known.posterior in used]
-    return CampaignMemory(tuple(remembered), tuple(left_out), tuple(f"{name}: {text}" for name, text in stale if text))
+    texts = tuple(f"{name}: {text}" for name, text in stale if text)
+    return CampaignMemory(tuple(remembered), tuple(left_out), texts, tuple(pours) or None)
+
+
+def _pours_unfit(known: KnownPosterior, needs: PriorNeeds, lost: Sequence[str], shape: str) -> str:
+    """Why the pours of a usable posterior say nothing here about the simulator, as text; empty if they do.
+
+    Args:
+        lost: parameters that their simulations have and this campaign does not take over.
+        shape: digest of the campaign's pourer.
+    """
+    liquid = needs.scene.liquid
+    if not known.weighed or known.liquid.mass is None:
+        return "its file or its run has none with their simulations"
+    if known.shape != shape:
+        return f"they are from another vessel ('{known.pourer}')"
+    if difference := _liquid_differs(known, needs.scene):
+        return difference
+    if not math.isclose(known.liquid.mass, liquid.mass, rel_tol=ALIKE):
+        return f"they are of {1e3 * known.liquid.mass:g} g, here it is {1e3 * liquid.mass:g} g"
+    if known.laboratory != needs.laboratory.name:
+        return f"they are of laboratory '{known.laboratory}', here it is '{needs.laboratory.name}'"
+    return f"their simulations have another {', '.join(lost)}" if lost else ""
 
 
 def _liquid_differs(known: KnownPosterior, scene: Scene) -> str:

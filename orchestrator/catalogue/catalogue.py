@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 INDEX_NAME = "catalogue.sqlite"
 
-FORMAT = 7
+FORMAT = 8
 """Version of the index's content. An index of another format, or of another version of Decant, is made again."""
 
 

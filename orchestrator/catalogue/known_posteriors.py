@@ -18,15 +18,19 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from orchestrator.campaigns.campaign_prior import KnownPosterior, arm_of, shape_digest
+from orchestrator.campaigns.campaign_prior import KnownPosterior, WeighedPairSettings, arm_of, shape_digest
 from orchestrator.campaigns.run_snapshot import written
 from orchestrator.catalogue.control_charts import LaboratoryChart
-from orchestrator.learning.calibration.campaign_memory import PLACEMENT, estimates, group_of
+from orchestrator.learning.calibration.calibration_scores import CALIBRATED, ScoredPair, ScoredPour
+from orchestrator.learning.calibration.campaign_memory import PLACEMENT, WeighedPair, estimates, group_of
+from orchestrator.learning.campaign_plan import MeasuredPour, RecordedPour
+from orchestrator.learning.deployment.calibration_evidence import weighed_pairs
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.codec import from_json
 from orchestrator.records.run_record import RunState, read_record
 from orchestrator.records.run_registry import make_state_directory, state_directory
 from orchestrator.runs.run_folder import SIMULATOR, read_versions
+from sim_engine.action import Action
 from sim_engine.liquids import Liquid, ParameterInfo, SimulationParameters
 from sim_engine.search_space import Axis
 
@@ -90,6 +94,7 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
                 "density": liquid.density,
                 "surface_tension": liquid.surface_tension,
                 "viscosity": liquid.dynamic_viscosity,
+                "mass": liquid.mass,
             },
             "pourer": scene["pourer"]["name"],
             "shape": shape_digest(scene),
@@ -103,8 +108,37 @@ def posterior_of(directory: Path, record: RunState | None = None) -> KnownPoster
                 if group["group"] == PLACEMENT and group["contradicted"]
                 for run in group["runs"]
             ],
+            "weighed": [WeighedPairSettings.of(pair) for pair in _weighed_pairs(calibration, results)],
         }
     )
+
+
+def _weighed_pairs(calibration: Mapping[str, Any], results: Iterable[Mapping[str, Any]]) -> list[WeighedPair]:
+    """The weighed pours of an evaluated calibration, with simulations by its θ*; none if it was not evaluated.
+
+    Args:
+        calibration: its plan in the run's fingerprint.
+        results: of the run's stages, as JSON.
+    """
+    by_kind = {str(result.get("kind")): result for result in results}
+    if "evaluation" not in by_kind:
+        return []
+    first, records = calibration["scene"], calibration["records"] or {"pours": ()}
+    scenes = {scene["name"]: scene for scene in (first, *calibration["further"], *calibration["tested"])}
+    weighed = []
+    for pour in by_kind.get("pours", {}).get("pours", ()):
+        if "poured" in pour:  # weighed
+            scene = scenes.get(pour["scene"], first)
+            action = Action.compose(scene["fixed"], pour["action_si"])
+            measured = MeasuredPour(action, pour["spillage"], pour["poured"], pour["split"])
+            weighed.append(ScoredPour(scene["receiver"]["name"], measured))
+    for row in records["pours"]:
+        scene = scenes.get(row["scene"], records["scene"])
+        pour = MeasuredPour.from_record(from_json(row, RecordedPour))
+        weighed.append(ScoredPour(scene["receiver"]["name"], pour))
+    pairs = [ScoredPair.model_validate(pair) for pair in by_kind["evaluation"]["pairs"]]
+    own = [pair for pair in pairs if pair.theta == CALIBRATED and pair.split != "transfer"]
+    return weighed_pairs(weighed, own, len(calibration["parameters"]["axes"]))
 
 
 def _without_range(

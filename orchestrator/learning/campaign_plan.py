@@ -312,15 +312,18 @@ class NormalPrior:
 
 @dataclass(frozen=True)
 class CalibrationEvidence:
-    """What the weighed pours of a calibration show about the simulator, for a deployment in one scene.
+    """What the weighed pours of calibrations show about the simulator, for a deployment in one scene.
 
     Attributes:
-        pours: by scene of the calibration; may be empty.
+        pours: by scene of the calibrations; may be empty.
         lines: the used pours, and the reasons why others are not used, one text each.
     """
 
     pours: tuple[CalibrationPours, ...]
     lines: tuple[str, ...]
+
+    def __add__(self, other: CalibrationEvidence) -> CalibrationEvidence:
+        return CalibrationEvidence(self.pours + other.pours, self.lines + other.lines)
 
 
 @dataclass(frozen=True)
@@ -434,7 +437,8 @@ class DeploymentPlan(StagePlan):
         left_over: residual of a calibration, given in the same case as `thetas`; None if unknown. A strategy
             gets it for its scene.
         memory: what earlier campaigns tell, if no calibration of the same campaign uses it.
-        evidence: pours of the preceding calibration; None without any, and for strategies that do not learn offsets.
+        evidence: pours of the preceding calibration and of earlier campaigns; None without any, and for strategies that
+            do not learn offsets.
     """
 
     settings: DeploymentSettings

@@ -31,6 +31,7 @@ from orchestrator.learning.calibration.calibration_scores import (
 )
 from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured
 from orchestrator.learning.campaign_plan import (
+    CalibrationEvidence,
     CalibrationPlan,
     CampaignPlan,
     DeploymentPlan,
@@ -39,7 +40,7 @@ from orchestrator.learning.campaign_plan import (
     MeasuredPour,
     RecordSet,
 )
-from orchestrator.learning.deployment.calibration_evidence import calibration_evidence
+from orchestrator.learning.deployment.calibration_evidence import calibration_evidence, memory_evidence
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import displacement
@@ -267,7 +268,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
         def build(results: Results, seed: int) -> Strategy:
             known = with_left_over(with_posterior(deployment, results), results, plan.calibration, scene)
             known = with_offsets(known, results, _theta(plan, results))
-            known = with_evidence(known, results, plan.calibration, scene)
+            known = with_evidence(known, results, plan.calibration, scene, _theta(plan, results))
             return known.settings.build(known, scene, _theta(plan, results), seed)
 
         return build
@@ -398,16 +399,26 @@ def with_offsets(deployment: DeploymentPlan, results: Results, best: SimulationP
 
 
 def with_evidence(
-    deployment: DeploymentPlan, results: Results, calibration: CalibrationPlan | None, scene: Scene
+    deployment: DeploymentPlan,
+    results: Results,
+    calibration: CalibrationPlan | None,
+    scene: Scene,
+    best: SimulationParameters,
 ) -> DeploymentPlan:
-    """The deployment with the weighed pours of an evaluated preceding calibration, as evidence about the simulator."""
-    if calibration is None or not deployment.settings.learns_offsets or EVALUATION not in results:
+    """The deployment with the weighed pours of an evaluated preceding calibration, and of a memory that its pours do
+    not contradict, as evidence about the simulator."""
+    if not deployment.settings.learns_offsets:
         return deployment
-    weighed = [*measured_pours(calibration, results), *_recorded(calibration.transfer)]
-    scores, searched = result_of(results, EVALUATION, Scores), len(calibrated_theta(results).searched)
-    theta = deployed_theta(results)
-    evidence = calibration_evidence(deployment, scene, theta, calibration, weighed, scores, searched)
-    return replace(deployment, evidence=evidence)
+    memory, evidence = deployment.memory, CalibrationEvidence((), ())
+    if calibration is not None and EVALUATION in results:
+        weighed = [*measured_pours(calibration, results), *_recorded(calibration.transfer)]
+        scores, searched = result_of(results, EVALUATION, Scores), len(calibrated_theta(results).searched)
+        evidence += calibration_evidence(deployment, scene, best, calibration, weighed, scores, searched)
+        remembered = result_of(results, CALIBRATION, Calibrated).memory
+        memory = None if remembered is None or remembered.contradicted else calibration.memory
+    if memory is not None:
+        evidence += memory_evidence(deployment, scene, best, memory)
+    return replace(deployment, evidence=evidence) if evidence.lines else deployment
 
 
 def by_receiver(deployment: DeploymentPlan) -> dict[str, Scene]:

@@ -12,14 +12,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
 
-from actors.optimizer.questions import Point, Posterior, RememberedGroup, truncated_quantiles
+from actors.optimizer.questions import WRITTEN_IF_SET, Point, Posterior, RememberedGroup, truncated_quantiles
 from orchestrator.learning.requests import Decision
 from orchestrator.learning.stage_result import ResultPart
+from sim_engine.action import Action
 from sim_engine.liquids import ParameterInfo, SimulationParameters
 from sim_engine.search_space import Axis, Space
 from sim_engine.settings.model import NOT_IN_FINGERPRINT
@@ -123,18 +124,37 @@ class RememberedParameter:
 
 
 @dataclass(frozen=True)
+class WeighedPair:
+    """A weighed pour and its simulation by a θ* that was fitted without it.
+
+    Attributes:
+        into: the calibration's scene of a pour in the same campaign, or the earlier run and the receiver.
+        poured: fraction of the load that left the pourer.
+        measured, simulated: spilled / poured.
+    """
+
+    into: str
+    action: Action
+    poured: float
+    measured: float
+    simulated: float
+
+
+@dataclass(frozen=True)
 class CampaignMemory:
     """The prior of a campaign from earlier ones.
 
     Attributes:
         parameters: may be empty, if nothing fits.
-        left_out: reasons why posteriors or parameters are not used, one text each.
+        left_out: reasons why posteriors, parameters or pours are not used, one text each.
         stale: posteriors that later pours disagree with, one text each.
+        pours: weighed pours of these runs, from the campaign's pourer; None if none fits.
     """
 
     parameters: tuple[RememberedParameter, ...]
     left_out: Annotated[tuple[str, ...], NOT_IN_FINGERPRINT] = ()
     stale: Annotated[tuple[str, ...], NOT_IN_FINGERPRINT] = ()
+    pours: tuple[WeighedPair, ...] | None = field(default=None, metadata=WRITTEN_IF_SET)
 
     @property
     def runs(self) -> tuple[str, ...]:

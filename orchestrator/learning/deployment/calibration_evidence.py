@@ -1,7 +1,8 @@
-"""What the weighed pours of a calibration show about the simulator, as evidence for D3 in another scene.
+"""What the weighed pours of calibrations show about the simulator, as evidence for D3 in another scene.
 
-`calibration_evidence` selects the pours that say something about a deployment and pairs each with its simulation. The
-optimiser weighs its hypotheses with them (`actors.optimizer.model_discrepancy`).
+`calibration_evidence` selects the pours of the same campaign that say something about a deployment and pairs each with
+its simulation, `memory_evidence` those of earlier campaigns. The optimiser weighs its hypotheses with them
+(`actors.optimizer.model_discrepancy`).
 
 The pours enter with three corrections:
 
@@ -20,9 +21,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-from actors.optimizer.questions import CalibrationPours, Point
+from actors.optimizer.questions import CalibrationPours
 from orchestrator.learning.calibration.calibration_scores import (
     CALIBRATED,
     UNCALIBRATED,
@@ -30,9 +30,9 @@ from orchestrator.learning.calibration.calibration_scores import (
     ScoredPour,
     Scores,
 )
-from orchestrator.learning.campaign_plan import CalibrationEvidence, CalibrationPlan, DeploymentPlan, MeasuredPour
+from orchestrator.learning.calibration.campaign_memory import RELIANCE, CampaignMemory, WeighedPair
+from orchestrator.learning.campaign_plan import CalibrationEvidence, CalibrationPlan, DeploymentPlan
 from orchestrator.learning.deployment.costing import Costing
-from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement
 from sim_engine.prediction_band import scene_digest
@@ -56,13 +56,25 @@ BEYOND = 1.0
 """Distance from the deployment's actions up to which a pour is used, in units of their range."""
 
 
-@dataclass(frozen=True)
-class _Pair:
-    """A weighed pour at a point of the deployment's actions, with both costs."""
+def weighed_pairs(weighed: Sequence[ScoredPour], pairs: Sequence[ScoredPair], fitted: int) -> list[WeighedPair]:
+    """The weighed pours of an evaluation, each with the simulation of a θ that was fitted without it.
 
-    point: Point
-    cost: float
-    simulated: float
+    Args:
+        weighed: all weighed pours that were evaluated, in the order in which the evaluation received them.
+        pairs: of one θ, in the evaluation's order.
+        fitted: number of parameters that were fitted to the training pours, which are left out if they are no more.
+    """
+    usable = [scored for scored in weighed if scored.pour.spillage is not None]
+    usable.sort(key=lambda scored: scored.pour.split == "train")  # the order of the evaluation: unseen pours first
+    train = sum(pair.split == "train" and pair.simulated is not None for pair in pairs)
+    matched = []
+    for scored, pair in zip(usable, pairs, strict=True):
+        if pair.measured is None or pair.simulated is None or (pair.split == "train" and train <= fitted):
+            continue
+        shrunk = 1.0 - fitted / train if pair.split == "train" else 1.0  # the fit has reduced the difference by it
+        simulated = min(max(pair.measured + (pair.simulated - pair.measured) / shrunk, 0.0), 1.0)
+        matched.append(WeighedPair(scored.scene, scored.pour.action, scored.pour.poured, pair.measured, simulated))
+    return matched
 
 
 def calibration_evidence(
@@ -81,74 +93,77 @@ def calibration_evidence(
         scene: of the deployment.
         parameters: the recommended θ.
         calibration: plan of the calibration, with the scenes of its pours.
-        weighed: all weighed pours that were evaluated, in the order in which the evaluation received them.
+        weighed: see `weighed_pairs`.
         scores: result of the evaluation.
         searched: number of parameters that were fitted.
     """
     plain = scores.gain is not None and scores.gain.recommended == UNCALIBRATED and UNCALIBRATED in scores.thetas
-    usable = [scored for scored in weighed if scored.pour.spillage is not None]
-    usable.sort(key=lambda scored: scored.pour.split == "train")  # the order of the evaluation: unseen pours first
-    pairs = [pair for pair in scores.pairs if pair.theta == (UNCALIBRATED if plain else CALIBRATED)]
-    both = [rows for rows in zip(usable, pairs, strict=True) if rows[1].simulated is not None]
-    train, fitted = sum(pair.split == "train" for _, pair in both), 0 if plain else searched
-    lines: list[str] = []
-    if 0 < train <= fitted:
-        lines.append(f"not used: {train} training pours of the calibration, to which {fitted} parameters were fitted")
-        both = [(scored, pair) for scored, pair in both if pair.split != "train"]
+    chosen = [pair for pair in scores.pairs if pair.theta == (UNCALIBRATED if plain else CALIBRATED)]
+    train = sum(pair.split == "train" and pair.simulated is not None for pair in chosen)
+    evidence = CalibrationEvidence((), ())
+    if not plain and 0 < train <= searched:
+        text = f"not used: {train} training pours of the calibration, to which {searched} parameters were fitted"
+        evidence = CalibrationEvidence((), (text,))
+    pairs = weighed_pairs(weighed, chosen, 0 if plain else searched)
     scenes = {place.name: place for place in calibration.poured}
     scenes |= {records.scene.name: records.scene for records in (calibration.records, calibration.transfer) if records}
-    groups: list[CalibrationPours] = []
-    for name in dict.fromkeys(scored.scene for scored, _ in both):
-        at, rows = scenes[name], [(scored.pour, pair) for scored, pair in both if scored.scene == name]
-        costing, shrunk = Costing.of(deployment, at, parameters), 1.0 - fitted / max(train, 1)
-        near = [known for pour, pair in rows if (known := _pair(deployment.actions, costing, pour, pair, shrunk))]
-        into, outside = f"calibration pours into {at.receiver.name}", len(rows) - len(near)
-        count = min(len(near), MOST_POURS)
-        used = [near[i * len(near) // count] for i in range(count)]
+    for name in dict.fromkeys(pair.into for pair in pairs):
+        at, rows = scenes[name], [pair for pair in pairs if pair.into == name]
+        into = f"calibration pours into {at.receiver.name}"
         if at.liquid.model_copy(update={"name": scene.liquid.name}) != scene.liquid:
-            lines.append(f"not used: {len(rows)} {into}: another liquid or amount")
+            evidence += CalibrationEvidence((), (f"not used: {len(rows)} {into}: another liquid or amount",))
         elif at.pourer.shape != scene.pourer.shape:
-            lines.append(f"not used: {len(rows)} {into}: poured from another vessel")
-        elif len(near) < LEAST_POURS:
-            text = f"only {len(near)} are close to the deployment's actions, and {LEAST_POURS} are needed"
-            lines.append(f"not used: {len(rows)} {into}: {text}")
+            evidence += CalibrationEvidence((), (f"not used: {len(rows)} {into}: poured from another vessel",))
         else:
             same = (digest := scene_digest(at)) is not None and digest == scene_digest(scene)
-            groups.append(
-                CalibrationPours(
-                    tuple(known.point for known in used),
-                    tuple(known.cost for known in used),
-                    tuple(known.simulated for known in used),
-                    1.0 if same else TRANSFER,
-                )
-            )
-            error = math.fsum(abs(known.cost - known.simulated) for known in used) / len(used) / costing.worst
-            missed = f"the simulator misses {len(used)} {into} by {100 * error:.1f} % of the largest loss on average"
-            lines.append(f"{missed}; the first predictions are based on this")
-            if count < len(near):
-                lines.append(f"not used: {len(near) - count} {into}: {MOST_POURS} of them are enough")
-            if outside:
-                lines.append(f"not used: {outside} {into}: far from the deployment's actions")
-    return CalibrationEvidence(tuple(groups), tuple(lines))
+            costing = Costing.of(deployment, at, parameters)
+            evidence += _evidence(deployment.actions, costing, rows, into, 1.0 if same else TRANSFER)
+    return evidence
 
 
-def _pair(actions: Space, costing: Costing, pour: MeasuredPour, pair: ScoredPair, shrunk: float) -> _Pair | None:
-    """A pour as evidence; None if its action is far from the space, or has no value along an axis.
+def memory_evidence(
+    deployment: DeploymentPlan, scene: Scene, parameters: SimulationParameters, memory: CampaignMemory
+) -> CalibrationEvidence:
+    """The weighed pours of earlier campaigns, each with its simulation by the θ* of its own campaign.
 
-    Args:
-        shrunk: factor by which the fit has reduced the differences of training pours.
+    Everything was set up again since then. So the errors of all are those of another receiver, and with the probability
+    1 − `RELIANCE`, with which a calibration doubts a memory, too, they say nothing.
     """
-    values = {name: getattr(pour.action, name) for name in actions.names}
-    if pair.measured is None or pair.simulated is None or None in values.values():
-        return None
-    point = tuple(float(u) for u in actions.encode(values))
-    if not all(-BEYOND <= u <= 1.0 + BEYOND for u in point):
-        return None
-    difference = (pair.simulated - pair.measured) / (shrunk if pair.split == "train" else 1.0)
-    simulated = min(max(pair.measured + difference, 0.0), 1.0)
-    return _Pair(point, *(_cost(costing, pour.action, pour.poured, r) for r in (pair.measured, simulated)))
+    evidence, pours = CalibrationEvidence((), ()), memory.pours or ()
+    costing = Costing.of(deployment, scene, parameters)
+    for name in dict.fromkeys(pair.into for pair in pours):
+        rows = [pair for pair in pours if pair.into == name]
+        evidence += _evidence(deployment.actions, costing, rows, f"pours of {name}", TRANSFER, 1.0 - RELIANCE)
+    return evidence
 
 
-def _cost(costing: Costing, action: Action, poured: float, spillage: float) -> float:
-    """Cost of a pour of which a fraction `poured` has left the pourer, `spillage` of it spilled."""
-    return costing.total(costing.poured(PourMeasurement(1.0, spillage * poured, 1.0 - poured), action))
+def _evidence(
+    actions: Space, costing: Costing, pairs: Sequence[WeighedPair], into: str, power: float, misled: float | None = None
+) -> CalibrationEvidence:
+    """The pours of one scene that are close to the deployment's actions."""
+    near = []
+    for pair in pairs:
+        values = {name: getattr(pair.action, name) for name in actions.names}
+        if None not in values.values():
+            point = tuple(float(u) for u in actions.encode(values))
+            if all(-BEYOND <= u <= 1.0 + BEYOND for u in point):
+                near.append((point, *(_cost(costing, pair, spillage) for spillage in (pair.measured, pair.simulated))))
+    if len(near) < LEAST_POURS:
+        text = f"only {len(near)} are close to the deployment's actions, and {LEAST_POURS} are needed"
+        return CalibrationEvidence((), (f"not used: {len(pairs)} {into}: {text}",))
+    count = min(len(near), MOST_POURS)
+    points, costs, simulated = zip(*(near[i * len(near) // count] for i in range(count)), strict=True)
+    error = math.fsum(abs(a - b) for a, b in zip(costs, simulated, strict=True)) / count / costing.worst
+    missed = f"the simulator misses {count} {into} by {100 * error:.1f} % of the largest loss on average"
+    lines = [f"{missed}; the first predictions are based on this"]
+    if count < len(near):
+        lines.append(f"not used: {len(near) - count} {into}: {MOST_POURS} of them are enough")
+    if outside := len(pairs) - len(near):
+        lines.append(f"not used: {outside} {into}: far from the deployment's actions")
+    return CalibrationEvidence((CalibrationPours(points, costs, simulated, power, misled),), tuple(lines))
+
+
+def _cost(costing: Costing, pair: WeighedPair, spillage: float) -> float:
+    """Cost of a pour if it had spilled this fraction of the liquid that left the pourer."""
+    measurement = PourMeasurement(1.0, spillage * pair.poured, 1.0 - pair.poured)
+    return costing.total(costing.poured(measurement, pair.action))

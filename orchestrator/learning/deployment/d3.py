@@ -51,7 +51,7 @@ class D3Settings(SearchSettings):
     'residual' is the paper's, which always believes it."""
 
     risk_limit: RiskLimitSettings | None = None
-    """With 'model: adaptive': what no pour may lose, from the first after a calibration, else once one kept it."""
+    """With 'model: adaptive': what no pour may lose; for the first one if a calibration or prior supports it."""
 
     stop: StopSettings | None = None
     """With 'model: adaptive': ends before all pours are made when no further one is worth it."""

@@ -41,7 +41,7 @@ WORDS = (
 
 
 class RiskLimitSettings(Settings):
-    """D3 with `model: adaptive`: what no pour may lose, from the first after a calibration, else once one kept it."""
+    """D3 with `model: adaptive`: what no pour may lose; for the first one if a calibration or prior supports it."""
 
     loss: Annotated[float, Quantity("1", "10 %", 1e-3, 1.0)] = 0.1
     """As a share of what spilling the whole load would cost."""
@@ -217,7 +217,7 @@ class SimulatorMonitor:
         limit = rules.limit
         if limit is None or not discrepancy.exceedances:
             if limit is not None and not pours:
-                text = "no calibration supports the risk limit: it applies after the first pour that keeps it"
+                text = "no calibration or prior supports the risk limit: it applies after the first pour that keeps it"
                 self.decisions.append(Decision(text, urgent=True))
             return ""
         risk = discrepancy.exceedances[0]

@@ -110,6 +110,17 @@ def test_pours_that_the_simulator_missed_widen_what_the_first_pour_may_lose():
     assert contradicted.discrepancy.uninformative > 0.5
 
 
+def test_pours_of_an_earlier_campaign_count_less_and_together_with_a_calibration_more():
+    known, earlier = calibrated(cup), (replace(calibrated(cup)[0], misled=0.2),)
+    without, doubted, trusted, both = (first_pour(pours) for pours in (None, earlier, known, known + earlier))
+    assert trusted.means[0] < doubted.means[0] < 0.4 * without.means[0]
+    shares = [answer.discrepancy.uninformative for answer in (without, doubted, trusted, both)]
+    assert shares[1] == pytest.approx(0.2 * shares[0], rel=0.1)  # with this probability they say nothing
+    assert shares[3] < 0.3 * shares[2]
+    with pytest.raises(ValueError, match=r"misled = 1\.2 is outside"):
+        first_pour((replace(known[0], misled=1.2),))
+
+
 def test_of_actions_that_look_alike_the_first_pour_is_the_one_that_is_safest_without_calibration(monkeypatch):
     def gutter(points):
         """Next to nothing lost along a valley: a little less towards its far end, where it is narrow."""

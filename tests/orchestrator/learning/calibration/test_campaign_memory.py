@@ -24,13 +24,15 @@ from orchestrator.catalogue.known_posteriors import import_posterior, posterior_
 from orchestrator.cli.app import app
 from orchestrator.cli.json_output import KnownOutput
 from orchestrator.learning.calibration.active_design import ActivePours
+from orchestrator.learning.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
-from orchestrator.learning.calibration.pour_design import DesignedPours
+from orchestrator.learning.calibration.pour_design import DesignedPours, DesignPoured, PouredPoint
 from orchestrator.learning.campaign_plan import MeasuredPour
 from orchestrator.records.events import StageClosed
 from orchestrator.records.run_record import Header, RunState
 from orchestrator.records.run_registry import VARIABLE
 from orchestrator.runs.run_folder import simulator_version
+from orchestrator.runs.stages import with_evidence
 from orchestrator.runs.strategy_harness import SCENE, StrategyHarness
 from sim_engine.action import DEG
 from sim_engine.liquids import SimulationParameters
@@ -288,6 +290,123 @@ def test_another_liquid_keeps_walls_and_placement(state: Path, tmp_path: Path) -
     assert memory is not None
     assert list(memory.means) == ["friction"]  # the placement is that of another laboratory
     assert "its placement is not transferred" in " ".join(memory.left_out)
+
+
+# -- the weighed pours -------------------------------------------------------------------------------------------------
+
+POURED: dict[str, Any] = {
+    "liquid": {"name": "water", "density": 998.0, "surface_tension": 0.0728, "viscosity": 1e-3, "mass": 0.2},
+    "weighed": [
+        {"into": "tumbler", "action": {"angular_velocity": speed, "x_offset": 0.11, "height": 0.1}, "poured": 0.98,
+         "measured": 0.1, "simulated": 0.12}
+        for speed in (1.2, 1.6)
+    ],
+}  # fmt: skip
+
+
+def deploys_only(tmp_path: Path, prior: str = "catalogue") -> Path:
+    """The shipped quickstart without its calibration."""
+    path = with_prior(tmp_path, prior)
+    head, tail = path.read_text("utf-8").split("calibration:")
+    searched = "    friction: [0, 0.6]"
+    path.write_text(head.split(searched)[0] + "deployment:" + tail.split("deployment:")[1], "utf-8")
+    return path
+
+
+def test_a_prior_brings_the_weighed_pours_with_their_simulations(state: Path, tmp_path: Path) -> None:
+    import_posterior(known("first-1", **POURED))
+    plan = load_campaign(deploys_only(tmp_path))
+    assert plan.deployment is not None
+    assert plan.memory is not None
+    assert [pair.into for pair in plan.memory.pours or ()] == ["first-1 into tumbler"] * 2
+    evidence = with_evidence(plan.deployment, {}, None, plan.deployment.scenes[0], plan.parameters).evidence
+    assert evidence is not None
+    assert "2 pours of first-1 into tumbler by 2.0 % of the largest loss on average" in evidence.lines[0]
+    from decant.running import build_campaign
+
+    again = build_campaign(plan.resolved, tmp_path)  # as the run's record has it
+    assert (again.memory, fingerprint(again)) == (plan.memory, fingerprint(plan))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"weighed": []}, "its file or its run has none with their simulations"),
+        ({"shape": "0123456789abcdef", "pourer": "jug"}, "they are from another vessel ('jug')"),
+        ({"liquid": {**POURED["liquid"], "mass": 0.1}}, "they are of 100 g, here it is 200 g"),
+        ({"liquid": {**POURED["liquid"], "viscosity": 0.06}}, "its viscosity is 0.06, here it is 0.001 (SI)"),
+        ({"laboratory": "other"}, "they are of laboratory 'other', here it is 'virtual'"),
+        ({"parameters": {"receiver_x": {"mean": 0.2, "deviation": 0.001}}}, "simulations have another receiver_x"),
+    ],
+)
+def test_pours_that_say_nothing_about_the_simulator_here_are_left_out_with_the_reason(
+    state: Path, tmp_path: Path, changes: dict[str, Any], reason: str
+) -> None:
+    import_posterior(known("first-1", **{**POURED, **changes}))
+    path = deploys_only(tmp_path)
+    if "parameters" in changes:
+        path.write_text(
+            path.read_text("utf-8").replace("particles: 600", "particles: 600\n    receiver_x: 3 mm"), "utf-8"
+        )
+        import_posterior(known("first-1", **{**POURED, "parameters": known("x").model_dump()["parameters"]}))
+    plan = load_campaign(path)
+    assert plan.deployment is not None
+    assert plan.memory is not None
+    assert plan.memory.pours is None
+    (line,) = [line for line in plan.memory.lines if "its weighed pours are not transferred" in line]
+    assert line.startswith("not used: first-1: ")
+    assert reason in line
+    assert with_evidence(plan.deployment, {}, None, plan.deployment.scenes[0], plan.parameters) == plan.deployment
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [({"action": {"x_offset": 9.0}}, "x_offset"), ({"poured": 1.2}, "1.2 is not between 0 and 1")],
+)
+def test_impossible_pours_in_the_file_of_a_posterior_are_refused(
+    tmp_path: Path, change: dict[str, Any], problem: str
+) -> None:
+    path, posterior = tmp_path / "first.yaml", known("first-1", **POURED)
+    text = posterior_text(posterior)
+    assert load_posterior_file(write(path, text)).weighed == posterior.weighed
+    (name, value), *_ = change.items()
+    wrong = text.replace("poured: 0.98", f"poured: {value}") if name == "poured" else text.replace("0.11", "9.0")
+    with pytest.raises(ConfigError, match=problem):
+        load_posterior_file(write(path, wrong))
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_run_that_was_evaluated_tells_its_pours_as_if_each_had_been_left_out_of_the_fit(tmp_path: Path) -> None:
+    header = fingerprint(load_campaign(shipped("campaigns/quickstart.yaml")))
+    axes = header["calibration"]["parameters"]["axes"]
+    header["calibration"]["parameters"]["axes"] = [axis for axis in axes if axis["name"] == "receiver_x"]
+    scene = header["calibration"]["scene"]["name"]
+    splits = ["test", "train", "train"]
+    poured = [
+        PouredPoint(number=i, split=split, scene=scene, action={}, action_si={"angular_velocity": 1.0, "x_offset": 0.1},
+                    spillage=0.1, poured=0.9, invalid_tries=0)
+        for i, split in enumerate(splits[::-1], 1)
+    ]  # fmt: skip
+    pairs = [
+        ScoredPair(theta=theta, split=split, scene=scene, measured=0.1, simulated=simulated, reason="")
+        for theta, simulated in (("theta", 0.12), ("uncalibrated", 0.5))
+        for split in splits
+    ]
+    scores = Scores(simulations=6, undefined={}, discrepancy={}, random_median={}, thetas={}, pairs=tuple(pairs))
+    record = RunState(Header("second", header))
+    record.closed["pours"] = StageClosed(stage="pours", result=DesignPoured(pours=tuple(poured)))
+    record.closed["calibration"] = StageClosed(stage="calibration", result=calibrated(None).result())
+    assert posterior_of(tmp_path, record).weighed == []  # without their simulations they say nothing
+    record.closed["evaluation"] = StageClosed(stage="evaluation", result=scores)
+    weighed = posterior_of(tmp_path, record).weighed
+    assert [pour.into for pour in weighed] == ["tumbler"] * 3
+    assert [pour.simulated for pour in weighed] == pytest.approx([0.12, 0.14, 0.14])  # 0.1 + 0.02 / (1 − 1 / 2)
+    assert weighed[0].action["x_offset"] == 0.1
+    assert posterior_of(tmp_path, record).liquid.mass == pytest.approx(0.2)
 
 
 def test_after_a_move_the_placement_comes_from_the_runs_since_then(state: Path, tmp_path: Path) -> None:

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from orchestrator.learning.calibration.calibration_scores import ScoredPair, ScoredPour, Scores
+from orchestrator.learning.calibration.campaign_memory import RELIANCE, CampaignMemory, WeighedPair
 from orchestrator.learning.campaign_plan import CalibrationEvidence, MeasuredPour
-from orchestrator.learning.deployment.calibration_evidence import TRANSFER, calibration_evidence
+from orchestrator.learning.deployment.calibration_evidence import TRANSFER, calibration_evidence, memory_evidence
 from orchestrator.runs.strategy_harness import ACTIONS, SCENE, THETA
 from sim_engine.action import DEG
 from sim_engine.prediction_band import RESOLUTION_AT, shift_of
@@ -88,6 +89,20 @@ def test_pours_that_say_nothing_about_the_deployment_are_named_with_the_reason(
 def test_a_calibration_that_is_used_says_by_how_much_its_simulator_misses() -> None:
     (line,) = evidence(searched=0).lines
     assert "misses 10 calibration pours into cup by 2.7 % of the largest loss" in line
+
+
+def test_pours_of_earlier_campaigns_count_as_of_another_receiver_and_as_reliably_as_a_memory() -> None:
+    at = [SCENE.action({"angular_velocity": speed * DEG, "x_offset": 0.12}) for speed in (60, 70, 300)]
+    pairs = [WeighedPair(f"first-1 into {name}", a, 0.9, 0.10, 0.13) for name in ("cup", "mug") for a in at]
+    memory = CampaignMemory((), pours=tuple(pairs[:-2]))
+    found = memory_evidence(deployment_plan(), SCENE, THETA, memory)
+    (pours,) = found.pours
+    assert (pours.power, pours.misled, len(pours.points)) == (TRANSFER, pytest.approx(1.0 - RELIANCE), 2)
+    assert (pours.costs[0], pours.simulated[0]) == pytest.approx((0.10 * 0.9 + 0.1, 0.13 * 0.9 + 0.1))
+    used, far, few = found.lines
+    assert "the simulator misses 2 pours of first-1 into cup by 2.7 % of the largest loss" in used
+    assert far == "not used: 1 pours of first-1 into cup: far from the deployment's actions"
+    assert few.startswith("not used: 1 pours of first-1 into mug: only 1 are close to the deployment's actions")
 
 
 def test_of_very_many_pours_some_are_used_evenly() -> None:
