@@ -1,7 +1,7 @@
 """Measure the pours of D3 after a calibration: are they as it expected, on right benches and on benches that mislead?
 
     python benchmarks/first_pours.py [--first 62000] [--seeds 10] [--pours 1] [--only calibrate first before ...]
-                                     [--into build/first-pours] [--write]
+                                     [--benches twin ...] [--into build/first-pours] [--write]
 
 Three benches with a calibration each, for every seed:
 
@@ -160,7 +160,7 @@ def one(seed: int, bench: str, program: str, pours: int, into: Path) -> list[dic
     campaign = build_campaign(content_of(seed, bench, program, pours, folder), folder)
     assert campaign.calibration is not None
     assert campaign.deployment is not None
-    kept = kept_pours(f"{bench}-{seed}".replace(" ", ""), into)
+    kept = kept_pours(seed, into)
     calibration = stages.calibration_stages(campaign.calibration, campaign.deployment)
     if program == "calibrate":
         request = RunRequest(campaign, calibration, folder=calibrated)
@@ -197,7 +197,7 @@ def wanted(asked: argparse.Namespace) -> Iterator[tuple[int, str, str, int]]:
     """Yield the missing runs in order: seed, bench, program, number of pours."""
     for program, seed in itertools.product(asked.only, range(asked.first, asked.first + asked.seeds)):
         on_twin = program.startswith(MISLED)
-        for bench in BENCHES[:1] if on_twin else BENCHES[:2] if program == "risk" else BENCHES:
+        for bench in BENCHES[:1] if on_twin else BENCHES[:2] if program == "risk" else asked.benches:
             pours = 5 if on_twin else asked.pours if program == "first" else 1
             yield seed, bench, program, pours
 
@@ -259,6 +259,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--pours", type=int, default=1, help="pours of each deployment of `first`")
     parser.add_argument("--only", nargs="+", choices=PROGRAMS, default=list(PROGRAMS))
+    parser.add_argument("--benches", nargs="+", choices=BENCHES, default=list(BENCHES))
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "first-pours")
     parser.add_argument("--write", action="store_true", help="write the tables into docs/data/results.json")
     parser.add_argument("--one", help=argparse.SUPPRESS)  # runs one in this process

@@ -1,8 +1,7 @@
 """Measure the quickstart: benefit of its calibration, losses of its pours, and number of pours until it stops.
 
     python benchmarks/quickstart.py [--seeds 10] [--first 401] [--strategies shipped ...] [--calibration-only]
-                                    [--fits 10] [--first-pours 10] [--laboratory FILE] [--into build/quickstart]
-                                    [--write]
+                                    [--fits 10] [--laboratory FILE] [--into build/quickstart] [--write]
 
 The benchmark runs the shipped campaign unchanged, on a simulated bench with the ground truth of its own laboratory. It
 only skips the scores of random θ, on which the deployment does not depend. Each seed runs in its own process, which
@@ -17,8 +16,6 @@ interrupted comparison continues.
   laboratory file, and one whose receiver stands 14 mm farther away. θ* of `simulations: auto` is compared with θ* of 30
   simulations, with the uncalibrated θ, and with the best θ of a 10 × 10 grid, which has the same seeds as the first.
   Further pours with new actions test all of them, and the prediction intervals.
-- `--first-pours` makes the shipped campaign for this number of seeds on the same two benches, and compares the first
-  pour of each with its prediction.
 - `--write` makes no runs; it writes the tables of stored runs to docs/data/results.json, for docs/make_tables.py.
 
 Questions, fixed before the first run on seeds from 401 on; seeds below 400 are for tuning or were used before:
@@ -30,8 +27,6 @@ Questions, fixed before the first run on seeds from 401 on; seeds below 400 are 
 4. (`--fits`.) Is θ* on the training pours in the mean at most 0.3 points above the best of the grid, and never above
    the uncalibrated θ? Is its mean error on 12 further pours at most 2 points? Do 85 to 95 % of these lie in their 90 %
    intervals?
-5. (`--first-pours`.) Is the mean |expected − measured| of the first pours at most 2 points, the mean width of their
-   intervals at most 8 points, and their interval score at most 0.08? Do 85 to 95 % lie in their intervals?
 """
 
 from __future__ import annotations
@@ -126,14 +121,8 @@ class KeptPours(WorkerPool):
         return SimulatedPour(from_json(self._known[key], PourOutcome))
 
 
-def one(
-    seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: bool = False, bench: str | None = None
-) -> dict[str, Any]:
-    """Run one campaign; return its calibration's error on the test pours, and every pour with its prediction.
-
-    Args:
-        bench: of `BENCHES`; None: with the ground truth of the campaign's own laboratory.
-    """
+def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: bool = False) -> dict[str, Any]:
+    """Run one campaign; return its calibration's error on the test pours, and every pour with its prediction."""
     from decant.running import build_campaign
     from orchestrator.reports.stage_views import deployments_of, evaluation_of, theta_of
     from orchestrator.runs.run_service import RunRequest, RunResources, RunService
@@ -150,7 +139,7 @@ def one(
         tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder,
         patch.object(deployment_base, "scaled_interval", scale),
     ):
-        content = on_numbers(seed, laboratory, folder, bench)
+        content = on_numbers(seed, laboratory, folder)
         ARMS[arm](content)
         campaign = build_campaign(content, folder)
         assert campaign.deployment is not None
@@ -167,7 +156,6 @@ def one(
     run: dict[str, Any] = {
         "seed": seed,
         "arm": arm,
-        "bench": bench,
         "test": {name: scores.discrepancy[name]["test"] for name in ("theta", "uncalibrated")},
         "theta": {name: theta.theta.model_dump()[name] for name in theta.searched},
     }
@@ -514,37 +502,6 @@ def _compare_fits(asked: argparse.Namespace) -> None:
         write_table("quickstart-fits", **shown, command=command, settings=settings)
 
 
-def first_pours_table(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return head and rows: the first pours compared with their predictions, by bench."""
-    rows = []
-    for bench in BENCHES:
-        pours = [run["pours"][0] for run in runs if run["bench"] == bench]
-        if pours:
-            inside, score = coverage([(*pour["band"], pour["loss"]) for pour in pours], LEVEL)
-            error, expected, lost, width = np.mean(
-                [(abs(pour["predicted"] - pour["loss"]), pour["predicted"], pour["loss"],
-                  pour["band"][1] - pour["band"][0]) for pour in pours], axis=0)  # fmt: skip
-            cells = [f"{100 * value:.1f}" for value in (expected, lost, error, width)]
-            rows.append([bench, str(len(pours)), *cells, f"{inside * len(pours):.0f}", f"{score:.3f}"])
-    head = ["bench", "first pours", "expected, %", "measured, %", "mean difference, points", "width of the interval"]
-    return {"head": [*head, "in their 90 % intervals", "interval score"], "rows": rows}
-
-
-def _compare_first_pours(asked: argparse.Namespace) -> None:
-    """Make the missing campaigns, one process for each seed and bench, and print or write the table."""
-    kept = KeptRows(asked.into / "first-pours.jsonl")
-    places = [f"--{name}={getattr(asked, name).resolve()}" for name in ("laboratory", "into")]
-    wanted = range(asked.first, asked.first + asked.first_pours)
-    for seed, bench in itertools.product(wanted, () if asked.write else BENCHES):
-        if not any((run["seed"], run["bench"]) == (seed, bench) for run in kept.rows):
-            kept.add(run_self(__file__, f"--one={seed}", f"--bench={bench}", "--first-pours=1", *places))
-    shown = first_pours_table([run for run in kept.rows if run["seed"] in wanted])
-    print("\n".join(" | ".join(cells) for cells in (shown["head"], *shown["rows"])))
-    if asked.write:
-        command = f"python benchmarks/quickstart.py --first-pours {asked.first_pours} --first {asked.first}"
-        write_table("first-pours", **shown, command=command, settings="quickstart.yaml on the bench of twin.yaml")
-
-
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -553,7 +510,6 @@ def main() -> None:
     parser.add_argument("--strategies", nargs="+", choices=list(ARMS), default=["shipped"])
     parser.add_argument("--calibration-only", action="store_true", help="skip the deployment")
     parser.add_argument("--fits", type=int, default=0, help="number of seeds to compare calibrations on")
-    parser.add_argument("--first-pours", type=int, default=0, help="number of seeds to compare first pours on")
     parser.add_argument("--bench", choices=list(BENCHES), help=argparse.SUPPRESS)
     parser.add_argument("--laboratory", type=Path, default=ROOT / "configs" / "laboratories" / "twin.yaml")
     parser.add_argument("--into", type=Path, default=ROOT / "build" / "quickstart")
@@ -562,17 +518,14 @@ def main() -> None:
     asked = parser.parse_args()
     asked.into.mkdir(parents=True, exist_ok=True)
     if asked.one is not None:
-        if asked.first_pours:
-            print(json.dumps(one(asked.one, "shipped", asked.laboratory, asked.into, bench=asked.bench)))
-            return
         if asked.bench is not None:
             print(json.dumps({"rows": fitted(asked.one, asked.bench, asked.laboratory, asked.into)}))
             return
         only = asked.calibration_only
         print(json.dumps(one(asked.one, asked.strategies[0], asked.laboratory, asked.into, calibration_only=only)))
         return
-    if asked.fits or asked.first_pours:
-        (_compare_fits if asked.fits else _compare_first_pours)(asked)
+    if asked.fits:
+        _compare_fits(asked)
         return
     kept = KeptRows(asked.into / "runs.jsonl")
     if not asked.write:

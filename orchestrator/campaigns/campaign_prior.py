@@ -43,6 +43,9 @@ CATALOGUE = "catalogue"
 ALIKE = 0.1
 """Largest relative difference of a property of two liquids that count as the same."""
 
+ENOUGH = 40
+"""Number of weighed pours of earlier runs from which those of still older ones are left out."""
+
 
 class EstimateSettings(Settings):
     """A parameter: mean and standard deviation."""
@@ -435,12 +438,17 @@ def _combined(posteriors: Sequence[KnownPosterior], needs: PriorNeeds, source: P
         remembered.append(parameter)
     used = {run for parameter in remembered for run in parameter.runs}
     pours: list[WeighedPair] = []
-    for known in usable:
+    older = 0
+    for known in reversed(usable):  # the newest first
         lost = [n for n in known.estimates if not any(n == p.name and known.posterior in p.runs for p in remembered)]
         if reason := _pours_unfit(known, needs, lost, shape):
             left_out.append(f"{known.posterior}: its weighed pours are not transferred, {reason}")
+        elif len(pours) >= ENOUGH:
+            older += 1
         else:
             pours += [settings.pair(known.posterior) for settings in known.weighed]
+    if older:
+        left_out.append(f"weighed pours of {older} older run{'s' * (older > 1)}: {len(pours)} of newer ones are enough")
     stale = [(known.posterior, source.stale(known)) for known in usable if known.posterior in used]
     texts = tuple(f"{name}: {text}" for name, text in stale if text)
     return CampaignMemory(tuple(remembered), tuple(left_out), texts, tuple(pours) or None)

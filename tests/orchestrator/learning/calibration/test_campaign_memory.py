@@ -359,6 +359,15 @@ def test_pours_that_say_nothing_about_the_simulator_here_are_left_out_with_the_r
     assert with_evidence(plan.deployment, {}, None, plan.deployment.scenes[0], plan.parameters) == plan.deployment
 
 
+def test_of_very_many_earlier_runs_the_newest_pours_are_enough(state: Path, tmp_path: Path) -> None:
+    for number in range(4):
+        import_posterior(known(f"run-{number}", **{**POURED, "weighed": POURED["weighed"] * 12}))
+    memory = load_campaign(deploys_only(tmp_path)).memory
+    assert memory is not None
+    assert list(dict.fromkeys(pair.into for pair in memory.pours or ())) == ["run-3 into tumbler", "run-2 into tumbler"]
+    assert memory.left_out == ("weighed pours of 2 older runs: 48 of newer ones are enough",)
+
+
 @pytest.mark.parametrize(
     ("change", "problem"),
     [({"action": {"x_offset": 9.0}}, "x_offset"), ({"poured": 1.2}, "1.2 is not between 0 and 1")],
