@@ -168,7 +168,7 @@ def doctor(laboratory: Path | str) -> BenchReport:
         laboratory: file of a laboratory with an arm.
 
     Returns:
-        The checks with their remedies; `ready` is whether none fails, `document()` the JSON of the command.
+        The checks with their remedies; `ready` is whether none fails.
 
     Raises:
         ConfigError: the file is invalid.

@@ -2,8 +2,7 @@
 
 - `RayWorker` is this program's side, `SimulatorProcess` runs inside the actor. `ray_pool` makes a pool of them.
 - `Packer` and `unpack` transfer meshes as bytes, since a path is valid on one machine only. Both machines then have
-  the same content, so that everything derived from it (distance grids, outcomes) has the same keys. `portable` does the
-  same for any value that contains meshes, such as the plan of a study.
+  the same content, so that everything derived from it (distance grids, outcomes) has the same keys.
 """
 
 from __future__ import annotations
@@ -12,9 +11,7 @@ import asyncio
 import contextlib
 import dataclasses
 import hashlib
-import io
 import os
-import pickle
 import re
 import socket
 import tempfile
@@ -262,42 +259,6 @@ class Packer:
             key = Path(hashlib.sha256(content).hexdigest()[:24]) / shape.path.name
             self._meshes[shape] = SerializedMesh(key, np.frombuffer(content, np.uint8))
         return self._meshes[shape]
-
-
-def portable(value: Any) -> bytes:
-    """Serialize a value for another machine, with the content of its meshes.
-
-    Raises:
-        SimulationError: a mesh cannot be read.
-    """
-    content = io.BytesIO()
-    _PortablePickler(content, pickle.HIGHEST_PROTOCOL).dump(value)
-    return content.getvalue()
-
-
-def from_portable(content: bytes) -> Any:
-    """Return the value of `portable`, with its meshes as files of this machine.
-
-    Raises:
-        OSError: the cache directory cannot be written.
-    """
-    return pickle.loads(content)
-
-
-class _PortablePickler(pickle.Pickler):
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self._packer = Packer()
-
-    def reducer_override(self, value: Any) -> Any:
-        if type(value) is not MeshShape:
-            return NotImplemented
-        values = {name: getattr(value, name) for name in MeshShape.model_fields if name != "path"}
-        return _written_mesh, (values, self._packer.serialized(value))
-
-
-def _written_mesh(values: Mapping[str, Any], mesh: SerializedMesh) -> MeshShape:
-    return MeshShape(path=_write(mesh), **values)
 
 
 def unpack(task: PourTask, meshes: Sequence[SerializedMesh]) -> PourTask:

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message
 
 if TYPE_CHECKING:
     from actors.balance.balance_check import CheckOperator
@@ -54,7 +53,6 @@ def check(
     record: Annotated[
         Path | None, typer.Option(help="Also record the raw traffic into this file, as 'decant balance record' does.")
     ] = None,
-    as_json: Json = False,
 ) -> None:
     """Check a balance before the first pour: connection, noise, drift, repeated readings, lag, linearity and vibration.
 
@@ -80,16 +78,11 @@ def check(
                 time_scale=spec.time_scale,
             ):
                 checks.append(finding)
-                if not as_json:
-                    print_table([finding])
+                print_table([finding])
             _finish(tap, record, driver)
         finally:
             driver.close()
     failed = [c for c in checks if c.state == "fail"]
-    if as_json:
-        from orchestrator.cli.command_results import CheckOutput
-
-        print_json(CheckOutput(laboratory=balance, mode="", ready=not failed, checks=checks))
     if failed:
         raise RefusalError(f"{len(failed)} of {len(checks)} checks fail", FAILED)
     print_message("ready" if all(c.state == "ok" for c in checks) else "ready, with warnings")

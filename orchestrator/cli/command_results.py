@@ -11,8 +11,6 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from actors.arm.arm_interface import PathReport
-from actors.interfaces import DeviceCheck
 from sim_engine.liquids import SimulationParameters
 from sim_engine.prediction_band import PredictionInterval, SampleStatistics
 
@@ -121,59 +119,6 @@ class SimulateOutput(CommandOutput):
     """Effects of this pour that are not simulated: `kind`, `share`, `text`."""
 
 
-class DryRunOutput(CommandOutput):
-    """A planned pour (`--dry-run`)."""
-
-    mode: str
-    action: dict[str, float | None]
-    report: PathReport
-    phases: list[dict[str, Any]]
-    """Phases of the tilt: `name`, `start` and `end` [s]."""
-
-    at_home: bool | None
-    """Whether the arm stands at home; null without `--connect`."""
-
-
-class EmptyPourOutput(CommandOutput):
-    """A cycle with an empty pourer (`--empty`), as in pour.json."""
-
-    run: str
-    mode: str
-    laboratory: str
-    date: str
-    robot: dict[str, str]
-    action: dict[str, float | None]
-    slow: float
-    planned: PathReport
-    tracking: dict[str, float]
-    """Deviations of the executed motion from the planned one."""
-
-    executed_s: float
-    """Duration of the pour."""
-
-
-class ReportOutput(CommandOutput):
-    """A written report."""
-
-    report: Path
-    figures: list[Path]
-
-
-class CheckOutput(CommandOutput):
-    """Checks of a laboratory, of a balance, or of the recordings of a commissioning day."""
-
-    laboratory: str
-    """Name of the laboratory; the balance as it was named; the archive."""
-
-    mode: str
-    """'virtual' or 'hardware'; '' for a balance and an archive."""
-
-    ready: bool
-    """Whether no check fails."""
-
-    checks: list[DeviceCheck]
-
-
 class ValidateSolverOutput(CommandOutput):
     """Results of the solver's validation cases."""
 
@@ -185,19 +130,6 @@ class ValidateSolverOutput(CommandOutput):
     """By case: title, cpu_s, figure, and measurements with value, bounds and whether they passed."""
 
 
-class VesselOutput(CommandOutput):
-    """A vessel file that was made."""
-
-    file: Path
-    picture: Path
-    capacity_mL: float  # noqa: N815
-    capacity_deviation_mL: float  # noqa: N815
-    radius_deviation_mm: float | None
-    notes: list[str]
-    doubts: list[str]
-    """Checks that failed."""
-
-
 class PluginsOutput(CommandOutput):
     """Plug-ins of installed packages."""
 
@@ -206,67 +138,3 @@ class PluginsOutput(CommandOutput):
 
     broken: list[dict[str, str]]
     """Plug-ins that can't be used, with the reason."""
-
-
-class StudyOutput(CommandOutput):
-    """A study that was run or reported."""
-
-    study: str
-    folder: Path
-    page: Path
-    cells: int
-    finished: int | None
-    """Number of finished cells; null for a report."""
-
-
-class StudyCostOutput(CommandOutput):
-    """Unfinished work of a study (`--dry-run`)."""
-
-    cells: list[str]
-    left: int
-    simulations: int
-    pours: int
-    cpu_hours: float
-
-
-class PredictedDoseOutput(CommandOutput):
-    """One dose, predicted."""
-
-    number: int
-    wanted_g: float
-    position: str
-    source: str
-    filled: bool
-    """Whether the source is filled before."""
-
-    expected_g: float
-    interval_g: tuple[float, float]
-    """The expected amount lies in it with a probability of 90 %."""
-
-    duration_s: float
-    longest_s: float
-    """Duration that 95 % of the doses do not exceed."""
-
-    enough: float
-    """Probability that the source holds the amount."""
-
-    fine_flow_g_s: float
-    """Flow at the end of the dose."""
-
-    clean_flow_g_s: float
-    """Smallest flow that leaves the lip cleanly; a slower one may run down the outside."""
-
-    left_g: float
-    """Expected content of the source after the dose."""
-
-    reachable_tolerance_g: float
-    """Half of the 90 % interval of the dose as weighed with this balance."""
-
-    ends: dict[str, int]
-    """Number of predicted doses by their end."""
-
-
-class DosePredictionOutput(CommandOutput):
-    """Doses that were predicted (`--dry-run`)."""
-
-    doses: list[PredictedDoseOutput]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Campaign, InProcess, Json, OtherLaboratory, Seed
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message, print_note
+from orchestrator.cli.command_options import Campaign, InProcess, OtherLaboratory, Seed
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message, print_note
 
 if TYPE_CHECKING:
     from actors.dosing.dose_series import DoseForecast
@@ -47,7 +47,6 @@ def dose(
     seed: Seed = None,
     laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
-    as_json: Json = False,
 ) -> None:
     """Pour wanted amounts: the tilt is decided from the balance while the liquid flows.
 
@@ -62,7 +61,7 @@ def dose(
     check_campaign_can_run(request)
     request = dataclasses.replace(request, campaign=dataclasses.replace(plan, seed=plan.seed if seed is None else seed))
     if dry_run:
-        _predict(request.campaign, as_json=as_json)
+        _predict(request.campaign)
         return
     assert amount is not None
     options = "".join(
@@ -71,7 +70,7 @@ def dose(
         if value is not None
     )
     again = f"Another dose: decant dose {campaign}{options} --amount '{amount[0]}'"
-    pour_doses(request, in_process=in_process, as_json=as_json, again=again)
+    pour_doses(request, in_process=in_process, again=again)
 
 
 def _dose_request(
@@ -125,7 +124,7 @@ def _known(plan: DispensePlan) -> dict[str, KnownSource]:
         raise RefusalError(f"the content of the sources is not known: {error}", FAILED) from None
 
 
-def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
+def _predict(plan: CampaignPlan) -> None:
     """Predict one dose after the other; each leaves the source with its expected content."""
     from actors.interfaces import DoseTarget
     from actors.laboratory import predicted_dose
@@ -137,9 +136,8 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
     series, known = plan.dispense, _known(plan.dispense)
     strategy, seeds = dose_strategy(series, plan.seed, known), SeedStream(plan.seed, "predict doses")
     count = 20 if len(series.doses) == 1 else 8
-    rows: list[dict[str, Any]] = []
     total, filled = 0.0, 0
-    for number, planned in enumerate(series.doses, start=1):
+    for planned in series.doses:
         source = strategy.next_source(planned)
         scene = series.scene(source.name, planned.receiver)
         target = DoseTarget(planned.amount, planned.limit, planned.position, source)
@@ -148,37 +146,11 @@ def _predict(plan: CampaignPlan, *, as_json: bool) -> None:
         deviation = max(source.deviation, FILL_DEVIATION) + WEIGHED_DEVIATION
         strategy.assume(source.name, KnownSource(mass=left, deviation=deviation))
         total, filled = total + forecast.duration, filled + source.fill
-        rows.append(_row(number, planned, source, forecast, left))
-        if not as_json:
-            print(forecast_text(planned, source, forecast))
-    if as_json:
-        from orchestrator.cli.command_results import DosePredictionOutput
-
-        print_json(DosePredictionOutput.model_validate({"doses": rows}))
-    elif len(rows) > 1:
+        print(forecast_text(planned, source, forecast))
+    if len(series.doses) > 1:
         times = "once" if filled == 1 else f"{filled} times"
-        print(f"{len(rows)} doses: {total:.0f} s of pouring and weighing; sources filled {times}")
+        print(f"{len(series.doses)} doses: {total:.0f} s of pouring and weighing; sources filled {times}")
     print_message("nothing was poured")
-
-
-def _row(number: int, planned: PlannedDose, source: DoseSource, forecast: DoseForecast, left: float) -> dict[str, Any]:
-    return {
-        "number": number,
-        "wanted_g": 1e3 * planned.amount,
-        "position": planned.position,
-        "source": source.name,
-        "filled": source.fill,
-        "expected_g": 1e3 * forecast.amount,
-        "interval_g": [1e3 * value for value in forecast.interval],
-        "duration_s": forecast.duration,
-        "longest_s": forecast.longest,
-        "enough": forecast.enough,
-        "fine_flow_g_s": 1e3 * forecast.fine_flow,
-        "clean_flow_g_s": 1e3 * forecast.clean_flow,
-        "left_g": 1e3 * left,
-        "reachable_tolerance_g": 1e3 * forecast.reachable,
-        "ends": {str(end): count for end, count in forecast.ends.items()},
-    }
 
 
 def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForecast) -> str:
@@ -214,13 +186,12 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
     return "\n".join(lines)
 
 
-def pour_doses(request: RunRequest, *, in_process: bool, as_json: bool, again: str) -> Path:
+def pour_doses(request: RunRequest, *, in_process: bool, again: str) -> Path:
     """Pour a series of doses as a small run of its own: journalled and weighed.
 
     Args:
         request: of `dose_task`.
         in_process: without Ray.
-        as_json: print the doses as JSON.
         again: the next command, for the message after an interruption.
 
     Returns:
@@ -244,14 +215,8 @@ def pour_doses(request: RunRequest, *, in_process: bool, as_json: bool, again: s
     )
     directory = finished.directory
     result: Dispensed = result_of(finished.results, DOSES, Dispensed)
-    if as_json:
-        from orchestrator.cli.json_output import DoseOutput
-
-        doses = [dose.model_dump(exclude={"signals"}) for dose in result.doses]
-        print_json(DoseOutput(run=str(directory), doses=doses))
-    else:
-        for dose in result.doses:
-            print(dose_text(dose))
+    for dose in result.doses:
+        print(dose_text(dose))
     print_note(f"run: {directory}")
     if any(dose.received_g is None for dose in result.doses):
         raise RefusalError("not every dose was poured", FAILED)

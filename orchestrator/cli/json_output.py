@@ -12,30 +12,16 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from orchestrator.campaigns.campaign_prior import KnownPosterior
-from orchestrator.catalogue.control_charts import LaboratoryChart
-from orchestrator.catalogue.known_posteriors import PosteriorAge
 from orchestrator.catalogue.run_reading import PreviousPour, PreviousRun, PreviousRunDetail
 from orchestrator.cli.command_results import (
     CalibrateOutput,
-    CheckOutput,
     CommandOutput,
-    DosePredictionOutput,
-    DryRunOutput,
-    EmptyPourOutput,
     PluginsOutput,
-    ReportOutput,
     SimulateOutput,
-    StudyCostOutput,
-    StudyOutput,
     ValidateSolverOutput,
-    VesselOutput,
 )
 from orchestrator.daemon.api.schemas import CampaignDetailOut, CampaignOut, StatusOut
-from orchestrator.daemon.api.station_schemas import AccountOut, ContentOut, PourOut
 from orchestrator.daemon.state.daemon_store import QuestionOut
-from orchestrator.learning.dispense import Dose
-from orchestrator.learning.single_action import WeighedPour
 from orchestrator.records.journal_check import JournalCheck
 from orchestrator.reports.run_summary import PLANNED, ReceiverSummary, RunSummary
 from sim_engine.liquids import SimulationParameters
@@ -101,14 +87,6 @@ RunOutput = create_model(
 )
 
 
-class PourOutput(WeighedPour):
-    """A weighed pour."""
-
-    run: str
-    mode: str
-    action: dict[str, float | None]
-
-
 class RunsOutput(CommandOutput):
     """Runs, newest first."""
 
@@ -119,21 +97,6 @@ class PoursOutput(CommandOutput):
     """Pours, oldest first."""
 
     pours: list[PreviousPour]  # type: ignore[valid-type]
-
-
-class KnownOutput(CommandOutput):
-    """What calibrations have found, by run."""
-
-    posteriors: list[KnownPosterior]
-
-    ages: dict[str, PosteriorAge]
-    """Age of each posterior that was made here, and whether later pours disagree with it."""
-
-
-class ChartsOutput(CommandOutput):
-    """Control charts, by laboratory and quantity."""
-
-    charts: list[LaboratoryChart]
 
 
 class QueueOutput(CommandOutput):
@@ -157,66 +120,20 @@ class EventOutput(BaseModel):
     campaign: str | None = None
 
 
-_DOSE = [name for name in Dose.model_fields if name != "signals"]
-
-
-class DoseOutput(CommandOutput):
-    """Doses that were poured."""
-
-    run: str
-    """Folder of the run."""
-
-    doses: list[create_model("DoseOut", __base__=CommandOutput, __doc__="One dose.", **_part(Dose, _DOSE))]  # type: ignore[valid-type]
-    """Completed doses, in the order made."""
-
-
-class VesselContentOutput(ContentOut):
-    """One vessel of `decant materials list`."""
-
-    id: str
-    """Id at the station, or LABORATORY/VESSEL for the source of a campaign."""
-
-    position: str
-    """Where it stands; '' if it is unknown."""
-
-
-class VesselContentsOutput(CommandOutput):
-    """Vessels with their contents."""
-
-    vessels: list[VesselContentOutput]
-
-
-class VesselHistoryOutput(CommandOutput):
-    """Entries of a vessel's account, oldest first."""
-
-    entries: list[AccountOut]
-
-
 OUTPUTS: dict[str, Any] = {
     "run": RunOutput,
     "calibrate": CalibrateOutput,
     "plan": PlanOutput,
     "simulate": SimulateOutput,
-    "dose": DoseOutput | DosePredictionOutput,
-    "pour": PourOutput | EmptyPourOutput | DryRunOutput,
-    "report": ReportOutput,
     "plugins": PluginsOutput,
-    **{f"vessel {source}": VesselOutput for source in ("profile", "photo", "mesh")},
     "validate-solver": ValidateSolverOutput,
     "runs list": RunsOutput,
     "runs pours": PoursOutput,
-    "runs chart": ChartsOutput,
     "runs show": PreviousRunDetail,
-    "runs known": KnownOutput,
     "runs check": JournalCheck,
-    "study run": StudyOutput | StudyCostOutput,
-    "robot check": CheckOutput,
-    "balance check": CheckOutput,
     "queue submit": CampaignOut,
     "queue list": QueueOutput | CampaignDetailOut,
     "queue logs": EventOutput,
-    "queue pour": PourOut,
-    "materials list": VesselContentsOutput | VesselHistoryOutput,
 }
 """Models of the output, by command."""
 

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Json
-from orchestrator.cli.console import RefusalError, Refused, print_json, print_message
+from orchestrator.cli.console import RefusalError, Refused, print_message
 from orchestrator.cli.queue_commands import State, Url, connected_client
 
 if TYPE_CHECKING:
@@ -97,7 +96,6 @@ def list_vessels(
     limit: Annotated[int, typer.Option(min=1, help="Number of entries.")] = 20,
     url: Url = None,
     state: State = None,
-    as_json: Json = False,
 ) -> None:
     """List vessels with what is left in each one, its standard deviation, and where it stands.
 
@@ -109,7 +107,7 @@ def list_vessels(
     from orchestrator.materials.vessel_account import VesselAccount
 
     if vessel is not None:
-        _show_entries(vessel, limit, url, state, as_json)
+        _show_entries(vessel, limit, url, state)
         return
     rows: list[dict[str, Any]]
     with _opened(url, state) as where:
@@ -124,9 +122,6 @@ def list_vessels(
                 | content.json_content()
                 for content in where.all()
             ]
-    if as_json:
-        print_json({"vessels": rows})
-        return
     if not rows:
         print_message("no vessel has content; 'decant materials weigh' enters one, see docs/laboratory/station.md")
     for row in rows:
@@ -140,7 +135,7 @@ def _content(row: dict[str, Any]) -> str:
     return f"{row['mass_g']:.1f} ± {row['deviation_g']:.1f} g"
 
 
-def _show_entries(vessel: str, limit: int, url: str | None, state: Path | None, as_json: bool) -> None:
+def _show_entries(vessel: str, limit: int, url: str | None, state: Path | None) -> None:
     from orchestrator.materials.vessel_account import VesselAccount
 
     with _opened(url, state) as where:
@@ -148,9 +143,6 @@ def _show_entries(vessel: str, limit: int, url: str | None, state: Path | None, 
             rows = where.get("/materials/account", vessel=vessel, limit=limit)
         else:
             rows = [entry.json_entry() for entry in reversed(where.history(vessel, limit))]
-    if as_json:
-        print_json({"entries": rows})
-        return
     if not rows:
         print_message(f"{vessel}: has no entry; 'decant materials list' lists the vessels")
     for row in rows:

@@ -18,7 +18,6 @@ from orchestrator.cli.command_options import (
     Campaign,
     EnableMotion,
     InProcess,
-    Json,
     OtherLaboratory,
     SceneName,
 )
@@ -27,7 +26,6 @@ from orchestrator.cli.console import (
     RefusalError,
     Refused,
     check_output,
-    print_json,
     print_message,
     print_note,
     print_warning,
@@ -61,7 +59,6 @@ def pour(
     laboratory: OtherLaboratory = None,
     in_process: InProcess = False,
     enable_motion: EnableMotion = False,
-    as_json: Json = False,
 ) -> None:
     """Pour once with a given action on the campaign's bench, only plan the pour, or try it with an empty pourer.
 
@@ -80,15 +77,15 @@ def pour(
     if png is not None:
         _draw(chosen, png)
     if dry_run:
-        _dry_run(chosen, connect=connect, as_json=as_json)
+        _dry_run(chosen, connect=connect)
         return
     again = f"decant pour {campaign}" + ("" if laboratory is None else f" --laboratory {laboratory}")
     require_flag(bench, enabled=enable_motion, again=f"{again} … --enable-motion")
     if empty:
         assert chosen.path is not None
-        pour_empty(chosen, chosen.path.slowed(slow), slow=slow, as_json=as_json)
+        pour_empty(chosen, chosen.path.slowed(slow), slow=slow)
         return
-    pour_weighed(chosen, in_process=in_process, again=f"Another pour: {again} …", as_json=as_json)
+    pour_weighed(chosen, in_process=in_process, again=f"Another pour: {again} …")
 
 
 @dataclass(frozen=True)
@@ -181,23 +178,17 @@ def _draw(chosen: Chosen, png: Path) -> None:
     print_note(f"picture: {figure_style.save(figure, png)}")
 
 
-def _dry_run(chosen: Chosen, *, connect: bool, as_json: bool) -> None:
+def _dry_run(chosen: Chosen, *, connect: bool) -> None:
     from orchestrator.runs.motion_approval import report_lines
 
     planned, laboratory = chosen.path, chosen.plan.laboratory
     assert planned is not None
     assert laboratory.arm is not None
     print_note(f"{chosen.scene.name}: {chosen.action.display()}; laboratory {laboratory.name}, {laboratory.mode}")
-    home = _stands_at_home(chosen) if connect else None
-    if as_json:
-        from orchestrator.cli.command_results import DryRunOutput
-
-        phases = [{"name": n, "start": a, "end": b} for n, a, b in planned.phases]
-        action, report = chosen.action.values(), planned.report
-        print_json(DryRunOutput(mode=laboratory.mode, action=action, report=report, phases=phases, at_home=home))
-    else:
-        for line in [*report_lines(planned.report), *_way_lines(planned)]:
-            print(line)
+    if connect:
+        _tell_whether_at_home(chosen)
+    for line in [*report_lines(planned.report), *_way_lines(planned)]:
+        print(line)
     print_message("nothing was moved")
 
 
@@ -210,7 +201,7 @@ def _way_lines(planned: PlannedPour) -> list[str]:
     ]
 
 
-def _stands_at_home(chosen: Chosen) -> bool:
+def _tell_whether_at_home(chosen: Chosen) -> None:
     """Read where the arm stands.
 
     Raises:
@@ -223,17 +214,15 @@ def _stands_at_home(chosen: Chosen) -> bool:
         assert ready.arm is not None
         check = arm_kind(ready.arm).diagnostics().at_home()
     print_message(f"the arm stands {check.found}" + (f" → {check.advice}" if check.advice else ""))
-    return check.state == "ok"
 
 
-def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool) -> Path:
+def pour_weighed(chosen: Chosen, *, in_process: bool, again: str) -> Path:
     """Pour as a small run of its own: journalled, with the operator's questions, weighed.
 
     Args:
         chosen: campaign, scene and action.
         in_process: without Ray.
         again: the next command, for the message after an interruption.
-        as_json: print the weights as JSON.
 
     Returns:
         The folder of the run.
@@ -258,13 +247,7 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str, as_json: bool)
     result = result_of(finished.results, POUR, OnePoured)
     if result.weighed is None:
         raise RefusalError(result.failed or "nothing was poured", FAILED)
-    if as_json:
-        from orchestrator.cli.json_output import PourOutput
-
-        about = {"run": str(finished.directory), "mode": chosen.plan.laboratory.mode, "action": chosen.action.values()}
-        print_json(PourOutput.model_validate({**about, **result.weighed.model_dump()}))
-    else:
-        print(told(result.weighed))
+    print(told(result.weighed))
     return finished.directory
 
 
@@ -278,14 +261,13 @@ def told(weighed: WeighedPour) -> str:
     return f"{masses} ({weighed.delivered_ml:.1f} mL); {spillage}"
 
 
-def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool) -> None:
+def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float) -> None:
     """Approach, tilt, return, retreat.
 
     Args:
         chosen: campaign, scene and action.
         path: slowed already; planned again if the arm reports a geometry of its own.
         slow: by what.
-        as_json: print the record.
 
     Raises:
         RefusalError: refused (exit code 2), or stopped on the way (1).
@@ -333,12 +315,7 @@ def pour_empty(chosen: Chosen, path: PlannedPour, *, slow: float, as_json: bool)
         "executed_s": float(executed.times[-1]),
     }
     (directory / RECORD).write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
-    if as_json:
-        from orchestrator.cli.command_results import EmptyPourOutput
-
-        print_json(EmptyPourOutput.model_validate({"run": str(directory), **record}))
-    else:
-        print(_told(executed))
+    print(_told(executed))
     print_message(f"record: {directory / RECORD}")
 
 

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.command_options import Json, RunFolder, run_folder
-from orchestrator.cli.console import FAILED, RefusalError, check_output, print_json, print_note, print_warning
+from orchestrator.cli.command_options import RunFolder, run_folder
+from orchestrator.cli.console import FAILED, RefusalError, check_output, print_note, print_warning
 
 
 def report(
@@ -17,7 +17,6 @@ def report(
         Path | None, typer.Option("--output", "-o", help="Other file than report.html in the run's folder.")
     ] = None,
     pdf: Annotated[bool, typer.Option("--pdf", help="Also write every figure of a run as PDF, for LaTeX.")] = False,
-    as_json: Json = False,
 ) -> None:
     """Write the report of a run: one self-contained HTML file, suitable for printing.
 
@@ -30,16 +29,12 @@ def report(
     check_output(output, "--output", ".html")
     folder = run_folder(run)
     if (folder / JOURNAL_NAME).is_file():
-        page, figures = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
+        page = _of_run(folder, output, (".svg", ".pdf") if pdf else (".svg",))
     elif folder.suffix in (".yaml", ".yml"):
         raise RefusalError(f"{folder}: is a file, no run's folder; for a study: decant study run {folder} --report")
     else:
         raise RefusalError(_nothing_there(folder))
     print_note(f"report  {page}")
-    if as_json:
-        from orchestrator.cli.command_results import ReportOutput
-
-        print_json(ReportOutput(report=page, figures=figures))
 
 
 def _nothing_there(folder: Path) -> str:
@@ -53,7 +48,7 @@ def _nothing_there(folder: Path) -> str:
     return f"{folder}: no run is here; name a run's folder (with its {JOURNAL_NAME}){known}"
 
 
-def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tuple[Path, list[Path]]:
+def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> Path:
     from orchestrator.campaigns.file_loading import load_campaign
     from orchestrator.campaigns.yaml.yaml_errors import ConfigError
     from orchestrator.learning.run_errors import RunError
@@ -76,11 +71,11 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
             if missing := missing_plugins(read_versions(folder)):
                 reason = f"Not installed here: {'; '.join(missing)}. Install what is missing for the whole report."
             print_warning(f"the report is reduced to what the journal has. {reason}")
-            return write_reduced_report(output or folder / REPORT_NAME, folder, reason), []
+            return write_reduced_report(output or folder / REPORT_NAME, folder, reason)
         print_note("drawing the figures …")
         if publish_if_missing(plan, result):
             print_note("summary.json and theta.json were not those of the finished run, and are written now")
-        page, figures = report_on(plan, result, output, formats)
+        return report_on(plan, result, output, formats)[0]
     except RunError as error:
         raise RefusalError(str(error), FAILED) from None
     except OSError as error:
@@ -89,4 +84,3 @@ def _of_run(folder: Path, output: Path | None, formats: tuple[str, ...]) -> tupl
         if not check.problems:
             raise
         raise RefusalError(f"{folder}: no report can be made of damaged records; {check.verdict}", FAILED) from None
-    return page, list(figures.values())

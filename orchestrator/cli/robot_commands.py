@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from orchestrator.cli.command_options import EnableMotion, Json, Laboratory
-from orchestrator.cli.console import FAILED, RefusalError, Refused, print_json, print_message
+from orchestrator.cli.command_options import EnableMotion, Laboratory
+from orchestrator.cli.console import FAILED, RefusalError, Refused, print_message
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm
@@ -52,7 +52,6 @@ def check(
             help="Also write what the controller sent into this new file (.json), for the key 'calibration_file'.",
         ),
     ] = None,
-    as_json: Json = False,
 ) -> None:
     """Check everything that a pour needs, and print advice: network, controller, safety settings, balance.
 
@@ -62,7 +61,6 @@ def check(
     """
     from actors.interfaces import LaboratoryError
     from actors.laboratory import check_bench_packages
-    from orchestrator.cli.command_results import CheckOutput
     from orchestrator.runs.bench_check import check_bench
     from orchestrator.runs.motion_approval import SafetyRecordError, read_record
 
@@ -95,10 +93,7 @@ def check(
         return accepted
 
     report = check_bench(spec, laboratory, record, tare=tare, read=read)
-    if as_json:
-        print_json(CheckOutput(**report.document()))
-    else:
-        print_table(report.checks)
+    print_table(report.checks)
     if report.failed:
         count = f"{len(report.failed)} of {len(report.checks)}"
         raise RefusalError(f"{count} checks fail; nothing should move before they are fixed", FAILED)

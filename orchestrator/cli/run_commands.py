@@ -179,7 +179,6 @@ def chart_command(
         Path | None, typer.Option(help="File of the picture; default: charts-LABORATORY-MODE.png in this folder.")
     ] = None,
     state: State = None,
-    as_json: Json = False,
 ) -> None:
     """Chart what every run measures, day by day, against limits from the laboratory's own history.
 
@@ -200,9 +199,6 @@ def chart_command(
         )
     charts = [chart for chart in charts if laboratory in (None, chart.laboratory)]
     benches = list(dict.fromkeys((chart.laboratory, chart.mode) for chart in charts))
-    if as_json:
-        print_json({"charts": [chart.model_dump() for chart in charts]})
-        return
     if png is not None and len(benches) > 1:
         raise RefusalError(
             f"--png: these are {', '.join(f'{name} ({mode})' for name, mode in benches)}; name one of them"
@@ -273,20 +269,14 @@ def _print_mixtures(folder: Path) -> None:
 def known(
     cup: Annotated[str | None, typer.Argument(help="Name of a vessel: the pourer or a receiver.")] = None,
     state: State = None,
-    as_json: Json = False,
 ) -> None:
     """Show what calibrations have found, by run: mean ± standard deviation from the pours of the run alone."""
-    from orchestrator.catalogue.known_posteriors import posterior_table
     from orchestrator.learning.calibration.campaign_memory import RememberedParameter
     from orchestrator.reports.console_view import print_table
 
     with _catalogue() as catalogue, _refusing():
         posteriors = [p for p in catalogue.posteriors() if cup in (None, p.pourer, *p.receivers)]
         ages = catalogue.posterior_ages(posteriors)
-    if as_json:
-        shown = {name: age.model_dump() for name, age in ages.items()}
-        print_json({"posteriors": [posterior_table(p) for p in posteriors], "ages": shown})
-        return
     if not posteriors:
         print_note(f"no posterior{'' if cup is None else f' about {cup}'}; a finished calibration with C4 has one")
         return

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Assignments, Json
-from orchestrator.cli.console import RefusalError, Refused, print_json, print_message
+from orchestrator.cli.command_options import Assignments
+from orchestrator.cli.console import RefusalError, Refused, print_message
 from orchestrator.cli.queue_commands import State, Url, connected_client
 from orchestrator.daemon.rigs.pour_request import PourIn, described
 
@@ -25,7 +25,6 @@ def order(
     wait: Annotated[float, typer.Option(min=0, max=600, help="Wait for the result [s].")] = 0.0,
     url: Url = None,
     state: State = None,
-    as_json: Json = False,
 ) -> None:
     """Order one pour: an amount, or an action."""
     action = {}
@@ -44,9 +43,6 @@ def order(
             )
         )  # fmt: skip
         poured = client.post(f"/pours?wait={wait:g}", body)
-    if as_json:
-        print_json(poured)
-        return
     print(pour_text(poured))
 
 

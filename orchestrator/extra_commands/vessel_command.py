@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
-from orchestrator.cli.command_options import Json, add_group, grouped
-from orchestrator.cli.console import RefusalError, print_json, print_note, print_warning, waiting_for
+from orchestrator.cli.command_options import add_group, grouped
+from orchestrator.cli.console import RefusalError, print_note, print_warning, waiting_for
 
 if TYPE_CHECKING:
     from sim_engine.vessel.mesh_shape import Axis
@@ -88,7 +88,6 @@ class Vessel:
     brimful: Annotated[str | None, typer.Option(help="Weighed mass when full to the brim: '322 g'; a check.")] = None
     density: Annotated[str, typer.Option(help="Density of the weighed liquid.")] = "998 kg/m^3"
     name: Annotated[str | None, typer.Option(help="Name of the vessel; default: the file's name.")] = None
-    as_json: Json = False
 
     def volume(self, mass: float) -> float:
         """Volume of a weighed mass [m³]."""
@@ -108,14 +107,12 @@ class Made:
 
     Attributes:
         capacity, deviation: volume to the brim and its standard deviation [m³].
-        radius_deviation: mean over the height [m]; None for a mesh.
         picture: path of the picture.
         notes, doubts: messages for the user.
     """
 
     capacity: float
     deviation: float
-    radius_deviation: float | None
     picture: Path
     notes: list[str]
     doubts: list[str]
@@ -230,20 +227,6 @@ def _make(out: Path, vessel: Vessel, work: Callable[[list[str]], Made]) -> None:
     print_note(
         f"{out} holds {1e6 * fitted.capacity:.0f} ± {1e6 * fitted.deviation:.1f} mL; its picture: {fitted.picture}"
     )
-    if vessel.as_json:
-        from orchestrator.cli.command_results import VesselOutput
-
-        print_json(
-            VesselOutput(
-                file=out,
-                picture=fitted.picture,
-                capacity_mL=1e6 * fitted.capacity,
-                capacity_deviation_mL=1e6 * fitted.deviation,
-                radius_deviation_mm=None if fitted.radius_deviation is None else 1e3 * fitted.radius_deviation,
-                notes=fitted.notes,
-                doubts=fitted.doubts,
-            )
-        )
 
 
 def _quantity(text: str | None, subject: str, unit: str, example: str) -> float | None:
@@ -316,7 +299,7 @@ def _turned(
     used = [f"{fit.count} from the {fit.name}, off by {fit.rms:.1f} standard deviations (rms)" for fit in outline.fits]
     picture = _draw_outline(name, outline, evidence, out.with_suffix(".png"))
     out.write_text(_profile_file(name, outline, used, doubts))
-    return Made(outline.capacity, outline.capacity_deviation, outline.radius_deviation, picture, notes + used, doubts)
+    return Made(outline.capacity, outline.capacity_deviation, picture, notes + used, doubts)
 
 
 def _measured(sizes: Sizes, vessel: Vessel, height: float) -> list[Evidence]:
@@ -542,7 +525,7 @@ def _written_mesh(
     lines = [f"# {note}." for note in (*notes, *doubts)]
     lines += [f"name: {json.dumps(name, ensure_ascii=False)}", f"mesh: {path.name}", "unit: mm", f"up: {up}"]
     out.write_text("\n".join(lines) + "\n")
-    return Made(built.capacity, deviation, None, picture, notes, doubts)
+    return Made(built.capacity, deviation, picture, notes, doubts)
 
 
 def register(app: typer.Typer) -> None:

@@ -191,14 +191,12 @@ def _pour_step(
     )
     if step.amount is None:
         used = dataclasses.replace(used, dispense=None)
-        run = pour_weighed(
-            chosen_pour(used, _assignments(used, step)), in_process=in_process, again=again, as_json=False
-        )
+        run = pour_weighed(chosen_pour(used, _assignments(used, step)), in_process=in_process, again=again)
     else:
         request = dose_task(used, [step.amount], DOSE_LIMIT)
         used = request.campaign
         check_campaign_can_run(request)
-        run = pour_doses(request, in_process=in_process, again=again, as_json=False)
+        run = pour_doses(request, in_process=in_process, again=again)
     written, left_out = export_recordings(run, plan=used)
     if not written:
         raise RefusalError(f"{step.name}: was not recorded: {'; '.join(left_out)}", FAILED)

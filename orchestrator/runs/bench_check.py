@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from actors.arm.arm_settings import ArmDiagnostics, SafetyRecord, arm_kind
 from actors.balance.balance_settings import balance_diagnostics
@@ -44,11 +43,6 @@ class BenchReport:
     def ready(self) -> bool:
         """Whether no check fails."""
         return not self.failed
-
-    def document(self) -> dict[str, Any]:
-        """The report for JSON, as `decant robot check --json` prints it."""
-        table = [asdict(check) for check in self.checks]
-        return {"laboratory": self.laboratory, "mode": self.mode, "ready": self.ready, "checks": table}
 
     def __str__(self) -> str:
         """The checks in lines, each with its remedy."""

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import Json, add_group
-from orchestrator.cli.console import FAILED, INTERRUPTED, RefusalError, Refused, print_json, print_note
+from orchestrator.cli.command_options import add_group
+from orchestrator.cli.console import FAILED, INTERRUPTED, RefusalError, print_note
 from sim_engine.settings.plugin_registry import FileKind
 
 if TYPE_CHECKING:
-    from actors.interfaces import RaySettings
     from orchestrator.study.study_plan import StudyCell, StudyPlan
-    from orchestrator.study.study_runner import CellStatus, CellWorkers
+    from orchestrator.study.study_runner import CellStatus, LocalCells
     from sim_engine.settings.model import Settings
 
 SHOWN_FAILURES = 5
@@ -30,88 +29,41 @@ StudyPath = Annotated[Path, typer.Argument(help="Study file (YAML).", metavar="S
 def run_study(
     file: StudyPath,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of cells at a time; default: one per core.")] = None,
-    ray: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Run the cells on the Ray cluster with this head node.")
-    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="List the unfinished cells with an estimate of their cost; start nothing.")
     ] = False,
     report: Annotated[
         bool, typer.Option("--report", help="Start nothing; write figures, tables and the page from what is finished.")
     ] = False,
-    as_json: Json = False,
 ) -> None:
     """Compare C1 to C4 and D1 to D3 with repetitions, on virtual benches that differ more or less from the simulator.
 
     Figures (PNG, SVG, CSV), tables and a page are written to runs/study-NAME/report/. Run the same command again to
-    continue a study that was stopped or killed, also on a cluster (--ray) or without it.
+    continue a study that was stopped or killed.
     """
     from orchestrator.study.study_folder import check_settings, opened
     from orchestrator.study.study_plan import cells_of
+    from orchestrator.study.study_runner import LocalCells
 
     plan = read_study(file)
-    cluster = None if ray is None or dry_run or report else _checked_cluster(ray)
     cells = cells_of(plan)
     if dry_run:
         check_settings(plan)
-        _print_remaining(plan, cells, as_json)
+        _print_remaining(plan, cells)
         return
     if report:
         with opened(plan) as folder:
-            page = _report(plan, folder)
-        if as_json:
-            _print_result(plan, folder, page, len(cells), None)
+            _report(plan, folder)
         return
     with opened(plan) as folder:
-        with _workers(plan, folder, jobs, cluster) as workers:
-            status = _run(plan, folder, workers, file)
-        page = _report(plan, folder)
-    if as_json:
-        _print_result(plan, folder, page, len(cells), len(status.finished))
+        status = _run(plan, folder, LocalCells(plan, folder, jobs or os.cpu_count() or 1), file)
+        _report(plan, folder)
     if status.failed:
         shown = list(status.failed.items())[:SHOWN_FAILURES]
         lines = [f"{len(status.failed)} of {len(cells)} cells failed, {len(status.skipped)} need one of them:"]
         lines += [f"  {name}: {why}" for name, why in shown]
         lines.append(f"finished cells are kept; correct that and continue with: decant study run {file}")
         raise RefusalError("\n".join(lines), FAILED)
-
-
-def _checked_cluster(address: str) -> RaySettings:
-    from pydantic import ValidationError
-
-    from actors.interfaces import LaboratoryError, RaySettings
-    from actors.runtime.ray_cluster import check_cluster
-
-    try:
-        settings = RaySettings(address=address)
-    except ValidationError as error:
-        raise RefusalError(f"--ray: {error.errors()[0]['msg']}") from None
-    print_note(f"looking at the Ray cluster at {address} …")
-    with Refused(LaboratoryError, at="--ray: "):
-        check_cluster(settings, pours=False)
-    return settings
-
-
-@contextlib.contextmanager
-def _workers(plan: StudyPlan, folder: Path, jobs: int | None, cluster: RaySettings | None) -> Iterator[CellWorkers]:
-    """The workers for the cells: child processes, or tasks on a cluster that is joined as long as this."""
-    from orchestrator.study.study_runner import LocalCells
-
-    if cluster is None:
-        yield LocalCells(plan, folder, jobs or os.cpu_count() or 1)
-        return
-    from actors.interfaces import LaboratoryError
-    from actors.runtime.ray_tasks import ClusterTasks
-    from orchestrator.study.cluster_cells import ClusterCells
-
-    with Refused(LaboratoryError), ClusterTasks(cluster) as tasks:
-        yield ClusterCells(plan, folder, tasks, jobs)
-
-
-def _print_result(plan: StudyPlan, folder: Path, page: Path, cells: int, finished: int | None) -> None:
-    from orchestrator.cli.command_results import StudyOutput
-
-    print_json(StudyOutput(study=plan.name, folder=folder, page=page, cells=cells, finished=finished))
 
 
 def read_study(path: Path) -> StudyPlan:
@@ -134,22 +86,13 @@ def read_study(path: Path) -> StudyPlan:
     return plan
 
 
-def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: bool) -> None:
-    from orchestrator.cli.command_results import StudyCostOutput
+def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...]) -> None:
     from orchestrator.study.study_folder import is_finished
     from orchestrator.study.study_plan import estimated_seconds
 
     left = [cell for cell in cells if not is_finished(plan.folder, cell.id)]
     simulations, pours = sum(cell.simulations for cell in left), sum(cell.pours for cell in left)
     hours = sum(estimated_seconds(plan, cell) for cell in left) / 3600
-    if as_json:
-        names = [cell.id for cell in cells]
-        print_json(
-            StudyCostOutput(
-                cells=names, left=len(left), simulations=simulations, pours=pours, cpu_hours=round(hours, 3)
-            )
-        )
-        return
     groups: dict[str, list[StudyCell]] = {}
     for cell in cells:
         groups.setdefault(" ".join(filter(None, (cell.kind, cell.level, cell.strategy))), []).append(cell)
@@ -166,7 +109,7 @@ def _print_remaining(plan: StudyPlan, cells: tuple[StudyCell, ...], as_json: boo
     )
 
 
-def _run(plan: StudyPlan, folder: Path, workers: CellWorkers, path: Path) -> CellStatus:
+def _run(plan: StudyPlan, folder: Path, workers: LocalCells, path: Path) -> CellStatus:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -216,12 +159,10 @@ def _duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min" if minutes >= 60 else f"{max(minutes, 1)} min"
 
 
-def _report(plan: StudyPlan, folder: Path) -> Path:
+def _report(plan: StudyPlan, folder: Path) -> None:
     from orchestrator.study.study_page import write_report
 
-    page = write_report(plan, folder)
-    print_note(f"figures, tables and a page: {page}")
-    return page
+    print_note(f"figures, tables and a page: {write_report(plan, folder)}")
 
 
 def _settings() -> type[Settings]:

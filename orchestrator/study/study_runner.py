@@ -1,8 +1,7 @@
 """Runs the cells of a study in child processes: `python -m orchestrator.study.study_runner STUDY.yaml` is one.
 
 - `run_cells` starts each cell as soon as the cells that it needs are finished, several at a time. `CellStatus` is the
-  progress. `CellWorkers` run the cells: `LocalCells` in child processes (`CellProcess`) of this machine,
-  `cluster_cells.ClusterCells` on a Ray cluster.
+  progress. `LocalCells` runs the cells in child processes (`CellProcess`).
 - `work` is the loop of a child process. Each line of its stdin names a cell, each line of its stdout is the JSON list
   [cell, error or null]. The process and its simulator are kept, since starting Python, Taichi and its kernels takes
   longer than a small cell.
@@ -23,7 +22,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from actors.interfaces import LaboratoryError
 from actors.runtime.child_process import ChildProcess, python_module
@@ -132,29 +130,9 @@ class CellProcess:
         self.child.release()
 
 
-class CellWorkers(Protocol):
-    """Runs cells, several at a time."""
-
-    @property
-    def slots(self) -> int:
-        """Number of cells at a time; it may change."""
-        ...
-
-    def begin(self, cell: StudyCell) -> None:
-        """Start a cell. Does not wait."""
-        ...
-
-    def ended(self) -> Iterable[tuple[StudyCell, str | None]]:
-        """The cells that have ended since the last call, with their errors. Does not wait."""
-        ...
-
-    def close(self) -> None:
-        """End the cells that run."""
-        ...
-
-
 class LocalCells:
-    """`CellWorkers` in child processes. When they are ended, the cells' journals contain their progress.
+    """Runs cells in child processes, several at a time. When they are ended, the cells' journals contain their
+    progress.
 
     Args:
         study: the study.
@@ -176,7 +154,7 @@ class LocalCells:
         self._started = 0
 
     def begin(self, cell: StudyCell) -> None:
-        """See `CellWorkers.begin`."""
+        """Start a cell. Does not wait."""
         idle = next((process for process in self._processes if process.cell is None), None)
         if idle is None:
             self._started += 1
@@ -185,7 +163,7 @@ class LocalCells:
         idle.begin(cell)
 
     def ended(self) -> Iterator[tuple[StudyCell, str | None]]:
-        """See `CellWorkers.ended`."""
+        """The cells that have ended since the last call, with their errors. Does not wait."""
         for process in list(self._processes):
             if (end := process.ended()) is not None:
                 yield end
@@ -194,13 +172,11 @@ class LocalCells:
                 self._processes.remove(process)
 
     def close(self) -> None:
-        """See `CellWorkers.close`."""
+        """End the cells that run."""
         _end(self._processes)
 
 
-def run_cells(
-    study: StudyPlan, folder: Path, workers: CellWorkers, *, watch: Watch = lambda status: None
-) -> CellStatus:
+def run_cells(study: StudyPlan, folder: Path, workers: LocalCells, *, watch: Watch = lambda status: None) -> CellStatus:
     """Run all cells that are not finished. A failed cell is recorded, and the others continue.
 
     On an interrupt (KeyboardInterrupt) the workers are closed first.

@@ -42,7 +42,7 @@ FORMS = {
     "record_of",
     "open_laboratory",
     "Deployment.ask",
-    "OneShotPlanning.ask",
+    "OneShotPlanning._next",
     "Journal.append",
 }
 """The functions in which a campaign changes its form: text, values, scenes, plan, stages, requests, entries."""

@@ -1,9 +1,8 @@
-"""The daemon and a study on a Ray cluster of two nodes, of which one is lost."""
+"""The daemon on a Ray cluster of two nodes, of which one is lost."""
 
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import time
@@ -17,13 +16,9 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.api.daemon_client import Client
 from orchestrator.daemon.rigs.submissions import pack
 from orchestrator.records.journal import JournalReader
-from orchestrator.study.study_file import load_study
-from orchestrator.study.study_folder import finished_results
-from orchestrator.study.study_plan import StudyPlan, cells_of
 from tests.support import small_campaign
 from tests.support.command_process import PATIENCE, Workplace, ended, finished_in, logical
 from tests.support.local_cluster import LocalCluster
-from tests.support.study_files import read, without, written
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow, pytest.mark.realtime]
 
@@ -99,35 +94,5 @@ def test_two_rigs_of_a_daemon_share_the_simulators_of_a_cluster_that_loses_a_nod
         assert left == right, "the same seed gives the same outcomes, on whichever node they are simulated"
         assert cluster.is_alive(), "the cluster is others'"
         assert cluster.workers(0) == []
-    finally:
-        place.close()
-
-
-def study_of_six_cells(folder: Path) -> StudyPlan:
-    quick = without(read("quick"), "calibration")
-    chosen = {"mismatch": quick["mismatch"][:1], "deployment": {"D2": {**quick["deployment"]["D2"], "repetitions": 3}}}
-    return load_study(written(folder, quick | chosen))
-
-
-def results(study: StudyPlan) -> dict[str, Any]:
-    return {key: one.results for key, one in finished_results(study.folder, cells_of(study)).items()}
-
-
-def test_a_study_on_a_cluster_that_loses_a_node_has_the_results_of_this_machine(
-    cluster: LocalCluster, tmp_path: Path
-) -> None:
-    here, there = study_of_six_cells(tmp_path / "here"), study_of_six_cells(tmp_path / "there")
-    place = Workplace(tmp_path, {**os.environ, **cluster.environment})
-    try:
-        place.finish("study", "run", str(here.source), "--jobs", "2")
-        process = place.start("study", "run", str(there.source), "--ray", cluster.address)
-        with ended(process):
-            until(lambda: len(results(there)) >= 1 and cluster.workers(1), process)
-            cluster.kill_node(1)
-            _, errors = process.communicate(timeout=PATIENCE)
-        assert process.returncode == 0, errors
-        assert len(results(here)) == 6
-        assert results(there) == results(here)
-        assert cluster.is_alive()
     finally:
         place.close()

@@ -25,7 +25,6 @@ def test_the_quick_study_runs_and_a_second_call_has_nothing_left_to_do(tmp_path:
         "study",
         "run",
         str(path),
-        "--json",
     ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     answers = []

@@ -63,7 +63,6 @@ def said(command: str) -> str:
         pytest.param("calibrate", "--in-process", marks=pytest.mark.slow),
         pytest.param("plan", "--in-process --iterations 2 --seeds 2", marks=pytest.mark.slow),
         ("simulate", f"{ACTION} --seeds 2"),
-        pytest.param("pour", f"{ACTION} --in-process", marks=pytest.mark.slow),
     ],
 )
 def test_work_on_a_campaign_prints_what_is_documented(campaign: Path, command: str, options: str) -> None:
@@ -84,7 +83,6 @@ def test_queries_of_the_catalogue_print_what_is_documented(tmp_path: Path, monke
     for command in (f"show {run.name}", f"check {run.name}"):
         name = f"runs {command.partition(' ')[0]}"
         validated(name, said(f"runs {command} --json"))
-    validated("report", said(f"report {run} --json"))
 
 
 def test_queries_of_a_daemon_print_what_is_documented(tmp_path: Path) -> None:

@@ -60,18 +60,14 @@ def test_dry_run_tells_and_draws_the_whole_path_and_connects_to_nobody(tmp_path:
     assert "nothing was moved" in result.stderr
     assert png.read_bytes().startswith(b"\x89PNG")
     assert not (tmp_path / "runs").exists()
-    report = json.loads(decant("pour", str(campaign), *ACTION, "--dry-run", "--json").stdout)
-    assert report["mode"] == "hardware"
-    assert degrees(report["report"]["tilt"]) == pytest.approx(110.0, abs=0.1)
-    assert report["at_home"] is None
 
 
 @pytest.mark.realtime
 def test_dry_run_can_look_where_the_arm_stands(tmp_path: Path, controller: VirtualController) -> None:
     campaign = hardware_laboratory.write_rig(tmp_path, controller.address)
     before = controller.fault("state")
-    at_home = decant("pour", str(campaign), *ACTION, "--dry-run", "--connect", "--json")
-    assert json.loads(at_home.stdout)["at_home"] is True
+    at_home = decant("pour", str(campaign), *ACTION, "--dry-run", "--connect")
+    assert "the arm stands at home" in at_home.stderr
     after = controller.fault("state")
     assert after["joints"] == before["joints"]
     assert after["program"] == before["program"]

@@ -5,7 +5,6 @@ process and restart.
 from __future__ import annotations
 
 import contextlib
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -204,12 +203,9 @@ def test_a_person_weighs_a_source_on_the_command_line_and_sees_what_is_left(
     assert "name the liquid" in invoke("materials weigh bench/beaker '200 g'").stderr
     assert invoke("materials weigh bench/beaker '200 g' --liquid water --note Monday").exit_code == 0
     assert invoke("materials poured m-1 --from bench/beaker --into bench/jar --weighed '30.5 g'").exit_code == 0
-    listed = json.loads(invoke("materials list --json").stdout)["vessels"]
-    assert {one["id"]: one["mass_g"] for one in listed} == {
-        "bench/beaker": pytest.approx(169.5),
-        "bench/jar": pytest.approx(30.5),
-    }
-    assert "169.5 ± 0.1 g" in invoke("materials list").stdout
+    listed = invoke("materials list").stdout
+    assert "169.5 ± 0.1 g" in listed
+    assert "bench/jar                water        30.5" in listed
     lines = invoke("materials list bench/beaker").stdout.splitlines()
     assert [line.split()[2] for line in lines] == ["weighed", "poured"]
     assert "Monday" in lines[0]

@@ -311,7 +311,7 @@ def test_a_run_of_another_campaign_is_not_reported_as_this_one(made: Made, tmp_p
 @pytest.mark.slow
 def test_the_verb_writes_where_it_is_told_and_figures_for_latex(made: Made, tmp_path: Path) -> None:
     page = tmp_path / "meeting.html"
-    done = decant(f"report {made.result.directory} --pdf -o {page} --json")
+    done = decant(f"report {made.result.directory} --pdf -o {page}")
     assert done.exit_code == 0, done.output
     assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
     for file in made.published.figures.values():

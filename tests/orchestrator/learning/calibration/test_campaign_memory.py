@@ -4,7 +4,6 @@ loses its weight.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.catalogue.catalogue import Catalogue
 from orchestrator.catalogue.known_posteriors import import_posterior, posterior_of, posterior_text
 from orchestrator.cli.app import app
-from orchestrator.cli.json_output import KnownOutput
 from orchestrator.learning.calibration.active_design import ActivePours
 from orchestrator.learning.calibration.calibration_scores import ScoredPair, Scores
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory, RememberedParameter, predicted
@@ -456,8 +454,8 @@ def test_a_campaign_is_told_since_when_later_pours_disagree_with_its_prior(
     from decant.running import build_campaign
 
     assert build_campaign(plan.resolved, tmp_path).memory == plan.memory  # a run's record keeps it
-    told = CliRunner().invoke(app, ["runs", "known", "--json"])
-    ages = KnownOutput.model_validate_json(told.stdout).ages
+    with Catalogue(state) as catalogue:
+        ages = catalogue.posterior_ages(catalogue.posteriors())
     assert ages["day-00"].later_pours > 20
     assert ages["day-00"].deviations == pytest.approx(7.0, abs=3.0)
     assert (ages["day-08"].later_pours, ages["day-08"].since) == (0, None)
@@ -486,12 +484,10 @@ def test_a_posterior_is_exported_and_imported_with_its_units(state: Path, tmp_pa
     assert outcome.exit_code == 0, outcome.output
     shown = CliRunner().invoke(app, ["runs", "known", "tumbler"])
     assert "first-1" in shown.output
-    told = CliRunner().invoke(app, ["runs", "known", "--json"]).stdout
-    (again,) = KnownOutput.model_validate(json.loads(told)).posteriors  # as configs/schema/output.json describes it
-    assert "13.9 mm" in told
-    assert again.estimates["receiver_x"] == pytest.approx((0.0139, 0.001))
     with Catalogue(state) as catalogue:
-        assert [one.posterior for one in catalogue.posteriors()] == ["first-1"]
+        (again,) = catalogue.posteriors()
+    assert again.posterior == "first-1"
+    assert again.estimates["receiver_x"] == pytest.approx((0.0139, 0.001))
     assert load_campaign(with_prior(tmp_path, f"[{path}]")).memory.runs == ("first-1",)  # type: ignore[union-attr]
 
 
