@@ -130,7 +130,7 @@ class UrArmKind(ArmKind[UrArmSettings]):
         return plan_path(plan_pour(scene, action), self.spec, vessel(scene.pourer), vessel(scene.receiver))
 
     def place_problems(
-        self, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel], opened: float = 0.0
+        self, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel], opened: Mapping[str, float] = {}
     ) -> Iterable[tuple[int, str]]:
         """See `ArmKind.place_problems`."""
         from actors.arm.planning.place_ways import place_problems

@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Annotated, Literal, Protocol
 
 from pydantic import AfterValidator, Field, Strict
@@ -67,6 +68,9 @@ class RackSettings(Settings):
     column_pitch: Annotated[float, PITCH]
     """Distance of two columns."""
 
+    row_rise: Annotated[float, Quantity("m", "0 mm", -0.5, 0.5)] = 0.0
+    """Height of each row above the one before, as on stairs. A gripper that reaches for the cups from the side passes over the rows behind them."""  # noqa: E501
+
     depth: Annotated[float, Quantity("m", "40 mm", 0.0, 0.3)] = 0.0
     """How deep a vessel stands in the rack; it is lifted by more before it is moved sideways."""
 
@@ -108,24 +112,27 @@ class RackSettings(Settings):
         measured = {key: complex(*pose.as_list[:2]) for key, pose in taught.items()}
         middle, centre = (sum(points.values()) / len(taught) for points in (grid, measured))
         # the rotation e^{iφ} that minimises Σ |m_k − m̄ − e^{iφ} (g_k − ḡ)|² has the angle of Σ (m_k − m̄) (g_k − ḡ)*
-        product = sum((measured[key] - centre) * (grid[key] - middle).conjugate() for key in taught)
-        turn = product / abs(product) if abs(product) > 0.0 else cmath.rect(1.0, self.direction)
+        aligned = sum((measured[key] - centre) * (grid[key] - middle).conjugate() for key in taught)
+        turn = aligned / abs(aligned) if abs(aligned) > 0.0 else cmath.rect(1.0, self.direction)
         residual = max(abs(measured[key] - centre - turn * (grid[key] - middle)) for key in taught)
         down, across = self.slopes(first)
         poses = {}
-        for row in range(self.rows):
-            for column in range(self.columns):
-                at = centre + turn * (complex(column * self.column_pitch, -row * self.row_pitch) - middle)
-                z = first.as_list[2] + down * row * self.row_pitch + across * column * self.column_pitch
-                poses[position_name(row, column)] = Pose.of(at.real, at.imag, z, *first.as_list[3:])
+        for row, column in product(range(self.rows), range(self.columns)):
+            right, below = column * self.column_pitch, row * self.row_pitch
+            at = centre + turn * (complex(right, -below) - middle)
+            z = first.as_list[2] + row * self.row_rise + down * below + across * right
+            poses[position_name(row, column)] = Pose.of(at.real, at.imag, z, *first.as_list[3:])
         return poses, residual
 
     def slopes(self, first: Pose) -> tuple[float, float]:
-        """Rise per length from row to row, and from column to column; 0 in a direction that is not taught."""
-        ends = ((self.last_row, self.rows, self.row_pitch), (self.last_column, self.columns, self.column_pitch))
+        """Rise per length beyond `row_rise`, from row to row and from column to column; 0 where it is not taught."""
+        ends = (
+            (self.last_row, self.rows, self.row_pitch, self.row_rise),
+            (self.last_column, self.columns, self.column_pitch, 0.0),
+        )
         down, across = (
-            0.0 if end is None or count < 2 else (end.as_list[2] - first.as_list[2]) / ((count - 1) * pitch)
-            for end, count, pitch in ends
+            0.0 if end is None or count < 2 else ((end.as_list[2] - first.as_list[2]) / (count - 1) - rise) / pitch
+            for end, count, pitch, rise in ends
         )
         return down, across
 
@@ -192,6 +199,8 @@ class CellVessel:
         spec: its shape, with `grip: {mass: …}`.
         liquid: of a source, its liquid; '' for a cup.
         mass, volume: largest load with which it is carried [kg], [m³].
+        filled: the operator fills a source with this load when the vessels are laid out.
+        home: the place where it belongs, if its name is another one.
     """
 
     name: str
@@ -199,6 +208,13 @@ class CellVessel:
     liquid: str
     mass: float
     volume: float
+    filled: bool = True
+    home: str = ""
+
+    @property
+    def place(self) -> str:
+        """Name of the place where it belongs."""
+        return self.home or self.name
 
 
 TIME_OF_DAY = r"^([01]\d|2[0-3]):[0-5]\d$"
@@ -305,7 +321,8 @@ def rack_problem(place: PlaceSettings) -> str:
             "and pitch. Seen from above, rows go down from A and columns to the right"
         )
     if (slope := math.atan(math.hypot(*place.rack.slopes(place.pose)))) > LEVEL:
-        return f"'{place.name}' slopes by {math.degrees(slope):.1f} deg; level it, and teach it again"
+        beyond = f"by {math.degrees(slope):.1f} deg besides its 'row_rise'"
+        return f"'{place.name}' slopes {beyond}; level it, and teach it again"
     return ""
 
 
@@ -345,4 +362,18 @@ class PlaceRecord(Protocol):
 
     def held(self, vessel: str) -> tuple[float, float] | None:
         """The content of a vessel and its deviation [kg]; None if it was never entered, or is unknown."""
+        ...
+
+    def unknown(self, vessel: str) -> bool:
+        """Whether the content of a vessel was entered, and is unknown now."""
+        ...
+
+    def composition(self, vessel: str) -> dict[str, tuple[float | None, float]]:
+        """Liquids in a vessel by name, mass and deviation [kg]; '' is the empty vessel itself. A mass of None is
+        UNKNOWN."""
+        ...
+
+    def add_component(self, vessel: str, liquid: str, mass: float | None, deviation: float, source: str = "") -> None:
+        """Enter a liquid that is poured into a vessel [kg], or begins to be (None); '': the vessel is empty, and weighs
+        this itself."""
         ...

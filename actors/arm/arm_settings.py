@@ -248,14 +248,14 @@ class ArmKind(ABC, Generic[S]):
         """
 
     def place_problems(
-        self, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel], opened: float = 0.0
+        self, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel], opened: Mapping[str, float] = {}
     ) -> Iterable[tuple[int, str]]:
         """Problems of a laboratory's places, each with the number of its place.
 
         Args:
             places: all places; `holds` names the vessels that may stand there.
             vessels: by name; without them, only what does not depend on them is checked.
-            opened: width of the open fingers [m].
+            opened: width of the fingers that are open for each vessel [m].
         """
         return [(0, f"an arm of the kind '{self.spec.kind}' carries no vessels between places; remove 'places'")]
 

@@ -23,12 +23,13 @@ from actors.balance.weighing_plan import Placement, PourMasses
 from actors.bench.bench_operators import BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.cell_liquids import CellLiquids
 from actors.bench.consent import Setup
+from actors.bench.dose_handling import DoseHandling
 from actors.bench.dose_procedure import DoseProcedure
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.held_vessel import HeldVessel, HoldingArm
 from actors.bench.liquid_supply import LiquidSupply, PumpDevice, SpillWatch
 from actors.bench.night_consent import NightConsent
-from actors.bench.pour_procedure import PourProcedure
+from actors.bench.pour_procedure import BenchProcedure, PourProcedure
 from actors.bench.simulated_bench import SimulatedBench, SimulatedOperator, simulated_balance
 from actors.bench.vessel_carrying import VesselCarrier
 from actors.bench.vessel_handling import VesselHandling
@@ -100,9 +101,9 @@ class PouringBench:
             with contextlib.suppress(LaboratoryError):  # the procedure reports why the arm is not ready
                 self._arm_spec = self._arm_spec.fitted_to(await self.arm.ready())
             path = await asyncio.to_thread(self._checked, scene, action)
-            if self._setup.handling is not None:
-                if dose is not None:
-                    raise InvalidActionError("wanted amounts are poured without places; remove 'places'")
+            if self._setup.doses is not None and dose is not None:
+                await asyncio.to_thread(self._setup.doses.fit, self._arm_spec, scene, dose, path)
+            elif self._setup.handling is not None:
                 await asyncio.to_thread(self._setup.handling.fit, self._arm_spec, scene, path)
 
             async def run() -> PourMeasurement:
@@ -119,21 +120,25 @@ class PouringBench:
         progress: ProgressCallback | None,
         dose: DoseTarget | None,
     ) -> PourMeasurement:
+        procedure: BenchProcedure
         if dose is not None:
-            return await self._dose(scene, dose, path, seed, progress)
-        pour = PourProcedure(
-            self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
-        )
+            procedure = self._dose(scene, dose, path, seed, progress)
+        else:
+            procedure = PourProcedure(
+                self._setup, scene, action, path, seed=seed, known=self._known.get(scene.pourer.name), progress=progress
+            )
         try:
-            return await pour.run()
+            return await procedure.run()
         except BaseException as error:
-            if self._setup.handling is not None:
-                self._setup.handling.forget()
+            for handling in (self._setup.handling, self._setup.doses):
+                if handling is not None:
+                    handling.forget()
             if self._setup.night is not None:
-                self._setup.night.end(str(error) or "the pour was given up")
+                self._setup.night.end(str(error) or f"the {procedure.name} was given up")
             raise
         finally:
-            self._known[scene.pourer.name] = pour.lasting
+            if isinstance(procedure, PourProcedure):
+                self._known[scene.pourer.name] = procedure.lasting
 
     async def stop(self) -> None:
         """Stop any motion, and the refill pump; the arm stays locked."""
@@ -155,15 +160,14 @@ class PouringBench:
         if self._watch is not None:
             await self._watch.close()
 
-    async def _dose(
+    def _dose(
         self, scene: Scene, dose: DoseTarget, path: PlannedPour, seed: int, progress: ProgressCallback | None
-    ) -> PourMeasurement:
+    ) -> DoseProcedure:
         if not arm_kind(self._arm_spec).doses:
             raise InvalidActionError(f"an arm of the kind '{self._arm_spec.kind}' can't pour wanted amounts")
         if self._arm_spec.time_scale > FASTEST_DOSE:
             raise InvalidActionError("wanted amounts are poured in real time; write 'bench: {time_scale: 1}'")
-        procedure = DoseProcedure(self._setup, scene, dose, path, seed=seed, settings=self._dosing, progress=progress)
-        return await procedure.run()
+        return DoseProcedure(self._setup, scene, dose, path, seed=seed, settings=self._dosing, progress=progress)
 
     def _checked(self, scene: Scene, action: Action) -> PlannedPour:
         try:
@@ -361,9 +365,10 @@ async def _open_devices(
     questions = OperatorQuestions(operator, spec.operator, tell, arm_spec.time_scale)
     supply = None if spec.source is None else opening.supply(spec.source, contents, arm_spec.time_scale, tell)
     watch = opening.watch(spec.spill_sensor, questions, tell)
-    handling = night = None
+    handling = doses = night = None
     if spec.unattended is not None:
-        night = NightConsent(spec.unattended, spec.safeguard, arm_spec.title, spec.places, tell)
+        safeguard, vessels = spec.safeguard, spec.vessels
+        night = NightConsent(spec.unattended, safeguard, arm_spec.title, spec.places, tell, vessels=vessels)
     if spec.places:
         assert held is not None
         assert balance is not None
@@ -374,6 +379,7 @@ async def _open_devices(
         carrier = VesselCarrier(pan.name, arm, arm_spec, held, balance, record, ground_truth)
         liquids = CellLiquids(record, carrier, pan.tray)
         handling = VesselHandling(places, carrier, liquids, balance_spec, supply, ground_truth, tell)
+        doses = DoseHandling(places, spec.vessels, carrier, liquids, record, balance_spec, supply, tell)
     setup = Setup(
         spec.mode,
         arm_spec,
@@ -388,6 +394,7 @@ async def _open_devices(
         watch,
         held,
         handling,
+        doses,
         night,
     )
     return OpenBench(PouringBench(setup, spec.dosing), opening.devices, emulators, operator)

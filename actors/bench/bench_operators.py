@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -108,29 +108,51 @@ class OperatorQuestions:
             self._notify(Notice(unseen, f"still waiting, for {waited:.0f} s now: {question.text}"))
 
 
-POURER, RECEIVER, TRAY = 0.312, 0.186, 0.428
+DRY = {"dry pourer": 0.312, "pourer": 0.312, "receiver": 0.186, "tray": 0.428}
 """Dry masses [kg] of glass beakers and a steel tray; all differ, so that no error cancels by chance."""
 
 
 @dataclass
 class BenchContents:
-    """Pourer, receiver and tray around a balance.
+    """Vessels and tray around a balance.
 
     Attributes:
         placement: where the balance stands.
-        on_balance: those of 'pourer', 'receiver', 'tray' that stand on it.
-        in_pourer, in_receiver, on_tray: liquid [kg].
+        on_balance: names of the vessels that stand on it, or 'tray'.
+        on_tray: liquid [kg].
         stands: names of the places where vessels stand that the arm carries.
         spilt_back: liquid that misses the pourer the next time the receiver is poured back [kg].
+        liquids, dry: liquid in the vessels, and their own masses [kg].
+        pourer, receiver: names of the two vessels of the present pour.
     """
 
     placement: Placement
     on_balance: set[str] = field(default_factory=set)
-    in_pourer: float = 0.0
-    in_receiver: float = 0.0
     on_tray: float = 0.0
     stands: dict[str, str] = field(default_factory=dict)
     spilt_back: float = 0.0
+    liquids: dict[str, float] = field(default_factory=dict)
+    dry: dict[str, float] = field(default_factory=lambda: dict(DRY))
+    pourer: str = "pourer"
+    receiver: str = "receiver"
+
+    @property
+    def in_pourer(self) -> float:
+        """Liquid in the pourer [kg]."""
+        return self.liquids.get(self.pourer, 0.0)
+
+    @in_pourer.setter
+    def in_pourer(self, mass: float) -> None:
+        self.liquids[self.pourer] = mass
+
+    @property
+    def in_receiver(self) -> float:
+        """Liquid in the receiver [kg]."""
+        return self.liquids.get(self.receiver, 0.0)
+
+    @in_receiver.setter
+    def in_receiver(self, mass: float) -> None:
+        self.liquids[self.receiver] = mass
 
     def move(self, vessel: str, place: str, *, on_balance: bool) -> None:
         """Move a vessel to a place, or into the gripper ('')."""
@@ -147,8 +169,7 @@ class BenchContents:
 
     def mass(self, name: str) -> float:
         """Mass of an object with its contents [kg]."""
-        dry = {"dry pourer": POURER, "pourer": POURER, "receiver": RECEIVER, "tray": TRAY}[name]
-        return dry + {"pourer": self.in_pourer, "receiver": self.in_receiver, "tray": self.on_tray}.get(name, 0.0)
+        return self.dry[name] + (self.on_tray if name == "tray" else self.liquids.get(name, 0.0))
 
     @property
     def carried(self) -> float:
@@ -183,8 +204,12 @@ class BenchContents:
             case "laid_out":
                 self.in_receiver = self.in_pourer = 0.0
                 self.on_balance = under
-            case "top_up":
+            case "top_up" | "source_refill":
                 self.in_pourer = fill
+            case "vessels_laid_out":
+                self.on_balance = under
+            case "cup_exchanged":
+                self.in_receiver = 0.0
             case "dry_pourer" | "dry_pourer_after":
                 self.on_balance = {"dry pourer"}
             case "cleared" | "cleared_after":
@@ -224,6 +249,9 @@ class BenchContents:
 
 SCATTER = 1e-3
 """Standard deviation of a filling by hand [kg]."""
+
+FILLED = 0.3e-3
+"""Likewise, of a source that is filled on a scale [kg]."""
 
 TYPED_STEP = 1e-4
 """Step of the scale for typed weights [kg]."""
@@ -287,6 +315,8 @@ class Hands:
         match question.about:
             case "laid_out":
                 self.contents.stands = {"receiver": str(question.details["receiver"])}
+            case "vessels_laid_out":
+                self._lay_out(question.details)
             case "grasp_failed":
                 self.contents.stands[str(question.details["role"])] = str(question.details["place"])
             case "pourer_empty" | "pourer_full":
@@ -295,6 +325,14 @@ class Hands:
             await self._put(self.contents.carried)
         if self._hold is not None and question.about in ("grasp", "let_go", "open_gripper", "activate_gripper"):
             await self._hold(1e-3 * float(question.details["width_mm"]) if question.about == "grasp" else None)
+
+    def _lay_out(self, details: Mapping[str, float | str]) -> None:
+        """Put vessels on their places: those to be filled get their load, others keep what they hold."""
+        self.contents.stands = {name: place for name, place in details.items() if isinstance(place, str)}
+        for name in self.contents.stands:
+            if (load := details.get(f"{name} filled_g")) is not None:
+                self.contents.liquids[name] = max(1e-3 * float(load) + float(self._rng.normal(0.0, FILLED)), 0.0)
+            self.contents.liquids.setdefault(name, 1e-3 * float(details.get(f"{name} held_g", 0.0)))
 
 
 class VirtualOperator:

@@ -20,6 +20,7 @@ from actors.arm.planned_pour import PlaceWay
 from actors.balance.balance_device import DeviceBalance
 from actors.balance.balance_settings import BalanceSettings
 from actors.bench.bench_operators import OperatorQuestions
+from actors.bench.dose_handling import DoseHandling
 from actors.bench.ground_truth import GroundTruth
 from actors.bench.held_vessel import HeldVessel
 from actors.bench.liquid_supply import LiquidSupply, SpillWatch
@@ -132,6 +133,7 @@ class Setup:
     watch: SpillWatch | None = None
     held: HeldVessel | None = None
     handling: VesselHandling | None = None
+    doses: DoseHandling | None = None
     night: NightConsent | None = None
 
     @property

@@ -9,6 +9,8 @@ connection.
 3. Consent, approach, dose, way home.
 4. Report the amount in the receiver: weighed, or UNKNOWN.
 
+In a laboratory with places the arm carries the vessels in place of the operator (`actors.bench.dose_handling`).
+
 The rules of `actors.bench.pour_procedure` hold here, too. The content of the source is not weighed.
 """
 
@@ -28,6 +30,7 @@ from actors.arm.arm_interface import ArmState, PlannedPour
 from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing_plan import GRIP, Placement
 from actors.bench.consent import Setup, grams, start_question
+from actors.bench.dose_handling import DoseHandling
 from actors.bench.pour_procedure import BenchProcedure, PourReport, largest_tilt
 from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult, check_display
 from actors.dosing.dose_estimator import DoseReading
@@ -116,19 +119,25 @@ class DoseProcedure(BenchProcedure):
         assert setup.balance is not None
         await self._ready()
         await setup.balance.connect()
-        await self._refill()
-        await setup.ground_truth.prepare_dose(self._scene, self._dose, self._seed)
+        names = None if setup.doses is None else setup.doses.names(self._scene, self._dose)
+        if setup.doses is None:
+            await self._refill()
+        await setup.ground_truth.prepare_dose(self._scene, self._dose, self._seed, names)
+        carried: dict[str, Any] = {}
         async with self._readings.running():
-            await self._prepare()
+            await (self._prepare() if setup.doses is None else self._carry(setup.doses))
             await self._consent.given(start_question(setup.spec, self._path))
             self._moves = True
             async with setup.ground_truth.followed():
                 result = await self._out_and_home()
+            truth = await setup.ground_truth.flowed()
+            if result.amount is None:
+                raise UnknownPourError(unknown_amount(result))
+            if setup.doses is not None:
+                amount = result.amount, result.deviation
+                carried = (await setup.doses.finish(self._consent, self._scene, self._dose, amount)).record
         self._report.enter("record", 1.0)
-        truth = await setup.ground_truth.flowed()
-        if result.amount is None:
-            raise UnknownPourError(unknown_amount(result))
-        return self._measurement(result, truth)
+        return self._measurement(result, {**carried, **truth})
 
     async def _refill(self) -> None:
         """Let the refill device fill the source, if there is one and the content is known."""
@@ -185,12 +194,24 @@ class DoseProcedure(BenchProcedure):
             )
         begin = before[0].time - 1.0
         self._placed = tuple(reading for reading in self._readings.all if reading.time >= begin)
+        self._begin_series(after[-1].mass)
+
+    async def _carry(self, handling: DoseHandling) -> None:
+        """Have the arm put the cup on the balance and take the source; the placing shows the lag of the balance."""
+        self._dose = await handling.prepare(self._consent, self._scene, self._dose, self._seed)
+        tare = await handling.set_up(self._consent, self._scene, self._dose, lambda: self._readings.all)
+        self._placed = handling.placed
+        self._begin_series(tare.mass)
+
+    def _begin_series(self, zero: float) -> None:
+        """Make the controller's belief from the readings of the placing."""
+        dose, begin = self._dose, self._placed[0].time if self._placed else 0.0
         placed = tuple(DoseReading(reading.time - begin, reading.mass, reading.stable) for reading in self._placed)
         rng = np.random.default_rng((self._seed, 41))
         step = self._readings.step or 1e-4
         self._series = series_of(self._scene, dose, self._settings, placed, rng, step=step)
         check_display(self._series.belief.display, dose.limit, self._settings)
-        self._zero = after[-1].mass
+        self._zero = zero
 
     async def _readings_for(self, seconds: float, count: int) -> None:
         """Wait for a time, and longer until so many readings have come; a balance that sends none ends the wait."""
@@ -208,6 +229,8 @@ class DoseProcedure(BenchProcedure):
             await self._consent.bring_home(error, begun=self._begun)
             raise
         await setup.ground_truth.flows()
+        if setup.doses is not None:
+            setup.doses.begins(self._scene, self._dose)
         self._begun = True
         self._report.enter("dose")
         try:

@@ -236,8 +236,14 @@ class GroundTruth:
         """The whole dose, if arm and balance need not act it out; None: they do."""
         return None
 
-    async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int) -> None:
+    async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int, carried: tuple[str, str] | None) -> None:
         """Called before the operator prepares a dose.
+
+        Args:
+            scene: pourer, receiver and liquid.
+            dose: wanted amount.
+            seed: of the dose.
+            carried: names of source and cup that the arm carries; None without places.
 
         Raises:
             InvalidActionError: a virtual bench has no such cup.

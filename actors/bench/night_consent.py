@@ -13,7 +13,7 @@ from datetime import datetime, timedelta
 from typing import Literal
 
 from actors.interfaces import Notice, OperatorQuestion
-from actors.places import PlaceSettings, UnattendedSettings
+from actors.places import CellVessel, PlaceSettings, UnattendedSettings
 
 MOTIONS = ("start", "move")
 """Questions for a motion that a consent for a night answers."""
@@ -29,6 +29,7 @@ class NightConsent:
         places: between which vessels are carried.
         tell: receives notices.
         now: the local time.
+        vessels: of the campaign's doses; empty for pours of a pourer and a receiver.
         elapsed: seconds that no change of the clock affects. A clock that is set back does not lengthen the consent.
     """
 
@@ -41,9 +42,11 @@ class NightConsent:
         tell: Callable[[Notice], None],
         now: Callable[[], datetime] = datetime.now,
         elapsed: Callable[[], float] = time.monotonic,
+        vessels: Sequence[CellVessel] = (),
     ) -> None:
         self._spec, self._safeguard, self._arm, self._places = spec, safeguard, arm, places
         self._tell, self._now, self._elapsed = tell, now, elapsed
+        self._vessels = vessels
         self._left, self._end_elapsed = 0, 0.0
         self._until: datetime | None = None
         self.asked = False
@@ -58,11 +61,16 @@ class NightConsent:
         """Ask for the consent, with everything that may move."""
         self.asked = True
         names = ", ".join(f"'{place.name}'" for place in self._places)
+        moves = f"pours over the balance, pouring back, and carrying pourer and receiver between {names}"
+        if self._vessels:
+            sources = ", ".join(f"'{vessel.name}' ({vessel.liquid})" for vessel in self._vessels if vessel.liquid)
+            cups = ", ".join(f"'{vessel.name}'" for vessel in self._vessels if not vessel.liquid)
+            moves = f"doses over the balance from the sources {sources}, into the cups {cups}, and carrying them"
         return OperatorQuestion(
             f"Unattended: up to {self._spec.pours} pours until {self._spec.until}, with nobody in the cell. The arm "
-            f"({self._arm}) and its gripper will move without further questions: pours over the balance, pouring back, "
-            f"and carrying pourer and receiver between {names}. Safeguard: {self._safeguard}. Is it in force, is the "
-            "cell empty, and do you agree? Any stop, failed grasp, open mass or question ends this consent.",
+            f"({self._arm}) and its gripper will move without further questions: {moves}. Safeguard: "
+            f"{self._safeguard}. Is it in force, is the cell empty, and do you agree? Any stop, failed grasp, open "
+            "mass or question ends this consent.",
             "yes or no",
             about="unattended",
             hands=False,

@@ -35,6 +35,9 @@ FILMED = 5e-3
 GONE_TIME = 6.0
 """Longest time for the balance to show that a vessel was lifted off it [s of bench time]."""
 
+SHOWN = 5
+"""Largest number of problems of places that one error states."""
+
 IN_GRIPPER = ""
 """Place of the vessel in the gripper."""
 
@@ -104,15 +107,12 @@ def check_carrying(
     Raises:
         InvalidActionError: it cannot; the text states why, for all places.
     """
-    kind, opened, checked = arm_kind(spec), 0.0, set[tuple[Vessel, float]]()
-    for load in loads.values():
-        if (load.vessel, load.mass) in checked:
-            continue
-        checked.add((load.vessel, load.mass))
-        opened = max(opened, _check_load(load, spec, gripper))
+    kind = arm_kind(spec)
+    widths = {load: _check_load(load, spec, gripper) for load in set(loads.values())}
     vessels = {name: load.vessel for name, load in loads.items()}
+    opened = {name: widths[load] for name, load in loads.items()}
     if problems := [text for _, text in kind.place_problems(places, vessels, opened)]:
-        raise InvalidActionError("; ".join(problems))
+        raise InvalidActionError(_joined(problems))
     ways, impossible = Ways(), list[str]()
     for place in stops:
         largest = max((loads[name].volume for name in place.holds if name in loads), default=0.0)
@@ -122,8 +122,14 @@ def check_carrying(
             except InvalidActionError as error:
                 impossible.append(str(error))
     if impossible:
-        raise InvalidActionError("; ".join(dict.fromkeys(impossible)))
+        raise InvalidActionError(_joined([*dict.fromkeys(impossible)]))
     return ways
+
+
+def _joined(problems: Sequence[str]) -> str:
+    """Problems as one text; of a rack with many, the first ones."""
+    more = f"; and {len(problems) - SHOWN} more" if len(problems) > SHOWN else ""
+    return "; ".join(problems[:SHOWN]) + more
 
 
 def _check_load(load: Load, spec: ArmSettings, gripper: GripperSettings) -> float:

@@ -345,6 +345,7 @@ class VirtualBench(GroundTruth):
     async def prepare(self, pour: PourAsk) -> None:
         """See `GroundTruth.prepare`."""
         self._pour = pour
+        self.contents.pourer, self.contents.receiver = "pourer", "receiver"
         self._hands.prepare(pour.scene.liquid.mass, stream(pour.seed, "arm"))
         await self.emulators.prepare(stream(pour.seed, "balance"))
         await self.emulators.put(self.contents.carried)
@@ -458,17 +459,24 @@ class FollowedBench(VirtualBench):
             with contextlib.suppress(LaboratoryError):  # the history is read once more at the end
                 await self.note()
 
-    async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int) -> None:
+    async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int, carried: tuple[str, str] | None) -> None:
         """See `GroundTruth.prepare_dose`."""
-        source = source_of(scene, dose)
+        source, contents = source_of(scene, dose), self.contents
+        contents.pourer, contents.receiver = carried or ("pourer", "receiver")
+        for name, spec, usual in (
+            (contents.pourer, scene.pourer, "pourer"),
+            (contents.receiver, scene.receiver, "receiver"),
+        ):
+            mass = None if spec.grip is None else spec.grip.mass
+            contents.dry.setdefault(name, contents.dry[usual] if mass is None else mass)
         cup, rng = true_cup(scene), np.random.default_rng((seed, 51))
         held = source.mass + source.deviation * float(rng.standard_normal())
-        if source.fill or self.contents.in_pourer <= 0.0:
+        if carried is None and (source.fill or self.contents.in_pourer <= 0.0):
             self.contents.in_pourer = min(max(held, 1e-3), 0.99 * cup.capacity * scene.liquid.density)
         wetness = 0.0 if source.unused else 0.2 if source.fill else 0.7
         held_tilt = draw_pose_error(self._spec, seed).tilt
         self._flow = FlowOrder(cup, scene.liquid, source.constants, seed, wetness, 0.0, held_tilt)
-        self._hands.prepare(self.contents.in_pourer, stream(seed, "arm"))
+        self._hands.prepare(source.mass if carried else contents.in_pourer, stream(seed, "arm"))
         await self.emulators.prepare(stream(seed, "balance"))
         await self.emulators.put(self.contents.carried)
 

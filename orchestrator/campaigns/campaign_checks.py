@@ -21,9 +21,9 @@ import numpy as np
 from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.bench.pour_feasibility import vessel as built
 from actors.grippers.gripper_interface import GripperSettings
-from actors.interfaces import InvalidActionError, LaboratoryError, UnreachablePlaceError
+from actors.interfaces import DoseTarget, InvalidActionError, LaboratoryError, UnreachablePlaceError
 from actors.laboratory_settings import LaboratorySettings
-from actors.places import PlaceSettings, all_places
+from actors.places import CellVessel, PlaceSettings, all_places
 from orchestrator.campaigns.yaml.file_access import why_not_writable
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError, Problem
 from orchestrator.campaigns.yaml.yaml_source import Document, Loc
@@ -360,6 +360,36 @@ class _Checker:
         except InvalidActionError as error:
             self.add(role.places(("receiver",), ("pourer",)), f"{role.text}: {error}")
 
+    def carried_doses(self, plan: DispensePlan, vessels: tuple[CellVessel, ...]) -> None:
+        """Whether the arm can carry the vessels of doses.
+
+        Args:
+            plan: of the doses.
+            vessels: of mixtures; empty: the only source, and one cup after the other.
+        """
+        from actors.bench.dose_handling import check_vessels, vessels_of
+
+        assert self.arm is not None
+        assert self.gripper is not None
+        section = dose_section(plan)
+        if not vessels and len(plan.sources) > 1:
+            text = "with places these doses have one source; several ones, each with its place, are those of 'mixtures'"
+            self.add((section,), text)
+            return
+        series = [vessels] if vessels else []
+        if not vessels:
+            most = {dose.receiver: dose for dose in sorted(plan.doses, key=lambda dose: dose.amount)}
+            series = [
+                vessels_of(self.places, plan.scene(plan.sources[0], name), DoseTarget(dose.amount, dose.limit))
+                for name, dose in most.items()
+            ]
+        for each in series:
+            try:
+                check_vessels(self.places, each, self.arm, self.gripper)
+            except InvalidActionError as error:
+                self.add((section,), str(error))
+                return
+
     def _payload(self, scene: Scene) -> None:
         """The configured payload of the arm can't be less than the mass of the liquid."""
         carries = None if self.arm is None else self.arm.payload_limit
@@ -596,11 +626,7 @@ def check_campaign(
     if plan.pour is not None:
         checker.pour(plan.pour)
     if plan.dispense is not None and lab.places:
-        text = (
-            f"laboratory '{lab.name}' has places, between which the arm carries the vessels; those of doses can't "
-            "be carried yet. Name a laboratory without 'places', in which a person puts them under the arm"
-        )
-        checker.add((dose_section(plan.dispense),), text)
+        checker.carried_doses(plan.dispense, lab.vessels)
     if plan.dispense is not None:
         balance = plan.laboratory.balance
         if plan.laboratory.arm is not None and (balance is None or balance.placement not in ("receiver", "everything")):

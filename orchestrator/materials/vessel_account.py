@@ -8,6 +8,8 @@ content uncertain by its amount; one with unknown outcome makes it unknown until
     account.weigh("virtual/beaker", 0.412, 1e-4, liquid="water")
     account.content("virtual/beaker")
 
+`composition` has the liquids of a vessel since it was empty, each with its mass as it was dosed.
+
 The command line, the library, runs and the daemon share the file. A vessel of the station has its id as its name, the
 source of a campaign 'LABORATORY/VESSEL'. `VesselAccount.follow` is a subscriber of a run
 (`orchestrator.records.events`). Entries have a key, so that the events of a resumed run are written once.
@@ -54,6 +56,10 @@ create table if not exists entry (
 create index if not exists entry_by_vessel on entry (vessel, id);
 create table if not exists stand (
     id integer primary key, vessel text not null, t real not null, place text, by text not null, note text not null
+) strict;
+create table if not exists component (
+    id integer primary key, vessel text not null, t real not null, liquid text not null, mass real,
+    deviation real not null, source text not null
 ) strict;
 create trigger if not exists entry_is_never_changed before update on entry begin
     select raise(abort, 'account entries are append-only'); end;
@@ -151,6 +157,25 @@ class VesselPlace:
     def text(self) -> str:
         """For tables: the place, or that it is unknown, and since which motion."""
         return self.place if self.place is not None else f"UNKNOWN ({self.note})" if self.note else "UNKNOWN"
+
+
+@dataclass(frozen=True)
+class Component:
+    """One liquid of a mixture, as it was poured in.
+
+    Attributes:
+        liquid: its name; '' in the entry of an empty vessel, whose own mass it is.
+        mass: [kg]; None: UNKNOWN, since a dose has begun and not been weighed, or an empty vessel that was not weighed.
+        deviation: standard deviation of the mass [kg].
+        source: vessel that it was poured from.
+        time: of the entry, seconds since 1970.
+    """
+
+    liquid: str
+    mass: float | None
+    deviation: float
+    source: str
+    time: float
 
 
 @dataclass(frozen=True)
@@ -278,6 +303,8 @@ class VesselAccount:
         self, kind: EntryKind, vessel: str, mass: float, deviation: float, liquid: str, by: str, note: str, key: str
     ) -> None:
         _check_stated(mass, deviation)
+        if mass == 0.0 and by and self.composition(vessel):
+            self.add_component(vessel, "", None, 0.0)  # a person has emptied it, or brought another one
         with self._writing() as connection:
             before = _last(connection, vessel)
             held = liquid or ("" if before is None else before.liquid)
@@ -362,6 +389,46 @@ class VesselAccount:
                     before.knowledge,
                 )  # fmt: skip
                 _write(connection, f"{pour} {role}", entry)
+
+    # ---- compositions
+
+    def composition(self, vessel: str) -> list[Component]:
+        """The liquids in a vessel since it was empty, the first entry the empty vessel itself if that was entered.
+
+        Raises:
+            OSError: the file can't be read.
+        """
+        if not self._path.is_file():
+            return []
+        with self._connection() as connection:
+            if not connection.execute("select 1 from sqlite_master where name = 'component'").fetchone():
+                return []
+            empty = "select coalesce(max(id), 0) from component where vessel = ? and liquid = ''"
+            rows = connection.execute(
+                f"select liquid, mass, deviation, source, t from component where vessel = ? and id >= ({empty}) "
+                "order by id",
+                (vessel, vessel),
+            ).fetchall()
+        latest = {row[0]: Component(*row) for row in rows}  # a begun dose is followed by its outcome
+        return list(latest.values())
+
+    def add_component(self, vessel: str, liquid: str, mass: float | None, deviation: float, source: str = "") -> None:
+        """Enter a liquid that was poured into a vessel, or that a dose of it begins; '' for the empty vessel.
+
+        Args:
+            vessel: its name.
+            liquid: its name. A second entry of a liquid replaces the first one.
+            mass, deviation: [kg]; a mass of None is UNKNOWN.
+            source: vessel that it was poured from.
+
+        Raises:
+            OSError: the file can't be written.
+        """
+        with self._writing() as connection:
+            connection.execute(
+                "insert into component (vessel, t, liquid, mass, deviation, source) values (?, ?, ?, ?, ?, ?)",
+                (vessel, time.time(), liquid, mass, deviation, source),
+            )
 
     # ---- places
 
@@ -531,6 +598,23 @@ class LaboratoryPlaces:
         with _writable():
             content = self._account.content(self._prefix + vessel)
         return None if content is None or content.mass is None else (content.mass, content.deviation)
+
+    def unknown(self, vessel: str) -> bool:
+        """See `PlaceRecord.unknown`."""
+        with _writable():
+            content = self._account.content(self._prefix + vessel)
+        return content is not None and content.mass is None
+
+    def composition(self, vessel: str) -> dict[str, tuple[float | None, float]]:
+        """See `PlaceRecord.composition`."""
+        with _writable():
+            return {c.liquid: (c.mass, c.deviation) for c in self._account.composition(self._prefix + vessel)}
+
+    def add_component(self, vessel: str, liquid: str, mass: float | None, deviation: float, source: str = "") -> None:
+        """See `PlaceRecord.add_component`."""
+        with _writable():
+            origin = self._prefix + source if source else ""
+            self._account.add_component(self._prefix + vessel, liquid, mass, deviation, origin)
 
 
 @contextlib.contextmanager

@@ -231,7 +231,7 @@ RUNS = [
         ("calibration", "D2", "doses", "objectives"),
         ("D1", "objectives", "doses"),
         ("D3", "objectives", "doses"),
-        ("doses", "recordings"),
+        ("doses", "recordings", "places", "unattended"),
     )
 ]
 RUNS += [Run(("D2", "cluster"), (way, "command line")) for way in sorted(JOINED)]

@@ -276,7 +276,10 @@ def _too_near(thing: str, apart: float, each: Standing, when: str) -> str:
 
 
 def place_problems(
-    places: Sequence[PlaceSettings], spec: UrArmSettings, vessels: Mapping[str, Vessel], opened: float = 0.0
+    places: Sequence[PlaceSettings],
+    spec: UrArmSettings,
+    vessels: Mapping[str, Vessel],
+    opened: Mapping[str, float] = {},
 ) -> Iterator[tuple[int, str]]:
     """Problems of a laboratory's places: number of the place, and the message.
 
@@ -284,10 +287,11 @@ def place_problems(
         places: all places.
         spec: of the arm and its cell.
         vessels: of a campaign; without them, only what does not depend on them is checked.
-        opened: width of the open fingers [m]; they keep the clearance of a neighbour in any direction.
+        opened: width of the fingers that are open for each vessel [m]; they keep the clearance of a neighbour in any
+            direction.
     """
     standing = [standing_at(place, vessels, spec) for place in places]
-    for (_, first), (i, other) in combinations(enumerate(standing), 2):
+    for (j, first), (i, other) in combinations(enumerate(standing), 2):
         apart = math.dist(first.foot[:2], other.foot[:2]) - first.radius - other.radius
         if apart < max(first.clearance, other.clearance):
             yield (
@@ -295,16 +299,18 @@ def place_problems(
                 f"places '{first.place}' and '{other.place}' overlap: what stands there is {1e3 * apart:.0f} mm apart, "
                 f"{1e3 * max(first.clearance, other.clearance):.0f} mm have to stay free",
             )
-        elif first.radius > 0.0 and other.radius > 0.0 and opened > 0.0:
-            # a full circle: the fingers of a taught pose may stand in any direction
-            free = apart + min(first.radius, other.radius) - 0.5 * opened - FINGER
-            if free < max(first.clearance, other.clearance):
-                yield (
-                    i,
-                    f"places '{first.place}' and '{other.place}' overlap when the gripper is open: its fingers stand "
-                    f"{1e3 * opened:.0f} mm apart and would come within {1e3 * free:.0f} mm of the neighbour, "
-                    f"{1e3 * max(first.clearance, other.clearance):.0f} mm have to stay free",
-                )
+            continue
+        fingers = [0.5 * max((opened.get(name, 0.0) for name in places[k].holds), default=0.0) for k in (j, i)]
+        # a full circle: the fingers of a taught pose may stand in any direction
+        reach = max(fingers[0] + other.radius, fingers[1] + first.radius) + FINGER
+        free = math.dist(first.foot[:2], other.foot[:2]) - reach
+        if min(first.radius, other.radius, *fingers) > 0.0 and free < max(first.clearance, other.clearance):
+            yield (
+                i,
+                f"places '{first.place}' and '{other.place}' overlap when the gripper is open: its fingers would come "
+                f"within {1e3 * free:.0f} mm of the neighbour, {1e3 * max(first.clearance, other.clearance):.0f} mm "
+                "have to stay free",
+            )
     for i, (place, foot) in enumerate(zip(places, standing, strict=True)):
         axis = vessel_at(place, spec).rotation[:, 2]
         lean = math.acos(float(np.clip(axis[2], -1.0, 1.0)))

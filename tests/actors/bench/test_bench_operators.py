@@ -12,9 +12,11 @@ import pytest
 
 from actors.arm.planned_pour import ExecutedPath, pack, unpack
 from actors.balance.weighing_plan import Placement, weighings
-from actors.bench.bench_operators import POURER, RECEIVER, TRAY, BenchContents, Hands, OperatorQuestions, PlayedOperator
+from actors.bench.bench_operators import DRY, BenchContents, Hands, OperatorQuestions, PlayedOperator
 from actors.bench.virtual_bench import LONGEST_REST, executed_pour
 from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, OperatorSettings
+
+POURER, RECEIVER, TRAY = DRY["pourer"], DRY["receiver"], DRY["tray"]
 
 STEP = 0.008
 

@@ -48,7 +48,7 @@ class Site:
         cls, arguments = balance_kind(scale).driver("source")
         device = LocalDevice("source-balance", lambda: cls(*arguments))
         self.notices: list[Notice] = []
-        self.contents = BenchContents(Placement.RECEIVER, in_pourer=0.1)
+        self.contents = BenchContents(Placement.RECEIVER, liquids={"pourer": 0.1})
         self.pump = LocalDevice("refill", lambda: pump.driver()[0](pump))
         self.supply = LiquidSupply(
             SourceSettings(refill=pump),

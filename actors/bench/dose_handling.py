@@ -1,0 +1,487 @@
+"""Doses in a laboratory with places: the arm carries the cup to the balance and back, and takes the source.
+
+`DoseHandling` takes the place of the operator's hands around one dose of `actors.bench.dose_procedure`:
+
+1. Have the vessels laid out: once, and again after an interruption.
+2. Put the cup on the balance, unless it stands there. Weigh it: that is its tare, and has to be what the account says.
+3. Take the source. After the dose put it back, and weigh the cup again.
+4. Put the cup back, unless the next dose goes into it.
+
+A cup whose content is UNKNOWN is not used before a person has entered it. No liquid is dosed into a cup twice. The
+moves are those of `actors.bench.vessel_carrying`, and so are their entries in the account of vessels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from actors.arm.arm_interface import PlannedPour
+from actors.arm.arm_settings import ArmSettings, arm_kind
+from actors.balance.balance_settings import BalanceSettings
+from actors.balance.weighing_plan import SURE, PourMasses, weighing_uncertainty
+from actors.bench.cell_liquids import RESERVOIR, CellLiquids
+from actors.bench.liquid_supply import LiquidSupply
+from actors.bench.pour_feasibility import vessel as built
+from actors.bench.vessel_carrying import Load, MotionConsent, VesselCarrier, Ways, check_carrying, label, move_question
+from actors.bench.vessel_handling import WRONG
+from actors.dosing.dose_estimator import DoseReading
+from actors.dosing.dose_series import LOST, source_of
+from actors.grippers.gripper_interface import GripperSettings
+from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, LaboratoryError, Notice, OperatorQuestion
+from actors.places import CellVessel, Layout, PlaceRecord, PlaceSettings, Role
+from sim_engine.liquids import Liquid
+from sim_engine.scene import Scene
+
+OPEN_LOSS = 0.3e-3
+"""Mass that a cup may lose unweighed, by evaporation and at its outside, before a person is asked about it [kg]."""
+
+BEFORE_PLACED, AFTER_PLACED = 1.5, 3.0
+"""Readings around the moment when a cup is let go of on the balance, which show its lag [s]."""
+
+MOST_SPILLED = 20e-3
+"""Largest mass that a dose is expected to spill into the tray [kg]."""
+
+
+@dataclass(frozen=True)
+class CarriedDose:
+    """Weighings of the cup of one dose.
+
+    Attributes:
+        cup, source: names of the vessels.
+        tare, gross: of the cup before and after the dose.
+        missing: content by the account less the weighed one, before the dose [kg]; None if it was not known.
+    """
+
+    cup: str
+    source: str
+    tare: PourMasses
+    gross: PourMasses
+    missing: float | None
+
+    @property
+    def record(self) -> dict[str, object]:
+        """For the record of the dose, JSON-ready [kg]."""
+        weighed = {name: [getattr(self, name).mass, getattr(self, name).uncertainty] for name in ("tare", "gross")}
+        return {"cup": self.cup, "vessel": self.source, **weighed, "missing": self.missing}
+
+
+@dataclass(frozen=True)
+class _Tare:
+    """Weight of the cup before a dose, its content then (mass and deviation), and what was missing [kg]."""
+
+    weight: PourMasses
+    content: tuple[float, float]
+    missing: float | None
+
+
+def vessels_of(places: Sequence[PlaceSettings], scene: Scene, dose: DoseTarget) -> tuple[CellVessel, CellVessel]:
+    """The only source and the only cup of a laboratory, for a dose that names none.
+
+    Args:
+        places: of the laboratory.
+        scene: vessels and liquid.
+        dose: wanted amount.
+
+    Raises:
+        InvalidActionError: its places do not suffice for a pour.
+    """
+    rest, liquid = Layout.of(places).rest, scene.liquid
+    cup = scene.receiver.name if scene.receiver.name != scene.pourer.name else f"{scene.receiver.name}-cup"
+    stand, most, fill = rest["pourer"].name, dose.amount + dose.limit, source_of(scene, dose).fill
+    return (
+        CellVessel(scene.pourer.name, scene.pourer, liquid.name, liquid.mass, liquid.volume, fill, stand),
+        CellVessel(cup, scene.receiver, "", most, most / liquid.density, False, rest["receiver"].name),
+    )
+
+
+def check_vessels(
+    places: Sequence[PlaceSettings], vessels: Sequence[CellVessel], spec: ArmSettings, gripper: GripperSettings
+) -> tuple[tuple[PlaceSettings, ...], dict[str, Load], Ways]:
+    """Check that an arm can carry all vessels of a series of doses.
+
+    Args:
+        places: of the laboratory.
+        vessels: of the series.
+        spec: of the arm.
+        gripper: its settings.
+
+    Returns:
+        The places, each with the names of the vessels that may stand there; the vessels; the ways.
+
+    Raises:
+        InvalidActionError: it cannot; the text has all reasons.
+    """
+    pan = [place for place in places if place.use == "balance" and "receiver" in place.holds]
+    if len(pan) != 1:
+        raise InvalidActionError("doses need one place with 'use: balance' that holds a receiver")
+    known, homes, problems = {place.name: place for place in places}, dict[str, str](), list[str]()
+    for vessel in vessels:
+        role: Role = "pourer" if vessel.liquid else "receiver"
+        place = known.get(vessel.place)
+        if place is None:
+            problems.append(f"there is no place '{vessel.place}' for a vessel; there are {', '.join(sorted(known))}")
+        elif role not in place.holds or place.use == "balance":
+            problems.append(f"place '{place.name}' is not for a {role}: see its 'use' and 'holds'")
+        elif vessel.place in homes:
+            problems.append(f"two vessels belong to place '{vessel.place}': {homes[vessel.place]} and {vessel.name}")
+        homes.setdefault(vessel.place, vessel.name)
+    if problems:
+        raise InvalidActionError("; ".join(problems))
+    loads = {vessel.name: Load(built(vessel.spec), vessel.mass, vessel.volume) for vessel in vessels}
+    cups = [vessel.name for vessel in vessels if not vessel.liquid]
+    # of several cups with one shape, the fullest stands for all of them
+    shapes = {loads[name].vessel: name for name in sorted(cups, key=lambda name: loads[name].volume)}
+    at_places = []
+    for place in places:
+        names = tuple(shapes.values()) if place is pan[0] else (homes[place.name],) if place.name in homes else ()
+        at_places.append(place.with_values(holds=names))
+    stops = [place for place in at_places if place.holds]
+    return tuple(at_places), loads, check_carrying(stops, at_places, spec, gripper, loads)
+
+
+def _step(readings: Sequence[DoseReading], rise: float) -> tuple[DoseReading, ...]:
+    """The readings from before a rise [kg] until it has settled; none without one."""
+    moment = next((reading.time for reading in readings if reading.mass - readings[0].mass > rise), None)
+    if moment is None:
+        return ()
+    begin, end = moment - BEFORE_PLACED, moment + AFTER_PLACED
+    return tuple(reading for reading in readings if begin <= reading.time <= end)
+
+
+class DoseHandling:
+    """The vessels of doses on a bench, and the arm that carries them.
+
+    Args:
+        places: of the laboratory.
+        vessels: of the series; empty: the only source and the only cup.
+        carrier: the arm with its gripper.
+        liquids: contents of the cell.
+        record: the account of vessels.
+        weighing: settings of the balance.
+        supply: has the refill device, if there is one.
+        tell: receives notices.
+
+    Attributes:
+        placed: readings of the balance while the cup on it was put there.
+    """
+
+    def __init__(
+        self,
+        places: Sequence[PlaceSettings],
+        vessels: Sequence[CellVessel],
+        carrier: VesselCarrier,
+        liquids: CellLiquids,
+        record: PlaceRecord,
+        weighing: BalanceSettings,
+        supply: LiquidSupply | None,
+        tell: Callable[[Notice], None],
+    ) -> None:
+        self._places, self._given = tuple(places), tuple(vessels)
+        self._carrier, self._liquids, self._record = carrier, liquids, record
+        self._weighing, self._supply, self._tell = weighing, supply, tell
+        self._pan = next(place for place in places if place.use == "balance").name
+        self._vessels: dict[str, CellVessel] = {}
+        self._checked: tuple[ArmSettings, tuple[CellVessel, ...]] | None = None
+        self._at_places: tuple[PlaceSettings, ...] = ()
+        self._loads: dict[str, Load] = {}
+        self._ways: Ways = {}
+        self._laid_out = False
+        self._filled: set[str] = set()
+        self._tare: _Tare | None = None
+        self.placed: tuple[DoseReading, ...] = ()
+
+    # ---- checks
+
+    def names(self, scene: Scene, dose: DoseTarget) -> tuple[str, str]:
+        """Names of the source and the cup of a dose."""
+        if self._given:
+            return source_of(scene, dose).vessel, dose.cup
+        source, cup = vessels_of(self._places, scene, dose)
+        return source.name, cup.name
+
+    def fit(self, spec: ArmSettings, scene: Scene, dose: DoseTarget, path: PlannedPour) -> None:
+        """Check, before anything is asked or moves, that the vessels of a dose can be handled.
+
+        Args:
+            spec: of the connected arm.
+            scene: vessels and liquid.
+            dose: wanted amount.
+            path: of the dose.
+
+        Raises:
+            InvalidActionError: they cannot; the text states why.
+        """
+        vessels = self._given or vessels_of(self._places, scene, dose)
+        carrier, source_name = self._carrier, self.names(scene, dose)[0]
+        known = {vessel.name: vessel for vessel in vessels}
+        for name, cup in zip(self.names(scene, dose), (False, True), strict=True):
+            if name not in known or cup != (not known[name].liquid):
+                kind = "cup" if cup else "source"
+                raise InvalidActionError(f"'{name}' is no {kind} of this series; it has {', '.join(sorted(known))}")
+        if self._checked != (spec, vessels):
+            self._at_places, self._loads, self._ways = check_vessels(self._places, vessels, spec, carrier.held.spec)
+            if {v.name: (v.spec, v.place) for v in vessels} != {n: (v.spec, v.place) for n, v in self._vessels.items()}:
+                self.forget()  # the operator brings other vessels
+                self._laid_out = False
+            self._checked, self._vessels = (spec, vessels), known
+        carrier.spec, carrier.loads, carrier.ways = spec, self._loads, self._ways
+        shapes = {name: load.vessel for name, load in self._loads.items()}
+        if problems := arm_kind(spec).in_the_way(path, shapes[source_name], self._at_places, shapes):
+            raise InvalidActionError("; ".join(problems))
+
+    # ---- before the dose
+
+    async def prepare(self, consent: MotionConsent, scene: Scene, dose: DoseTarget, seed: int) -> DoseTarget:
+        """Have the vessels laid out, and the source filled.
+
+        Args:
+            consent: of the dose.
+            scene: vessels and liquid.
+            dose: wanted amount.
+            seed: of a virtual bench.
+
+        Returns:
+            The dose with its source as it is then.
+
+        Raises:
+            InvalidActionError: the cup has this liquid already.
+            LaboratoryError: something failed; nothing was poured.
+        """
+        source_name, cup = self.names(scene, dose)
+        if self._carrier.at.keys() != self._vessels.keys():
+            await self._lay_out(consent)
+        elif not dose.cup and self._record.composition(cup):
+            await self._exchange(cup, consent)
+        self._carrier.require_known()
+        await self._known(cup, consent)
+        if scene.liquid.name in (composition := self._record.composition(cup)):
+            mass = composition[scene.liquid.name][0]
+            held = "an UNKNOWN mass" if mass is None else f"{1e3 * mass:.1f} g"
+            raise InvalidActionError(
+                f"'{cup}' has {held} of {scene.liquid.name} already, and no liquid is dosed into a cup twice"
+            )
+        await self._liquids.room_for_spills(scene.liquid, MOST_SPILLED, consent)
+        source, fresh = source_of(scene, dose), source_name in self._filled
+        self._filled.discard(source_name)
+        if source.fill and not fresh:
+            source = await self._refilled(source, source_name, scene.liquid, consent, seed)
+        self._carrier.mass[source_name] = source.mass
+        return replace(dose, source=replace(source, fill=False, before=None))
+
+    async def _lay_out(self, consent: MotionConsent) -> None:
+        """Have the operator lay out all vessels; afterwards it is known where they stand."""
+        await self._carrier.let_go(consent)
+        vessels, held = self._vessels.values(), {name: self._record.held(name) for name in self._vessels}
+        used = [vessel.name for vessel in vessels if not vessel.liquid and (held[vessel.name] or (0.0,))[0] > 0.0]
+        new = {vessel.name for vessel in vessels if not vessel.liquid and not self._record.unknown(vessel.name)} - {
+            *used
+        }
+        if used:
+            content = ", ".join(f"{name} ({1e3 * (held[name] or (0.0,))[0]:.1f} g)" for name in used)
+            question = OperatorQuestion(
+                f"By the account of vessels these cups hold something: {content}. Are they these, with what they hold? "
+                "'no': you have put empty, dry ones in their place.",
+                "yes or no",
+                about="cups_kept",
+            )
+            if (await self._carrier.ask(question, consent)).strip().lower() not in ("yes", "y"):
+                new |= {*used}
+        fill = {v.name: v.mass for v in vessels if v.liquid and v.filled and not self._laid_out}
+        details: dict[str, float | str] = {vessel.name: vessel.place for vessel in vessels}
+        details |= {f"{name} filled_g": 1e3 * mass for name, mass in (fill | dict.fromkeys(new, 0.0)).items()}
+        details |= {f"{name} held_g": 1e3 * content[0] for name, content in held.items() if content is not None}
+        text = "; ".join(
+            [f"'{v.name}' on '{v.place}' with {1e3 * v.mass:.0f} g of {v.liquid}, weighed"
+             for v in vessels if v.name in fill]
+            + [f"'{v.name}' on '{v.place}' as it is" for v in vessels if v.name not in new and v.name not in fill]
+            + ([f"empty, dry cups on {', '.join(v.place for v in vessels if v.name in new)}"] if new else [])
+        )  # fmt: skip
+        question = OperatorQuestion(
+            f"Lay out the vessels: {text}. Leave the gripper, the balance and all other places empty.",
+            "done",
+            self._carrier.unknown(),
+            about="vessels_laid_out",
+            details=details,
+        )
+        await self._carrier.ask(question, consent)
+        for name in new:
+            self._empty(name)
+        for name, mass in fill.items():
+            self._liquids.enter(name, mass, 0.5e-3, self._vessels[name].liquid)
+        self._filled, self._laid_out = self._filled | fill.keys(), True
+        masses = {name: (self._record.held(name) or (self._vessels[name].mass,))[0] for name in self._vessels}
+        self._carrier.laid_out({vessel.name: vessel.place for vessel in vessels}, masses)
+
+    def _empty(self, cup: str) -> None:
+        """An empty, dry cup stands there."""
+        self._liquids.enter(cup, 0.0, 0.0, "")
+        self._record.add_component(cup, "", None, 0.0)
+        self._carrier.mass[cup] = 0.0
+
+    async def _exchange(self, cup: str, consent: MotionConsent) -> None:
+        """Have the only cup exchanged for an empty one."""
+        place = self._carrier.at[cup]
+        question = OperatorQuestion(
+            f"Take '{cup}' from '{place}', and put an empty, dry one there.", "done", about="cup_exchanged"
+        )
+        await self._carrier.ask(question, consent)
+        self._empty(cup)
+
+    async def _known(self, cup: str, consent: MotionConsent) -> None:
+        """Wait until a person has entered the content of a cup that is UNKNOWN."""
+        problem = ""
+        while self._record.unknown(cup):
+            question = OperatorQuestion(
+                f"What '{cup}' on '{self._carrier.at[cup]}' holds is UNKNOWN. Weigh it and enter its content with "
+                f"'decant materials weigh LABORATORY/{cup}', or put an empty, dry cup there and enter 0 g.",
+                "done",
+                problem,
+                about="cup_unknown",
+            )
+            await self._carrier.ask(question, consent)
+            problem = "the account has no content for it yet"
+
+    async def _refilled(
+        self, source: DoseSource, name: str, liquid: Liquid, consent: MotionConsent, seed: int
+    ) -> DoseSource:
+        """Fill a source where it stands: by the refill device if that is there, else by the operator."""
+        place = next(place for place in self._at_places if place.name == self._vessels[name].place)
+        if place.use == "source" and self._supply is not None and source.before is not None:
+            missing = max(source.mass - source.before, 0.0)
+            reserve = await self._liquids.reserve(missing, consent)
+            await self._supply.connect()
+            filled = await self._supply.filled(source, liquid.density, seed)
+            if filled is not None:
+                if reserve is not None:
+                    spread = math.hypot(reserve[1], filled.deviation)
+                    self._liquids.enter(RESERVOIR, reserve[0] - missing, spread, liquid.name)
+                return filled
+        question = OperatorQuestion(
+            f"Fill '{name}' on '{place.name}' with {liquid.name} to {1e3 * source.mass:.0f} g, weighed, and put it "
+            "back there.",
+            "done",
+            about="source_refill",
+        )
+        await self._carrier.ask(question, consent)
+        return source
+
+    async def set_up(
+        self, consent: MotionConsent, scene: Scene, dose: DoseTarget, readings: Callable[[], Sequence[DoseReading]]
+    ) -> PourMasses:
+        """Put the cup on the balance, weigh it, and take the source. Returns the tare.
+
+        Args:
+            consent: of the dose.
+            scene: vessels and liquid.
+            dose: wanted amount.
+            readings: all readings of the balance so far.
+
+        Raises:
+            LaboratoryError: something failed; nothing was poured.
+        """
+        source, cup = self.names(scene, dose)
+        carrier = self._carrier
+        other = next((name for name, place in carrier.at.items() if place == self._pan and name != cup), None)
+        steps = [f"put {label(other)} back"] if other is not None else []
+        steps += [f"put {label(cup)} on the balance"] if carrier.at[cup] != self._pan else []
+        async with carrier.driving(consent, " and ".join([*steps, f"take {label(source)}"])):
+            if other is not None:
+                await carrier.move(other, self._vessels[other].place, consent)
+            if carrier.at[cup] != self._pan:
+                begin = len(readings())
+                await carrier.move(cup, self._pan, consent)
+                self.placed = _step(readings()[begin:], 0.5 * self._loads[cup].empty_mass)
+            tare = await self._weigh()
+            missing = await self._closed(cup, tare, source, consent)
+            self._tare = _Tare(tare, self._record.held(cup) or (0.0, 0.0), missing)
+            await carrier.take(source, consent)
+        return tare
+
+    async def _closed(self, cup: str, gross: PourMasses, source: str, consent: MotionConsent) -> float | None:
+        """Compare the weight of a cup with its account; a person is asked if they differ. Returns what is missing."""
+        held, empty = self._record.held(cup), self._record.composition(cup).get("", (None, 0.0))
+        content, spread = held or (0.0, 0.0)
+        if empty[0] is None:  # its own mass is not known yet
+            stated = self._loads[cup].empty_mass
+            if content == 0.0 and abs(gross.mass - stated) > WRONG:
+                text = (
+                    f"The empty cup '{cup}' on the balance weighs {1e3 * gross.mass:.1f} g, and its file states "
+                    f"{1e3 * stated:.1f} g. Is it the right one, empty and dry?"
+                )
+                await self._go_on(text, stated - gross.mass, source, consent)
+            if content == 0.0:
+                self._record.add_component(cup, "", gross.mass, gross.uncertainty)
+            return None
+        missing = empty[0] + content - gross.mass
+        sigma = math.sqrt(empty[1] ** 2 + spread**2 + gross.uncertainty**2)
+        if abs(missing) > OPEN_LOSS + SURE * sigma:
+            text = (
+                f"'{cup}' on the balance holds {1e3 * (gross.mass - empty[0]):.2f} g, and {1e3 * content:.2f} g by the "
+                f"account of vessels: {1e3 * missing:.2f} ± {1e3 * sigma:.2f} g are missing. Look for spilled liquid, "
+                "and for a wrong cup; leave the vessels where they stand."
+            )
+            await self._go_on(text, missing, source, consent)
+        self._liquids.enter(cup, gross.mass - empty[0], math.hypot(gross.uncertainty, empty[1]), self._mixture(cup))
+        return missing
+
+    async def _go_on(self, text: str, missing: float, source: str, consent: MotionConsent) -> None:
+        """Ask a person about masses, and then for the rest of the sequence."""
+        question = OperatorQuestion(
+            f"{text} Shall it go on?", "yes or no", about="mass", details={"missing_g": 1e3 * missing}
+        )
+        if (await self._carrier.ask(question, consent)).strip().lower() not in ("yes", "y"):
+            raise LaboratoryError("the masses are not what they should be, and the operator ended the dose")
+        await consent.given(move_question(f"take {label(source)}"))
+
+    def _mixture(self, cup: str) -> str:
+        liquids = [name for name in self._record.composition(cup) if name]
+        return liquids[0] if len(liquids) == 1 else "mixture" if liquids else ""
+
+    # ---- the dose
+
+    def begins(self, scene: Scene, dose: DoseTarget) -> None:
+        """The source is about to tilt: the contents are UNKNOWN until they are weighed."""
+        source, cup = self.names(scene, dose)
+        self._record.add_component(cup, scene.liquid.name, None, 0.0, source)
+        self._liquids.unknown((cup,), self._mixture(cup))
+
+    async def finish(
+        self, consent: MotionConsent, scene: Scene, dose: DoseTarget, amount: tuple[float, float]
+    ) -> CarriedDose:
+        """Put the source back, weigh the cup, and put it back unless the next dose goes into it.
+
+        Args:
+            consent: of the dose.
+            scene: vessels and liquid.
+            dose: wanted amount.
+            amount: dosed, and its standard deviation [kg].
+        """
+        source, cup = self.names(scene, dose)
+        assert self._tare is not None
+        tare, content = self._tare.weight, self._tare.content
+        self._record.add_component(cup, scene.liquid.name, *amount, source)
+        self._liquids.spilled(*LOST)
+        self._liquids.enter_tray(scene.liquid.name)
+        carrier = self._carrier
+        back = f"put {label(source)} back" + ("" if dose.stays else f", and {label(cup)} once it is weighed")
+        carrier.mass[source] = max(carrier.mass[source] - amount[0], 0.0)
+        async with carrier.driving(consent, back):
+            await carrier.put(source, self._vessels[source].place)
+            gross = await self._weigh()
+            carrier.mass[cup] = content[0] + gross.mass - tare.mass
+            spread = math.hypot(content[1], tare.uncertainty, gross.uncertainty)
+            self._liquids.enter(cup, carrier.mass[cup], spread, self._mixture(cup))
+            if not dose.stays:
+                await carrier.move(cup, self._vessels[cup].place, consent)
+        return CarriedDose(cup, source, tare, gross, self._tare.missing)
+
+    def forget(self) -> None:
+        """The dose was interrupted: the vessels are laid out again before the next one."""
+        self._carrier.forget()
+        self._tare = None
+
+    async def _weigh(self) -> PourMasses:
+        weight = await self._carrier.balance.weigh()
+        return PourMasses(weight.mass, weighing_uncertainty(weight.step, self._weighing.deviation))
