@@ -223,7 +223,7 @@ def test_blocks_of_yaml_have_only_keys_that_exist() -> None:
 
 
 def words_of(value: Any, within: str = "") -> Iterator[str]:
-    if isinstance(value, dict):
+    if isinstance(value, dict) and within != "wanted":  # below are names of cups and liquids
         for key, inner in value.items():
             if within not in ("rigs", "columns"):
                 yield str(key)

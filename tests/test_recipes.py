@@ -92,6 +92,19 @@ def test_the_script_pours_once_and_waits_for_the_operator_after_the_daemon_was_k
     assert poured(tmp_path) == 1
 
 
+def test_the_closed_loop_pours_what_its_optimiser_proposes_and_learns_from_what_was_reached(tmp_path: Path) -> None:
+    script = str(RECIPES / "mixtures_loop.py")
+    process = subprocess.run(
+        [sys.executable, script, "2"], capture_output=True, text=True, timeout=600, check=False, cwd=tmp_path,
+        env=child_environment({"XDG_STATE_HOME": str(tmp_path / "state")}),
+    )  # fmt: skip
+    assert process.returncode == 0, process.stderr[-3000:]
+    first, second = map(json.loads, process.stdout.splitlines())
+    assert 0.0 < first["best"] < second["best"] <= 1.0
+    assert sum(second["shares"]) == pytest.approx(1.0, abs=0.01)
+    assert len(list((tmp_path / "runs").glob("loop-*/mixtures.csv"))) == 2
+
+
 def test_a_flow_of_prefect_fills_vials_and_pours_nothing_again_in_its_second_run(tmp_path: Path) -> None:
     python = python_with("prefect", "PREFECT")
     with station_process(tmp_path, "station") as (url, _, _):

@@ -510,20 +510,30 @@ class _Checker:
 
     def mixtures(self, plan: CampaignPlan, tell: Callable[[str], None]) -> None:
         """Balance and sources must support every amount of the mixtures, and no cup may be open for too long."""
-        from orchestrator.campaigns.mixture_forecast import forecast_mixtures
+        from orchestrator.campaigns.mixture_forecast import MixtureForecast
 
+        assert plan.dispense is not None
+        assert plan.dispense.mixtures is not None
         self.doing("predicting the doses of the mixtures")
-        forecast = forecast_mixtures(plan)
-        for line in forecast.lines:
+        try:
+            forecast = MixtureForecast(plan)
+        except InvalidActionError as error:
+            self.add((("mixtures",),), str(error))
+            return
+        for line in forecast.lines():
             tell(line)
-        for cups, liquid, text in forecast.problems:
+        for cups, liquid, text in forecast.refused():
             name = cups[0].partition("/")[2]
             places = (("mixtures", "wanted", name, liquid), ("mixtures", "from"), ("mixtures", "wanted"))
             self.add(places, f"{liquid} into {', '.join(cups)}: {text}")
-        longest = None if plan.dispense is None or plan.dispense.mixtures is None else plan.dispense.mixtures.max_open
+        longest, supply = plan.dispense.mixtures.max_open, plan.laboratory.source
         if longest is not None and forecast.open_time > longest:
             text = f"a cup is open for up to {forecast.open_time / 60.0:.1f} min; pour fewer liquids, or raise it"
             self.add((("mixtures", "max_open"),), text)
+        again = [f"{name} {count - 1} times" for name, count in forecast.fills.items() if count > 1]
+        if again and plan.laboratory.unattended is not None and (supply is None or supply.refill is None):
+            text = f"have to be filled again ({', '.join(again)}), and nobody is there; add stands with the same liquid"
+            self.add((("mixtures", "liquids"),), text)
 
     def recorded(self, scene: Scene, recorded: list[Action], role: _Role, place: Loc) -> None:
         """Recorded pours were possible: if their vessels touch, the description of the scene is wrong."""

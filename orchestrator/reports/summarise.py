@@ -257,13 +257,16 @@ def pour_summary(plan: CampaignPlan | None, pour: RunPour, *, live: bool = False
     if measured is not None and masses.spilled_g is None:
         came = f"{1e3 * measured.delivered:.2f} g received"
     action = style.display_values({name: values[name] for name in names})
+    receiver = request.scene if plan is None else receiver_names(plan).get(request.scene, request.scene)
     if request.dose is not None:
         action = f"{1e3 * request.dose.amount:g} g wanted"
+        if request.dose.cup and request.dose.source is not None:
+            receiver, action = request.dose.cup, f"{action} from {request.dose.source.name}"
         came = "" if measured is None else f"{1e3 * measured.delivered:.1f} g"
     return PourSummary(
         stage=pour.stage,
         number=request.number,
-        receiver=request.scene if plan is None else receiver_names(plan).get(request.scene, request.scene),
+        receiver=receiver,
         state=state,
         calibration=calibrating,
         action=action,
