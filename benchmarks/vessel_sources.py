@@ -54,14 +54,11 @@ class Row:
 def vessel_sources(of: MeasuredVessel, folder: Path) -> dict[str, dict[str, Any]]:
     """Return the arguments of `decant vessel` by source."""
     tall, wall, floor = f"{of.height} m", f"{of.shape.wall} m", f"{of.shape.floor} m"
-    outside = f"{of.height + of.shape.floor} m"
     diameters = of.diameters(6)
     fill, tilt = of.fill(folder / "fill.csv"), of.tilt(folder / "tilt.csv")
-    photo = of.photo(folder / "side.png")
     of.solid().export(folder / "scan.stl")
     return {
         "callipers": {"height": tall, "diameters": diameters, "wall": wall, "floor": floor},
-        "photograph": {"photo": photo, "known_height": outside, "wall": wall, "floor": floor},
         "fill table": {"height": tall, "fill": fill, "wall": wall, "floor": floor},
         "tilt table": {"height": tall, "tilt": tilt, "wall": wall, "floor": floor},
         "all tables and callipers": {

@@ -1,8 +1,7 @@
 """The commands `decant vessel ...`: each makes a vessel file from one kind of source.
 
-`profile` and `photo` fit a turned vessel to their source and to the sizes and tables that are given (`Sizes`); `mesh`
-repairs a mesh and uses it alone. Tables and photographs are read in `vessel_tables`; the fits are in
-`sim_engine.vessel_acquisition`.
+`profile` fits a turned vessel to the sizes and tables that are given (`Sizes`); `mesh` repairs a mesh and uses it.
+Tables are read in `vessel_tables`; the fits are in `sim_engine.vessel_acquisition`.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -23,7 +22,6 @@ from orchestrator.cli.console import RefusalError, print_note, print_warning, wa
 if TYPE_CHECKING:
     from sim_engine.vessel.mesh_shape import Axis
     from sim_engine.vessel.shapes import LengthUnit
-    from sim_engine.vessel_acquisition.measurements import Radii
     from sim_engine.vessel_acquisition.outline_fit import Evidence, FittedOutline
 
 CALLIPERS = 2e-4
@@ -133,43 +131,6 @@ def profile(out: Out, sizes: Sizes, vessel: Vessel) -> None:
 
 
 @grouped
-def photo(
-    picture: Annotated[Path, typer.Argument(help="Photograph from the side.", metavar="PICTURE")],
-    out: Out,
-    known_height: Annotated[str | None, typer.Option(help="Outer height, for the scale of the photograph.")] = None,
-    known_width: Annotated[str | None, typer.Option(help="Largest outer width, for the scale.")] = None,
-    *,
-    sizes: Sizes,
-    vessel: Vessel,
-) -> None:
-    """Make the file of a turned vessel from a photograph on a plain background.
-
-    Take it from ten widths away, level with the middle of the vessel. It shows the outside: give `--wall`, and one
-    outer length for the scale. Sizes and tables of the same vessel are combined with it.
-    """
-
-    def seen(wall: float, floor: float) -> tuple[Radii, float]:
-        from orchestrator.extra_commands.vessel_tables import read_photograph
-        from sim_engine.resources import require
-        from sim_engine.vessel_acquisition.photograph import radii_within, silhouette
-
-        require("skimage", "a photograph")
-        tall = _quantity(known_height, "--known-height", "m", "99 mm")
-        wide = _quantity(known_width, "--known-width", "m", "78 mm")
-        if (tall is None) == (wide is None):
-            raise RefusalError(
-                "a photograph needs one known outer length for its scale: --known-height '99 mm' or --known-width "
-                "'78 mm'"
-            )
-        grey = read_photograph(picture)
-        known: Literal["height", "width"] = "height" if tall is not None else "width"
-        shape = silhouette(grey, known, cast(float, tall or wide))
-        return radii_within(shape, wall, floor), shape.height - floor
-
-    _make(out, vessel, lambda notes: _turned(out, sizes, vessel, notes, seen))
-
-
-@grouped
 def mesh(
     file: Annotated[Path, typer.Argument(help="Mesh: STL, OBJ, PLY or GLB.", metavar="MESH")],
     out: Out,
@@ -243,18 +204,8 @@ def _quantity(text: str | None, subject: str, unit: str, example: str) -> float 
 # -- turned vessels ----------------------------------------------------------------------------------------------------
 
 
-def _turned(
-    out: Path,
-    sizes: Sizes,
-    vessel: Vessel,
-    notes: list[str],
-    seen: Callable[[float, float], tuple[Radii, float]] | None = None,
-) -> Made:
-    """Make a surface of revolution from all measurements.
-
-    Args:
-        seen: for a wall and a floor, the radii of a source and the height inside [m].
-    """
+def _turned(out: Path, sizes: Sizes, vessel: Vessel, notes: list[str]) -> Made:
+    """Make a surface of revolution from all measurements."""
     import numpy as np
 
     from sim_engine.vessel.shapes import VesselSpec
@@ -266,17 +217,11 @@ def _turned(
     if wall is None:
         raise RefusalError("how thick is the wall? Say it with --wall, for example --wall '3 mm'")
     floor = wall if floor is None else floor
-    evidence: list[Evidence] = []
-    if seen is not None:
-        radii, inside = seen(wall, floor)
-        evidence.append(radii)
-        if height is None:
-            height = inside
     if height is None:
         raise RefusalError(
             "how deep is it inside, from floor to rim? Say it with --height, for example --height '95 mm'"
         )
-    evidence += _measured(sizes, vessel, height)
+    evidence = _measured(sizes, vessel, height)
 
     def fitted(measurements: Sequence[Evidence]) -> FittedOutline:
         return find_outline(height, measurements, wall, floor, height_deviation=HEIGHT)
@@ -544,10 +489,6 @@ def register(app: typer.Typer) -> None:
         profile,
         "decant vessel profile cup.yaml --height '95 mm' --diameters '5 mm: 60 mm, 95 mm: 72 mm' --wall '3 mm'",
         "decant vessel profile cup.yaml --height '95 mm' --fill fill.csv --tare '104 g' --wall '3 mm'",
-    )
-    add(
-        photo,
-        "decant vessel photo side.png cup.yaml --known-height '99 mm' --wall '3 mm' --fill fill.csv --brimful '322 g'",
     )
     add(
         mesh,

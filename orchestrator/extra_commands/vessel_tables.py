@@ -1,4 +1,4 @@
-"""Input of `decant vessel`: pairs of lengths, tables of two columns, and photographs.
+"""Input of `decant vessel`: pairs of lengths, and tables of two columns.
 
 Every reader reports invalid input as a `RefusalError` with file and line.
 """
@@ -6,7 +6,6 @@ Every reader reports invalid input as a `RefusalError` with file and line.
 from __future__ import annotations
 
 import math
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +19,6 @@ from sim_engine.settings.quantity import QuantityError, typed_quantity
 
 Floats = NDArray[np.float64]
 
-LARGEST_FILE = 200_000_000
-"""Largest file that is read [bytes]."""
-
 LARGEST_TABLE = 2_000_000
 """Largest file of a table [bytes]."""
 
@@ -32,8 +28,6 @@ FEWEST_ROWS = 3
 
 NARROWEST_MM, WIDEST_MM = 4.0, 1000.0
 """Limits of the mean inner diameter of vessels [mm]."""
-
-MOST_PIXELS = 60_000_000
 
 COLUMNS = {
     one.standard: one
@@ -179,31 +173,3 @@ def _read_rows(path: Path, column: str, *, upper: float, tare: float) -> list[tu
     if len(rows) < FEWEST_ROWS:
         raise RefusalError(f"{path}: has {len(rows)} row(s); at least {FEWEST_ROWS} say something about a shape")
     return rows
-
-
-def read_photograph(path: Path) -> Floats:
-    """Read the brightness of a picture as viewers show it, rows from the top, shape (rows, columns).
-
-    Raises:
-        RefusalError: it is not a readable picture (exit code 2).
-    """
-    from PIL import Image, ImageOps, UnidentifiedImageError
-
-    _check_size(path)
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # large ones: see below
-            if picture.width * picture.height > MOST_PIXELS:
-                raise RefusalError(f"{path}: {picture.width} × {picture.height} pixels; make it smaller")
-            upright = ImageOps.exif_transpose(picture)  # cameras store the sensor's rows and their orientation
-            return np.asarray(upright.convert("L"), dtype=float)
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError) as error:  # truncated, damaged
-        raise RefusalError(f"{path}: is not a picture that can be read ({error})") from None
-
-
-def _check_size(path: Path) -> None:
-    if path.is_dir():
-        raise RefusalError(f"{path}: is a folder; name a file in it")
-    if not path.is_file():
-        raise RefusalError(f"{path}: there is no such file")
-    if (size := path.stat().st_size) > LARGEST_FILE:
-        raise RefusalError(f"{path}: {size / 1e6:.0f} MB; at most {LARGEST_FILE / 1e6:.0f} MB are read")

@@ -1,1 +1,1 @@
-"""Vessel shapes from measurements: outlines, photographs, meshes."""
+"""Vessel shapes from measurements: outlines, meshes."""

@@ -20,7 +20,7 @@ SLICES = 240
 
 @dataclass(frozen=True, eq=False)
 class Radii:
-    """Inner radii at heights, from callipers or a photograph.
+    """Inner radii at heights, from callipers.
 
     Attributes:
         heights: above the inner floor, shape (n,) [m].

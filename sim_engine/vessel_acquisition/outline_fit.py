@@ -186,7 +186,7 @@ def find_outline(
         VesselError: there are no measurements, or no profile fits them.
     """
     if not evidence or sum(len(piece.observed) for piece in evidence) == 0:
-        raise VesselError("nothing says how wide the vessel is; give diameters, a photograph or a fill table")
+        raise VesselError("nothing says how wide the vessel is; give diameters or a fill table")
     share = np.linspace(0.0, 1.0, NODES)
     heights = height * share**CROWDING
     observed = np.concatenate([piece.observed for piece in evidence])

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFilter
 
 from orchestrator.extra_commands import vessel_command
-from sim_engine.vessel.profile import outer_profile
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec
 from sim_engine.vessel.vessel import build_vessel
 from sim_engine.vessel_acquisition.measurements import held_when_tilted
@@ -21,12 +19,11 @@ from sim_engine.vessel_acquisition.outline_fit import volume_below
 Floats = NDArray[np.float64]
 
 WATER = 998.0
-PIXELS_PER_MM = 6.0
 
 
 def vessel(out: Path, **options: Any) -> None:
-    """Run the command of `decant vessel` whose source is among the options: photo, mesh, or none."""
-    kind = next((one for one in ("photo", "mesh") if one in options), "profile")
+    """Run the command of `decant vessel` whose source is among the options: a mesh, or none."""
+    kind = "mesh" if "mesh" in options else "profile"
     source = [options.pop(kind)] if kind in options else []
     getattr(vessel_command, kind)(*source, out, **options)
 
@@ -69,25 +66,6 @@ class MeasuredVessel:
         volumes = [held_when_tilted(z, self.radius(z), float(np.radians(t))) for t in tilts]
         masses = np.maximum(1e3 * WATER * np.array(volumes) + self.rng.normal(0.0, 0.3, len(tilts)), 0.0)
         return _table(path, "tilt_deg", tilts, masses)
-
-    def photo(self, path: Path, *, lean: float = 1.2, handle: bool = False) -> Path:
-        """Dark before a bright wall, a little out of level, blurred and noisy."""
-        outer = outer_profile(self.inner, self.shape.wall, self.shape.floor)
-        corners = [
-            (450.0 + side * PIXELS_PER_MM * 1e3 * r, 750.0 - PIXELS_PER_MM * 1e3 * (z + self.shape.floor))
-            for side, curve in ((1.0, outer), (-1.0, outer[::-1]))
-            for r, z in curve
-        ]
-        picture = Image.new("L", (900, 800), 230)
-        draw = ImageDraw.Draw(picture)
-        draw.polygon(corners, fill=60)
-        if handle:
-            draw.ellipse((650, 300, 840, 600), outline=60, width=40)
-        turned = picture.rotate(lean, resample=Image.Resampling.BICUBIC, fillcolor=230)
-        grey = np.asarray(turned.filter(ImageFilter.GaussianBlur(1.5)), float)
-        noisy = np.clip(grey + self.rng.normal(0.0, 6.0, grey.shape), 0, 255)
-        Image.fromarray(noisy.astype(np.uint8)).save(path)
-        return path
 
     def solid(self) -> trimesh.Trimesh:
         """Millimetres."""

@@ -36,30 +36,7 @@ class ControllerFaults:
         self._host = host
         self._controller = host.controller
         self._names: dict[str, Callable[..., dict[str, Any] | None]] = {
-            "protective_stop": self.protective_stop,
-            "freedrive": self.freedrive,
-            "force": self.force,
-            "emergency_stop": self.emergency_stop,
-            "release_emergency_stop": self.release_emergency_stop,
-            "safeguard": self.safeguard,
-            "reduced": self.reduced,
-            "safety_fault": self.safety_fault,
-            "stall": self.stall,
-            "drop": self.drop,
-            "refuse": self.refuse,
-            "reboot": self.reboot,
-            "noise": self.noise,
-            "lag": self.lag,
-            "slider": self.slider,
-            "slowing": self.slowing,
-            "remote": self.remote,
-            "checksum": self.checksum,
-            "limits": self.limits,
-            "inputs": self.inputs,
-            "power": self.power,
-            "state": self.state,
-            "history": self.history,
-            "clear": self.clear,
+            name: getattr(self, name) for name in vars(type(self)) if not name.startswith("_") and name != "call"
         }
 
     def call(self, request: Any) -> dict[str, Any]:

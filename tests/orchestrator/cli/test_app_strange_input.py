@@ -8,9 +8,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 from ruamel.yaml import YAML
 
 from actors.runtime.child_process import child_environment
@@ -60,10 +58,8 @@ WRITTEN: dict[str, str | bytes] = {
     "twice.json": '{"theta": {"friction": 0.1, "friction": 0.2}}',
     "weight.json": '{"theta": {"friction": 0.1}, "posterior": [{"theta": {"friction": 0.1}, "weight": -1}]}',
     "deep.json": "[" * 100_000,
-    "text.png": "no picture",
 }
 
-PHOTO = "--known-height '100 mm' --wall '3 mm'"
 
 # command line: what stderr has to say
 BAD: dict[str, str] = {
@@ -90,11 +86,6 @@ BAD: dict[str, str] = {
     "plan campaigns/quickstart.yaml --parameters twice.json": "twice.json:1:29: theta.friction: duplicate key",
     f"simulate campaigns/quickstart.yaml {ACTION} --parameters weight.json": "needs a 'theta' and a 'weight' above 0",
     "plan campaigns/quickstart.yaml --parameters deep.json": "is nested more than 30 deep",
-    f"vessel photo text.png out.yaml {PHOTO}": "text.png: is not a picture that can be read",
-    f"vessel photo cut.png out.yaml {PHOTO}": "cut.png: is not a picture that can be read (image file is truncated)",
-    f"vessel photo campaigns out.yaml {PHOTO}": "campaigns: is a folder; name a file in it",
-    f"vessel photo white.png out.yaml {PHOTO}": "the photograph shows nothing",
-    f"vessel photo large.png out.yaml {PHOTO}": "large.png: 10000 × 9000 pixels; make it smaller",
 }
 
 
@@ -108,11 +99,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).write_text(text.replace(old, new, 1), encoding="utf-8")
     for name, content in WRITTEN.items():
         (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-    noise = np.random.default_rng(0).integers(0, 255, (60, 60, 3), dtype=np.uint8)
-    Image.fromarray(noise).save(folder / "cut.png")
-    (folder / "cut.png").write_bytes((folder / "cut.png").read_bytes()[:3000])
-    Image.new("L", (200, 200), 255).save(folder / "white.png")
-    Image.new("1", (10_000, 9_000), 1).save(folder / "large.png")
     return folder
 
 

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from PIL import ExifTags, Image
 
 from orchestrator.campaigns.file_loading import load_vessel
-from orchestrator.extra_commands.vessel_tables import read_fill_table, read_photograph
+from orchestrator.extra_commands.vessel_tables import read_fill_table
 from sim_engine.errors import DecantError
 from sim_engine.vessel.profile import volume
 from sim_engine.vessel.vessel import build_vessel
@@ -49,12 +48,6 @@ def tilt(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     return {"height": f"{of.height} m", "tilt": of.tilt(folder / "tilt.csv"), "wall": "3 mm"}
 
 
-def photo(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
-    tall = of.height + of.shape.floor
-    wall, floor = f"{of.shape.wall} m", f"{of.shape.floor} m"
-    return {"photo": of.photo(folder / "side.png"), "known_height": f"{tall} m", "wall": wall, "floor": floor}
-
-
 def mesh(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
     of.solid().export(folder / "scan.stl")
     return {"mesh": folder / "scan.stl"}
@@ -64,68 +57,11 @@ def mesh(of: MeasuredVessel, folder: Path) -> dict[str, Any]:
 @pytest.mark.parametrize("name", ["tumbler", pytest.param("cone", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "door",
-    [callipers, fill, tilt, photo, mesh],
+    [callipers, fill, tilt, mesh],
 )
 def test_a_cup_comes_out_as_it_is_through_every_door(tmp_path: Path, name: str, door: Door) -> None:
     of = measured(name)
     assert made(tmp_path, door(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_photograph_is_measured_as_it_is_shown_however_the_camera_was_held(tmp_path: Path, orientation: int) -> None:
-    """A camera stores what its sensor saw, and in EXIF how that has to be turned or mirrored."""
-    of = measured("tumbler")
-    shown = Image.open(of.photo(tmp_path / "shown.png"))
-    stored = shown if (turn := AS_STORED[orientation]) is None else shown.transpose(turn)
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    stored.save(tmp_path / "stored.png", exif=exif)
-    np.testing.assert_array_equal(read_photograph(tmp_path / "stored.png"), read_photograph(tmp_path / "shown.png"))
-
-
-AS_STORED = {
-    1: None,
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_90,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_270,
-}
-"""What undoes the turn that an EXIF orientation asks for."""
-
-
-@pytest.mark.slow
-def test_a_cup_photographed_upright_by_a_camera_on_its_side_comes_out_as_it_is(tmp_path: Path) -> None:
-    of = measured("tumbler")
-    sources = photo(of, tmp_path)
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    Image.open(sources["photo"]).transpose(Image.Transpose.ROTATE_90).save(sources["photo"], exif=exif)
-    assert made(tmp_path, sources) == pytest.approx(of.vessel.capacity, rel=0.015)
-
-
-@pytest.mark.slow
-def test_a_bowl_wider_than_high_comes_out_as_it_is_from_a_photograph_out_of_level(tmp_path: Path) -> None:
-    of = measured("bowl")
-    assert made(tmp_path, photo(of, tmp_path)) == pytest.approx(of.vessel.capacity, rel=0.015)
-
-
-@pytest.mark.slow
-def test_a_large_photograph_with_little_room_beside_the_vessel_will_do(tmp_path: Path) -> None:
-    from PIL import Image, ImageChops
-
-    of = measured("tumbler")
-    sources = photo(of, tmp_path)
-    with Image.open(sources["photo"]) as whole:
-        seen = ImageChops.difference(whole, Image.new(whole.mode, whole.size, whole.getpixel((0, 0))))
-        box = seen.point(lambda value: 255 * (value > 60)).getbbox()
-        assert box is not None
-        left, top, right, bottom = box
-        close = whole.crop((left - 8, top - 8, right + 8, bottom + 8))
-        close.resize((4 * close.width, 4 * close.height)).save(sources["photo"])
-    assert made(tmp_path, sources) == pytest.approx(of.vessel.capacity, rel=0.015)
 
 
 @pytest.mark.slow
@@ -154,7 +90,7 @@ def test_sources_that_are_joined_know_more_than_each_alone(tmp_path: Path, capsy
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("door", [callipers, fill, pytest.param(photo, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("door", [callipers, fill])
 def test_the_file_says_how_far_the_shape_may_be_off(tmp_path: Path, door: Door) -> None:
     made(tmp_path, door(measured("cone"), tmp_path))
     told = float((tmp_path / "made.yaml").read_text().partition("±")[2].split()[0])
@@ -256,16 +192,6 @@ def written(text: str) -> Door:
             r"not between the inner",
         ),
         (lambda of, folder: {"height": "95 mm", "diameters": "60", "wall": "3 mm"}, r"a height and a diameter"),
-        (lambda of, folder: {"photo": folder / "none.png", "known_height": "9 cm", "wall": "3 mm"}, r"no such file"),
-        (lambda of, folder: {"photo": of.photo(folder / "p.png"), "wall": "3 mm"}, r"one known outer length"),
-        (
-            lambda of, folder: {
-                "photo": of.photo(folder / "p.png", handle=True),
-                "known_height": "9 cm",
-                "wall": "3 mm",
-            },
-            r"not the same on both sides",
-        ),
         (written("mass_g\n2\n"), r"fill.csv:1: the column 'level_mm' is missing"),
         (written("level,mass\n1,2\n"), r"fill.csv:1:1: level: has no unit; write 'level_mm' or 'level \[mm\]'"),
         (
