@@ -20,7 +20,6 @@ from orchestrator.daemon.rigs.pour_orders import OrderBook
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.daemon_settings import DaemonSettings
 from orchestrator.daemon.state.run_readout import violated_charts
-from orchestrator.learning.run_errors import RunError
 from orchestrator.live_view.live_server import LiveView
 
 LEAVING = 10.0
@@ -91,8 +90,8 @@ class Supervisor:
             self.shared.rested.clear()
             try:
                 await self.report_charts()
-            except (RunError, OSError) as error:
-                _log.warning("the control charts can't be read: %s", error)
+            except Exception:  # the next campaign's charts are read again, whatever was wrong with these
+                _log.exception("the control charts can't be read")
 
     async def report_charts(self) -> None:
         """Publish each violation of a control chart once.

@@ -9,9 +9,11 @@ from typing import Any
 
 import pytest
 
+from orchestrator.daemon.rigs import supervisor
 from orchestrator.daemon.state.access_tokens import Role
 from orchestrator.records.run_registry import VARIABLE, use_state_directory
 from tests.support.toy_daemon import Served, run, serving
+from tests.support.waiting import wait_async
 
 
 @pytest.fixture(autouse=True)
@@ -78,6 +80,26 @@ def test_a_chart_out_of_control_is_reported_once_and_again_after_another_violati
             await served.supervisor.report_charts()
             await served.supervisor.report_charts()
             assert len(reported()) == 2
+
+    run(work())
+
+
+def test_charts_are_read_again_after_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: list[Path] = []
+
+    def violated(state: Path) -> list[Any]:
+        reads.append(state)
+        if len(reads) == 1:
+            raise ValueError("a value that no chart can have")
+        return []
+
+    monkeypatch.setattr(supervisor, "violated_charts", violated)
+
+    async def work() -> None:
+        async with serving(tmp_path) as served:
+            for count in (1, 2):
+                served.supervisor.shared.rested.set()
+                await wait_async(lambda: len(reads) == count, f"charts read {count} times")  # noqa: B023
 
     run(work())
 
