@@ -13,13 +13,12 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, computed_field
 
 FEWEST, HISTORY = 5, 30
@@ -43,44 +42,53 @@ LARGEST = 4.0
 Rule = Literal["limit", "two of three", "cusum"]
 
 
-@dataclass(frozen=True)
-class ChartPoint:
-    """One day of one group.
+class ChartPoint(BaseModel):
+    """One point of a chart: the mean of one day, of one vessel or liquid where these differ."""
 
-    Attributes:
-        day: its number.
-        group: number of the group.
-        values: number of values.
-        mean: of the values.
-        deviations: distance from the history's mean in standard deviations; None before there are limits.
-        limits: of a mean of so many values; None before there are any.
-    """
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
-    day: int
-    group: int
-    values: int
-    mean: float
+    time: float
+    """Time of the day's first value, seconds since 1970."""
+
+    about: str
+    """The vessels and the liquid; '' if the quantity does not depend on them."""
+
+    pours: int
+    """Number of values."""
+
+    value: float
+    """Their mean, in the unit of the chart; the geometric one for scatter and time."""
+
     deviations: float | None = None
-    limits: tuple[float, float] | None = None
+    """Distance from the history's mean in standard deviations; null while there are fewer than five days."""
+
+    low: float | None = None
+    """Lower limit (four standard deviations)."""
+
+    high: float | None = None
+    """Upper limit."""
 
 
-@dataclass
-class Violation:
-    """A period in which a chart was out of control. Points are numbered as in the chart.
+class ChartViolation(BaseModel):
+    """A period in which a chart was out of control."""
 
-    Attributes:
-        begun: first point of the change, as estimated.
-        noticed: point at which a rule reported it.
-        ended: point at which no rule holds any more; None if it lasts.
-        rule: that reported it.
-        sign: 1 above the limits, -1 below.
-    """
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
-    begun: int
-    noticed: int
+    begun: float
+    """Estimated begin of the change, seconds since 1970."""
+
+    noticed: float
+    """Day on which it was noticed, seconds since 1970."""
+
+    ended: float | None = None
+    """When it was in control again; null if it lasts."""
+
     rule: Rule
-    sign: int
-    ended: int | None = None
+    """'limit': a point beyond four standard deviations; 'two of three' beyond three; 'cusum': a small change that
+    lasts."""
+
+    deviations: float = 0.0
+    """Mean distance since it began, in standard deviations."""
 
 
 @dataclass
@@ -96,12 +104,12 @@ class _History:
 
     def add(self, point: ChartPoint, squares: float) -> None:
         self.days += 1
-        step = point.mean - self.mean
+        step = point.value - self.mean
         self.mean += step / self.days
-        self.squares += step * (point.mean - self.mean)
-        self.inverse += 1.0 / point.values
+        self.squares += step * (point.value - self.mean)
+        self.inverse += 1.0 / point.pours
         self.within += squares
-        self.freedom += point.values - 1
+        self.freedom += point.pours - 1
 
     def deviation(self, values: int, resolution: float) -> float:
         """Standard deviation of the next day's difference from the mean, if it has so many values.
@@ -117,8 +125,8 @@ class _History:
 
 
 def control_chart(
-    days: ArrayLike, values: ArrayLike, groups: ArrayLike | None = None, *, resolution: float = 0.0
-) -> tuple[list[ChartPoint], list[Violation]]:
+    times: Sequence[float], values: Sequence[float], about: Sequence[str] | None = None, *, resolution: float = 0.0
+) -> tuple[list[ChartPoint], list[ChartViolation]]:
     """The chart of one quantity: Shewhart limits with a run rule, and a two-sided CUSUM.
 
     Every day is compared with the days of its group before it, at most the first `HISTORY` of them that were in
@@ -126,9 +134,9 @@ def control_chart(
     however short the history is. Groups of different level (other vessels, other liquids) share one chart.
 
     Args:
-        days: number of the day of each value (n,).
+        times: of each value, the oldest first, seconds since 1970 (n,). A day is a local one.
         values: finite numbers (n,).
-        groups: number of the group of each value (n,); None: one group.
+        about: group of each value (n,); None: one group.
         resolution: smallest standard deviation: differences of this size mean nothing, even in a constant history.
 
     Returns:
@@ -142,22 +150,21 @@ def control_chart(
     first day on is seen late, because the limits contain it.
     """
     points: list[ChartPoint] = []
-    histories: dict[int, _History] = {}
-    violations: list[Violation] = []
+    histories: dict[str, _History] = {}
+    periods: list[tuple[ChartViolation, int, int | None]] = []
     sums, since = [0.0, 0.0], [0, 0]
     recent: deque[float] = deque(maxlen=3)
-    for number, (point, squares) in enumerate(_days(days, values, groups)):
-        history = histories.setdefault(point.group, _History())
+    for number, (point, squares) in enumerate(_days(times, values, about or [""] * len(values))):
+        points.append(point)
+        history = histories.setdefault(point.about, _History())
         if history.days < FEWEST:
             history.add(point, squares)
-            points.append(point)
             continue
-        deviation = history.deviation(point.values, resolution)
+        deviation = history.deviation(point.pours, resolution)
         # Beyond 37, Student's distribution is exactly 0 or 1 in floating-point numbers.
-        z = _normal((point.mean - history.mean) / max(deviation, 1e-300), history.days - 1)
+        z = _normal((point.value - history.mean) / max(deviation, 1e-300), history.days - 1)
         half = _student(LIMIT, history.days - 1) * deviation
-        limits = (history.mean - half, history.mean + half)
-        points.append(ChartPoint(point.day, point.group, point.values, point.mean, z, limits))
+        point.deviations, point.low, point.high = z, history.mean - half, history.mean + half
         recent.append(z)
         before = tuple(sums)
         for side, sign in enumerate((1, -1)):
@@ -167,16 +174,18 @@ def control_chart(
             sums[side] = min(max(sums[side] + counted - SLACK, 0.0), DECISION)
         side = int(z < 0.0) if abs(z) > TWICE else int(sums[1] > sums[0])
         rule = _rule(z, recent, sums[side])
-        lasting = violations[-1] if violations and violations[-1].ended is None else None
-        if rule is None and lasting is not None and max(sums) < CALM:
-            lasting.ended = number
-        elif rule is not None and lasting is None:
-            ended = violations[-1].ended or 0 if violations else 0
+        last, begun, ended = periods[-1] if periods else (None, 0, 0)
+        if rule is None and last is not None and ended is None and max(sums) < CALM:
+            last.ended, periods[-1] = point.time, (last, begun, number)
+        elif rule is not None and ended is not None:
             begun = max(since[side], ended) if before[side] > CALM else number
-            violations.append(Violation(begun, number, rule, 1 - 2 * side))
-        elif rule is None and lasting is None and history.days < HISTORY:
+            periods.append((ChartViolation(begun=points[begun].time, noticed=point.time, rule=rule), begun, None))
+        elif rule is None and ended is not None and history.days < HISTORY:
             history.add(point, squares)
-    return points, violations
+    for violation, begun, ended in periods:
+        distances = [point.deviations for point in points[begun:ended] if point.deviations is not None]
+        violation.deviations = float(np.mean(distances))
+    return points, [violation for violation, _, _ in periods]
 
 
 def _rule(z: float, recent: Iterable[float], cusum: float) -> Rule | None:
@@ -187,16 +196,18 @@ def _rule(z: float, recent: Iterable[float], cusum: float) -> Rule | None:
     return "cusum" if cusum >= DECISION else None
 
 
-def _days(days: ArrayLike, values: ArrayLike, groups: ArrayLike | None) -> list[tuple[ChartPoint, float]]:
+def _days(times: Sequence[float], values: Sequence[float], about: Sequence[str]) -> Iterator[tuple[ChartPoint, float]]:
     """One point for each day and group, with the sum of squares of its values about their mean."""
-    number, value = np.asarray(days, dtype=np.int64), np.asarray(values, dtype=np.float64)
-    group = np.zeros_like(number) if groups is None else np.asarray(groups, dtype=np.int64)
-    keys, place, counts = np.unique(np.stack([number, group]), axis=1, return_inverse=True, return_counts=True)
-    place = place.reshape(-1)
-    means = np.bincount(place, value, len(counts)) / counts
-    squares = np.bincount(place, (value - means[place]) ** 2, len(counts))
-    rows = zip(*keys.tolist(), counts.tolist(), means.tolist(), squares.tolist(), strict=True)
-    return [(ChartPoint(d, g, n, mean), square) for d, g, n, mean, square in rows]
+    groups = {name: number for number, name in enumerate(dict.fromkeys(about))}
+    days: dict[tuple[int, int], list[int]] = {}
+    for place, moment in enumerate(times):
+        day = int((moment + time.localtime(moment).tm_gmtoff) // 86_400)
+        days.setdefault((day, groups[about[place]]), []).append(place)
+    for _, places in sorted(days.items()):
+        of_day = [values[place] for place in places]
+        mean = math.fsum(of_day) / len(of_day)
+        point = ChartPoint(time=times[places[0]], about=about[places[0]], pours=len(of_day), value=mean)
+        yield point, math.fsum((value - mean) ** 2 for value in of_day)
 
 
 def _normal(t: float, freedom: int) -> float:
@@ -329,55 +340,6 @@ NEW_LIMITS = "new limits"
 """Beginning of a note on a run, after which the charts of its laboratory begin again."""
 
 
-class DailyMean(BaseModel):
-    """One point of a chart: the mean of one day, of one vessel or liquid where these differ."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    time: float
-    """Time of the day's first value, seconds since 1970."""
-
-    about: str
-    """The vessels and the liquid; '' if the quantity does not depend on them."""
-
-    pours: int
-    """Number of values."""
-
-    value: float
-    """Their mean, in the unit of the chart; the geometric one for scatter and time."""
-
-    deviations: float | None
-    """Distance from the history's mean in standard deviations; null while there are fewer than five days."""
-
-    low: float | None
-    """Lower limit (four standard deviations)."""
-
-    high: float | None
-    """Upper limit."""
-
-
-class ChartViolation(BaseModel):
-    """A period in which a chart was out of control."""
-
-    model_config = ConfigDict(use_attribute_docstrings=True)
-
-    begun: float
-    """Estimated begin of the change, seconds since 1970."""
-
-    noticed: float
-    """Day on which it was noticed, seconds since 1970."""
-
-    ended: float | None
-    """When it was in control again; null if it lasts."""
-
-    rule: Rule
-    """'limit': a point beyond four standard deviations; 'two of three' beyond three; 'cusum': a small change that
-    lasts."""
-
-    deviations: float
-    """Mean distance since it began, in standard deviations."""
-
-
 class LaboratoryChart(BaseModel):
     """The control chart of one quantity of one laboratory."""
 
@@ -401,7 +363,7 @@ class LaboratoryChart(BaseModel):
     check: str
     """What to look at if it leaves its limits."""
 
-    points: list[DailyMean]
+    points: list[ChartPoint]
     """The days, the oldest first."""
 
     violations: list[ChartViolation]
@@ -427,13 +389,11 @@ class LaboratoryChart(BaseModel):
 
 @dataclass
 class _Values:
-    """Values of one quantity in one laboratory: times, days, numbers of groups."""
+    """Values of one quantity in one laboratory with their times and groups, and the runs that they are from."""
 
     times: list[float] = field(default_factory=list)
-    days: list[int] = field(default_factory=list)
     values: list[float] = field(default_factory=list)
-    groups: list[int] = field(default_factory=list)
-    names: dict[str, int] = field(default_factory=dict)
+    about: list[str] = field(default_factory=list)
     runs: set[tuple[str, str]] = field(default_factory=set)
 
 
@@ -445,9 +405,6 @@ def charts_of(rows: Sequence[Mapping[str, Any]]) -> list[LaboratoryChart]:
     """
     streams: dict[tuple[str, str], dict[str, _Values]] = {}
     for row in rows:
-        moment = float(row["time"])
-        local = time.localtime(moment)
-        day = int((moment + local.tm_gmtoff) // 86_400)
         laboratory = streams.setdefault((str(row["laboratory"] or ""), str(row["mode"])), {})
         for quantity in QUANTITIES:
             value = row[quantity.column]
@@ -458,10 +415,9 @@ def charts_of(rows: Sequence[Mapping[str, Any]]) -> list[LaboratoryChart]:
             if quantity.once and (row["path"], about) in stream.runs:
                 continue
             stream.runs.add((row["path"], about))
-            stream.times.append(moment)
-            stream.days.append(day)
+            stream.times.append(float(row["time"]))
             stream.values.append(math.log(value) if quantity.logarithmic else value)
-            stream.groups.append(stream.names.setdefault(about, len(stream.names)))
+            stream.about.append(about)
     return [
         _chart(name, mode, quantity, laboratory[quantity.column])
         for (name, mode), laboratory in sorted(streams.items())
@@ -471,36 +427,11 @@ def charts_of(rows: Sequence[Mapping[str, Any]]) -> list[LaboratoryChart]:
 
 
 def _chart(laboratory: str, mode: str, quantity: ChartedQuantity, stream: _Values) -> LaboratoryChart:
-    points, violations = control_chart(stream.days, stream.values, stream.groups, resolution=quantity.resolution)
-    names = list(stream.names)
-    times: dict[tuple[int, int], float] = {}
-    for key, moment in zip(zip(stream.days, stream.groups, strict=True), stream.times, strict=True):
-        times.setdefault(key, moment)
-    shown = math.exp if quantity.logarithmic else float
-    means = [
-        DailyMean(
-            time=times[point.day, point.group],
-            about=names[point.group],
-            pours=point.values,
-            value=shown(point.mean),
-            deviations=point.deviations,
-            low=None if point.limits is None else shown(point.limits[0]),
-            high=None if point.limits is None else shown(point.limits[1]),
-        )
-        for point in points
-    ]
-    periods = [
-        ChartViolation(
-            begun=means[violation.begun].time,
-            noticed=means[violation.noticed].time,
-            ended=None if violation.ended is None else means[violation.ended].time,
-            rule=violation.rule,
-            deviations=float(
-                np.mean([p.deviations for p in points[violation.begun : violation.ended] if p.deviations is not None])
-            ),
-        )
-        for violation in violations
-    ]
+    points, violations = control_chart(stream.times, stream.values, stream.about, resolution=quantity.resolution)
+    for point in points if quantity.logarithmic else ():
+        point.value = math.exp(point.value)
+        if point.low is not None and point.high is not None:
+            point.low, point.high = math.exp(point.low), math.exp(point.high)
     return LaboratoryChart(
         laboratory=laboratory,
         mode=mode,
@@ -508,6 +439,6 @@ def _chart(laboratory: str, mode: str, quantity: ChartedQuantity, stream: _Value
         label=quantity.label,
         unit=quantity.unit,
         check=quantity.check,
-        points=means,
-        violations=periods,
+        points=points,
+        violations=violations,
     )

@@ -19,8 +19,9 @@ from orchestrator.catalogue.control_charts import (
     FEWEST,
     LIMIT,
     QUANTITIES,
+    ChartPoint,
+    ChartViolation,
     LaboratoryChart,
-    Violation,
     charts_of,
     control_chart,
 )
@@ -38,9 +39,28 @@ def drawn(seed: int, days: int = 60) -> tuple[NDArray[np.int64], Floats]:
     return day, rng.normal(0.0, 0.7, days)[day] + rng.normal(0.0, 1.0, len(day))
 
 
-def violations(values: Any, **options: Any) -> list[Violation]:
+DAY = 86_400.0
+
+
+def chart(days: Any, values: Any, groups: Any = None, **options: Any) -> tuple[list[ChartPoint], list[ChartViolation]]:
+    """The chart of values at noon of numbered days."""
+    numbers = [0] * len(values) if groups is None else groups
+    times = [DAY * float(day) + 43_200.0 + float(number) for day, number in zip(days, numbers, strict=True)]
+    return control_chart(times, [float(value) for value in values], [str(number) for number in numbers], **options)
+
+
+def day(moment: float | None) -> int:
+    assert moment is not None
+    return int(moment // DAY)
+
+
+def side(violation: ChartViolation) -> float:
+    return math.copysign(1, violation.deviations)
+
+
+def violations(values: Any, **options: Any) -> list[ChartViolation]:
     """Violations of a chart with one value a day."""
-    return control_chart(range(len(values)), values, **options)[1]
+    return chart(range(len(values)), values, **options)[1]
 
 
 def still(days: int, seed: int = 1) -> Floats:
@@ -51,11 +71,11 @@ def still(days: int, seed: int = 1) -> Floats:
 @given(SEEDS, st.floats(1e-6, 1e6), st.floats(-1e3, 1e3), st.sampled_from([-1, 1]))
 def test_a_chart_does_not_depend_on_unit_zero_and_direction(seed: int, unit: float, zero: float, sign: int) -> None:
     days, values = drawn(seed, 25)
-    points, found = control_chart(days, values)
-    changed, found_then = control_chart(days, sign * unit * (values + zero))
+    points, found = chart(days, values)
+    changed, found_then = chart(days, sign * unit * (values + zero))
     expected = [None if p.deviations is None else sign * p.deviations for p in points]
     assert [p.deviations for p in changed] == [None if z is None else pytest.approx(z, abs=1e-3) for z in expected]
-    assert [(v.noticed, v.rule, sign * v.sign) for v in found_then] == [(v.noticed, v.rule, v.sign) for v in found]
+    assert [(v.noticed, v.rule, sign * side(v)) for v in found_then] == [(v.noticed, v.rule, side(v)) for v in found]
 
 
 @settings(max_examples=examples(40))
@@ -63,8 +83,8 @@ def test_a_chart_does_not_depend_on_unit_zero_and_direction(seed: int, unit: flo
 def test_the_order_of_values_within_a_day_does_not_matter(seed: int) -> None:
     days, values = drawn(seed, 20)
     order = np.random.default_rng(seed).permutation(len(days))
-    points, _ = control_chart(days, values)
-    shuffled, _ = control_chart(days[order], values[order])
+    points, _ = chart(days, values)
+    shuffled, _ = chart(days[order], values[order])
     assert [p.deviations for p in shuffled] == [
         None if p.deviations is None else pytest.approx(p.deviations, abs=1e-6) for p in points
     ]
@@ -75,15 +95,14 @@ def test_the_order_of_values_within_a_day_does_not_matter(seed: int) -> None:
 def test_a_point_is_beyond_its_limits_exactly_if_it_deviates_by_more_than_the_limit(seed: int) -> None:
     days, values = drawn(seed, 40)
     values[days > 20] += np.random.default_rng(seed).uniform(-8.0, 8.0)
-    for point in control_chart(days, values)[0]:
-        if point.limits is not None and point.deviations is not None:
-            low, high = point.limits
-            assert (not low <= point.mean <= high) == (abs(point.deviations) > LIMIT)
+    for point in chart(days, values)[0]:
+        if point.low is not None and point.high is not None and point.deviations is not None:
+            assert (not point.low <= point.value <= point.high) == (abs(point.deviations) > LIMIT)
 
 
 def test_a_still_process_gives_hardly_any_false_alarm() -> None:
     """Nine charts of 60 days: at most one alarm in three laboratories."""
-    alarms = sum(len(control_chart(*drawn(50_000 + seed))[1]) for seed in range(300))
+    alarms = sum(len(chart(*drawn(50_000 + seed))[1]) for seed in range(300))
     assert 9 * alarms / 300 < 0.33
 
 
@@ -92,10 +111,10 @@ def test_a_drift_is_noticed_once_in_its_direction_within_five_days_of_two_deviat
     late = 0
     for seed in range(20):
         days, values = drawn(51_000 + seed)
-        found = control_chart(days, values + slope * np.maximum(days - 20, 0))[1]
-        (drift,) = [v for v in found if v.noticed >= 20][-1:]
-        assert (drift.sign, drift.ended) == (math.copysign(1, slope), None)
-        late += drift.noticed > 20 + 2.0 * math.hypot(0.7, 1.0) / abs(slope) + 5
+        found = chart(days, values + slope * np.maximum(days - 20, 0))[1]
+        (drift,) = [v for v in found if day(v.noticed) >= 20][-1:]
+        assert (side(drift), drift.ended) == (math.copysign(1, slope), None)
+        late += day(drift.noticed) > 20 + 2.0 * math.hypot(0.7, 1.0) / abs(slope) + 5
     assert late <= 1
 
 
@@ -104,11 +123,10 @@ def test_one_bad_day_is_one_violation_and_changes_no_later_limit() -> None:
     bad = values.copy()
     bad[15] += 50.0
     (violation,) = violations(bad)
-    assert (violation.begun, violation.noticed, violation.rule, violation.sign) == (15, 15, "limit", 1)
-    assert violation.ended is not None
-    assert violation.ended < 30
-    limits = control_chart(range(40), bad)[0][39].limits
-    assert limits == pytest.approx(control_chart(range(39), np.delete(values, 15))[0][38].limits, rel=0.35)
+    assert (day(violation.begun), day(violation.noticed), violation.rule, side(violation)) == (15, 15, "limit", 1)
+    assert day(violation.ended) < 30
+    then, otherwise = chart(range(40), bad)[0][39], chart(range(39), np.delete(values, 15))[0][38]
+    assert (then.low, then.high) == pytest.approx((otherwise.low, otherwise.high), rel=0.35)
 
 
 def test_a_change_that_lasts_is_one_violation_and_a_second_one_after_a_repair_is_another() -> None:
@@ -118,11 +136,10 @@ def test_a_change_that_lasts_is_one_violation_and_a_second_one_after_a_repair_is
     assert first.ended is None
     values[130:] -= 3.0
     first, second = violations(values)
-    assert (first.sign, second.sign) == (1, -1)
-    assert 40 <= first.noticed < 46
-    assert first.ended is not None
-    assert 80 < first.ended < 110
-    assert 130 <= second.noticed < 136
+    assert (side(first), side(second)) == (1, -1)
+    assert 40 <= day(first.noticed) < 46
+    assert 80 < day(first.ended) < 110
+    assert 130 <= day(second.noticed) < 136
 
 
 def test_two_of_three_days_count_on_the_same_side_only() -> None:
@@ -138,29 +155,30 @@ def test_a_constant_history_has_finite_limits() -> None:
     constant = np.full(20, 0.25)
     assert violations(constant) == []
     assert violations([*constant, 0.26], resolution=0.01) == []
-    points, found = control_chart(range(21), [*constant, 0.75], resolution=0.01)
+    points, found = chart(range(21), [*constant, 0.75], resolution=0.01)
     assert found[0].rule == "limit"
-    assert all(math.isfinite(value) for point in points if point.limits for value in (*point.limits, point.mean))
-    points, found = control_chart(range(21), [*constant, 0.75])
+    assert all(math.isfinite(value) for point in points for value in (point.low or 0.0, point.high or 0.0, point.value))
+    points, found = chart(range(21), [*constant, 0.75])
     assert len(found) == 1
     assert all(math.isfinite(point.deviations) for point in points if point.deviations is not None)
 
 
 def test_few_days_have_no_limits_and_nothing_has_no_points() -> None:
-    points, found = control_chart(range(FEWEST), [0.0, 1e9, -1e9, 3.0, 4.0])
-    assert {point.limits for point in points} == {None}
+    points, found = chart(range(FEWEST), [0.0, 1e9, -1e9, 3.0, 4.0])
+    assert {point.low for point in points} == {None}
     assert found == []
-    assert control_chart([], []) == ([], [])
+    assert chart([], []) == ([], [])
     assert charts_of([]) == []
 
 
 def test_vessels_of_different_weight_share_a_chart() -> None:
     values = np.concatenate([150.0 + 0.02 * still(30), 80.0 + 0.02 * still(30, 2)])
     days, groups = np.tile(np.arange(30), 2), np.repeat([0, 1], 30)
-    assert control_chart(days, values, groups)[1] == []
+    assert chart(days, values, groups)[1] == []
     values[groups == 1] -= 0.2 * (days[groups == 1] >= 20)  # only one of them is off
-    points, (violation,) = control_chart(days, values, groups)
-    assert (points[violation.noticed].group, violation.sign) == (1, -1)
+    points, (violation,) = chart(days, values, groups)
+    (noticed,) = (point for point in points if point.time == violation.noticed)
+    assert (noticed.about, side(violation)) == ("1", -1)
 
 
 def row(day: int, **values: Any) -> dict[str, Any]:
@@ -181,8 +199,8 @@ def test_a_violation_says_what_since_when_and_what_to_check() -> None:
 
 def test_an_empty_pourer_counts_once_in_a_run_and_values_that_are_no_numbers_do_not() -> None:
     rows = [row(1, empty_pourer_g=152.0, zero_g=math.nan), row(1, empty_pourer_g=152.0, reading_noise_g=0.0)]
-    (chart,) = charts_of([*rows, row(2, empty_pourer_g=152.1)])
-    assert [(point.pours, point.value) for point in chart.points] == [(1, 152.0), (1, 152.1)]
+    (pourer,) = charts_of([*rows, row(2, empty_pourer_g=152.1)])
+    assert [(point.pours, point.value) for point in pourer.points] == [(1, 152.0), (1, 152.1)]
 
 
 def test_every_quantity_is_a_column_with_a_unit_and_a_check() -> None:
