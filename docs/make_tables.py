@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import itertools
 import json
 import os
 import re
@@ -62,7 +61,6 @@ from sim_engine.outcome import Loss
 from sim_engine.scene import PoseErrorSettings
 from sim_engine.settings.model import Choice, Settings, meanings
 from sim_engine.settings.quantity import Quantity
-from sim_engine.validation import sensitivity
 from sim_engine.vessel.shapes import ProfileShape, VesselGrip
 
 FOLDER = Path(__file__).parent
@@ -262,48 +260,9 @@ def parameters() -> str:
     return _table(("name", "bounds", "default", "meaning"), rows)
 
 
-EFFECTS = {"no effect beyond the seeds' noise": "none", "spillage rises": "rises", "spillage falls": "falls"}
-
-
-def effects() -> str:
-    """What each parameter does to the spillage of three pours, as last measured by the case `sensitivity`."""
-    found = {(e.parameter, e.pour): e for e in sensitivity.effects(_measured("sensitivity"))}
-    rows = []
-    for name, info in SimulationParameters.info().items():
-        if info.nuisance:
-            continue
-        cells = []
-        for pour in sensitivity.POURS:
-            e = found.get((name, pour))
-            if e is None:
-                cells.append("not measured yet")
-            elif EFFECTS.get(e.effect) == "none":
-                cells.append("none")
-            else:
-                cells.append(f"{EFFECTS.get(e.effect, e.effect)}, {e.where}: {e.change:+.3f} ± {e.error}")
-        rows.append((f"`{name}`", "" if info.unit == "1" else info.unit, *cells))
-    return _table(("name", "unit", *(f"{pour} pour" for pour in sensitivity.POURS)), rows)
-
-
-def seeds() -> str:
-    """What the defaults spill in these pours, and how much a seed differs from it."""
-    rows = []
-    measured = _measured("sensitivity")
-    for mean, deviation in itertools.pairwise(measured):
-        pour, marked, _ = str(mean["name"]).partition(" pour with the defaults: ")
-        if marked:
-            rows.append((pour, f"{mean['particles']}", f"{mean['value']:.3f}", f"{deviation['value']:.3f}"))
-    return _table(("pour", "particles", "spilled / poured", "standard deviation of a seed"), rows)
-
-
 def _validated() -> dict[str, Any]:
     """The records of the solver's validation, by case."""
     return dict(json.loads((FOLDER / "data" / "validation.json").read_text(encoding="utf-8"))["cases"])
-
-
-def _measured(case: str) -> list[dict[str, Any]]:
-    records = _validated()
-    return list(records[case]["measurements"]) if case in records else []
 
 
 def counted_claims() -> str:
@@ -445,6 +404,8 @@ MEASURED = (
         "optimizers",
         "viscosity",
         "dribbling",
+        "effects",
+        "seeds",
     ),
 )
 """Tables of docs/data/results.json that a page shows."""
@@ -787,8 +748,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "catalogue-pours": partial(catalogued, "pour"),
     "actions": actions,
     "parameters": parameters,
-    "effects": effects,
-    "seeds": seeds,
     "columns": columns,
     "counted-claims": counted_claims,
     "liquids": liquids,

@@ -135,13 +135,10 @@ def _panel(axes: Axes, figure: Figure, number: int, styles: Mapping[str, CaseFig
             series.x, series.y, color=look.colour, ls=look.line or "none", marker=look.marker or None, ms=5,
             mfc="white", lw=1.2 if series.kind == "reference" else 1.6, label=series.name, zorder=above,
         )  # fmt: skip
-        if series.spread:
-            low, high = ([y + side * s for y, s in zip(series.y, series.spread, strict=True)] for side in (-1, 1))
-            axes.fill_between(series.x, low, high, color=look.colour, alpha=0.18, lw=0)
     figure_style.dress(
         axes, title=figure.titles[number], x=figure.x_labels[number], y=figure.y_labels[number], grid="both"
     )
-    if figure.log_x if isinstance(figure.log_x, bool) else figure.log_x[number]:
+    if figure.log_x:
         axes.set_xscale("log")
         places = sorted({x for s in figure.series if s.panel == number and s.kind == "measured" for x in s.x})
         if len(places) > MOST_PLACES:
@@ -160,13 +157,9 @@ def figure_of(record: Mapping[str, Any]) -> Figure | None:
     stored = record.get("figure")
     if stored is None:
         return None
-    series = [
-        Series(s["name"], tuple(s["x"]), tuple(s["y"]), s["kind"], s["panel"], tuple(s["spread"]))
-        for s in stored["series"]
-    ]
+    series = [Series(s["name"], tuple(s["x"]), tuple(s["y"]), s["kind"], s["panel"]) for s in stored["series"]]
     titles, x_labels, y_labels = (tuple(stored[name]) for name in ("titles", "x_labels", "y_labels"))
-    log_x = stored["log_x"] if isinstance(stored["log_x"], bool) else tuple(stored["log_x"])
-    return Figure(titles, x_labels, y_labels, tuple(series), log_x)
+    return Figure(titles, x_labels, y_labels, tuple(series), stored["log_x"])
 
 
 def kept_records(folder: Path) -> dict[str, dict[str, Any]]:

@@ -16,7 +16,6 @@ from orchestrator.cli.command_options import Json, add_command
 from orchestrator.cli.console import FAILED, RefusalError, print_json, print_message, stdout_for_results
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
     from rich.table import Table
 
     from sim_engine.validation.case_result import CaseResult, Figure
@@ -36,7 +35,6 @@ def validate_solver(
     Exit code 1 if a criterion is not met.
     """
     from rich.console import Console
-    from rich.progress import Progress
 
     from orchestrator.reports.console_view import PLAIN_WIDTH
     from sim_engine.simulator import PourSimulator
@@ -49,14 +47,8 @@ def validate_solver(
     try:
         for case in chosen:
             print_message(f"{case.name}: {case.title} …")
-            # a bar is shown only after the first report of progress, which short cases don't make
-            with stdout_for_results(), Progress(console=Console(stderr=True), transient=True) as bars:
-                bar = bars.add_task(case.name, total=None, visible=False)
-
-                def tell(done: int, total: int, bars: Progress = bars, bar: TaskID = bar) -> None:
-                    bars.update(bar, completed=done, total=total, visible=True)
-
-                result = case.run(simulator, CaseEffort(full, progress=tell))
+            with stdout_for_results():
+                result = case.run(simulator, CaseEffort(full))
             records[case.name] = case_record(case, result)
     finally:
         simulator.close()

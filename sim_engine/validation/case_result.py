@@ -96,7 +96,6 @@ class Series:
             takes the colour of the curve whose name begins with its own name up to a comma, and is black if there is
             none.
         panel: number of the panel, in figures of several panels.
-        spread: standard deviation at each point, drawn as a band; empty: none.
     """
 
     name: str
@@ -104,7 +103,6 @@ class Series:
     y: tuple[float, ...]
     kind: Literal["measured", "reference"] = "measured"
     panel: int = 0
-    spread: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -114,14 +112,14 @@ class Figure:
     Attributes:
         titles, x_labels, y_labels: one of each per panel.
         series: curves.
-        log_x: whether the horizontal axes are logarithmic: one value for all, or one for each.
+        log_x: whether the horizontal axes are logarithmic.
     """
 
     titles: tuple[str, ...]
     x_labels: tuple[str, ...]
     y_labels: tuple[str, ...]
     series: tuple[Series, ...]
-    log_x: bool | tuple[bool, ...] = False
+    log_x: bool = False
 
 
 def collected(

@@ -15,7 +15,6 @@ from sim_engine.validation import (
     dribbling_onset,
     hydrostatic_cases,
     jet_landing,
-    sensitivity,
     sloshing,
     torricelli,
     viscous_flows,
@@ -42,11 +41,9 @@ class CaseEffort:
 
     Attributes:
         full: all resolutions and seeds; else the quick subset.
-        progress: called by long cases with the number of finished simulations and their total.
     """
 
     full: bool = False
-    progress: Callable[[int, int], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -175,11 +172,6 @@ def _convergence(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Mea
     return convergence.convergence(simulator, convergence.QUICK, (1_000,), 1, PLAIN)
 
 
-def _sensitivity(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    extent = sensitivity.FULL if effort.full else sensitivity.QUICK
-    return sensitivity.sensitivity(simulator, extent, effort.progress)
-
-
 def _walls(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
     many = 40 if effort.full else 5
     return wall_tightness.walls(many, 10_000 if effort.full else 1_500), None
@@ -284,15 +276,6 @@ CASES: tuple[Case, ...] = (
         "(`benchmarks/convergence.py`). Three pours change by more than 0.02 from 10,000 to 40,000: they splash, and "
         "without surface tension the spray grows with the number of particles. They are not judged.",
         _convergence,
-    ),
-    Case(
-        "sensitivity",
-        "What the parameters do",
-        "Each θ is turned alone, around the defaults, in a slow, a standard and a fast pour (20, 30 and 100 °/s) into "
-        "a tumbler a little too far away. For each: the widest interval in which spillage is monotone as far as the "
-        "seeds allow to tell (isotonic fit, χ² below its 95 % quantile), its change over that interval and its mean "
-        "slope, with standard errors. Nothing is judged; bands are the standard deviation of a single seed.",
-        _sensitivity,
     ),
     Case(
         "walls",

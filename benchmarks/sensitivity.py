@@ -1,9 +1,11 @@
 """Effect of each simulation parameter on the spillage: one is varied at a time, around the defaults, in three pours.
 
-There is no criterion. For every parameter and pour the result is the widest part of its range in which the spillage
-only rises or only falls within the seeds' noise, with the change and the slope there. Spillage is monotone over an
-interval if the residuals of an isotonic (least-squares monotone) fit are consistent with the noise: χ² below its 95 %
-quantile.
+    python benchmarks/sensitivity.py
+
+It takes eight minutes, and writes two tables to docs/data/results.json, and docs/images/sensitivity.png. For every
+parameter and pour the result is the widest part of its range in which the spillage only rises or only falls within the
+seeds' noise, with the change there. Spillage is monotone over an interval if the residuals of an isotonic
+(least-squares monotone) fit are consistent with the noise: χ² below its 95 % quantile.
 
 Source of the fit: Barlow, Bartholomew, Bremner & Brunk, Statistical Inference under Order Restrictions (1972).
 
@@ -13,19 +15,19 @@ Limitations: interactions of two parameters are not covered; a slope is the mean
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
 
 import numpy as np
+from machine import write_table
 from numpy.typing import NDArray
 
+from orchestrator.reports import figure_style
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid, ParameterInfo, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.case_result import Figure, Measurement, Series, reported
 from sim_engine.vessel.shapes import cylinder
 
 Floats = NDArray[np.float64]
@@ -195,33 +197,28 @@ class Extent:
 
 
 FULL = Extent(particles=1_000, values=6, seeds=5, pours=tuple(POURS))
-QUICK = Extent(particles=300, values=3, seeds=2, pours=("fast",))
+PICTURE = Path("docs/images/sensitivity.png")
 
 
-def sensitivity(
-    simulator: PourSimulator, extent: Extent, progress: Callable[[int, int], None] | None = None
-) -> tuple[list[Measurement], Figure]:
+def sensitivity(simulator: PourSimulator, extent: Extent) -> tuple[dict[str, Floats], list[Sensitivity]]:
     """Vary every parameter in every pour.
 
     Args:
         extent: of the simulations.
-        progress: called with the number of finished simulations and their total.
+
+    Returns:
+        By pour, the spillages of the seeds with the defaults; and the effects.
     """
     base = SimulationParameters(particles=extent.particles)
     known = {n: i for n, i in SimulationParameters.info().items() if not i.nuisance}
     turned = {n: i for n, i in known.items() if not extent.parameters or n in extent.parameters}
     grids = {name: grid(info, float(getattr(base, name)), extent.values) for name, info in turned.items()}
-    jobs = list(_jobs(base, grids, extent))
     spilled: dict[tuple[str, SimulationParameters], list[float]] = {}
-    for done, (pour, theta, seed) in enumerate(jobs):
-        if progress is not None:
-            progress(done, len(jobs))
+    for pour, theta, seed in _jobs(base, grids, extent):
         outcome = simulator.simulate(PourTask(SCENE, POURS[pour], theta, seed)).outcome
         spillage = outcome.fractions.spillage
         if outcome.invalid is None and spillage is not None:
             spilled.setdefault((pour, theta), []).append(spillage)
-    if progress is not None:
-        progress(len(jobs), len(jobs))
     sensitivities = []
     for name, values in grids.items():
         for pour in extent.pours:
@@ -230,9 +227,7 @@ def sensitivity(
             if len(usable) >= 3:
                 at, seeds = np.array([v for v, _ in usable]), [s for _, s in usable]
                 sensitivities.append(analyse(name, pour, at, seeds, 1.0 / extent.particles))
-    return [*_spreads(base, spilled, extent), *_measurements(sensitivities, extent)], sensitivity_figure(
-        sensitivities, base
-    )
+    return {pour: np.array(spilled[pour, base]) for pour in extent.pours}, sensitivities
 
 
 def _turned(base: SimulationParameters, name: str, value: float) -> SimulationParameters:
@@ -250,99 +245,74 @@ def _jobs(
                 yield pour, theta, seed
 
 
-def _spreads(
-    base: SimulationParameters, spilled: dict[tuple[str, SimulationParameters], list[float]], extent: Extent
-) -> list[Measurement]:
-    """Spillage of the defaults in each pour."""
-    spreads = []
-    for pour in extent.pours:
-        seeds = np.array(spilled.get((pour, base), [math.nan, math.nan]))
-        n = extent.particles
-        spreads.append(reported(f"{pour} pour with the defaults: spilled / poured", float(seeds.mean()), particles=n))
-        spreads.append(reported("… and the standard deviation of its seeds", float(seeds.std(ddof=1)), particles=n))
-    return spreads
+WORDS = {1: "rises", -1: "falls"}
 
 
-WORDS = {1: "spillage rises", -1: "spillage falls", 0: "no effect beyond the seeds' noise"}
-
-_CHANGE = re.compile(
-    r"(?P<parameter>\w+) (?P<where>.+), (?P<pour>\w+) pour: (?P<effect>.+); change \(± (?P<error>\S+)\)"
-)
-
-
-def _measurements(sensitivities: list[Sensitivity], extent: Extent) -> list[Measurement]:
+def effects_table(sensitivities: Sequence[Sensitivity], pours: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+    """Head and rows: the effect of each parameter on each pour."""
     infos = SimulationParameters.info()
+    known = {(row.parameter, row.pour): row for row in sensitivities}
     rows = []
-    for row in sensitivities:
-        unit = "" if infos[row.parameter].unit == "1" else infos[row.parameter].unit
-        where = f"{row.parameter} {row.lower:g} … {row.upper:g} {unit}".rstrip()
-        change = f"{where}, {row.pour} pour: {WORDS[row.direction]}; change (± {row.change_error:.2g})"
-        per = "doubling" if row.parameter == "particles" else unit or "1"
-        slope = f"… mean slope, per {per} (± {row.slope_error:.2g})"
-        rows.append(reported(change, row.change, particles=extent.particles))
-        rows.append(reported(slope, row.slope, particles=extent.particles))
-    return rows
+    for name in dict.fromkeys(row.parameter for row in sensitivities):
+        unit = "" if infos[name].unit == "1" else infos[name].unit
+        cells = []
+        for pour in pours:
+            row = known.get((name, pour))
+            if row is None or row.direction == 0:
+                cells.append("not measured" if row is None else "none")
+                continue
+            where = f"{row.lower:g} … {row.upper:g} {unit}".rstrip()
+            cells.append(f"{WORDS[row.direction]}, {where}: {row.change:+.3f} ± {row.change_error:.2g}")
+        rows.append([f"`{name}`", unit, *cells])
+    return ["name", "unit", *(f"{pour} pour" for pour in pours)], rows
 
 
-@dataclass(frozen=True)
-class ParameterEffect:
-    """One line of a page: the effect of a parameter on a pour.
-
-    Attributes:
-        where: the interval, with its unit.
-        effect: one of `WORDS`.
-        change, error: of the spillage over the interval; the error as displayed.
-    """
-
-    parameter: str
-    pour: str
-    where: str
-    effect: str
-    change: float
-    error: str
-
-
-def effects(records: Sequence[Mapping[str, Any]]) -> list[ParameterEffect]:
-    """Effects of parameters, from the measurements as a page stores them (`Measurement.as_json`)."""
-    effects_of_parameters = []
-    for record in records:
-        match = _CHANGE.fullmatch(str(record["name"]))
-        if match is not None and record["value"] is not None:
-            effects_of_parameters.append(ParameterEffect(**match.groupdict(), change=float(record["value"])))
-    return effects_of_parameters
-
-
-def sensitivity_figure(sensitivities: list[Sensitivity], base: SimulationParameters) -> Figure:
+def draw(sensitivities: Sequence[Sensitivity], base: SimulationParameters, path: Path) -> None:
     """A panel for each parameter, a curve for each pour, with the standard deviation of its seeds as a band.
 
     Args:
         base: value of each parameter while another one is varied.
+        path: of the PNG.
     """
     infos = SimulationParameters.info()
-    names = [name for name in infos if any(row.parameter == name for row in sensitivities)]
-    curves = []
-    for row in sensitivities:
-        curves.append(
-            Series(
-                f"{row.pour} pour",
-                row.values,
-                row.means,
-                panel=names.index(row.parameter),
-                spread=row.deviations,
+    names = list(dict.fromkeys(row.parameter for row in sensitivities))
+    colours = dict(zip(POURS, (figure_style.MEASURED, figure_style.PREDICTED, figure_style.GOOD), strict=True))
+    lines = -(-len(names) // 3)
+    figure, grid_of_axes = figure_style.new_figure(lines, 3, size=(10.2, 0.5 + 2.7 * lines), squeeze=False)
+    for axes, name in zip(grid_of_axes.flat, names, strict=False):
+        for row in (row for row in sensitivities if row.parameter == name):
+            means, deviations = np.array(row.means), np.array(row.deviations)
+            axes.plot(row.values, means, color=colours[row.pour], label=f"{row.pour} pour")
+            axes.fill_between(
+                row.values, means - deviations, means + deviations, color=colours[row.pour], alpha=0.18, lw=0
             )
-        )
-    top = max((mean for row in sensitivities for mean in row.means), default=1.0)
-    for panel, name in enumerate(names):
-        held = float(getattr(base, name))
-        curves.append(Series("held at", (held, held), (0.0, top), "reference", panel))
-    units = [infos[name].unit for name in names]
-    return Figure(
-        tuple(name.replace("_", " ") for name in names),
-        tuple(
-            name.replace("_", " ") + ("" if unit == "1" else f" [{unit}]")
-            for name, unit in zip(names, units, strict=True)
-        ),
-        ("spilled / poured",) * len(names),
-        tuple(curves),
-        log_x=tuple(name == "particles" for name in names),
+        axes.axvline(float(getattr(base, name)), color=figure_style.INK, ls="--", lw=1.2)
+        axes.set_xscale("log" if name == "particles" else "linear")
+        unit = "" if infos[name].unit == "1" else f" [{infos[name].unit}]"
+        title = name.replace("_", " ")
+        figure_style.dress(axes, title=title, x=f"{title}{unit}", y="spilled / poured")
+    for axes in grid_of_axes.flat[len(names) :]:
+        axes.set_visible(False)
+    figure.legend(*grid_of_axes.flat[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    figure_style.save(figure, path)
+
+
+def main() -> None:
+    """Measure, and write tables and picture."""
+    seeds, sensitivities = sensitivity(PourSimulator(), FULL)
+    command, settings = (
+        "python benchmarks/sensitivity.py",
+        f"{FULL.particles:,} particles, {FULL.seeds} seeds, {FULL.values} values of each parameter",
     )
+    write_table("effects", *effects_table(sensitivities, FULL.pours), command, settings)
+    rows = [
+        [pour, f"{FULL.particles}", f"{spilled.mean():.3f}", f"{spilled.std(ddof=1):.3f}"]
+        for pour, spilled in seeds.items()
+    ]
+    head = ["pour", "particles", "spilled / poured", "standard deviation of a seed"]
+    write_table("seeds", head, rows, command, settings)
+    draw(sensitivities, SimulationParameters(particles=FULL.particles), PICTURE)
+
+
+if __name__ == "__main__":
+    main()

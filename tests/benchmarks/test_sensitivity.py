@@ -1,10 +1,11 @@
-"""`sensitivity`: what a parameter does to the spillage: found in made-up pours whose answer is known, and in a real
-one.
-"""
+"""`benchmarks/sensitivity.py`: what a parameter does to the spillage, in made-up pours and in a real one."""
 
 from __future__ import annotations
 
 import math
+import sys
+from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,19 +18,13 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome
 from sim_engine.scene import PourTask
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation import cases as suite
-from sim_engine.validation.sensitivity import (
-    PARTICLES,
-    POURS,
-    Extent,
-    ParameterEffect,
-    Sensitivity,
-    analyse,
-    effects,
-    grid,
-    sensitivity,
-)
 from tests.support.hypothesis_examples import examples
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+try:
+    from sensitivity import PARTICLES, POURS, Extent, Sensitivity, analyse, draw, effects_table, grid, sensitivity
+finally:
+    sys.path.pop(0)
 
 INFOS = {name: info for name, info in SimulationParameters.info().items() if not info.nuisance}
 NOISE = 0.01
@@ -112,50 +107,41 @@ class MadeUp:
         return SimpleNamespace(outcome=o)
 
 
-def test_every_parameter_is_turned_alone_and_the_defaults_are_simulated_once() -> None:
-    made_up, told = MadeUp(), []
-    extent = Extent(1_000, 5, 3, ("slow", "fast"))
-    measurements, figure = sensitivity(made_up, extent, lambda done, total: told.append((done, total)))  # type: ignore[arg-type]
+def test_every_parameter_is_turned_alone_and_the_defaults_are_simulated_once(tmp_path: Path) -> None:
+    made_up = MadeUp()
+    _, sensitivities = sensitivity(made_up, Extent(1_000, 5, 3, ("slow", "fast")))  # type: ignore[arg-type]
     base = SimulationParameters(particles=1_000)
     turned = [{n for n in INFOS if getattr(t.parameters, n) != getattr(base, n)} for t in made_up.tasks]
     assert max(len(names) for names in turned) == 1
-    assert len(made_up.tasks) == 2 * 3 * (1 + 4 * len(INFOS)) == told[-1][0] == told[-1][1]
+    assert len(made_up.tasks) == 2 * 3 * (1 + 4 * len(INFOS))
     assert turned.count(set()) == 2 * 3
     assert {t.action for t in made_up.tasks} == {POURS["slow"], POURS["fast"]}
-    known = {(e.parameter, e.pour): e for e in effects([m.as_json() for m in measurements])}
+    known = {(row.parameter, row.pour): row for row in sensitivities}
     assert len(known) == 2 * len(INFOS)
-    assert known["friction", "slow"].effect == "spillage rises"
-    assert known["friction", "slow"].where == "0 … 1"
-    assert known["friction", "slow"].change == pytest.approx(0.3, abs=0.01)
-    assert known["cohesion", "fast"].effect == "spillage falls"
-    assert known["cohesion", "fast"].where == "0 … 0.2 N/m"
-    assert known["xsph_rate", "fast"].effect.startswith("no effect")
-    assert known["rim_correction", "fast"].where == "0 … 0.75"  # what leaked does not count
-    assert len(figure.titles) == len(INFOS)
-    assert all(len(s.spread) == len(s.x) for s in figure.series if s.kind == "measured")
+    friction, cohesion = known["friction", "slow"], known["cohesion", "fast"]
+    assert (friction.direction, friction.lower, friction.upper) == (1, 0.0, 1.0)
+    assert friction.change == pytest.approx(0.3, abs=0.01)
+    assert (cohesion.direction, cohesion.upper) == (-1, 0.2)
+    assert known["xsph_rate", "fast"].direction == 0
+    assert known["rim_correction", "fast"].upper == 0.75  # what leaked does not count
+    head, rows = effects_table(sensitivities, ("slow", "fast"))
+    assert head == ["name", "unit", "slow pour", "fast pour"]
+    shown = {row[0]: row[1:] for row in rows}
+    assert shown["`friction`"][1].startswith("rises, 0 … 1: +0.3")
+    assert shown["`cohesion`"][2].startswith("falls, 0 … 0.2 N/m: -0.1")
+    assert shown["`xsph_rate`"][1:] == ["none", "none"]
+    draw(sensitivities, base, tmp_path / "sensitivity.png")
+    assert (tmp_path / "sensitivity.png").stat().st_size > 10_000
 
 
-def test_what_the_defaults_spill_is_told_with_the_deviation_of_its_seeds() -> None:
-    measurements, _ = sensitivity(MadeUp(), Extent(1_000, 3, 4, ("fast",), ("friction",)))  # type: ignore[arg-type]
-    mean, deviation = measurements[:2]
-    assert mean.name == "fast pour with the defaults: spilled / poured"
-    assert mean.value == pytest.approx(0.19, abs=0.01)
-    assert 0.0 < deviation.value < 0.01
-
-
-def test_other_lines_of_a_page_are_no_effects() -> None:
-    rows = [{"name": "height", "value": 1.0}, {"name": "… mean slope, per 1 (± 0.1)", "value": 2.0}]
-    assert effects(rows) == []
-    line = {"name": "friction 0 … 1, fast pour: spillage rises; change (± 0.02)", "value": 0.15}
-    assert effects([line]) == [ParameterEffect("friction", "fast", "0 … 1", "spillage rises", 0.15, "0.02")]
+def test_what_the_defaults_spill_is_told_by_seed() -> None:
+    seeds, _ = sensitivity(MadeUp(), Extent(1_000, 3, 4, ("fast",), ("friction",)))  # type: ignore[arg-type]
+    assert seeds["fast"].mean() == pytest.approx(0.19, abs=0.01)
+    assert 0.0 < seeds["fast"].std(ddof=1) < 0.01
 
 
 @pytest.mark.slow
-def test_walls_that_rub_spill_more_in_a_real_pour(simulator: PourSimulator) -> None:
-    measurements, _ = sensitivity(simulator, Extent(300, 3, 2, ("fast",), ("friction",)))
-    (found,) = effects([m.as_json() for m in measurements])
-    assert found.effect == "spillage rises"
-
-
-def test_the_case_is_one_of_the_suite() -> None:
-    assert suite.case("sensitivity").title == "What the parameters do"
+def test_walls_that_rub_spill_more_in_a_real_pour() -> None:
+    with closing(PourSimulator()) as simulator:
+        _, (effect,) = sensitivity(simulator, Extent(300, 3, 2, ("fast",), ("friction",)))
+    assert effect.direction == 1
