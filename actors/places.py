@@ -40,9 +40,6 @@ PlaceName = Annotated[
 OUTSIDE = ""
 """Place of a vessel that is not in the cell."""
 
-LIFT = 10e-3
-"""Height above a rack to which a vessel is lifted at least before it moves sideways [m]."""
-
 
 PITCH = Quantity("m", "90 mm", 5e-3, 0.5)
 
@@ -70,9 +67,6 @@ class RackSettings(Settings):
 
     row_rise: Annotated[float, Quantity("m", "0 mm", -0.5, 0.5)] = 0.0
     """Height of each row above the one before, as on stairs. A gripper that reaches for the cups from the side passes over the rows behind them."""  # noqa: E501
-
-    depth: Annotated[float, Quantity("m", "40 mm", 0.0, 0.3)] = 0.0
-    """How deep a vessel stands in the rack; it is lifted by more before it is moved sideways."""
 
     direction: Annotated[float, Quantity("rad", "0 deg", -math.pi, math.pi)] = 0.0
     """Direction from A1 to A2 around the base's z, from its x; used while only A1 is taught."""
@@ -161,7 +155,7 @@ class PlaceSettings(Settings):
     """Vessels that may stand there."""
 
     approach: Annotated[float, Quantity("m", "120 mm", 20e-3, 0.5)] = 0.12
-    """Height above the pose from which the tool comes straight down, and to which it rises again."""
+    """Height above the pose from which the tool comes straight down, and to which it rises again; more than the depth to which a vessel stands in a rack."""  # noqa: E501
 
     clearance: Annotated[float, Quantity("m", "15 mm", 5e-3, 0.2)] = 15e-3
     """Gap that arm, gripper and carried vessel keep from a vessel that stands there."""
@@ -178,11 +172,7 @@ class PlaceSettings(Settings):
         if self.rack is None:
             return (self,)
         poses, _ = self.rack.positions(self.pose)
-        lift = max(self.approach, self.rack.depth + LIFT)
-        return tuple(
-            self.with_values(name=f"{self.name}/{name}", pose=pose, approach=lift, rack=None)
-            for name, pose in poses.items()
-        )
+        return tuple(self.with_values(name=f"{self.name}/{name}", pose=pose, rack=None) for name, pose in poses.items())
 
 
 def all_places(places: Sequence[PlaceSettings]) -> tuple[PlaceSettings, ...]:

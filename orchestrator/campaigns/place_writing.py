@@ -1,8 +1,16 @@
-"""Writes a taught place into a laboratory file, whose comments, order and other values stay as they are."""
+"""Writes a taught place into a laboratory file, whose comments, order and other values stay as they are.
+
+`labware_rack` reads a rack from a labware definition of Opentrons (JSON, schemas 2 and 3).
+Source: github.com/Opentrons/opentrons, shared-data/labware/schemas; lengths in mm, y towards the back, z of a well is
+that of its bottom.
+"""
 
 from __future__ import annotations
 
+import json
+import math
 import os
+import re
 from io import StringIO
 from pathlib import Path
 
@@ -11,8 +19,17 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
 
 from actors.arm_geometry import Pose
-from actors.places import PlaceSettings
+from actors.places import PlaceSettings, RackSettings, position_name
 from sim_engine.errors import DecantError
+
+RACKS = ("tubeRack", "aluminumBlock", "other")
+"""Categories of labware out of which vessels may be taken."""
+
+ON_GRID = 0.5
+"""Largest distance of a well from the grid of its rack [mm]."""
+
+LIFT = 10e-3
+"""Height above a rack to which a vessel is lifted at least before it moves sideways [m]."""
 
 
 def write_place(path: Path, place: PlaceSettings) -> None:
@@ -20,7 +37,7 @@ def write_place(path: Path, place: PlaceSettings) -> None:
 
     Args:
         path: of the file.
-        place: pose, tool and use are written.
+        place: pose, tool, use and rack are written.
 
     Raises:
         DecantError: the file is no mapping, or `places` is no list.
@@ -46,11 +63,75 @@ def write_place(path: Path, place: PlaceSettings) -> None:
     entry["pose"], entry["tool"] = _pose(place.pose), _pose(place.tool)
     if place.use != "stand" or "use" in entry:
         entry["use"] = place.use
+    if place.rack is not None:
+        if "rack" not in entry:
+            entry["holds"] = list(place.holds)
+            entry["approach"] = f"{1e3 * place.approach:.0f} mm"
+        _write_rack(entry.setdefault("rack", CommentedMap()), place.rack)
     text = StringIO()
     yaml.dump(document, text)
     written = path.with_name(f".{path.name}.written")
     written.write_text(text.getvalue(), encoding="utf-8")
     os.replace(written, path)  # noqa: PTH105 - atomic
+
+
+def _write_rack(entry: CommentedMap, rack: RackSettings) -> None:
+    entry["rows"], entry["columns"] = rack.rows, rack.columns
+    for key in ("row_pitch", "column_pitch", "row_rise"):
+        if (value := getattr(rack, key)) or key in entry:
+            entry[key] = f"{1e3 * value:.2f} mm"
+    if rack.direction or "direction" in entry:
+        entry["direction"] = f"{math.degrees(rack.direction):.3f} deg"
+    for key in ("last_row", "last_column"):
+        entry.pop(key, None)
+        if (pose := getattr(rack, key)) is not None:
+            entry[key] = _pose(pose)
+
+
+def labware_rack(path: Path) -> tuple[RackSettings, float]:
+    """The rack of a labware definition, and the height to which a vessel has to be lifted out of it [m].
+
+    Raises:
+        DecantError: it is no definition, its wells are no regular grid, or cannot be taken out; the text states why.
+        OSError: it can't be read.
+    """
+    try:
+        labware = json.loads(path.read_text(encoding="utf-8"))
+        schema, wells, meta = labware["schemaVersion"], labware["wells"], labware["metadata"]
+        category, name = str(meta["displayCategory"]), str(meta["displayName"])
+        cells = {key: tuple(float(well[axis]) for axis in ("x", "y", "z", "depth")) for key, well in wells.items()}
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DecantError(
+            f"{path}: should be a labware definition of Opentrons with 'schemaVersion', 'metadata' and 'wells', each "
+            f"with x, y, z and depth ({type(error).__name__}: {error})"
+        ) from None
+    if schema not in (2, 3):
+        raise DecantError(f"{path}: has schemaVersion {schema!r}; 2 and 3 can be read")
+    if category not in RACKS or labware.get("parameters", {}).get("isTiprack"):
+        raise DecantError(
+            f"{path}: '{name}' is a {category}: its wells are part of it, and no gripper can grip them or take them "
+            f"out; a rack has the displayCategory {' or '.join(RACKS[:2])}"
+        )
+    positions = {key: re.fullmatch(r"([A-Z])([1-9]\d?)", key) for key in cells}
+    if "A1" not in cells or None in positions.values():
+        raise DecantError(f"{path}: the wells of '{name}' should have names such as A1; they are {', '.join(cells)}")
+    at = {key: (ord(match[1]) - ord("A"), int(match[2]) - 1) for key, match in positions.items() if match}
+    rows, columns = (1 + max(index[k] for index in at.values()) for k in (0, 1))
+    x, y, z, depth = cells["A1"]
+    # with one row or column the other pitch is never used
+    row_pitch = y - cells["B1"][1] if "B1" in cells else 100.0
+    column_pitch = cells["A2"][0] - x if "A2" in cells else 100.0
+    for key in (position_name(row, column) for row in range(rows) for column in range(columns)):
+        row, column = at.get(key, (0, 0))
+        expected = (x + column * column_pitch, y - row * row_pitch, z)
+        if key not in cells or math.dist(cells[key][:3], expected) > ON_GRID:
+            where = "is missing" if key not in cells else f"is {math.dist(cells[key][:3], expected):.1f} mm beside it"
+            raise DecantError(
+                f"{path}: '{name}' is not one regular grid: with the pitch of A1, A2 and B1, {key} {where}. Make one "
+                "place for each regular part"
+            )
+    rack = RackSettings(rows=rows, columns=columns, row_pitch=1e-3 * row_pitch, column_pitch=1e-3 * column_pitch)
+    return rack, 1e-3 * depth + LIFT
 
 
 def _pose(pose: Pose) -> CommentedMap:

@@ -158,6 +158,8 @@ _robot(
     robot_commands.teach,
     "decant robot teach my-lab.yaml pan --use balance     # after guiding the arm there by hand",
     "decant robot teach my-lab.yaml left --use source",
+    "decant robot teach my-lab.yaml rack A1 --rack 'rows: 4, columns: 6, row_pitch: 120 mm, column_pitch: 100 mm'",
+    "decant robot teach my-lab.yaml rack D1",
 )
 _robot(
     robot_commands.try_place,

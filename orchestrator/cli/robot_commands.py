@@ -26,8 +26,10 @@ from orchestrator.cli.console import FAILED, RefusalError, Refused, print_messag
 if TYPE_CHECKING:
     from actors.arm.arm_interface import Arm
     from actors.arm.arm_settings import ArmDiagnostics, ArmSettings, SafetyRecord
+    from actors.arm_geometry import Pose
     from actors.interfaces import DeviceCheck
     from actors.laboratory_settings import LaboratorySettings
+    from actors.places import PlaceSettings, RackSettings
 
 _MARKS = {"ok": ("ok", "green"), "warn": ("warn", "yellow"), "fail": ("FAIL", "bold red")}
 
@@ -239,19 +241,31 @@ TRIED = 0.25
 def teach(
     laboratory: Laboratory,
     name: PlaceName,
+    position: Annotated[
+        str | None, typer.Argument(metavar="POSITION", help="Of a rack: A1 first, then a corner in each direction.")
+    ] = None,
     use: Annotated[
         Literal["stand", "balance", "source"] | None,
         typer.Option(help="'balance' under the receiver, 'source' under the outlet of the refill pump."),
+    ] = None,
+    rack: Annotated[
+        str | None, typer.Option(help="A new rack: 'rows: 4, columns: 6, row_pitch: 120 mm, column_pitch: 100 mm'.")
+    ] = None,
+    labware: Annotated[
+        Path | None, typer.Option(help="A new rack from this labware definition of Opentrons (JSON, schema 2 or 3).")
     ] = None,
 ) -> None:
     """Read where the arm stands and write it into the laboratory file as a place. Nothing moves.
 
     Guide the arm by hand (free drive) until the fingers are at a vessel that stands there, then run this. The place is
     checked: reach, limits, the way from home, distance from other places. Comments in the file are kept.
+
+    Of a rack, teach A1, then the last positions of column 1 and of row A, such as D1 and A6. How far they are from a
+    grid with its pitch is printed. Teach both again after A1.
     """
     from actors.arm.arm_settings import arm_kind
     from actors.laboratory import reached
-    from actors.places import PlaceSettings
+    from actors.places import PlaceSettings, all_places, rack_problem
     from orchestrator.campaigns.place_writing import write_place
     from orchestrator.cli.motion_control import connected
     from orchestrator.runs.motion_approval import accepted_checksum
@@ -259,21 +273,84 @@ def teach(
     spec = read_laboratory(laboratory)
     if spec.arm is None or (tool := getattr(spec.arm, "tool", None)) is None:
         raise without_arm(laboratory, spec, "'decant robot teach' reads the pose of an arm's tool")
+    before = next((place for place in spec.places if place.name == name), None)
+    grid, lift = _rack(before, rack, labware)
+    if (position is None) != (grid is None) or (grid is not None and position not in grid.corners):
+        raise RefusalError(_position_problem(name, position, grid))
     accepted = accepted_checksum(laboratory) if spec.mode == "hardware" else None
     with reached(spec) as ready, connected(ready, accepted) as (driver, facts):
         pose = driver.where().tool
         arm = (ready.arm or spec.arm).fitted_to(facts)
-    before = next((place for place in spec.places if place.name == name), None)
     taught = {"pose": pose, "tool": tool, **({} if use is None else {"use": use})}
-    place = PlaceSettings(name=name, **taught) if before is None else before.with_values(**taught)
-    places = [*(other for other in spec.places if other.name != name), place]
-    problems = [text for number, text in arm_kind(arm).place_problems(places, {}) if number == len(places) - 1]
+    if grid is not None and position != "A1":
+        if before is None or before.tool != tool:
+            raise RefusalError(f"teach A1 of '{name}' first, with the present tool of the arm")
+        corner = "last_row" if grid.corners[str(position)][0] else "last_column"
+        taught = {"rack": grid.with_values(**{corner: pose})}
+    elif grid is not None:
+        taught |= {"rack": grid.with_values(last_row=None, last_column=None)}
+    fresh = {} if grid is None else {"holds": ("receiver",), "approach": max(0.12, lift)}
+    place = before.with_values(**taught) if before is not None else PlaceSettings(name=name, **{**fresh, **taught})
+    others = all_places([other for other in spec.places if other.name != name])
+    problems = [] if place.rack is None else [text for text in [rack_problem(place)] if text]
+    if not problems:
+        found = arm_kind(arm).place_problems([*others, *place.each], {})
+        problems = [text for number, text in found if number >= len(others)]
     if problems:
         raise RefusalError("nothing is written: " + "; ".join(problems))
     with Refused(OSError):
         write_place(laboratory, place)
     x, y, z = (1e3 * value for value in pose.as_list[:3])
-    print_message(f"{laboratory}: place '{name}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm ({place.use})")
+    if place.rack is None:
+        print_message(f"{laboratory}: place '{name}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm ({place.use})")
+        return
+    print_message(f"{laboratory}: '{name}/{position}' is at x {x:.1f}, y {y:.1f}, z {z:.1f} mm")
+    missing = [
+        name for name, key in zip([*place.rack.corners][1:], _taught_keys(place.rack), strict=True) if key is None
+    ]
+    residual = f"residual of the taught positions: {1e3 * place.rack.positions(place.pose)[1]:.2f} mm"
+    print_message(f"{residual}; still to be taught: {', '.join(missing)}" if missing else residual)
+
+
+def _rack(before: PlaceSettings | None, text: str | None, labware: Path | None) -> tuple[RackSettings | None, float]:
+    """The rack that is taught, and the height of its approach [m]; None and 0 for a single place."""
+    from pydantic import ValidationError
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    from actors.places import RackSettings
+    from orchestrator.campaigns.place_writing import labware_rack
+
+    known = None if before is None else before.rack
+    if text is None and labware is None:
+        return known, 0.0
+    if before is not None or (text is not None and labware is not None):
+        raise RefusalError("'--rack' or '--labware' begin a new place; remove it, or change 'rack' in the file")
+    if labware is not None:
+        with Refused(OSError):
+            return labware_rack(labware)
+    try:
+        return RackSettings.model_validate(YAML(typ="safe").load(f"{{{text}}}")), 0.0
+    except YAMLError:
+        raise RefusalError(f"--rack: '{text}' should be keys and values, such as 'rows: 4, columns: 6'") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise RefusalError(f"--rack: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def _position_problem(name: str, position: str | None, rack: RackSettings | None) -> str:
+    if rack is None:
+        return (
+            f"'{name}' is no rack in the file, and has no position {position}. For a new rack add '--rack \"rows: 4, "
+            "columns: 6, row_pitch: 120 mm, column_pitch: 100 mm\"', or '--labware FILE'"
+        )
+    given = "name one" if position is None else f"not {position}"
+    return f"'{name}' is a rack, which is taught at {', '.join(rack.corners)}: {given}"
+
+
+def _taught_keys(rack: RackSettings) -> list[Pose | None]:
+    """The poses of the corners after A1, as far as they are taught."""
+    return [getattr(rack, "last_row" if row else "last_column") for row, _ in [*rack.corners.values()][1:]]
 
 
 def try_place(laboratory: Laboratory, name: PlaceName, enable_motion: EnableMotion = False) -> None:

@@ -1,0 +1,145 @@
+"""`place_writing`: racks are taught position by position, or read from labware definitions, and comments stay."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from actors.arm_geometry import Pose
+from actors.places import PlaceSettings, RackSettings
+from orchestrator.campaigns.file_loading import load_laboratory
+from orchestrator.campaigns.place_writing import labware_rack, write_place
+from orchestrator.cli.app import app
+from sim_engine.errors import DecantError
+
+NIGHT = Path(__file__).parents[3] / "configs" / "laboratories" / "night.yaml"
+
+TURN = (1.2092, 1.2092, 1.2092)
+
+Labware = dict[str, Any]
+
+
+def tubes(schema: int = 2) -> Labware:
+    """A rack of 2 × 3 tubes with the structure and the lengths of opentrons_6_tuberack_falcon_50ml_conical. In schema 3
+    the origin is the back left corner: y is negative."""
+    shift = 0.0 if schema == 2 else -85.48
+    wells = {
+        f"{'AB'[row]}{column + 1}": {"x": 35.5 + 35 * column, "y": shift + 60.24 - 35 * row, "z": 8.22, "depth": 113.78}
+        for column in range(3)
+        for row in range(2)
+    }
+    meta = {"displayCategory": "tubeRack", "displayName": "six tubes"}
+    return {"schemaVersion": schema, "metadata": meta, "parameters": {"isTiprack": False}, "wells": wells}
+
+
+def labware(folder: Path, value: Any) -> Path:
+    path = folder / "labware.json"
+    path.write_text(value if isinstance(value, str) else json.dumps(value), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("schema", [2, 3])
+def test_a_rack_of_tubes_is_read_with_its_pitch_and_the_height_of_a_tube(schema: int, tmp_path: Path) -> None:
+    rack, lift = labware_rack(labware(tmp_path, tubes(schema)))
+    assert (rack.rows, rack.columns) == (2, 3)
+    assert (rack.row_pitch, rack.column_pitch) == (pytest.approx(0.035), pytest.approx(0.035))
+    assert lift > 0.11378  # out of the rack before it moves sideways
+
+
+def _of(**meta: Any) -> Labware:
+    return {**tubes(), "metadata": {**tubes()["metadata"], **meta}}
+
+
+def _well(name: str, **values: float) -> Labware:
+    definition = tubes()
+    definition["wells"][name].update(values)
+    return definition
+
+
+def _without(name: str) -> Labware:
+    definition = tubes()
+    del definition["wells"][name]
+    return definition
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (_of(displayCategory="wellPlate"), "'six tubes' is a wellPlate: its wells are part of it, and no gripper can"),
+        (_of(displayCategory="reservoir"), "is a reservoir: its wells are part of it"),
+        ({**tubes(), "parameters": {"isTiprack": True}}, "its wells are part of it"),
+        # opentrons_10_tuberack_falcon_4x50ml_6x15ml_conical: columns 3 and 4 are wider apart than 1 and 2
+        (_well("A3", x=116.1), "not one regular grid: with the pitch of A1, A2 and B1, A3 is 10.6 mm beside it"),
+        (_well("B2", z=20.0), "B2 is 11.8 mm beside it"),
+        (_without("B3"), "B3 is missing"),
+        (_without("A1"), "should have names such as A1; they are B1, A2"),
+        ({**tubes(), "schemaVersion": 1}, "has schemaVersion 1; 2 and 3 can be read"),
+        ({"ordering": []}, "should be a labware definition of Opentrons with 'schemaVersion'"),
+        (_well("A1", depth="deep"), "each with x, y, z and depth"),  # type: ignore[arg-type]
+        ("{", "should be a labware definition of Opentrons"),
+    ],
+)
+def test_labware_whose_vessels_cannot_be_taken_out_is_refused(value: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(DecantError) as refused:
+        labware_rack(labware(tmp_path, value))
+    assert message in str(refused.value)
+    assert "labware.json: " in str(refused.value)
+
+
+def test_corners_of_a_rack_are_written_one_by_one_and_go_when_the_first_is_taught_again(tmp_path: Path) -> None:
+    path = tmp_path / "night.yaml"
+    path.write_text(NIGHT.read_text(encoding="utf-8"), encoding="utf-8")
+    grid = RackSettings(rows=2, columns=1, row_pitch=0.13, column_pitch=0.1, row_rise=0.13, direction=1.5708)
+    first = Pose.of(0.58, 0.37, 0.08, *TURN)
+    rack = PlaceSettings(name="rack", pose=first, tool=Pose(z=0.17), holds=("receiver",), approach=0.14, rack=grid)
+    write_place(path, rack)
+    assert load_laboratory(path).places[-1] == rack.with_values(
+        rack=grid.with_values(direction=pytest.approx(grid.direction, abs=1e-4))
+    )
+    corner = Pose.of(0.711, 0.37, 0.21, *TURN)
+    write_place(path, rack.with_values(rack=grid.with_values(last_row=corner)))
+    taught = load_laboratory(path).places[-1].rack
+    assert taught is not None
+    assert taught.last_row == corner
+    assert "# under the outlet of the pump" in path.read_text(encoding="utf-8")
+    write_place(path, rack)
+    assert load_laboratory(path).places[-1].rack == taught.with_values(last_row=None)
+
+
+Says = Callable[..., str]
+
+
+@pytest.fixture
+def teach(tmp_path: Path) -> Says:
+    """Teaches in a copy of the shipped night; the virtual arm stands at home."""
+    path = tmp_path / "lab.yaml"
+    path.write_text(NIGHT.read_text(encoding="utf-8"), encoding="utf-8")
+
+    def command(*arguments: str) -> str:
+        result = CliRunner().invoke(app, ["robot", "teach", str(path), *arguments])
+        return f"{result.exit_code} {result.output}"
+
+    return command
+
+
+def test_a_rack_is_taught_at_its_corners_alone(teach: Says, tmp_path: Path) -> None:
+    assert "'shelf' is no rack in the file, and has no position A1" in teach("shelf", "A1")
+    grid = "rows: 2, columns: 3, row_pitch: 100 mm, column_pitch: 100 mm, row_rise: 120 mm, direction: 90 deg"
+    assert "--rack: columns:" in teach("shelf", "A1", "--rack", "rows: 2, columns: two")
+    assert "is taught at A1, B1, A3: name one" in teach("shelf", "--rack", grid)
+    assert "is taught at A1, B1, A3: not B3" in teach("shelf", "B3", "--rack", grid)
+    said = teach("shelf", "A1", "--rack", grid)
+    assert said.startswith("0 ")
+    assert "residual of the taught positions: 0.00 mm; still to be taught: B1, A3" in said
+    rack = load_laboratory(tmp_path / "lab.yaml").places[-1]
+    assert (rack.name, rack.holds) == ("shelf", ("receiver",))
+    # the arm has not moved: the corner would be at A1, 100 mm beside its place
+    said = teach("shelf", "B1")
+    assert said.startswith("2 ")
+    assert "nothing is written: the taught positions of 'shelf' are up to 50.0 mm away from a grid" in said
+    assert load_laboratory(tmp_path / "lab.yaml").places[-1] == rack
