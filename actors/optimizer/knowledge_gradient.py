@@ -369,6 +369,7 @@ def found(
         allowed = over <= (1.0 if limit is None else limit.probability)
         gain = float(pour_gains(process, candidates[allowed], known).max()) if allowed.any() else None
     shifts, deviations, factor = process.displaced()
+    drifts = process.drifts
     offsets: tuple[BenchOffset, ...] = ()
     if query.count == 0:
         offsets = tuple(BenchOffset(*pair) for pair in zip(*map(tuples, process.drawn(DRAWN)), strict=True))
@@ -382,6 +383,7 @@ def found(
         least_exceedance=None if limit is None else float(over.min()),
         drawn=offsets,
         since_change=None if process.since is None else len(process.points) - process.since,
+        drifts=None if drifts is None else tuple(map(float, drifts)),
     )
 
 

@@ -36,12 +36,22 @@ together with the start of the present segment: the observations before it were 
 of this one. Two Cholesky factors of every hypothesis, in both orders, give the marginal likelihoods of all beginnings
 and ends. Alternatively the latest observation is an outlier.
 
+**A bench that drifts.** From the tenth observation on, the bench drifts by one hypothesis in five. Offset, h and g as
+above are those at present; a observations ago they were
+
+    s_j − a d_j, h_j − a d′_j, g_j − a d″_j,    d_j ~ N(0, r_j² Var s), d′_j ~ N(0, r_j² Var h), d″_j ~ N(0, r_j² Var g)
+
+and δ is forgotten: Cov(δ(x, n), δ(x′, n′)) = v_j(x) v_j(x′) M_{ℓ_j}(x, x′) e^{−κ_j |n − n′|}, κ_j = r_j. The sizes r_j
+have a prior, so the observations decide whether, where to and how fast the bench drifts, and how fast they age. A bench
+that walks otherwise than evenly is left to δ, and to the starts of a segment.
+
 Source: Bayesian model averaging, Hoeting et al., Statistical Science 1999; discrepancy, Kennedy & O'Hagan 2001;
 power prior of earlier data, Ibrahim & Chen 2000, in a robust mixture, Schmidli et al., Biometrics 2014;
 changes, Adams & MacKay, Bayesian online changepoint detection, 2007, and binary segmentation, Scott & Knott 1974;
+forgetting, Bogunovic, Scarlett & Cevher, Time-varying Gaussian process bandit optimization, AISTATS 2016;
 moves after resampling, Gilks & Berzuini 2001.
 Limitations: the weights of the groups, and of the starts of a segment, come from the prior draws; predictions use 48
-moved draws, and the uninformative group.
+moved draws, and the uninformative group, which does not drift.
 """
 
 from __future__ import annotations
@@ -112,8 +122,12 @@ MISLED = 1.0 / 22.0
 """ε: probability that a calibration says nothing about the bench of the observations, because something was moved or
 exchanged since. None of the 20 calibrations in docs/evidence/results.md (quickstart) misled; by Laplace's rule of
 succession the next one does with (0 + 1) / (20 + 2)."""
-STEPS = (0.5, 0.25, 0.12) * 4
-"""Sizes of the steps of the Markov chains, relative to the prior's standard deviation."""
+DRIFTING, DRIFTS, DRIFTS_FROM = 0.2, (0.002, 0.05), 10
+"""Prior probability of a drift; smallest and largest r, log-uniform; and the number of observations from which a drift
+is considered: with fewer, it can hardly be told from an offset."""
+STEPS, DRIFT_ROUNDS = (0.5, 0.25, 0.12) * 4, 3
+"""Sizes of the steps of the Markov chains, relative to the prior's standard deviation; how often they are made where a
+drift is considered, whose prior draws are coarser."""
 RECENT = 4
 """Number of sets of points whose projections are kept."""
 KNOWN_SHARE = 0.75
@@ -136,7 +150,10 @@ class Hypotheses:
         growths: (J,), m.
         near: (J,), whether by the hypothesis the simulator is nearly right.
         contrary: (J,), whether the hypothesis reverses the simulator.
+        drifts: (J, 2 dimension + 2), changes per observation of the shifts, of the factors' logarithms, of h and of g.
+        fading: (J,), κ.
         centre: (dimension,), the simulated best.
+        origin: (dimension,), about which a factor stretches, as negative coordinate.
     """
 
     scales: Array
@@ -149,17 +166,22 @@ class Hypotheses:
     growths: Array
     near: NDArray[np.bool_]
     contrary: NDArray[np.bool_]
+    drifts: Array
+    fading: Array
     centre: Array
+    origin: Array
 
     @classmethod
     def of(cls, discrepancy: ModelDiscrepancy, centre: Array, latent: Array, contrary: NDArray[np.bool_]) -> Hypotheses:
-        """Return the hypotheses of latent variables (J, `latent_size`), a priori standard normal."""
+        """Return the hypotheses of latent variables (J, `latent_size`), a priori standard normal; with `drift_size`
+        further ones the bench may drift.
+        """
         dimension = len(discrepancy.offset_priors)
         # Columns: z of shifts and of factors, then h and g (all normal); σ, ℓ, s, the earlier offset, n and m as
         # uniform numbers Φ(z).
         z, rows = latent[:, : 2 * dimension], np.asarray(ndtr(latent[:, 2 * dimension :]))
         width, gain = latent[:, 2 * dimension : 2 * dimension + 2].T
-        residual, length, far, known, noise, growth = rows[:, 2:].T
+        residual, length, far, known, noise, growth = rows[:, 2:8].T
         near = far < NEAR_SHARE
         beyond = (far - NEAR_SHARE) / (1.0 - NEAR_SHARE)
         spread = np.where(near, _evenly(NEAR, far / NEAR_SHARE), _evenly(FARTHER, beyond))
@@ -179,6 +201,10 @@ class Hypotheses:
         # After an earlier offset (scales, shifts), the two maps are composed.
         factors = np.exp(spread[:, None] * factor * z[:, dimension:])
         moved = spread[:, None] * shift * z[:, :dimension] + (factors - 1.0) * origin
+        drift, pace = np.zeros(len(rows)), np.zeros((len(rows), 2 * dimension + 2))
+        if latent.shape[1] > latent_size(dimension):
+            level, pace = rows[:, 8], latent[:, latent_size(dimension) + 1 :]
+            drift = np.where(level < DRIFTING, _evenly(DRIFTS, level / DRIFTING), 0.0)
         return cls(
             factors * scales,
             factors * shifts + moved,
@@ -190,18 +216,64 @@ class Hypotheses:
             _evenly(NOISE_GROWTHS, growth),
             near & ~contrary,
             contrary,
+            drift[:, None] * pace * np.concatenate([shift, factor, (WIDTH, GAIN)]),
+            drift,
             centre,
+            origin,
         )
 
     def only(self, indices: NDArray[np.int_]) -> Hypotheses:
         """Return a subset."""
-        names = "scales", "shifts", "widths", "gains", "rests", "lengths", "noises", "growths", "near", "contrary"
-        return replace(self, **{name: getattr(self, name)[indices] for name in names})
+        common = "centre", "origin"
+        return replace(self, **{name: value[indices] for name, value in vars(self).items() if name not in common})
 
-    def moved(self, points: Array) -> Array:
-        """(J, m, dimension): the simulator's points that each hypothesis assigns to points (m, dimension)."""
+    def moved(self, points: Array, ages: Array | None = None) -> Array:
+        """(J, m, dimension): the simulator's points that each hypothesis assigns to points (m, dimension).
+
+        Args:
+            ages: (m,), numbers of observations since each point's; None: at present.
+        """
         positions = self.scales[:, None, :] * points[None, :, :] + self.shifts[:, None, :]
-        return np.asarray(self.centre + np.exp(self.widths)[:, None, None] * (positions - self.centre))
+        widths, dimension = self.widths[:, None], points.shape[1]
+        if ages is not None and self.fading.any():
+            since = self.drifts[:, None, :] * ages[:, None]
+            shift, factor, width, _ = np.split(since, np.cumsum([dimension, dimension, 1]), axis=2)
+            factors = np.exp(-factor)
+            positions = factors * positions - shift + (factors - 1.0) * self.origin
+            widths = widths - width[:, :, 0]
+        return np.asarray(self.centre + np.exp(widths)[:, :, None] * (positions - self.centre))
+
+    def gains_at(self, ages: Array | None) -> Array:
+        """Factors e^g (J, m) on the cost at these ages, or (J, 1) at present."""
+        return np.exp(self.gains[:, None] - (0.0 if ages is None else self.drifts[:, -1:] * ages))
+
+    @property
+    def kernel(self) -> _Kernel:
+        """The kernel of δ."""
+        return _Kernel(self.lengths, self.fading)
+
+
+@dataclass(frozen=True)
+class _Kernel:
+    """Correlations of δ by hypotheses (J): Matérn 5/2 in the point, times e^{−κ |Δn|} in the observation's number,
+    (1 − ε)^{|Δn| / 2} of Bogunovic et al. (2016).
+    """
+
+    lengths: Array
+    fading: Array
+
+    def correlation(self, first: Array, second: Array, apart: Array | None = None) -> Array:
+        """(J, m, k), between points (m, dimension) and (k, dimension) whose numbers differ by `apart` (m, k)."""
+        s = np.sqrt(5.0) * cdist(first, second)[None, :, :] / self.lengths[:, None, None]
+        correlation = np.asarray((1.0 + s + s**2 / 3.0) * np.exp(-s))
+        if apart is not None and (fades := self.fading > 0.0).any():
+            correlation[fades] *= np.exp(-self.fading[fades, None, None] * apart)
+        return correlation
+
+    def with_uninformative(self) -> _Kernel:
+        """The kernel of these hypotheses and of the uninformative group."""
+        lengths = np.concatenate([self.lengths, UNINFORMATIVE_LENGTHS])
+        return _Kernel(lengths, np.append(self.fading, np.zeros(len(UNINFORMATIVE_LENGTHS))))
 
 
 @dataclass(frozen=True)
@@ -287,8 +359,14 @@ class ModelAveragedProcess:
         dimension, centre = len(discrepancy.offset_priors), _least(simulated)
         size, J, distrust = latent_size(dimension), HYPOTHESES + CONTRARY, discrepancy.uninformative
         rows = np.clip(qmc.Sobol(size, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES), 1e-6, 1 - 1e-6)
+        if len(points) >= DRIFTS_FROM:
+            # Further columns of a longer sequence: all together are a scrambled Sobol sequence, too.
+            longer = qmc.Sobol(size + drift_size(dimension), scramble=True, rng=np.random.default_rng(2))
+            further = np.clip(longer.random(HYPOTHESES)[:, size:], 1e-6, 1 - 1e-6)
+            rows = np.concatenate([rows, further], axis=1)
         latent = ndtri(np.concatenate([rows, rows[:CONTRARY]]))  # the same for the same question, and even
         contrary = np.arange(J) >= HYPOTHESES
+        self._ages = np.arange(len(points), 0.0, -1.0)
         self._all = Hypotheses.of(discrepancy, centre, latent, contrary)
         scenes = [_CalibratedScene.of(pours, discrepancy.worst) for pours in discrepancy.calibration or ()]
         by_misled = dict.fromkeys(scene.misled for scene in scenes)
@@ -314,20 +392,26 @@ class ModelAveragedProcess:
 
             self._kept = self._resampled(latent[sample], self._kept, counting, make)
         self.mixture = np.concatenate([np.full(KEPT, informed.sum() / KEPT), uninformative.sum(axis=0)])
-        self._lengths = np.concatenate([self._kept.lengths, UNINFORMATIVE_LENGTHS])
+        self._kernel = self._kept.kernel.with_uninformative()
         self._least_noises = np.concatenate([self._kept.noises, UNINFORMATIVE_NOISES])
         self._growths = np.concatenate([self._kept.growths, UNINFORMATIVE_GROWTHS])
-        at_data = self._prior(points, self._costs)
+        at_data = _joined(self._informed(self._kept, points, ages=self._ages), self._uninformative(points, self._costs))
         counting = np.concatenate([counting, segments.counting[uninformative.argmax(axis=0)]])
         self._at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        self._inverses = np.linalg.inv(_factorised(self._at_data, self._lengths, points))
+        self._inverses = np.linalg.inv(_factorised(self._at_data, self._kernel, points, self._ages))
         self._residuals = np.einsum("jik,jk->ji", self._inverses, self._costs - self._at_data.means)
         self._recent: dict[bytes, tuple[_Prior, Array]] = {}
 
     # -- prior moments ---------------------------------------------------------------------------------------------
 
-    def _informed(self, hypotheses: Hypotheses, points: Array, scene: _CalibratedScene | None = None) -> _Prior:
-        """Moments in the scene of the observations, or at the pours of a calibration's scene."""
+    def _informed(
+        self, hypotheses: Hypotheses, points: Array, scene: _CalibratedScene | None = None, ages: Array | None = None
+    ) -> _Prior:
+        """Moments in the scene of the observations, or at the pours of a calibration's scene.
+
+        Args:
+            ages: see `Hypotheses.moved`.
+        """
         J, m = len(hypotheses.gains), len(points)
         if m == 0:
             return _Prior(*(np.empty((J, 0)) for _ in range(3)))
@@ -335,13 +419,13 @@ class ModelAveragedProcess:
             hypotheses = replace(hypotheses, centre=scene.centre)
         simulated = self.simulated if scene is None else scene.surrogate
         mean, deviation = (
-            moments.reshape(J, m) for moments in simulated.predict(hypotheses.moved(points).reshape(J * m, -1))
+            moments.reshape(J, m) for moments in simulated.predict(hypotheses.moved(points, ages).reshape(J * m, -1))
         )
         if scene is not None:
             mean = mean + scene.corrections
         # μ_j = clip(e^{g_j} f̂_s(z_j(x)), 0, 1), contrary: 1 − f̂_s; v_j = √(σ_j² + e^{2 g_j} s_s²); noise n_j + m_j
         # μ_j
-        gain = np.exp(hypotheses.gains)[:, None] / self.worst
+        gain = hypotheses.gains_at(ages) / self.worst
         means = np.clip(gain * np.where(hypotheses.contrary[:, None], self.worst - mean, mean), 0.0, 1.0)
         spreads = np.hypot(hypotheses.rests[:, None], gain * deviation)
         return _Prior(means, spreads, hypotheses.noises[:, None] + hypotheses.growths[:, None] * means)
@@ -354,8 +438,8 @@ class ModelAveragedProcess:
         noises = UNINFORMATIVE_NOISES[:, None] + UNINFORMATIVE_GROWTHS[:, None] * np.broadcast_to(seen, shape)
         return _Prior(means, np.full(shape, UNINFORMATIVE_SIGNAL), noises)
 
-    def _prior(self, points: Array, seen: Array | float = UNINFORMATIVE_MEAN) -> _Prior:
-        return _joined(self._informed(self._kept, points), self._uninformative(points, seen))
+    def _prior(self, points: Array) -> _Prior:
+        return _joined(self._informed(self._kept, points), self._uninformative(points, UNINFORMATIVE_MEAN))
 
     # -- posterior weights -----------------------------------------------------------------------------------------
 
@@ -370,7 +454,8 @@ class ModelAveragedProcess:
                     prior, lengths = self._uninformative(scene.points, scene.costs), UNINFORMATIVE_LENGTHS
                 else:
                     prior, lengths = self._informed(hypotheses, scene.points, scene), hypotheses.lengths
-                logs[i] += scene.power * _sequential(prior, lengths, scene.points, scene.costs)[0].sum(axis=1)
+                kernel = _Kernel(lengths, np.zeros(len(lengths)))
+                logs[i] += scene.power * _sequential(prior, kernel, scene.points, scene.costs)[0].sum(axis=1)
         return logs
 
     def _reliance(self, calibrated: Array) -> Array:
@@ -396,7 +481,7 @@ class ModelAveragedProcess:
         rng = np.random.default_rng(1)
         likelihood = self._likelihood(sample, counting)
         # z′ = √(1 − β²) z + β ξ keeps N(0, 1), so the acceptance is the likelihoods' ratio alone (Cotter et al. 2013).
-        for step in STEPS:
+        for step in STEPS * (DRIFT_ROUNDS if sample.fading.any() else 1):
             proposed = np.sqrt(1.0 - step**2) * latent + step * rng.standard_normal(latent.shape)
             candidates = make(proposed)
             proposed_likelihood = self._likelihood(candidates, counting)
@@ -409,9 +494,9 @@ class ModelAveragedProcess:
         """Log-likelihoods (k,) of the observations that count for each hypothesis, (k, n), and the weights after a
         change.
         """
-        at_data = self._informed(hypotheses, self.points)
+        at_data = self._informed(hypotheses, self.points, ages=self._ages)
         at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        chances = _sequential(at_data, hypotheses.lengths, self.points, self._costs)[0]
+        chances = _sequential(at_data, hypotheses.kernel, self.points, self._costs, self._ages)[0]
         changed = ~counting[:, :1].all(axis=1)
         weights = self._reliance(self._calibrated(hypotheses))
         weights = np.where(changed, np.where(hypotheses.near, np.log(NEAR_CHANGED), 0.0), weights)
@@ -426,21 +511,22 @@ class ModelAveragedProcess:
 
         If the observations after the likeliest change hold another one, they alone are weighed.
         """
-        at_data = _joined(self._informed(self._all, self.points), self._uninformative(self.points, self._costs))
-        lengths = np.concatenate([self._all.lengths, UNINFORMATIVE_LENGTHS])
-        weighted = self._weighed(at_data, lengths, prior, calibrated, 0)
+        informed = self._informed(self._all, self.points, ages=self._ages)
+        at_data = _joined(informed, self._uninformative(self.points, self._costs))
+        kernel = self._all.kernel.with_uninformative()
+        weighted = self._weighed(at_data, kernel, prior, calibrated, 0)
         while weighted.since is not None:
-            later = self._weighed(at_data, lengths, prior, calibrated, weighted.since)
+            later = self._weighed(at_data, kernel, prior, calibrated, weighted.since)
             if later.since is None:
                 return replace(later, since=weighted.since) if later.surprised else weighted
             weighted = later
         return weighted
 
-    def _weighed(self, at_data: _Prior, lengths: Array, prior: Array, calibrated: Array, begin: int) -> _Segments:
+    def _weighed(self, at_data: _Prior, kernel: _Kernel, prior: Array, calibrated: Array, begin: int) -> _Segments:
         """Weights of the starts of a segment among the observations from `begin`, with at most one change there."""
         n, m = len(self.points), len(self.points) - begin
         order = np.arange(begin, n)
-        chances, residuals = _sequential(at_data, lengths, self.points, self._costs, order)
+        chances, residuals = _sequential(at_data, kernel, self.points, self._costs, self._ages, order)
         changed = prior + np.log(
             np.append(np.where(self._all.near, NEAR_CHANGED, 1.0), np.ones(len(UNINFORMATIVE_LENGTHS)))
         )
@@ -454,7 +540,8 @@ class ModelAveragedProcess:
         surprising = np.abs(below - 0.5) > 0.5 * SURPRISE
         counting, logs = [np.arange(n) >= begin], [before[:, m]]
         if surprising.any():
-            after = np.cumsum(_sequential(at_data, lengths, self.points, self._costs, order[::-1])[0], axis=1)[:, ::-1]
+            backwards = _sequential(at_data, kernel, self.points, self._costs, self._ages, order[::-1])[0]
+            after = np.cumsum(backwards, axis=1)[:, ::-1]
             # Change before `start`: Σ_j of the old bench's evidence, times CHANGE, times w_j p_j(y_start … y_n) of the
             # new (Adams & MacKay 2007, with one change).
             for start in range(1, m):
@@ -489,7 +576,7 @@ class ModelAveragedProcess:
         key = points.tobytes()
         if key not in self._recent:
             prior = self._prior(points)
-            cross = _correlation(self.points, points, self._lengths)
+            cross = self._kernel.correlation(self.points, points, self._ages[:, None])
             cross *= self._at_data.spreads[:, :, None] * prior.spreads[:, None, :]
             if len(self._recent) == RECENT:
                 self._recent.pop(next(iter(self._recent)))
@@ -502,7 +589,7 @@ class ModelAveragedProcess:
     def covariances(self, first: Array, second: Array) -> Array:
         """Posterior covariances (components, m, k) of f between points (m, dimension) and others (k, dimension)."""
         (at_first, V), (at_second, W) = self._projected(first), self._projected(second)
-        covariance = _correlation(first, second, self._lengths)
+        covariance = self._kernel.correlation(first, second)
         covariance *= at_first.spreads[:, :, None] * at_second.spreads[:, None, :]
         return np.asarray(covariance - V.transpose(0, 2, 1) @ W)
 
@@ -556,6 +643,19 @@ class ModelAveragedProcess:
         median = order[np.searchsorted(np.cumsum(weights[order]), 0.5).clip(max=len(order) - 1)]
         return np.asarray(mean), np.asarray(deviation), float(np.exp(self._all.gains[median]))
 
+    @property
+    def drifts(self) -> Array | None:
+        """Change per observation of the shift of the cube's centre (dimension,), 0 where its sign is uncertain; None
+        unless the bench probably drifts.
+        """
+        kept, drifting = self._kept, self._kept.fading > 0.0
+        if self.mixture[: len(drifting)][drifting].sum() < NOTICED:
+            return None
+        shift, factor = np.split(kept.drifts[drifting, :-2], 2, axis=1)
+        steps = shift + factor * (0.5 + kept.origin)
+        mean = steps.mean(axis=0)
+        return np.where(np.abs(mean) > steps.std(axis=0), mean, 0.0)
+
     def drawn(self, count: int) -> tuple[Array, Array]:
         """Scales and shifts (count, dimension) of bench offsets drawn from the posterior, evenly by their weight."""
         chosen = _evenly_drawn(self._trusting, count)
@@ -567,25 +667,31 @@ class ModelAveragedProcess:
         return self._kept, self.mixture[: len(self._kept.gains)]
 
 
-def _factorised(prior: _Prior, lengths: Array, points: Array) -> Array:
+def _factorised(prior: _Prior, kernel: _Kernel, points: Array, ages: Array) -> Array:
     """Lower Cholesky factors (J, n, n) of the observations' covariances."""
     n = len(points)
     if n == 0:
-        return np.zeros((len(lengths), 0, 0))
-    # K_j = v_j(x) v_j(x′) M_{ℓ_j}(x, x′) + n_j(x)² 1
-    K = _correlation(points, points, lengths) * prior.spreads[:, :, None] * prior.spreads[:, None, :]
+        return np.zeros((len(kernel.lengths), 0, 0))
+    # K_j = v_j(x) v_j(x′) M_{ℓ_j}(x, x′) e^{−κ_j |Δn|} + n_j(x)² 1
+    apart = np.abs(ages[:, None] - ages)
+    K = kernel.correlation(points, points, apart) * prior.spreads[:, :, None] * prior.spreads[:, None, :]
     K[:, np.arange(n), np.arange(n)] += prior.noises**2
     return np.asarray(np.linalg.cholesky(K))
 
 
 def _sequential(
-    prior: _Prior, lengths: Array, points: Array, costs: Array, order: NDArray[np.int_] | slice = slice(None)
+    prior: _Prior,
+    kernel: _Kernel,
+    points: Array,
+    costs: Array,
+    ages: Array | None = None,
+    order: NDArray[np.int_] | slice = slice(None),
 ) -> tuple[Array, Array]:
     """Log probabilities (J, n) of observations given those before them in an order, and standardised residuals."""
     if not len(points[order]):
-        return np.empty((len(lengths), 0)), np.empty((len(lengths), 0))
+        return np.empty((len(kernel.lengths), 0)), np.empty((len(kernel.lengths), 0))
     prior = _Prior(*(getattr(prior, name)[:, order] for name in ("means", "spreads", "noises")))
-    L = _factorised(prior, lengths, points[order])
+    L = _factorised(prior, kernel, points[order], (np.zeros(len(points)) if ages is None else ages)[order])
     costs = costs[order]
     # Residuals L⁻¹ (y − μ): the i-th is (y_i − E[y_i | y_<i]) / L_ii, L_ii its conditional deviation. The
     # probability of an interval [low, high] of it is Φ(high) − Φ(low), from the side on which it is not a
@@ -605,8 +711,13 @@ def _least(simulated: GaussianProcess) -> Array:
 
 
 def latent_size(dimension: int) -> int:
-    """Number of latent variables of a hypothesis."""
+    """Number of latent variables of a hypothesis about a still bench."""
     return 2 * dimension + 8
+
+
+def drift_size(dimension: int) -> int:
+    """Number of further latent variables of a drift."""
+    return 2 * dimension + 3
 
 
 def clipped_moments(means: Array, deviations: Array) -> tuple[Array, Array]:
@@ -654,9 +765,3 @@ def _log_sum(logs: Array) -> float:
 def _evenly(bounds: tuple[float, float], u: Array) -> Array:
     low, high = bounds
     return np.asarray(low * (high / low) ** u)
-
-
-def _correlation(first: Array, second: Array, lengths: Array) -> Array:
-    """Matérn 5/2 correlations (J, m, k) for each of the lengthscales (J,)."""
-    s = np.sqrt(5.0) * cdist(first, second)[None, :, :] / lengths[:, None, None]
-    return np.asarray((1.0 + s + s**2 / 3.0) * np.exp(-s))

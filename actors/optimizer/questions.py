@@ -127,6 +127,8 @@ class DiscrepancyFound:
         least_exceedance: smallest probability over all actions; None without a limit.
         drawn: bench offsets drawn from the posterior, for another receiver; only with `count=0`.
         since_change: number of observations since the bench has behaved differently; None if it does not.
+        drifts: change of the shifts per observation, 0 where its sign is uncertain; None unless the bench probably
+            drifts.
     """
 
     uninformative: float
@@ -138,6 +140,7 @@ class DiscrepancyFound:
     least_exceedance: float | None = None
     drawn: tuple[BenchOffset, ...] = ()
     since_change: int | None = None
+    drifts: Numbers | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 Point = tuple[float, ...]

@@ -141,7 +141,7 @@ class SimulatorMonitor:
         self._after: list[Belief] = []
         self._latest: DiscrepancyFound | None = None
         self._changed: int | None = None
-        self._alarmed = self._accepted = False
+        self._alarmed = self._accepted = self._drifted = False
         self.decisions: list[Decision] = []
 
     # -- what is logged --------------------------------------------------------------------------------------------
@@ -155,6 +155,14 @@ class SimulatorMonitor:
         if self._changed is not None and (before is None or self._changed > before + 1):
             text = f"since pour {self._changed} the bench behaves differently: what was poured before no longer counts"
             self.decisions.append(Decision(text, {"changed_since": float(self._changed)}, urgent=True))
+        if latest.drifts is not None and not self._drifted:
+            self._drifted = True
+            text = "the bench drifts"
+            if paces := [
+                _pace(axis, drift) for axis, drift in zip(self._actions.axes, latest.drifts, strict=True) if drift
+            ]:
+                text += f": with every pour, it is as if {' and '.join(paces)} than before"
+            self.decisions.append(Decision(f"{text}; older pours count less", urgent=True))
         if self._after and self._after[-1].pour == number:
             return
         self._after.append(Belief(pour=number, ignorance=latest.uninformative, gain=latest.gain))
@@ -281,10 +289,22 @@ def _in_si(axis: Axis, shift: float, deviation: float) -> Displaced:
 
 def _moved(axis: Axis, offset: Displaced) -> str:
     """'x_offset were 6 ± 2 mm more'."""
+    factor, unit, sense = _shown(axis, offset.mean)
+    return f"{axis.name} were {abs(offset.mean) / factor:.2g} ± {offset.deviation / factor:.1g}{unit} {sense}"
+
+
+def _pace(axis: Axis, drift: float) -> str:
+    """'x_offset were about 0.2 mm more'."""
+    offset = _in_si(axis, drift, 0.0)
+    factor, unit, sense = _shown(axis, offset.mean)
+    return f"{axis.name} were about {abs(offset.mean) / factor:.1g}{unit} {sense}"
+
+
+def _shown(axis: Axis, shift: float) -> tuple[float, str, str]:
+    """Factor and text of the unit in which a shift is displayed, and its sense."""
     dimension = ACTION_DIMENSIONS.get(axis.name)
     factor, unit = (1.0, "") if dimension is None else (dimension.factor, f" {dimension.display_unit}")
-    sense = "more" if offset.mean > 0.0 else "less"
-    return f"{axis.name} were {abs(offset.mean) / factor:.2g} ± {offset.deviation / factor:.1g}{unit} {sense}"
+    return factor, unit, "more" if shift > 0.0 else "less"
 
 
 def _percent(share: float) -> str:

@@ -358,6 +358,26 @@ def test_a_second_change_is_noticed_like_the_first():
     assert propose(on_a_changed_bench(costs)).discrepancy.since_change == 3
 
 
+def on_a_drifting_bench(count, pace, **changes):
+    """Pours all around a valley that moves away with every one."""
+    places = [(0.35 + 0.1 * np.cos(2.4 * i), 0.6 + 0.1 * np.sin(2.4 * i)) for i in range(count)]
+    costs = [float(cup(np.subtract(place, (pace * i, 0.0)))[0]) for i, place in enumerate(places)]
+    near = (0.35, 0.6) + 0.15 * np.random.default_rng(3).standard_normal((40, 2))
+    simulated = np.concatenate([np.random.default_rng(1).random((40, 2)), near])
+    return asked(cup, [], data=data_of(places, costs), simulated=data_of(simulated, cup(simulated)), **changes)
+
+
+def test_the_pace_of_a_bench_that_drifts_is_inferred():
+    found = propose(on_a_drifting_bench(20, 0.004)).discrepancy
+    assert found.drifts is not None
+    assert -0.006 < found.drifts[0] < -0.001
+    assert found.since_change is None
+
+
+def test_a_bench_that_stands_still_is_not_said_to_drift():
+    assert propose(on_a_drifting_bench(20, 0.0)).discrepancy.drifts is None
+
+
 def test_question_and_answer_survive_the_journal():
     question = asked(displaced, POURED, acquisition="least_loss", count=2)
     assert from_json(to_json(question, SuggestionQuery), SuggestionQuery) == question

@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.optimizer.questions import CalibrationPours, PourQuery
+from actors.optimizer.questions import CalibrationPours, DiscrepancyFound, PourQuery
 from orchestrator.learning.campaign_plan import CalibrationEvidence
 from orchestrator.learning.deployment.d3 import Hybrid
 from orchestrator.learning.deployment.deployment_result import Deployed
 from orchestrator.learning.deployment.model_monitoring import (
     Believed,
     RiskLimitSettings,
+    Rules,
+    SimulatorMonitor,
     StopSettings,
     displacement,
     offset_priors,
@@ -135,6 +137,31 @@ def test_a_bench_that_changes_is_noticed_and_said() -> None:
     assert trust.changed_since == 5
     assert "since pour 5" in trust.text
     assert losses(strategy)[-1] < 0.1
+
+
+@pytest.mark.slow
+def test_a_bench_that_drifts_is_followed() -> None:
+    poured = 0
+
+    def drifting(action: Any, theta: Any, rng: Any) -> float:
+        nonlocal poured
+        poured += 1
+        return narrow_cup(replace(action, x_offset=action.x_offset + 0.001 * poured), theta, rng)
+
+    strategy = adaptive(1, pours=16, prior_simulations=24)
+    StrategyHarness(narrow_cup, drifting).run(strategy)
+    assert np.mean(losses(strategy)[10:]) < 0.1
+
+
+def test_a_drift_is_said_once_and_how_fast() -> None:
+    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0)
+    still = DiscrepancyFound(0.01, (0.0, 0.0), (0.1, 0.1), 1.0)
+    for latest in (still, replace(still, drifts=(0.0, 0.003)), replace(still, drifts=(0.0, 0.004))):
+        monitor.record(latest, [])
+    assert [decision.text for decision in monitor.decisions if decision.urgent] == [
+        "the bench drifts: with every pour, it is as if x_offset were about 0.2 mm more than before; "
+        "older pours count less"
+    ]
 
 
 def test_a_result_with_what_was_said_survives_its_file() -> None:

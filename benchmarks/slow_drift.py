@@ -1,0 +1,150 @@
+"""Measure what a slow drift of the bench costs D3: mean loss of 40 pours, beside the same strategy on a still bench.
+
+    python benchmarks/slow_drift.py [--levels 'cliff, small' small] [--drifts 0 0.5 2] [--programs drift still]
+                                    [--still-drifts 0] [--seeds 20] [--first 71000] [--pours 40] --out FILE
+
+The receiver of a toy bench (`mismatch_worlds.py`) moves evenly, by some millimetres in ten pours, in a direction
+that the seed draws. Strategy and optimiser are the real ones; a seed has the same world and scatter of pours in
+all rows. The program `still` has hypotheses of still benches only, as before drifts were added. Runs are stored in
+FILE, so an interrupted comparison continues.
+
+Questions, fixed before the first run on seeds from 71000. Seeds 70000 to 70999 are for tuning. Losses are without
+scatter:
+
+1. Is the mean loss of 40 pours with 0.5 and with 2 mm of drift in ten pours at most 1.3 times that without drift?
+2. Without drift: is it at most 1.02 times that of the program `still`?
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from mismatch_worlds import OFFSET, Floats, Valley
+from players import SCENE, Numbers, interval, play
+
+from actors.optimizer import model_discrepancy
+from actors.optimizer.questions import PourQuery, Suggestion, SuggestionQuery
+from actors.optimizer.suggest import propose
+from orchestrator.learning.campaign_plan import DeploymentPlan
+from orchestrator.learning.deployment.d3 import D3Settings, Hybrid
+from orchestrator.learning.requests import Outcome, Request
+from sim_engine.liquids import SimulationParameters
+from sim_engine.outcome import Loss
+
+NEVER = 10**6
+"""Number of pours from which a drift is considered by the program `still`."""
+
+TENTH = 1e-4
+"""A millimetre in ten pours, per pour [m]."""
+
+
+class Drifting(Valley):
+    """The world of one seed, with a receiver that moves by `drift` [m] with every pour."""
+
+    def __init__(self, level: str, seed: int, drift: float) -> None:
+        super().__init__(level, seed)
+        self._drift = drift
+
+    def true(self, unit: Floats, index: int = 0) -> float:
+        """Return the loss of pour `index`, from 0, at a point of the unit cube (dimension,), without scatter."""
+        moved = np.clip(np.asarray(unit, dtype=float), 0.0, 1.0)
+        moved[1] += self._signs[1] * self._drift * index / (OFFSET.upper - OFFSET.lower)
+        return self._lost(moved, 1.0)
+
+
+def campaign(
+    level: str, seed: int, drift: float, program: str, pours: int, answers: dict[Any, Suggestion]
+) -> dict[str, Any]:
+    """Run one campaign.
+
+    Args:
+        drift: in ten pours [mm].
+        program: 'drift' or 'still'.
+        answers: of earlier campaigns on the same seed, whose beginnings are the same.
+    """
+    valley, settings = Drifting(level, seed, TENTH * drift), D3Settings(pours=pours)
+    plan = DeploymentPlan(settings, (SCENE,), valley.space, Loss())
+    strategy = Hybrid(plan, SCENE, SimulationParameters(), seed)
+    world = Numbers(valley.space, valley.true, valley.observe, valley.simulated, valley.scatter)
+    world.true = lambda unit: valley.true(unit, len(world.poured))
+    first = NEVER if program == "still" else model_discrepancy.DRIFTS_FROM
+
+    def answer(query: SuggestionQuery) -> Suggestion:
+        late = isinstance(query, PourQuery) and len(query.data) >= model_discrepancy.DRIFTS_FROM
+        key = repr(query), program if late else ""
+        if key not in answers:
+            with patch.object(model_discrepancy, "DRIFTS_FROM", first):
+                answers[key] = propose(query)
+        return answers[key]
+
+    def outcome(request: Request) -> Outcome:
+        return world.answer(request)
+
+    with patch("players.propose", answer):
+        play(strategy, outcome)
+    texts = [decision.text for decision in strategy.decisions]
+    return {
+        "level": level,
+        "seed": seed,
+        "drift": drift,
+        "program": program,
+        "poured": world.poured,
+        "said": [text for text in texts if text.startswith(("the bench drifts", "since pour"))],
+    }
+
+
+def rows(runs: list[dict[str, Any]]) -> list[str]:
+    """Return a line per level, drift and program: mean loss, and the ratio to the still bench and to the other program.
+
+    Each ratio is of the means over the seeds that both have.
+    """
+    lost = {(r["level"], r["program"], r["drift"], r["seed"]): float(np.mean(r["poured"])) for r in runs}
+    noticed = {key for r in runs if any("drifts" in text for text in r["said"])
+               for key in [(r["level"], r["program"], r["drift"], r["seed"])]}  # fmt: skip
+    lines = []
+    for level, program, drift in dict.fromkeys((r["level"], r["program"], r["drift"]) for r in runs):
+        seeds = sorted(seed for *other, seed in lost if other == [level, program, drift])
+        mean, low, high = interval([lost[level, program, drift, seed] for seed in seeds])
+        line = f"{level} | {program} | {drift:g} mm | {len(seeds)} | {mean:.4f} ({low:.4f} … {high:.4f})"
+        for name, other in (("still bench", (level, program, 0.0)), ("program still", (level, "still", drift))):
+            both = [seed for seed in seeds if (*other, seed) in lost]
+            beside = sum(lost[*other, seed] for seed in both)
+            if both and beside and other != (level, program, drift):
+                line += f" | {sum(lost[level, program, drift, seed] for seed in both) / beside:.2f} x {name}"
+        lines.append(f"{line} | drift said: {sum((level, program, drift, seed) in noticed for seed in seeds)}")
+    return lines
+
+
+def main() -> None:
+    """Run the campaigns that FILE lacks, and print its table."""
+    parser = argparse.ArgumentParser(description="Measure what a slow drift of the bench costs D3.")
+    parser.add_argument("--levels", nargs="+", default=["cliff, small", "small"])
+    parser.add_argument("--drifts", nargs="+", type=float, default=[0.0, 0.5, 2.0], help="in ten pours [mm]")
+    parser.add_argument("--programs", nargs="+", choices=("drift", "still"), default=["drift", "still"])
+    parser.add_argument("--still-drifts", nargs="+", type=float, default=[0.0], help="the same for the program `still`")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=71000)
+    parser.add_argument("--pours", type=int, default=40)
+    parser.add_argument("--out", type=Path, required=True)
+    chosen = parser.parse_args()
+    runs = [json.loads(line) for line in chosen.out.read_text().splitlines()] if chosen.out.exists() else []
+    known = {(run["level"], run["seed"], run["drift"], run["program"]) for run in runs}
+    for seed in range(chosen.first, chosen.first + chosen.seeds):
+        for level in chosen.levels:
+            answers: dict[Any, Suggestion] = {}
+            for program in chosen.programs:
+                for drift in chosen.drifts if program == "drift" else chosen.still_drifts:
+                    if (level, seed, drift, program) not in known:
+                        runs.append(campaign(level, seed, drift, program, chosen.pours, answers))
+                        with chosen.out.open("a") as file:
+                            file.write(json.dumps(runs[-1]) + "\n")
+    print("\n".join(rows(runs)))
+
+
+if __name__ == "__main__":
+    main()
