@@ -12,14 +12,13 @@ Every child has:
 - its own session. Ctrl-C in the terminal reaches this program only, which ends its children in order.
 - a way to notice the end of this program, however it ends: its standard input ends, or its connection does.
 
-`ConnectedProcess` exchanges Python objects with its child. `run` and `run_async` start a program and wait for its end.
+`ConnectedProcess` exchanges Python objects with its child. `run` starts a program and waits for its end.
 
 This module does not restart anything: the owner of a child decides that.
 """
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import ctypes
 import os
@@ -301,37 +300,6 @@ def run(command: Sequence[str], *, timeout: float, environment: Mapping[str, str
         )
     except subprocess.TimeoutExpired as error:
         raise TimeoutError(str(error)) from None
-
-
-async def run_async(command: Sequence[str], data: bytes, *, timeout: float) -> bytes:
-    """Run a program to its end from an event loop.
-
-    Args:
-        command: program and arguments.
-        data: for its standard input.
-        timeout: longest time for it [s]; then it is killed.
-
-    Returns:
-        Its output.
-
-    Raises:
-        TimeoutError: it took too long.
-        OSError: it does not start.
-    """
-    process = await asyncio.create_subprocess_exec(
-        *command,
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.DEVNULL,
-        env=child_environment(),
-    )
-    try:
-        async with asyncio.timeout(timeout):
-            return (await process.communicate(data))[0]
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            process.kill()
-        await process.wait()
 
 
 def _tied_to_parent() -> Callable[[], None] | None:

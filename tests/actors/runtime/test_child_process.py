@@ -5,7 +5,6 @@ they ended.
 from __future__ import annotations
 
 import ast
-import asyncio
 import os
 import re
 import signal
@@ -25,7 +24,6 @@ from actors.runtime.child_process import (
     child_environment,
     own_environment,
     run,
-    run_async,
 )
 from tests.support.waiting import PATIENCE, alive, wait_for
 
@@ -171,13 +169,6 @@ def test_writing_to_a_child_that_has_ended_is_an_os_error() -> None:
 def test_a_program_that_takes_too_long_is_killed() -> None:
     with pytest.raises(TimeoutError):
         run(python("import time; time.sleep(600)"), timeout=0.1)
-    with pytest.raises(TimeoutError):
-        asyncio.run(run_async(python("import time; time.sleep(600)"), b"", timeout=0.1))
-
-
-def test_a_program_is_run_from_an_event_loop() -> None:
-    program = python("import sys; sys.stdout.write(sys.stdin.read().upper())")
-    assert asyncio.run(run_async(program, b"abc", timeout=PATIENCE)) == b"ABC"
 
 
 @pytest.mark.parametrize(

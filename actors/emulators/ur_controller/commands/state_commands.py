@@ -1,7 +1,7 @@
 """Commands that read the arm's state, set tool, payload and messages, and access registers and signals.
 
 `Queries` reads joints, tool and payload. `SettingCommands` sets TCP, payload and gravity, and sends messages.
-`Signalling` reads and writes registers, digital inputs and digital outputs.
+`Signalling` reads and writes registers, and sets digital outputs.
 """
 
 from __future__ import annotations
@@ -31,9 +31,7 @@ class Queries:
         controller, robot = self._controller, self._controller.robot
         answers: dict[str, Callable[..., Any]] = {
             "get_actual_joint_positions": lambda: list(robot.q),
-            "get_actual_joint_speeds": lambda: list(robot.qd),
             "get_target_joint_positions": lambda: list(robot.mover.q),
-            "get_target_joint_speeds": lambda: list(robot.mover.qd),
             "get_actual_tcp_pose": lambda: UrPose(robot.pose),
             "is_steady": lambda: robot.steady,
             "get_steptime": lambda: controller.dt,
@@ -57,10 +55,8 @@ WITHOUT_EFFECT = (
     "zero_ftsensor",
     "ft_rtde_input_enable",
     "enable_external_ft_sensor",
-    "set_tool_voltage",
-    "set_tool_communication",
 )
-"""Accepted and ignored: there is no force, no sensor and no tool connector here."""
+"""Accepted and ignored: there is no force and no sensor here."""
 
 
 class SettingCommands:
@@ -81,8 +77,6 @@ class SettingCommands:
             "set_tcp": Command(self.set_tcp),
             "set_payload": Command(self.set_payload),
             "set_target_payload": Command(self.set_payload),
-            "set_payload_mass": Command(self.set_payload),
-            "set_payload_cog": Command(lambda cog: self.set_payload(self._robot.payload, cog)),
             "set_gravity": Command(self.set_gravity),
             "textmsg": Command(self.textmsg),
             "popup": Command(self.popup),
@@ -137,12 +131,12 @@ class SettingCommands:
         self._controller.watchdogs.set(name, 1.0 / positive(min_frequency, "min_frequency"), doing)
 
 
-_GROUPS = {"standard_digital": (0, 7), "configurable_digital": (8, 7), "tool_digital": (16, 1), "digital": (0, 15)}
+_GROUPS = {"standard_digital": (0, 7), "configurable_digital": (8, 7), "tool_digital": (16, 1)}
 """First bit and highest number of each group of digital signals."""
 
 
 class Signalling:
-    """The register and signal commands of one controller.
+    """The commands of one controller that read registers, and set registers and digital outputs.
 
     Args:
         controller: owner of registers and signals.
@@ -156,41 +150,18 @@ class Signalling:
         """Return the commands by name."""
         r, by_name = self._registers, {}
         for name, store in (("integer", (r.input_int, r.output_int)), ("float", (r.input_double, r.output_double))):
-            inputs, outputs = store
-            by_name[f"read_input_{name}_register"] = _reader(inputs)
-            by_name[f"read_output_{name}_register"] = _reader(outputs)
-            by_name[f"write_output_{name}_register"] = _writer(outputs, integer=name == "integer")
-        by_name["read_input_boolean_register"] = lambda at: bool(r.input_bits >> whole(at, 0, 127, "register") & 1)
-        by_name["read_output_boolean_register"] = lambda at: bool(r.output_bits >> whole(at, 0, 127, "register") & 1)
-        by_name["write_output_boolean_register"] = self._write_bit
+            by_name[f"read_input_{name}_register"] = _reader(store[0])
+            by_name[f"write_output_{name}_register"] = _writer(store[1], integer=name == "integer")
         for group, (first, highest) in _GROUPS.items():
             by_name[f"set_{group}_out"] = self._digital_setter(first, highest)
-            by_name[f"get_{group}_out"] = self._digital_getter(first, highest, inputs=False)
-            by_name[f"get_{group}_in"] = self._digital_getter(first, highest, inputs=True)
         return {name: Command(function) for name, function in by_name.items()}
-
-    def _write_bit(self, at: Any, value: Any) -> None:
-        bit = 1 << whole(at, 0, 127, "register")
-        self._registers.output_bits = self._registers.output_bits | bit if value else self._registers.output_bits & ~bit
 
     def _digital_setter(self, first: int, highest: int) -> Callable[..., Any]:
         return lambda n, b: self._signals.set_output(first + whole(n, 0, highest, "output"), bool(b))
 
-    def _digital_getter(self, first: int, highest: int, *, inputs: bool) -> Callable[..., Any]:
-        def get(n: Any) -> bool:
-            bits = self._signals.digital_in if inputs else self._signals.digital_out
-            return bool(bits >> (first + whole(n, 0, highest, "signal")) & 1)
-
-        return get
-
 
 def _reader(store: list[Any]) -> Callable[..., Any]:
-    def read(at: Any) -> Any:
-        if type(at) is int and 0 <= at < REGISTERS:
-            return store[at]
-        return store[whole(at, 0, REGISTERS - 1, "register")]
-
-    return read
+    return lambda at: store[whole(at, 0, REGISTERS - 1, "register")]
 
 
 def _writer(store: list[Any], *, integer: bool) -> Callable[..., Any]:

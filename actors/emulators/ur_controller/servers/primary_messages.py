@@ -127,19 +127,6 @@ def robot_state(s: PrimaryState, *packages: bytes) -> bytes:
     )
 
 
-def safety_checksum(state: bytes) -> str | None:
-    """Return the checksum of the safety configuration in a robot state, as eight hexadecimal digits.
-
-    Args:
-        state: the body of a package of type `ROBOT_STATE`, as `split` returns it.
-
-    Returns:
-        None if the state has none: controllers leave it out while no configuration is applied.
-    """
-    data = dict(split(state)).get(SAFETY_DATA, b"")
-    return f"{int.from_bytes(data[:4], 'big'):08X}" if len(data) >= 4 else None
-
-
 def kinematics_info(dh: Calibration) -> bytes:
     """Encode the Denavit–Hartenberg parameters; a robot without calibration sends checksums of all ones."""
     rows = (struct.pack(">4d", *row) for row in zip(dh.theta, dh.a, dh.d, dh.alpha, strict=True))

@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from actors.arm.ur import rtde
+from actors.arm.ur.primary_interface import robot_state
 from actors.emulators.ur_controller.commands import commands_of
 from actors.emulators.ur_controller.controller import Controller
 from actors.emulators.ur_controller.robot import MODELS
@@ -564,8 +565,9 @@ def test_the_primary_port_says_its_version_and_then_its_state() -> None:
 def test_the_safety_checksum_can_be_read_where_a_real_controller_gives_it() -> None:
     controller = Controller(MODELS["ur10e"])
 
-    def told() -> str | None:
-        return primary.safety_checksum(dict(primary.split(Wire(_primary(controller)).take()))[primary.ROBOT_STATE])
+    def told() -> str:
+        body = dict(primary.split(Wire(_primary(controller)).take()))[primary.ROBOT_STATE]
+        return robot_state(dict(primary.split(body))).checksum
 
     assert told() == controller.safety.configuration.checksum
     controller.safety.reported_checksum = "DEADBEEF"
