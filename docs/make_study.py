@@ -23,7 +23,7 @@ MARKED = re.compile(
 )
 FIGURES = {
     "benches": ("study", ("3b", "6", "final")),
-    "paper": ("paper-study", ("3b", "3c", "4", "5a", "5b", "6", "7", "final")),
+    "paper": ("paper-study", ("3b", "3c", "4", "5b", "6", "7", "final")),
 }
 """Folder of the images, and the figures that the page shows, by the name of the study."""
 

@@ -1,4 +1,4 @@
-"""Figures of a study's deployments: 5a, 5b and 6 loss against pours, 7 loss against time, and the recommended actions.
+"""Figures of a study's deployments: 5b and 6 loss against pours, 7 loss against time, and the recommended actions.
 
 `Losses` selects the losses that figures and tables show.
 """
@@ -100,7 +100,6 @@ def draw_deployments(study: StudyPlan, pooled: Gathered) -> list[Drawn]:
     if pooled.losses:
         losses = Losses(study, pooled)
         figures = [
-            _after_pours(study, pooled, losses),
             _mean_of_pours(study, pooled, losses),
             _best_so_far(pooled, losses),
             _against_time(study, pooled, losses),
@@ -189,7 +188,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 def _grouped(
     study: StudyPlan, losses: Losses, groups: Sequence[str], of: Callable[[str, int, str], Sequence[float]],
-    *, title: str, x: str = "", height: float = 4.2,
+    *, title: str, height: float = 4.2,
 ) -> tuple[Figure, list[tuple[str, int, str, list[float]]]]:  # fmt: skip
     """Draw a panel for each level, with a group of means for each name.
 
@@ -208,31 +207,9 @@ def _grouped(
             return losses.mean(of(level, i, strategy))
 
         rows += [(level, *row) for row in means(axes, groups, losses.strategies, one, losses.least_shown)]
-        style.dress(axes, title=_level_title(study, level), x=x, y=title if is_first(axes) else "")
+        style.dress(axes, title=_level_title(study, level), y=title if is_first(axes) else "")
     legend(figure, losses.strategies)
     return figure, rows
-
-
-def _after_pours(study: StudyPlan, pooled: Gathered, losses: Losses) -> Drawn:
-    unit, receiver, pours = losses.unit, losses.receivers[0], losses.checkpoints()
-    figure, rows = _grouped(
-        study,
-        losses,
-        [str(pour) for pour in pours],
-        lambda level, i, strategy: at_pour(pooled.best_so_far(Key(level, receiver, strategy)), pours[i]),
-        title=f"least {unit.label}",
-        x="pours",
-    )
-    return Drawn(
-        "figure-5a",
-        "5a",
-        f"Least loss after so many pours into '{receiver}'",
-        "Mean over repetitions of the least loss so far, with 95 % t intervals; arrows: the interval goes on below "
-        f"{losses.least_shown:g} {unit.unit}. D1 pours once: its number stays. {LEVELS}",
-        figure,
-        ("level", "receiver", "strategy", "pours", "repetitions", f"least_{unit.unit}", "low", "high"),
-        [[level, receiver, strategy, pours[i], *numbers] for level, i, strategy, numbers in rows],
-    )
 
 
 def _mean_of_pours(study: StudyPlan, pooled: Gathered, losses: Losses) -> Drawn:

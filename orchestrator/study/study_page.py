@@ -1,8 +1,7 @@
 """The report of a study: figure and table files, and one self-contained HTML page.
 
 - `write_report` writes all files from the finished cells; an unfinished study is allowed.
-- `tables` makes the tables: discrepancies of the calibrations, losses of the deployments, effects, pours to the same
-  loss.
+- `tables` makes the tables: discrepancies of the calibrations, losses of the deployments, effects.
 - `plain_words` describes the differences between strategies in sentences: which one is better, by how much, and where
   the data does not decide.
 """
@@ -17,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.calibration.calibration_scores import UNCALIBRATED
@@ -49,7 +47,6 @@ from orchestrator.study.study_statistics import (
     estimate,
     gather,
     mean,
-    statistic,
     tests_of,
 )
 
@@ -64,13 +61,6 @@ _PAIRED = (
     "repetitions. Many rows are tested: one in twenty is below 0.05 by chance."
 )
 _EFFECT_COLUMNS = ("compared", "of", "mismatch", "receiver", "repetitions", "difference", "better in", "probability")
-_NEEDED = (
-    "The loss that both D2 and D3 reach: the larger of their mean least losses after the last pour. Pours until the "
-    "mean of the least loss so far is there, with 95 % intervals: percentile bootstraps over the repetitions, too "
-    "narrow with ten or fewer; a resampled mean that never gets there counts as one pour more than there were."
-)
-
-
 TableRow = list[str | int | float | Estimate]
 
 
@@ -109,11 +99,7 @@ def tables(study: StudyPlan, pooled: Gathered) -> list[StudyTable]:
     if pooled.finals:
         shown.append(_finals(pooled, Losses(study, pooled, final=True)))
     if pooled.losses:
-        losses = Losses(study, pooled)
-        shown.append(_deployments(pooled, losses))
-        if rows := _needed(pooled, losses):
-            header = ("mismatch", "receiver", "loss", "D2", "D3")
-            shown.append(StudyTable("table-pours", "Pours to the same loss", _NEEDED, header, rows))
+        shown.append(_deployments(pooled, Losses(study, pooled)))
     return shown
 
 
@@ -250,36 +236,6 @@ def _finals(pooled: Gathered, losses: Losses) -> StudyTable:
             rows.append([level, receiver, strategy, len(by_repetition), loss, spilled.scaled(100.0), lost])
     header = ("mismatch", "receiver", "strategy", "repetitions", losses.unit.label, "spilled / poured [%]", "not made")
     return StudyTable("table-final", "The recommended action, poured again", CAPTION, header, rows)
-
-
-def _needed(pooled: Gathered, losses: Losses) -> list[TableRow]:
-    rows: list[TableRow] = []
-    for level, receiver in itertools.product(losses.levels, losses.receivers):
-        curves = {
-            strategy: [
-                [math.inf if math.isnan(v) else v for v in (at_pour([curve], n)[0] for n in range(1, losses.pours + 1))]
-                for curve in pooled.best_so_far(Key(level, receiver, strategy))
-                if curve
-            ]
-            for strategy in ("D2", "D3")
-        }
-        if all(curves.values()):
-            loss = max(float(np.mean([curve[-1] for curve in each])) for each in curves.values())
-            rows.append([level, receiver, losses.unit.text(loss), *(pours_needed(c, loss) for c in curves.values())])
-    return rows
-
-
-def pours_needed(curves: Sequence[Sequence[float]], loss: float) -> Estimate:
-    """Number of pours until the mean of the curves is at most `loss`; one more than available if it is never
-    reached."""
-
-    def first(data: NDArray[np.float64]) -> NDArray[np.float64]:
-        reached = data.mean(axis=-2) <= loss + 1e-12
-        ever = reached.any(axis=-1)
-        first_place: NDArray[np.float64] = np.where(ever, 1.0 + reached.argmax(axis=-1), data.shape[-1] + 1.0)
-        return first_place
-
-    return statistic(curves, first)
 
 
 def plain_words(shown: Sequence[StudyTable]) -> list[str]:

@@ -2,8 +2,6 @@
 
 - `gather` collects the finished cells in a `Gathered`; an unfinished study is allowed.
 - `estimate` calculates a mean with Student's t interval. For normal data it covers 95 % at any sample size.
-- `statistic` uses the percentile bootstrap, for quantities other than means. Applied to means, it covers 83 % with five
-  repetitions and 91 % with ten.
 - `effect` compares two strategies by paired differences, at the same level and into the same receiver.
 
 The same numbers yield the same interval. The pairs share the following random influences:
@@ -17,11 +15,10 @@ The same numbers yield the same interval. The pairs share the following random i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.calibration.calibration_scores import CALIBRATED, UNCALIBRATED, Scores
@@ -201,7 +198,6 @@ def at_pour(curves: Sequence[Sequence[float]], pour: int) -> list[float]:
     return [curve[min(pour, len(curve)) - 1] for curve in curves if curve]
 
 
-RESAMPLES = 4_000
 COVERED = 0.95
 
 Range = tuple[float, float]
@@ -266,29 +262,6 @@ def estimate(values: Sequence[float], within: Range = ANYTHING) -> Estimate:
 def difference_of(within: Range) -> Range:
     """Possible range of a difference of two quantities with this range."""
     return within[0] - within[1], within[1] - within[0]
-
-
-def statistic(
-    repetitions: Sequence[Sequence[float]], of: Callable[[NDArray[np.float64]], NDArray[np.float64]]
-) -> Estimate:
-    """Estimate of a quantity other than a mean, with the percentile bootstrap's interval over whole repetitions.
-
-    Repetitions are drawn with replacement.
-
-    Args:
-        repetitions: (n, m) numbers.
-        of: maps (…, n, m) numbers to (…).
-    """
-    data = np.array(repetitions, dtype=np.float64)
-    count = len(data)
-    if count == 0:
-        return Estimate(math.nan, math.nan, math.nan, 0)
-    mean = float(of(data))
-    if count < 2:
-        return Estimate(mean, math.nan, math.nan, count)
-    samples = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
-    low, high = np.quantile(of(data[samples]), [(1 - COVERED) / 2, (1 + COVERED) / 2])
-    return Estimate(mean, float(low), float(high), count)
 
 
 ALL = "all"

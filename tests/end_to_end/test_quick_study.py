@@ -36,4 +36,4 @@ def test_the_quick_study_runs_and_a_second_call_has_nothing_left_to_do(tmp_path:
     assert answers[0]["finished"] == answers[0]["cells"] == 29 + 12
     page = Path(answers[0]["page"]).read_text(encoding="utf-8")
     assert "Unfinished" not in page
-    assert all(f'id="figure-{number}"' in page for number in ("3b", "3c", "4", "5a", "5b", "6", "7", "final"))
+    assert all(f'id="figure-{number}"' in page for number in ("3b", "3c", "4", "5b", "6", "7", "final"))
