@@ -280,6 +280,7 @@ class PriorNeeds:
         fixed: values of the parameters that are not searched.
         measured: searched parameters whose prior the file gives itself.
         why: completes the message about a parameter that is not wanted.
+        poured: scene of a deployment that believes weighed pours; None without one.
     """
 
     scene: Scene
@@ -288,6 +289,7 @@ class PriorNeeds:
     fixed: Mapping[str, float]
     measured: frozenset[str] = frozenset()
     why: str = "is not searched here"
+    poured: Scene | None = None
 
 
 @dataclass(frozen=True)
@@ -439,9 +441,9 @@ def _combined(posteriors: Sequence[KnownPosterior], needs: PriorNeeds, source: P
     used = {run for parameter in remembered for run in parameter.runs}
     pours: list[WeighedPair] = []
     older = 0
-    for known in reversed(usable):  # the newest first
+    for known in reversed(usable) if needs.poured is not None else ():  # the newest first
         lost = [n for n in known.estimates if not any(n == p.name and known.posterior in p.runs for p in remembered)]
-        if reason := _pours_unfit(known, needs, lost, shape):
+        if reason := _pours_unfit(known, needs, lost):
             left_out.append(f"{known.posterior}: its weighed pours are not transferred, {reason}")
         elif len(pours) >= ENOUGH:
             older += 1
@@ -454,19 +456,20 @@ def _combined(posteriors: Sequence[KnownPosterior], needs: PriorNeeds, source: P
     return CampaignMemory(tuple(remembered), tuple(left_out), texts, tuple(pours) or None)
 
 
-def _pours_unfit(known: KnownPosterior, needs: PriorNeeds, lost: Sequence[str], shape: str) -> str:
+def _pours_unfit(known: KnownPosterior, needs: PriorNeeds, lost: Sequence[str]) -> str:
     """Why the pours of a usable posterior say nothing here about the simulator, as text; empty if they do.
 
     Args:
+        needs: of a campaign with a deployment that believes weighed pours.
         lost: parameters that their simulations have and this campaign does not take over.
-        shape: digest of the campaign's pourer.
     """
-    liquid = needs.scene.liquid
+    assert needs.poured is not None
+    liquid = needs.poured.liquid
     if not known.weighed or known.liquid.mass is None:
         return "its file or its run has none with their simulations"
-    if known.shape != shape:
+    if known.shape != shape_digest(scene_by_content(needs.poured)):
         return f"they are from another vessel ('{known.pourer}')"
-    if difference := _liquid_differs(known, needs.scene):
+    if difference := _liquid_differs(known, needs.poured):
         return difference
     if not math.isclose(known.liquid.mass, liquid.mass, rel_tol=ALIKE):
         return f"they are of {1e3 * known.liquid.mass:g} g, here it is {1e3 * liquid.mass:g} g"

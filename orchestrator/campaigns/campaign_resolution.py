@@ -382,6 +382,7 @@ def _memory(
     if calibration is not None and not calibration.settings.makes_posterior:
         report.add(place, f"belongs to C4; {calibration.strategy} takes all values for alike", key=True)
         return None
+    poured = deployment.scenes[0] if deployment is not None and deployment.settings.learns_offsets else None
     if calibration is not None:
         needs = PriorNeeds(
             scene=calibration.scene,
@@ -389,6 +390,7 @@ def _memory(
             wanted={axis.name: (axis.lower, axis.upper) for axis in calibration.parameters.axes},
             fixed=calibration.fixed_parameters,
             measured=frozenset(prior.name for prior in calibration.parameter_prior),
+            poured=poured,
         )
     elif deployment is not None and deployment.settings.simulates:
         fixed = {} if parameters is None else parameters.fixed()
@@ -398,6 +400,7 @@ def _memory(
             wanted={name: (info.lower, info.upper) for name, info in infos.items() if name not in fixed},
             fixed=SimulationParameters().model_dump() | fixed,
             why="the campaign fixes",
+            poured=poured,
         )
     else:
         reason = "doses have none" if deployment is None else f"{deployment.strategy} simulates nothing"

@@ -357,6 +357,15 @@ def test_pours_that_say_nothing_about_the_simulator_here_are_left_out_with_the_r
     assert with_evidence(plan.deployment, {}, None, plan.deployment.scenes[0], plan.parameters) == plan.deployment
 
 
+def test_a_campaign_whose_strategy_believes_no_pours_is_told_nothing_of_them(state: Path, tmp_path: Path) -> None:
+    import_posterior(known("first-1", **{**POURED, "shape": "0123456789abcdef"}))
+    path = with_prior(tmp_path, "catalogue")
+    path.write_text(path.read_text("utf-8").split("deployment:")[0] + "outputs: {directory: ../../runs}\n", "utf-8")
+    memory = load_campaign(path).memory
+    assert memory is not None
+    assert (memory.pours, memory.left_out) == (None, ())
+
+
 def test_of_very_many_earlier_runs_the_newest_pours_are_enough(state: Path, tmp_path: Path) -> None:
     for number in range(4):
         import_posterior(known(f"run-{number}", **{**POURED, "weighed": POURED["weighed"] * 12}))
