@@ -27,9 +27,10 @@ predictions are therefore moved by Markov chains that keep the posterior.
 
 **After a calibration.** Its weighed pours have simulations c_i and a surrogate f̂_c of these in their own scene.
 Hypothesis j predicts them as clip(e^{g_j} (c_i + f̂_c(z_j(x_i)) − f̂_c(x_i)), 0, 1) + δ, with its noise. Its weight is
-prior times ((1 − ε) L_j / Σ_k w_k L_k + ε), L_j the likelihood of these pours to the power that they have for another
-receiver. With the probability ε the calibration misleads, and only the prior is known; so it is after a change of the
-bench.
+prior times (1 − ε) L_j / Σ_k w_k L_k, L_j the likelihood of these pours to the power that they have for another
+receiver. Small losses have small errors in these hypotheses: v_j² has the further term (ρ min(μ_j(x), 0.1))², and σ_j
+may be smaller. With the probability ε the calibration misleads, and only the prior is known: every second hypothesis is
+one without these changes, of a bench that was never compared with its simulator. So it is after a change of the bench.
 
 **A bench that changes.** Once an observation lies outside its 99 % prediction interval, the hypotheses are weighed
 together with the start of the present segment: the observations before it were made on another bench, and say nothing
@@ -81,6 +82,11 @@ WIDTH = 0.25
 """Standard deviation of h."""
 RESTS = (0.02, 0.3)
 """Smallest and largest σ, in units of the largest cost; log-uniform, like ℓ."""
+CALIBRATED_RESTS, RELATIVE_REST, SMALL = (0.006, 0.3), 0.5, 0.1
+"""The same after a calibration, ρ, and the largest small loss: chosen by twelve first pours
+(docs/notes/deployment-tried.md)."""
+EXCLUDED = -700.0
+"""Logarithm of the prior weight of hypotheses that do not belong to a mixture's component."""
 LENGTHS = (0.15, 0.6)
 NEAR, FARTHER = (0.03, 0.4), (0.4, 3.0)
 """Ranges of a hypothesis' factor s on the standard deviations of its offset, and up to 1 of g and h, too; log-uniform.
@@ -152,6 +158,7 @@ class Hypotheses:
         contrary: (J,), whether the hypothesis reverses the simulator.
         drifts: (J, 2 dimension + 2), changes per observation of the shifts, of the factors' logarithms, of h and of g.
         fading: (J,), κ.
+        calibrated: (J,), whether by the hypothesis a calibration holds.
         centre: (dimension,), the simulated best.
         origin: (dimension,), about which a factor stretches, as negative coordinate.
     """
@@ -168,11 +175,19 @@ class Hypotheses:
     contrary: NDArray[np.bool_]
     drifts: Array
     fading: Array
+    calibrated: NDArray[np.bool_]
     centre: Array
     origin: Array
 
     @classmethod
-    def of(cls, discrepancy: ModelDiscrepancy, centre: Array, latent: Array, contrary: NDArray[np.bool_]) -> Hypotheses:
+    def of(
+        cls,
+        discrepancy: ModelDiscrepancy,
+        centre: Array,
+        latent: Array,
+        contrary: NDArray[np.bool_],
+        calibrated: NDArray[np.bool_],
+    ) -> Hypotheses:
         """Return the hypotheses of latent variables (J, `latent_size`), a priori standard normal; with `drift_size`
         further ones the bench may drift.
         """
@@ -186,6 +201,7 @@ class Hypotheses:
         beyond = (far - NEAR_SHARE) / (1.0 - NEAR_SHARE)
         spread = np.where(near, _evenly(NEAR, far / NEAR_SHARE), _evenly(FARTHER, beyond))
         less = np.minimum(spread, 1.0)
+        rests = np.where(calibrated, _evenly(CALIBRATED_RESTS, residual), _evenly(RESTS, residual))
         scales, shifts = np.ones((len(rows), dimension)), np.zeros((len(rows), dimension))
         if discrepancy.drawn:
             index = np.minimum((known / KNOWN_SHARE * len(discrepancy.drawn)).astype(int), len(discrepancy.drawn) - 1)
@@ -210,7 +226,7 @@ class Hypotheses:
             factors * shifts + moved,
             less * WIDTH * width,
             less * GAIN * gain,
-            np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), residual), _evenly(RESTS, residual)),
+            np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), residual), rests),
             _evenly(LENGTHS, length),
             _evenly(NOISES, noise),
             _evenly(NOISE_GROWTHS, growth),
@@ -218,6 +234,7 @@ class Hypotheses:
             contrary,
             drift[:, None] * pace * np.concatenate([shift, factor, (WIDTH, GAIN)]),
             drift,
+            calibrated,
             centre,
             origin,
         )
@@ -367,7 +384,8 @@ class ModelAveragedProcess:
         latent = ndtri(np.concatenate([rows, rows[:CONTRARY]]))  # the same for the same question, and even
         contrary = np.arange(J) >= HYPOTHESES
         self._ages = np.arange(len(points), 0.0, -1.0)
-        self._all = Hypotheses.of(discrepancy, centre, latent, contrary)
+        held = (np.arange(J) % 2 == 1) & ~contrary if discrepancy.calibration else np.zeros(J, dtype=bool)
+        self._all = Hypotheses.of(discrepancy, centre, latent, contrary, held)
         scenes = [_CalibratedScene.of(pours, discrepancy.worst) for pours in discrepancy.calibration or ()]
         by_misled = dict.fromkeys(scene.misled for scene in scenes)
         self._calibrations = {misled: [scene for scene in scenes if scene.misled == misled] for misled in by_misled}
@@ -375,8 +393,11 @@ class ModelAveragedProcess:
         shares = 1.0 - distrust, CONTRARY_SHARE * distrust, (1.0 - CONTRARY_SHARE) * distrust
         prior = np.log(np.repeat(np.divide(shares, numbers), numbers))
         calibrated = np.concatenate([self._calibrated(self._all), self._calibrated(None)], axis=1)
-        self._calibrated_totals = [_log_sum(prior + logs) for logs in calibrated]
-        segments = self._segments(prior, prior + self._reliance(calibrated))
+        anyway = np.append(contrary, np.ones(len(UNINFORMATIVE_LENGTHS), dtype=bool))  # calibrated or not
+        by_case = _shares(np.append(held, np.zeros(len(UNINFORMATIVE_LENGTHS), dtype=bool)), anyway)
+        self._calibrated_totals = [_log_sum(prior + by_case[0] + logs) for logs in calibrated]
+        unknown = prior + by_case[1] if self._calibrations else prior
+        segments = self._segments(unknown, prior + self._reliance(calibrated, by_case))
         self.since, weights = segments.since, segments.weights
         informed, uninformative = weights[:, :J], weights[:, J:]
         self._trusting = np.where(self._all.contrary, 0.0, informed.sum(axis=0))
@@ -388,7 +409,7 @@ class ModelAveragedProcess:
         if len(points):
 
             def make(moved: Array) -> Hypotheses:
-                return Hypotheses.of(discrepancy, centre, moved, contrary[sample])
+                return Hypotheses.of(discrepancy, centre, moved, contrary[sample], held[sample])
 
             self._kept = self._resampled(latent[sample], self._kept, counting, make)
         self.mixture = np.concatenate([np.full(KEPT, informed.sum() / KEPT), uninformative.sum(axis=0)])
@@ -427,7 +448,8 @@ class ModelAveragedProcess:
         # μ_j
         gain = hypotheses.gains_at(ages) / self.worst
         means = np.clip(gain * np.where(hypotheses.contrary[:, None], self.worst - mean, mean), 0.0, 1.0)
-        spreads = np.hypot(hypotheses.rests[:, None], gain * deviation)
+        relative = hypotheses.calibrated[:, None] * RELATIVE_REST * np.minimum(means, SMALL)
+        spreads = np.hypot(np.hypot(hypotheses.rests[:, None], gain * deviation), relative)
         return _Prior(means, spreads, hypotheses.noises[:, None] + hypotheses.growths[:, None] * means)
 
     def _uninformative(self, points: Array, seen: Array | float) -> _Prior:
@@ -458,13 +480,21 @@ class ModelAveragedProcess:
                 logs[i] += scene.power * _sequential(prior, kernel, scene.points, scene.costs)[0].sum(axis=1)
         return logs
 
-    def _reliance(self, calibrated: Array) -> Array:
-        """Logarithms (J,) of the factors on prior weights by the calibrations, whose log-likelihoods are given."""
-        # (1 − ε) L_j / Σ_k w_k L_k + ε: with the probability ε, the weights are those without this calibration
-        factors = np.zeros(calibrated.shape[1])
-        for misled, logs, total in zip(self._calibrations, calibrated, self._calibrated_totals, strict=True):
-            factors += np.logaddexp(np.log1p(-misled) + logs - total, np.log(misled))
-        return factors
+    def _reliance(self, calibrated: Array, shares: Array) -> Array:
+        """Logarithms (J,) of the factors on prior weights by the calibrations.
+
+        Args:
+            calibrated: (calibrations, J), log-likelihoods of their pours.
+            shares: see `_shares`.
+        """
+        if not self._calibrations:
+            return np.zeros(calibrated.shape[1])
+        # Π_c ((1 − ε_c) L_jc / Σ_k w_k L_kc + ε_c), of which Π_c ε_c is the case that all of them mislead
+        misled = np.log(list(self._calibrations))
+        relative = calibrated - np.array(self._calibrated_totals)[:, None]
+        factors = np.logaddexp(np.log1p(-np.exp(misled))[:, None] + relative, misled[:, None]).sum(axis=0)
+        holding = factors + np.log(np.maximum(-np.expm1(misled.sum() - factors), np.exp(EXCLUDED)))
+        return np.asarray(np.logaddexp(shares[0] + holding, shares[1] + misled.sum()))
 
     def _resampled(self, latent: Array, sample: Hypotheses, counting: NDArray[np.bool_], make: Remake) -> Hypotheses:
         """Move drawn hypotheses (k) by Markov chains that keep the posterior: the drawn ones are few, and coarse.
@@ -498,7 +528,7 @@ class ModelAveragedProcess:
         at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
         chances = _sequential(at_data, hypotheses.kernel, self.points, self._costs, self._ages)[0]
         changed = ~counting[:, :1].all(axis=1)
-        weights = self._reliance(self._calibrated(hypotheses))
+        weights = self._reliance(self._calibrated(hypotheses), _shares(hypotheses.calibrated, hypotheses.contrary))
         weights = np.where(changed, np.where(hypotheses.near, np.log(NEAR_CHANGED), 0.0), weights)
         return np.asarray(np.where(counting, chances, 0.0).sum(axis=1) + weights)
 
@@ -756,6 +786,17 @@ def _evenly_drawn(weights: Array, count: int) -> NDArray[np.int_]:
     order = np.argsort(-weights, kind="stable")
     levels = (np.arange(count) + 0.5) / count * weights.sum()
     return np.asarray(order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)])
+
+
+def _shares(calibrated: NDArray[np.bool_], anyway: NDArray[np.bool_]) -> Array:
+    """Logarithms (2, J) of the factors on prior weights if a calibration holds, and if it does not.
+
+    Args:
+        calibrated: (J,), hypotheses by which it holds, every second one of those that are not `anyway`.
+        anyway: (J,), hypotheses of both cases.
+    """
+    twice = np.where(anyway, 0.0, np.log(2.0))
+    return np.array([np.where(calibrated | anyway, twice, EXCLUDED), np.where(calibrated, EXCLUDED, twice)])
 
 
 def _log_sum(logs: Array) -> float:

@@ -373,8 +373,8 @@ def _pour_panel(axes: Axes, series: PourSeries) -> float:
             label=f"predicted: mean, {100 * LEVEL:.0f} % interval",
             zorder=2,
         )
-        # A first, uncertain prediction must not compress the measured values into the lowest tenth.
-        top = max(top, min(float(np.nanmax(high)), 2.0 * top))
+        # A first, uncertain prediction must not compress several measured values into the lowest tenth.
+        top = max(top, min(float(np.nanmax(high)), 2.0 * top if len(numbers) > 1 else np.inf))
         for number, end in zip(numbers, high, strict=True):
             if end > TOP * top:
                 axes.annotate(

@@ -247,6 +247,15 @@ def test_receivers_and_predictors_that_are_missing_leave_room_not_errors(tmp_pat
     assert is_picture(style.save(draw_discrepancy([alone], title="θ* alone"), tmp_path / "alone.png"))
 
 
+def test_a_single_pour_is_drawn_with_its_whole_prediction() -> None:
+    one = PourSeries("cup", [0.25], [(2.1, 0.0, 6.7)])
+    two = PourSeries("cup", [0.25, 0.2], [(2.1, 0.0, 6.7), (0.5, 0.1, 0.9)])
+    shown = [draw_losses([series], cost="loss [%]", title="").axes[0].get_ylim()[1] for series in (one, two)]
+    assert shown[0] > 6.7
+    assert shown[1] < 1.0  # several measured values remain apart
+
+
+
 def test_quantities_are_shown_in_the_units_that_people_type() -> None:
     assert display_value("angular_velocity", 41.2 * DEG) == "41.2 deg/s"
     assert display_value("x_offset", 0.104) == "104 mm"
