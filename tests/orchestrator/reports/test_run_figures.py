@@ -255,7 +255,6 @@ def test_a_single_pour_is_drawn_with_its_whole_prediction() -> None:
     assert shown[1] < 1.0  # several measured values remain apart
 
 
-
 def test_quantities_are_shown_in_the_units_that_people_type() -> None:
     assert display_value("angular_velocity", 41.2 * DEG) == "41.2 deg/s"
     assert display_value("x_offset", 0.104) == "104 mm"
