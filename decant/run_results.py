@@ -23,7 +23,7 @@ from orchestrator.records.codec import Results
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.run_record import CampaignResult, Row, answers, read_record, read_result
 from orchestrator.reports.loss_units import loss_of_pour
-from orchestrator.reports.mixture_report import mixture_rows, mixtures_of
+from orchestrator.reports.mixture_report import mixture_rows, mixtures_of, with_unfinished
 from orchestrator.reports.publishing import Published, report_on, summary_of
 from orchestrator.reports.publishing import publish as write
 from orchestrator.reports.run_summary import RunSummary
@@ -132,7 +132,7 @@ class Run:
         """One row for each liquid of each cup of `mixtures`: wanted and received mass [g] and share, with half of their
         90 % intervals, dose, source, time [s since 1970] and state of the cup; empty without mixtures.
         """
-        mixtures = mixtures_of(self.results)
+        mixtures = mixtures_of(with_unfinished(self.campaign, self.result).results)
         return _frame(iter([] if mixtures is None else mixture_rows(mixtures, read_record(self.directory))))
 
     def figures(self) -> dict[str, Figure]:

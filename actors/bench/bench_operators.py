@@ -222,10 +222,12 @@ class BenchContents:
                 self.in_receiver, self.on_balance = 0.0, under | {"receiver"}
             case "dose_source":
                 self.in_pourer, self.on_balance = fill, under
-            case "dose_cleared":
+            case "dose_cleared" | "dose_exchanged":
                 self.on_balance = under
             case "dose_receiver":
-                self.in_receiver, self.on_balance = 0.0, under | {"receiver"}
+                if self.receiver == "receiver":  # an empty one; a cup with a name has what was poured into it
+                    self.in_receiver = 0.0
+                self.on_balance = under | {self.receiver}
             case "set_up":
                 self.in_receiver, self.on_tray = 0.0, 0.0
                 self.on_balance = {"tray"} if alone else under | {"receiver"}

@@ -161,6 +161,15 @@ class DoseProcedure(BenchProcedure):
                     about="dose_source",
                 )
             )
+        elif dose.cup:  # the dose before may have been poured from another source
+            await self._consent.ask(
+                OperatorQuestion(
+                    f"Take '{source.name}', which holds {1e3 * source.mass:.0f} g of {self._scene.liquid.name}. "
+                    f"{GRIP}Take everything off the balance, and wipe its pan.",
+                    wants="done",
+                    about="dose_exchanged",
+                )
+            )
         else:
             await self._consent.ask(
                 OperatorQuestion(
@@ -168,14 +177,16 @@ class DoseProcedure(BenchProcedure):
                 )
             )
         place = f" {dose.position}" if dose.position else ""
+        receiver = f"the empty receiver{place}"
+        if dose.held is not None:
+            receiver = f"the receiver{place}, which holds {1e3 * dose.held:.0f} g,"
         problem = ""
         while True:
             await self._readings_for(BEFORE_PLACING, 1)
             before = self._readings.all[-3:]
             await self._consent.ask(
                 OperatorQuestion(
-                    f"Put the empty receiver{place} on the balance in one movement, and let go; nothing else may touch "
-                    "its pan.",
+                    f"Put {receiver} on the balance in one movement, and let go; nothing else may touch its pan.",
                     "done",
                     problem,
                     about="dose_receiver",

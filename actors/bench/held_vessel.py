@@ -48,10 +48,10 @@ BLIND = 2
 BELOW = 0.8
 """Width to which the fingers close, as a fraction of the vessel's: an object stops them well before."""
 
-TAKES = ("pourer_empty", "pourer_full", "pourer_after", "dose_source")
+TAKES = ("pourer_empty", "pourer_full", "pourer_after", "dose_source", "dose_exchanged")
 """Questions whose step needs the pourer, which the gripper holds."""
 
-GIVES = ("set_up", "receiver_empty", "tray_before", "dose_source", "dose_cleared")
+GIVES = ("set_up", "receiver_empty", "tray_before", "dose_source", "dose_exchanged", "dose_cleared")
 """Questions after whose step the gripper holds the pourer; their instructions contain `GRIP` or need none."""
 
 Ask = Callable[[OperatorQuestion], Awaitable[str]]

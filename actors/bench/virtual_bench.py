@@ -462,7 +462,10 @@ class FollowedBench(VirtualBench):
     async def prepare_dose(self, scene: Scene, dose: DoseTarget, seed: int, carried: tuple[str, str] | None) -> None:
         """See `GroundTruth.prepare_dose`."""
         source, contents = source_of(scene, dose), self.contents
-        contents.pourer, contents.receiver = carried or ("pourer", "receiver")
+        contents.pourer, contents.receiver = carried or (source.vessel or "pourer", dose.cup or "receiver")
+        if carried is None and dose.cup:
+            known = contents.liquids.get(dose.cup, dose.held or 0.0)
+            contents.in_receiver = 0.0 if dose.held is None else known
         for name, spec, usual in (
             (contents.pourer, scene.pourer, "pourer"),
             (contents.receiver, scene.receiver, "receiver"),

@@ -393,7 +393,8 @@ def cell_vessels(plan: DispensePlan) -> tuple[CellVessel, ...]:
     vessels = []
     for source in plan.sources:
         scene = next(scene for scene in plan.scenes if scene.pourer.name == source)
-        vessels.append(CellVessel(source, scene.pourer, scene.liquid.name, scene.liquid.mass, scene.liquid.volume))
+        liquid = scene.liquid
+        vessels.append(CellVessel(source, scene.pourer, liquid.name, liquid.mass, liquid.volume, not plan.as_left))
     densities = {scene.liquid.name: scene.liquid.density for scene in plan.scenes}
     rows = [list(row.values()) for row in plan.mixtures.cups.values()]
     mass = max(sum(dose.amount + dose.limit for dose in row) for row in rows)

@@ -119,13 +119,16 @@ def list_vessels(
             places = where.places()
             rows = [
                 {"id": content.vessel, "position": places[content.vessel].text if content.vessel in places else ""}
-                | content.json_content()
+                | {"parts": where.composition(content.vessel), **content.json_content()}
                 for content in where.all()
             ]
     if not rows:
         print_message("no vessel has content; 'decant materials weigh' enters one, see docs/laboratory/station.md")
     for row in rows:
         text = f"{row['id']:24s} {row['liquid'] or '-':12s} {_content(row):24s} {row['position']}"
+        if parts := [part for part in row.get("parts", ()) if part.liquid and part.mass != 0.0]:
+            grams = ("UNKNOWN" if part.mass is None else f"{1e3 * part.mass:.1f} g" for part in parts)
+            text += " " + ", ".join(f"{part.liquid} {mass}" for part, mass in zip(parts, grams, strict=True))
         print(text.rstrip())
 
 

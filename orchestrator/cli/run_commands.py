@@ -254,15 +254,11 @@ def show(run: Which, state: State = None, as_json: Json = False) -> None:
 
 
 def _print_mixtures(folder: Path) -> None:
-    """The cups of a run that poured mixtures, if its results can be read."""
-    from orchestrator.learning.run_errors import RunError
-    from orchestrator.records.run_record import read_result
-    from orchestrator.reports.mixture_report import mixture_lines, mixtures_of
+    """The cups of a run that poured mixtures, if it is published."""
+    from orchestrator.reports.mixture_report import mixture_lines
 
-    with contextlib.suppress(RunError, OSError):
-        mixtures = mixtures_of(read_result(folder).results)
-        for line in [] if mixtures is None else ["", *mixture_lines(mixtures)]:
-            print(line)
+    with contextlib.suppress(OSError, ValueError, LookupError):
+        print("\n".join(["", *mixture_lines(folder)]))
 
 
 @_command("decant runs known", "decant runs known beaker")

@@ -34,6 +34,7 @@ from actors.interfaces import LaboratoryError
 from orchestrator.learning.campaign_plan import DispensePlan
 from orchestrator.learning.dispense import ENOUGH, KnownSource, left_after
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured
+from orchestrator.learning.stage_result import DOSE
 from orchestrator.records.events import CampaignOpened, Event, RequestFinished, RequestStarted
 from orchestrator.records.run_registry import make_state_directory, state_directory
 from sim_engine.errors import InvalidArgumentError
@@ -514,11 +515,42 @@ class VesselAccount:
             )
             _write(connection, key, entry)
 
-    def follow(self, plan: DispensePlan) -> Callable[[Event], None]:
+    def _note_cup(self, plan: DispensePlan, pour: Pour, outcome: Outcome | None, *, key: str) -> None:
+        """A dose into a cup that a person put under the arm begins, or has an outcome; each is entered once."""
+        dose = pour.dose
+        assert dose is not None
+        assert dose.source is not None
+        cup, liquid, source = (
+            f"{plan.laboratory}/{dose.cup}",
+            plan.liquid(dose.source.name),
+            plan.tracked(dose.source.name),
+        )
+        key = f"{key} into" if outcome is not None else f"{key} into begun"
+        if self._entries("where key = ?", (key,)):
+            return
+        if outcome is None and dose.held is None:
+            self.fill(cup, 0.0, 0.0, by="operator", note="empty, as asked for", key=f"{key} empty")
+        mass, deviation = None, 0.0
+        if isinstance(outcome, Poured):
+            about = outcome.measurement.notes.get(DOSE, {})
+            mass, deviation = float(about.get("received", outcome.measurement.delivered)), about.get("deviation", 0.0)
+        elif isinstance(outcome, Failed) and outcome.kind == "invalid_action":  # nothing was poured
+            mass = 0.0
+        self.add_component(cup, liquid, mass, deviation, source)
+        parts = [part for part in self.composition(cup) if part.liquid and part.mass != 0.0]
+        known = None
+        if all(part.mass is not None for part in parts):
+            spread = math.hypot(*(part.deviation for part in parts))
+            known = KnownSource(mass=math.fsum(part.mass or 0.0 for part in parts), deviation=spread)
+        kind: EntryKind = "begun" if outcome is None else "unknown" if known is None else "poured"
+        self._note_dose(cup, kind, known, key, parts[0].liquid if len(parts) == 1 else MIXTURE if parts else "")
+
+    def follow(self, plan: DispensePlan, *, carried: bool = False) -> Callable[[Event], None]:
         """A subscriber that writes the doses of a run.
 
         Args:
             plan: of its series.
+            carried: whether the arm carries the cups, whose contents the bench then enters.
         """
         run = ""
 
@@ -531,12 +563,16 @@ class VesselAccount:
                     name = pour.dose.source.name
                     key = f"{run} {event.stage} {pour.number}"
                     self.begin(plan.tracked(name), pour, plan.liquid(name), key=key)
+                    if pour.dose.cup and not carried:
+                        self._note_cup(plan, pour, None, key=key)
                 case RequestFinished(request=Pour() as pour, outcome=Poured() | Failed() as outcome) if (
                     pour.dose is not None and pour.dose.source is not None
                 ):
                     name = pour.dose.source.name
                     key = f"{run} {event.stage} {pour.number}"
                     self.finish(plan.tracked(name), pour, outcome, plan.liquid(name), key=key)
+                    if pour.dose.cup and not carried:
+                        self._note_cup(plan, pour, outcome, key=key)
 
         return subscriber
 

@@ -10,15 +10,20 @@ import json
 import re
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.dispense import Dispensed, MixedComponent
+from orchestrator.learning.mixtures import dose_strategy
+from orchestrator.learning.requests import Failed
 from orchestrator.records.codec import Results
-from orchestrator.records.run_record import Row, RunState
+from orchestrator.records.run_record import CampaignResult, Row, RunState, read_record
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.stage_views import all_of
 from orchestrator.reports.wording import ResultRow, ResultTable
+from orchestrator.runs.stages import DOSES
 from sim_engine.resources import installed
 
 if TYPE_CHECKING:
@@ -36,6 +41,23 @@ STATES = {"rejected": "rejected", "refused": "not poured", "unknown": "UNKNOWN",
 def mixtures_of(results: Results) -> Dispensed | None:
     """The stage that poured mixtures; None if there is none."""
     return next((dispensed for dispensed in all_of(results, Dispensed) if dispensed.cups), None)
+
+
+def with_unfinished(plan: CampaignPlan, result: CampaignResult) -> CampaignResult:
+    """The result of a run with the mixtures so far, if it has stopped within them.
+
+    A dose that has begun and has no outcome makes its cup UNKNOWN.
+
+    Raises:
+        RunError: the journal can't be read.
+    """
+    if plan.dispense is None or plan.dispense.mixtures is None or mixtures_of(result.results) is not None:
+        return result
+    strategy = dose_strategy(plan.dispense, plan.seed)
+    for pour in read_record(result.directory).pours:
+        if pour.request.dose is not None and (pour.outcome is not None or pour.state in ("under way", "unknown")):
+            strategy.take(pour.request, pour.outcome or Failed("pour_unknown", "the run has stopped during the dose"))
+    return replace(result, results={**result.results, DOSES: strategy.result()})
 
 
 def mixture_rows(dispensed: Dispensed, record: RunState) -> list[Row]:
@@ -106,18 +128,23 @@ def mixture_table(dispensed: Dispensed) -> ResultTable:
     return ResultTable(f"{len(dispensed.cups)} mixtures", header, rows, frozenset(range(2, 10))).filled()
 
 
-def mixture_lines(dispensed: Dispensed) -> list[str]:
-    """Each cup in one line: reached and wanted amounts."""
-    lines = []
-    for cup in dispensed.cups:
-        parts = [
-            f"{c.liquid} {'—' if c.received_g is None else f'{c.received_g:.1f}'} of {c.wanted_g:g} g"
-            for c in dispensed.components()
-            if c.cup == cup.position
-        ]
-        replaced = f", instead of {cup.replaces}" if cup.replaces else ""
-        lines.append(f"{cup.position}  {cup.state}{replaced}: {', '.join(parts)}")
-    return lines
+def mixture_lines(directory: Path) -> list[str]:
+    """Each cup of a published run in one line: reached and wanted amounts.
+
+    Args:
+        directory: folder of the run.
+
+    Raises:
+        OSError: it has no mixtures.
+        ValueError, LookupError: its file is damaged.
+    """
+    lines: dict[str, list[str]] = {}
+    for row in json.loads((directory / f"{FILE_NAME}.json").read_text(encoding="utf-8")):
+        received = "—" if row["received_g"] is None else f"{row['received_g']:.1f}"
+        replaced = f", instead of {row['replaces']}" if row["replaces"] else ""
+        text = f"{row['liquid']} {received} of {row['wanted_g']:g} g"
+        lines.setdefault(f"{row['cup']}  {row['state']}{replaced}: ", []).append(text)
+    return [start + ", ".join(texts) for start, texts in lines.items()]
 
 
 # ---- the rack from above

@@ -22,7 +22,7 @@ from orchestrator.records.journal_check import check_journal
 from orchestrator.records.run_record import CampaignResult, read_record, read_result
 from orchestrator.records.states import State
 from orchestrator.reports.html_report import REPORT_NAME, run_page
-from orchestrator.reports.mixture_report import mixture_rows, mixtures_of, write_mixtures
+from orchestrator.reports.mixture_report import mixture_rows, mixtures_of, with_unfinished, write_mixtures
 from orchestrator.reports.run_figures import draw_figures
 from orchestrator.reports.run_summary import SUMMARY_NAME, RunFiles, RunSummary, Totals, write_summary
 from orchestrator.reports.stage_views import evaluation_of, theta_of
@@ -76,7 +76,7 @@ def publish(
     Raises:
         OSError: a file can't be written.
     """
-    directory = result.directory
+    directory, result = result.directory, with_unfinished(plan, result)
     figures = draw_figures(directory / FIGURES, plan, result.results) if plan.outputs.figures else {}
     if plan.outputs.pour_recordings:
         exports = own_extras("decant.documents")
@@ -212,6 +212,7 @@ def report_on(
         OSError: a file can't be written.
         RunError: the journal can't be read.
     """
+    result = with_unfinished(plan, result)
     figures = draw_figures(result.directory / FIGURES, plan, result.results, formats) if draw else {}
     page = run_page(summary_of(plan, result, RunFiles(figures=figures)), plan.resolved)
     return _write_page(path or result.directory / REPORT_NAME, page), figures

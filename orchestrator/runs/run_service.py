@@ -268,7 +268,8 @@ class RunHandle:
         if recorder is not None:
             self._subscribers.append(recorder)
         if (series := request.campaign.dispense) is not None and series.laboratory:
-            self._subscribers.append(VesselAccount.open().follow(series))
+            carried = bool(request.campaign.laboratory.places)
+            self._subscribers.append(VesselAccount.open().follow(series, carried=carried))
         self.begun = self._pausing = self._aborting = self._abandoning = False
         self._winding_down = asyncio.Event()
         self.result: CampaignResult | None = None

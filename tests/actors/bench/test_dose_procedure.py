@@ -10,6 +10,7 @@ import asyncio
 import contextlib
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -35,6 +36,7 @@ from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
 from orchestrator.campaigns.shipped import shipped
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.dispense import Dispense, Dispensed
+from orchestrator.learning.mixtures import Mix
 from orchestrator.learning.requests import Pour, Poured, Slots
 from orchestrator.runs.run_service import RunResources, RunService
 from orchestrator.runs.run_tasks import run_task
@@ -43,6 +45,7 @@ from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
+from tests.support import mixtures
 from tests.support.waiting import PATIENCE
 from tests.support.wired_bench import LABORATORIES, OpenStage, Stage
 
@@ -133,6 +136,30 @@ def test_a_short_series_is_poured_over_the_wires(open_stage: OpenStage) -> None:
         assert [dose.filled for dose in poured] == [True, False]
         received = math.fsum(dose.received_g or 0.0 for dose in poured)
         assert poured[-1].left_g == pytest.approx(350.0 - received, abs=5.0)
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.slow
+def test_a_mixture_is_poured_from_two_sources_into_a_cup_that_comes_back(open_stage: OpenStage) -> None:
+    async def scenario() -> None:
+        series = mixtures.plan({"water": 25.0, "oil": 15.0})
+        strategy = Mix(series, 3)
+        async with open_stage(dosing_spec()) as stage:
+            texts: list[str] = []
+            while not strategy.finished:
+                pour, dose = mixtures.asked(strategy)
+                scene = replace(SCENE, liquid=Liquid(mass=0.3, density=mixtures.DENSITIES[dose.source.name[7:]]))
+                measured = await stage.bench.pour(scene, ACTION, seed=pour.seed, dose=dose)
+                texts += [question.text for question in stage.operator.heard]
+                assert 1e3 * measured.notes["dose"]["received"] == pytest.approx(1e3 * dose.amount, abs=4.0)
+                strategy.tell(pour, Poured(measured))
+            held = {name: round(1e3 * mass) for name, mass in stage.contents.liquids.items() if "/" in name}
+        poured = {dose.liquid: dose.received_g for dose in strategy.result().doses}
+        assert held["rack/A1"] == pytest.approx(sum(mass or 0.0 for mass in poured.values()), abs=1.5)
+        assert held["source/water"] == pytest.approx(300.0 - (poured["water"] or 0.0), abs=4.0)
+        assert any(text.startswith("Put the empty receiver rack/A1 on the balance") for text in texts)
+        assert any(re.match(r"Put the receiver rack/A1, which holds 1\d g, on the balance", text) for text in texts)
 
     asyncio.run(scenario())
 

@@ -15,12 +15,16 @@ from actors.interfaces import LaboratoryError, ProgressCallback
 from orchestrator.daemon.rigs.materials import MaterialError, Materials, mass_of
 from orchestrator.daemon.state.daemon_store import Store
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
+from orchestrator.learning.mixtures import Mix
+from orchestrator.learning.requests import Failed
 from orchestrator.materials.vessel_account import FILE_NAME, MIXTURE, LaboratoryPlaces, Transfer, VesselAccount
+from orchestrator.records.events import CampaignOpened, RequestFinished, RequestStarted
 from sim_engine.errors import InvalidArgumentError
 from sim_engine.liquids import Liquid
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import cylinder
+from tests.support import mixtures
 from tests.support.cli_inputs import invoke
 from tests.support.station import BEAKER, content, rigs_in
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
@@ -276,3 +280,47 @@ def test_a_mass_of_a_request_has_one_meaning(text: str, said: str, tmp_path: Pat
     with pytest.raises(MaterialError) as refusal:
         Materials(Store(tmp_path / "queue.sqlite")).weigh("lab/jug", mass_of(text, "mass"), 1e-4, "water", "ada")
     assert str(refusal.value) == said
+
+
+# ---- mixtures
+
+
+def composition(account: VesselAccount, cup: str) -> dict[str, float | None]:
+    return {part.liquid: part.mass for part in account.composition(cup) if part.liquid}
+
+
+def test_a_cup_of_a_mixture_has_what_was_weighed_into_it_and_is_unknown_during_a_dose(tmp_path: Path) -> None:
+    account, series = VesselAccount(tmp_path / "account.sqlite"), mixtures.plan({"water": 40.0, "oil": 10.0})
+    subscriber, strategy, cup = account.follow(series), Mix(series, 5), "bench/rack/A1"
+    subscriber(CampaignOpened(name="mix", run_directory=tmp_path, stages=("doses",), mode="virtual", simulators=1))
+    for grams, held in ((10.2, 10.2), (39.9, 50.1)):
+        pour, _ = mixtures.asked(strategy)
+        for _ in range(2):  # events of a resumed run come again
+            subscriber(RequestStarted(stage="doses", id=pour.number, request=pour))
+        during = account.content(cup)
+        assert during is not None
+        assert (during.kind, during.mass) == ("begun", None)
+        outcome = mixtures.poured(pour, grams)
+        strategy.tell(pour, outcome)
+        for _ in range(2):
+            subscriber(RequestFinished(stage="doses", id=pour.number, request=pour, outcome=outcome))
+        after = account.content(cup)
+        assert after is not None
+        assert 1e3 * (after.mass or 0.0) == pytest.approx(held)
+    assert composition(account, cup) == {"oil": pytest.approx(0.0102), "water": pytest.approx(0.0399)}
+    assert (after.liquid, 1e3 * after.deviation) == ("mixture", pytest.approx(0.2 * 2**0.5))
+    account.weigh(cup, 0.0, 0.0, by="a person", note="emptied")
+    assert composition(account, cup) == {}
+
+
+def test_a_cup_with_a_dose_of_unknown_amount_is_unknown(tmp_path: Path) -> None:
+    account, series = VesselAccount(tmp_path / "account.sqlite"), mixtures.plan({"water": 40.0, "oil": 10.0})
+    subscriber, (pour, _) = account.follow(series), mixtures.asked(Mix(series, 5))
+    subscriber(CampaignOpened(name="mix", run_directory=tmp_path, stages=("doses",), mode="virtual", simulators=1))
+    subscriber(RequestStarted(stage="doses", id=pour.number, request=pour))
+    failed = Failed("pour_unknown", "it fell")
+    subscriber(RequestFinished(stage="doses", id=pour.number, request=pour, outcome=failed))
+    content = account.content("bench/rack/A1")
+    assert content is not None
+    assert (content.kind, content.mass) == ("unknown", None)
+    assert composition(account, "bench/rack/A1") == {"oil": None}

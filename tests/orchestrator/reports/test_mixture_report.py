@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import re
+import shutil
+import sqlite3
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -12,7 +16,9 @@ from typer.testing import CliRunner
 import decant
 from orchestrator.cli.app import app
 from orchestrator.learning.dispense import Dispensed, Dose, MixedCup
-from orchestrator.reports.mixture_report import draw_rack, mixture_lines, mixture_table
+from orchestrator.records.journal_file import Header
+from orchestrator.records.run_record import RunState
+from orchestrator.reports.mixture_report import draw_rack, mixture_lines, mixture_rows, mixture_table, write_mixtures
 from tests.support import small_campaign
 
 MIXTURES = """\
@@ -112,8 +118,37 @@ def test_the_picture_shows_the_cups_where_they_stand_and_their_differences() -> 
     assert bold == {"+3.00"}
 
 
+def test_a_line_for_each_cup_says_which_one_it_replaces(tmp_path: Path) -> None:
+    write_mixtures(tmp_path, mixture_rows(PARTLY, RunState(Header("mix", {}))))
+    assert mixture_lines(tmp_path) == [
+        "rack/A1  rejected: oil 13.0 of 10 g",
+        "rack/C4  full, instead of rack/A1: oil 9.9 of 10 g",
+        "rack/A2  waiting: oil — of 10 g",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("kind", "states"),
+    [("pour.finished", ["filling", "filling", "waiting"]), ("pour.started", ["unknown", "unknown", "waiting"])],
+    ids=["between two doses", "in a dose"],
+)
+def test_a_run_that_has_stopped_shows_the_cups_so_far(
+    run: decant.Run, tmp_path: Path, kind: str, states: list[str]
+) -> None:
+    folder = tmp_path / "stopped"
+    shutil.copytree(run.directory, folder)
+    with contextlib.closing(sqlite3.connect(folder / "journal.sqlite")) as journal, journal:
+        events = "select seq from event where kind = ? order by seq"
+        number = 0 if kind == "pour.finished" else 1
+        last = journal.execute(events, (kind,)).fetchall()[number][0]
+        for table in ("event", "chain"):
+            journal.execute(f"drop trigger {table}_is_never_deleted")
+            journal.execute(f"delete from {table} where seq > ?", (last,))
+    table = decant.open_run(folder).mixtures
+    assert [*table["state"]] == states
+
+
 def test_a_cup_that_is_not_filled_has_no_share_and_a_replaced_one_is_marked() -> None:
     rejected, full, waiting = PARTLY.components()
     assert (rejected.share, full.share, waiting.share) == (None, 1.0, None)
-    assert mixture_lines(PARTLY)[1] == "rack/C4  full, instead of rack/A1: oil 9.9 of 10 g"
     assert [row.look for row in mixture_table(PARTLY).rows] == ["bad", "", ""]
