@@ -19,7 +19,7 @@ from actors.arm.planned_pour import MotionPath, PlaceWay, PourPath
 from actors.arm.simulated_arm import APPROACH_TIME, SimulatedArm, SimulatedArmSettings
 from actors.arm.ur.robot_models import MODELS, same_robot
 from actors.arm.ur_settings import UrArmSettings
-from actors.arm_geometry import RobotCell
+from actors.arm_geometry import Point, RobotCell
 from actors.balance.balance_settings import BalanceEmulator, BalanceKind, SerialBalanceSettings
 from actors.balance.serial_port import look_at_port
 from actors.balance.simulated_balance import SimulatedBalanceSettings, VirtualBalance
@@ -148,6 +148,14 @@ class UrArmKind(ArmKind[UrArmSettings]):
         from actors.arm.planning.place_ways import way_to
 
         return way_to(place, places, self.spec, vessels, volume)
+
+    def pouring_at(self, place: PlaceSettings) -> UrArmSettings:
+        """See `ArmKind.pouring_at`."""
+        from actors.arm.planning.place_ways import vessel_at
+
+        x, y, z = map(float, vessel_at(place, self.spec).position)
+        foot = Point(x=x, y=y, z=z)
+        return self.spec.with_values(cell=self.spec.cell.with_values(receiver=foot))
 
     def in_the_way(
         self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel]

@@ -26,7 +26,7 @@ from actors.arm_geometry import Pose
 from actors.interfaces import InvalidActionError
 from sim_engine.settings.model import Example, PositiveCount, Problems, Settings
 from sim_engine.settings.quantity import Quantity
-from sim_engine.vessel.shapes import VesselSpec
+from sim_engine.vessel.shapes import VesselSpec, cylinder
 
 Role = Literal["pourer", "receiver"]
 
@@ -136,6 +136,22 @@ def position_name(row: int, column: int) -> str:
     return f"{chr(ord('A') + row)}{column + 1}"
 
 
+class ContainerSettings(Settings):
+    """A round, open container for waste."""
+
+    diameter: Annotated[float, Quantity("m", "200 mm", 0.05, 0.6)]
+    """Outer diameter."""
+
+    height: Annotated[float, Quantity("m", "120 mm", 0.02, 0.6)]
+    """Outer height."""
+
+    @property
+    def vessel(self) -> VesselSpec:
+        """Its shape."""
+        inside = 0.5 * self.diameter - 2e-3
+        return cylinder("waste", inner_radius=inside, inner_height=self.height - 2e-3, wall=2e-3, floor=2e-3)
+
+
 class PlaceSettings(Settings):
     """A place where a vessel stands, taught by hand with 'decant robot teach'."""
 
@@ -148,8 +164,11 @@ class PlaceSettings(Settings):
     tool: Annotated[Pose, Example("{z: 170 mm}")]
     """Tool centre point in the flange's frame when the pose was taught; it has to be that of the arm."""
 
-    use: Literal["stand", "balance", "source"] = "stand"
-    """'balance': on the balance, where the receiver stands in a pour. 'source': under the outlet of the refill pump. 'stand': any other."""  # noqa: E501
+    use: Literal["stand", "balance", "source", "waste"] = "stand"
+    """'balance': on the balance, where the receiver stands in a pour. 'source': under the outlet of the refill pump. 'waste': a container into which cups are emptied. 'stand': any other."""  # noqa: E501
+
+    container: ContainerSettings | None = None
+    """The container at a place with 'use: waste', which is taught with a cup that stands where it stands."""
 
     holds: tuple[Role, ...] = ROLES
     """Vessels that may stand there."""
@@ -249,7 +268,7 @@ class Layout:
             InvalidActionError: they do not suffice for a pour.
         """
         balance = [place for place in places if place.use == "balance" and set(ROLES) <= set(place.holds)]
-        others = [place for place in places if place.use != "balance"]
+        others = [place for place in places if place.use not in ("balance", "waste")]
         # the pourer stands where it can be filled up; the receiver anywhere else
         pourer = next((p for p in sorted(others, key=lambda p: p.use != "source") if "pourer" in p.holds), None)
         receiver = next((p for p in others if "receiver" in p.holds and p is not pourer), None)
@@ -276,6 +295,9 @@ def check_places(problems: Problems, places: Sequence[PlaceSettings], tool: Pose
         names.update(position.name for position in place.each)
         if place.rack is not None:
             _check_rack(problems, place, number)
+        if (place.use == "waste") != (place.container is not None):
+            text = "'use: waste' and a 'container: {diameter: 200 mm, height: 120 mm}' belong together"
+            problems.add(text, "places", number, "container" if place.container is not None else "use")
         if place.tray is not None and place.use != "balance":
             problems.add("belongs to the place with 'use: balance', over which is poured", "places", number, "tray")
         if tool is not None and _differ(place.tool, tool):

@@ -34,7 +34,7 @@ from actors.grippers.onrobot_gripper import OnRobotSettings
 from actors.grippers.robotiq_gripper import RobotiqSettings
 from actors.interfaces import OperatorSettings, RaySettings
 from actors.liquid_devices import SimulatedPumpSettings, SimulatedSpillSensorSettings, SourceSettings
-from actors.places import PlaceSettings, RackSettings, UnattendedSettings
+from actors.places import ContainerSettings, PlaceSettings, RackSettings, UnattendedSettings
 from orchestrator.campaigns import campaign_file as campaign
 from orchestrator.campaigns import file_references as vessel
 from orchestrator.campaigns.pour_table import MASS_COLUMNS, SPLITS, column_name
@@ -101,6 +101,7 @@ SECTIONS: dict[str, type[Settings]] = {
     "cell": RobotCell,
     "places": PlaceSettings,
     "rack": RackSettings,
+    "container": ContainerSettings,
     "unattended": UnattendedSettings,
     "gripper-robotiq": RobotiqSettings,
     "gripper-onrobot": OnRobotSettings,
@@ -150,6 +151,7 @@ OF_SECTIONS = {
     "GripperSettings": "[gripper](grippers.md)",
     "PlaceSettings": "[place](places.md#settings)",
     "RackSettings": "[rack](places.md#racks)",
+    "ContainerSettings": "[container](places.md#waste)",
     "UnattendedSettings": "[unattended](places.md#settings)",
     "EmulatedOnRobotSettings": "[gripper](grippers.md)",
     "EmulatedRobotiqSettings": "[gripper](grippers.md)",

@@ -273,6 +273,14 @@ class ArmKind(ABC, Generic[S]):
         """
         raise InvalidActionError(f"an arm of the kind '{self.spec.kind}' carries no vessels")
 
+    def pouring_at(self, place: PlaceSettings) -> S:
+        """The settings with which pours end at a place instead of the balance.
+
+        Raises:
+            InvalidActionError: this kind of arm carries no vessels.
+        """
+        raise InvalidActionError(f"an arm of the kind '{self.spec.kind}' carries no vessels")
+
     def in_the_way(
         self, path: PlannedPour, pourer: Vessel, places: Sequence[PlaceSettings], vessels: Mapping[str, Vessel]
     ) -> list[str]:

@@ -379,7 +379,7 @@ async def _open_devices(
         carrier = VesselCarrier(pan.name, arm, arm_spec, held, balance, record, ground_truth)
         liquids = CellLiquids(record, carrier, pan.tray)
         handling = VesselHandling(places, carrier, liquids, balance_spec, supply, ground_truth, tell)
-        doses = DoseHandling(places, spec.vessels, carrier, liquids, record, balance_spec, supply, tell)
+        doses = DoseHandling(places, spec.vessels, carrier, liquids, record, balance_spec, supply, ground_truth)
     setup = Setup(
         spec.mode,
         arm_spec,

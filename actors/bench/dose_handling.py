@@ -7,6 +7,8 @@
 3. Take the source. After the dose put it back, and weigh the cup again.
 4. Put the cup back, unless the next dose goes into it.
 
+A cup may be emptied first, at the waste place; what leaves it is added to the content of that place.
+
 A cup whose content is UNKNOWN is not used before a person has entered it. No liquid is dosed into a cup twice. The
 moves are those of `actors.bench.vessel_carrying`, and so are their entries in the account of vessels.
 """
@@ -14,7 +16,7 @@ moves are those of `actors.bench.vessel_carrying`, and so are their entries in t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from actors.arm.arm_interface import PlannedPour
@@ -22,23 +24,31 @@ from actors.arm.arm_settings import ArmSettings, arm_kind
 from actors.balance.balance_settings import BalanceSettings
 from actors.balance.weighing_plan import SURE, PourMasses, weighing_uncertainty
 from actors.bench.cell_liquids import RESERVOIR, CellLiquids
+from actors.bench.ground_truth import GroundTruth
 from actors.bench.liquid_supply import LiquidSupply
 from actors.bench.pour_feasibility import vessel as built
 from actors.bench.vessel_carrying import Load, MotionConsent, VesselCarrier, Ways, check_carrying, label, move_question
-from actors.bench.vessel_handling import WRONG
+from actors.bench.vessel_handling import WRONG, plan_emptying
 from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import LOST, source_of
 from actors.grippers.gripper_interface import GripperSettings
-from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, LaboratoryError, Notice, OperatorQuestion
+from actors.interfaces import DoseSource, DoseTarget, InvalidActionError, LaboratoryError, OperatorQuestion
 from actors.places import CellVessel, Layout, PlaceRecord, PlaceSettings, Role
 from sim_engine.liquids import Liquid
 from sim_engine.scene import Scene
+from sim_engine.vessel.vessel import Vessel
 
 OPEN_LOSS = 0.3e-3
 """Mass that a cup may lose unweighed, by evaporation and at its outside, before a person is asked about it [kg]."""
 
 BEFORE_PLACED, AFTER_PLACED = 1.5, 3.0
 """Readings around the moment when a cup is let go of on the balance, which show its lag [s]."""
+
+FILM = 0.5e-3
+"""Liquid that an emptied cup keeps, and its standard deviation, until it is weighed [kg]."""
+
+WATER, FULL = 998.0, 0.9
+"""Density that a waste container is filled with [kg/m³], and the part of its capacity that is used."""
 
 MOST_SPILLED = 20e-3
 """Largest mass that a dose is expected to spill into the tray [kg]."""
@@ -136,9 +146,14 @@ def check_vessels(
     at_places = []
     for place in places:
         names = tuple(shapes.values()) if place is pan[0] else (homes[place.name],) if place.name in homes else ()
+        names = (place.name,) if place.container is not None else names
         at_places.append(place.with_values(holds=names))
-    stops = [place for place in at_places if place.holds]
-    return tuple(at_places), loads, check_carrying(stops, at_places, spec, gripper, loads)
+    stops = [place for place in at_places if place.holds and place.container is None]
+    return tuple(at_places), loads, check_carrying(stops, at_places, spec, gripper, loads, _containers(places))
+
+
+def _containers(places: Sequence[PlaceSettings]) -> dict[str, Vessel]:
+    return {place.name: built(place.container.vessel) for place in places if place.container is not None}
 
 
 def _step(readings: Sequence[DoseReading], rise: float) -> tuple[DoseReading, ...]:
@@ -161,7 +176,7 @@ class DoseHandling:
         record: the account of vessels.
         weighing: settings of the balance.
         supply: has the refill device, if there is one.
-        tell: receives notices.
+        truth: of the bench.
 
     Attributes:
         placed: readings of the balance while the cup on it was put there.
@@ -176,17 +191,18 @@ class DoseHandling:
         record: PlaceRecord,
         weighing: BalanceSettings,
         supply: LiquidSupply | None,
-        tell: Callable[[Notice], None],
+        truth: GroundTruth,
     ) -> None:
         self._places, self._given = tuple(places), tuple(vessels)
         self._carrier, self._liquids, self._record = carrier, liquids, record
-        self._weighing, self._supply, self._tell = weighing, supply, tell
+        self._weighing, self._supply, self._truth = weighing, supply, truth
         self._pan = next(place for place in places if place.use == "balance").name
         self._vessels: dict[str, CellVessel] = {}
         self._checked: tuple[ArmSettings, tuple[CellVessel, ...]] | None = None
         self._at_places: tuple[PlaceSettings, ...] = ()
         self._loads: dict[str, Load] = {}
         self._ways: Ways = {}
+        self._emptying: PlannedPour | None = None
         self._laid_out = False
         self._filled: set[str] = set()
         self._tare: _Tare | None = None
@@ -227,9 +243,25 @@ class DoseHandling:
                 self._laid_out = False
             self._checked, self._vessels = (spec, vessels), known
         carrier.spec, carrier.loads, carrier.ways = spec, self._loads, self._ways
-        shapes = {name: load.vessel for name, load in self._loads.items()}
+        shapes = {name: load.vessel for name, load in self._loads.items()} | _containers(self._places)
+        self._emptying = self._plan_emptying(spec, scene, dose, shapes) if dose.emptied else None
         if problems := arm_kind(spec).in_the_way(path, shapes[source_name], self._at_places, shapes):
             raise InvalidActionError("; ".join(problems))
+
+    def _plan_emptying(
+        self, spec: ArmSettings, scene: Scene, dose: DoseTarget, shapes: Mapping[str, Vessel]
+    ) -> PlannedPour:
+        waste = next((place for place in self._places if place.container is not None), None)
+        cup = self._vessels[self.names(scene, dose)[1]]
+        if waste is None or waste.container is None:
+            raise InvalidActionError(f"'{cup.name}' is to be emptied, and no place has 'use: waste'")
+        liquid = scene.liquid.model_copy(update={"mass": cup.mass, "density": cup.mass / cup.volume})
+        emptying = replace(scene, pourer=cup.spec, receiver=waste.container.vessel, liquid=liquid)
+        others = [place for place in self._at_places if place.name != waste.name]
+        try:
+            return plan_emptying(emptying, others, arm_kind(spec).pouring_at(waste), shapes)
+        except InvalidActionError as error:
+            raise InvalidActionError(f"'{cup.name}' cannot be emptied at '{waste.name}': {error}") from error
 
     # ---- before the dose
 
@@ -256,6 +288,8 @@ class DoseHandling:
             await self._exchange(cup, consent)
         self._carrier.require_known()
         await self._known(cup, consent)
+        if self._emptying is not None:
+            await self._empty_at_waste(cup, self._emptying, consent, seed)
         if scene.liquid.name in (composition := self._record.composition(cup)):
             mass = composition[scene.liquid.name][0]
             held = "an UNKNOWN mass" if mass is None else f"{1e3 * mass:.1f} g"
@@ -319,6 +353,37 @@ class DoseHandling:
         self._liquids.enter(cup, 0.0, 0.0, "")
         self._record.add_component(cup, "", None, 0.0)
         self._carrier.mass[cup] = 0.0
+
+    async def _empty_at_waste(self, cup: str, path: PlannedPour, consent: MotionConsent, seed: int) -> None:
+        """Empty a cup at the waste place, and put it back; what has left it is added there."""
+        carrier, waste = self._carrier, next(place for place in self._places if place.container is not None)
+        assert waste.container is not None
+        content, own = self._record.held(cup) or (0.0, 0.0), self._record.composition(cup).get("", (None, 0.0))
+        before = self._record.held(waste.name) or (0.0, 0.0)
+        room = WATER * built(waste.container.vessel).capacity
+        if before[0] + content[0] > FULL * room:
+            question = OperatorQuestion(
+                f"The container at '{waste.name}' holds {1e3 * before[0]:.0f} g, and {1e3 * content[0]:.0f} g more are "
+                "poured into it. Empty it.",
+                "done",
+                about="waste_full",
+            )
+            await carrier.ask(question, consent)
+            before = (0.0, 0.0)
+        async with carrier.driving(consent, f"empty {label(cup)} at '{waste.name}', and put it back"):
+            place = self._vessels[cup].place
+            await carrier.take(cup, consent)
+            self._liquids.enter(cup, None, 0.0, self._mixture(cup))
+            self._liquids.enter(waste.name, None, 0.0, "mixture")
+            await carrier.pour_out(path, consent, f"emptying {label(cup)}")
+            await self._truth.emptied(cup, seed)
+            await carrier.back_home(path)
+            carrier.mass[cup] = 0.0
+            spread = math.hypot(before[1], content[1], FILM)
+            self._liquids.enter(waste.name, before[0] + content[0], spread, "mixture")
+            self._liquids.enter(cup, FILM, FILM, self._mixture(cup))
+            self._record.add_component(cup, "", *own)
+            await carrier.put(cup, place)
 
     async def _exchange(self, cup: str, consent: MotionConsent) -> None:
         """Have the only cup exchanged for an empty one."""

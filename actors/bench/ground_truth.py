@@ -230,6 +230,9 @@ class GroundTruth:
     async def poured_back(self, seed: int) -> None:
         """Called when the receiver was poured back into the pourer."""
 
+    async def emptied(self, vessel: str, seed: int) -> None:
+        """Called when a vessel was emptied at the waste place."""
+
     async def simulated_dose(
         self, scene: Scene, dose: DoseTarget, seed: int, dosing: DosingSettings, progress: ProgressCallback | None
     ) -> PourMeasurement | None:

@@ -94,6 +94,7 @@ def check_carrying(
     spec: ArmSettings,
     gripper: GripperSettings,
     loads: Mapping[str, Load],
+    others: Mapping[str, Vessel] = {},
 ) -> Ways:
     """Check that an arm can carry vessels between places.
 
@@ -103,13 +104,14 @@ def check_carrying(
         spec: of the arm.
         gripper: its settings.
         loads: the vessels by name.
+        others: vessels that stay where they stand, by name.
 
     Raises:
         InvalidActionError: it cannot; the text states why, for all places.
     """
     kind = arm_kind(spec)
     widths = {load: _check_load(load, spec, gripper) for load in set(loads.values())}
-    vessels = {name: load.vessel for name, load in loads.items()}
+    vessels = {name: load.vessel for name, load in loads.items()} | dict(others)
     opened = {name: widths[load] for name, load in loads.items()}
     if problems := [text for _, text in kind.place_problems(places, vessels, opened)]:
         raise InvalidActionError(_joined(problems))

@@ -35,6 +35,7 @@ from sim_engine.lip_flow import flow_course
 from sim_engine.motion import plan_motion
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import VesselSpec
+from sim_engine.vessel.vessel import Vessel
 
 WRONG = 5e-3
 """Difference of an empty vessel from the mass that its file states [kg], above which it may be another one."""
@@ -104,9 +105,31 @@ def plan_back(places: Sequence[PlaceSettings], spec: ArmSettings, scene: Scene) 
     Raises:
         InvalidActionError: none of the tried actions is possible; the text states why the first one is not.
     """
-    kind, vessels = arm_kind(spec), {role: load.vessel for role, load in _loads(scene).items()}
-    source, target = vessels["receiver"], vessels["pourer"]
-    back = replace(scene, pourer=scene.receiver, receiver=scene.pourer, fixed={})
+    vessels = {role: load.vessel for role, load in _loads(scene).items()}
+    try:
+        return plan_emptying(replace(scene, pourer=scene.receiver, receiver=scene.pourer), places, spec, vessels)
+    except InvalidActionError as error:
+        raise InvalidActionError(
+            f"the receiver cannot be poured back into the pourer on the balance: {error}"
+        ) from error
+
+
+def plan_emptying(
+    scene: Scene, places: Sequence[PlaceSettings], spec: ArmSettings, vessels: Mapping[str, Vessel]
+) -> PlannedPour:
+    """Plan to empty a vessel into another one, slowly enough for its stream to stay near the lip.
+
+    Args:
+        scene: the two vessels and the liquid.
+        places: of the laboratory.
+        spec: of the arm, with the place where the pour ends.
+        vessels: that may stand at the places, by name.
+
+    Raises:
+        InvalidActionError: none of the tried actions is possible; the text states why the first one is not.
+    """
+    kind, back = arm_kind(spec), replace(scene, fixed={})
+    source, target = built(scene.pourer), built(scene.receiver)
     angle = min(BACK_ANGLE, getattr(getattr(spec, "limits", None), "tilt", BACK_ANGLE) - 1 * DEG)
     speed = min(BACK_SPEED, spec.tilt_speed_limit or BACK_SPEED)
     reason = ""
@@ -128,7 +151,7 @@ def plan_back(places: Sequence[PlaceSettings], spec: ArmSettings, scene: Scene) 
         if not problems:
             return path
         reason = reason or problems[0]
-    raise InvalidActionError(f"the receiver cannot be poured back into the pourer on the balance: {reason}")
+    raise InvalidActionError(reason)
 
 
 class VesselHandling:

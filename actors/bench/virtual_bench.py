@@ -264,6 +264,11 @@ class DeviceEmulators:
         await self.device.call("close", deadline=DEADLINE)
 
 
+def _film(seed: int) -> float:
+    """Liquid that stays in an emptied vessel [kg]."""
+    return FILM * (1.0 + 0.1 * float(np.random.default_rng((seed, 71)).standard_normal()))
+
+
 def slipped(motion: SampledMotion, grip_tilt: float) -> SampledMotion:
     """The motion of a pourer that is rotated in the grip by `grip_tilt` [rad] about the y axis of its underside."""
     c, s = math.cos(0.5 * grip_tilt), math.sin(0.5 * grip_tilt)
@@ -367,8 +372,12 @@ class VirtualBench(GroundTruth):
 
     async def poured_back(self, seed: int) -> None:
         """See `GroundTruth.poured_back`: all but a film arrives."""
-        self.contents.pour_back(FILM * (1.0 + 0.1 * float(np.random.default_rng((seed, 71)).standard_normal())))
+        self.contents.pour_back(_film(seed))
         await self.emulators.put(self.contents.carried)
+
+    async def emptied(self, vessel: str, seed: int) -> None:
+        """See `GroundTruth.emptied`: all but a film leaves it."""
+        self.contents.liquids[vessel] = min(self.contents.liquids.get(vessel, 0.0), _film(seed))
 
     @contextlib.asynccontextmanager
     async def followed(self) -> AsyncIterator[None]:

@@ -300,11 +300,14 @@ def place_problems(
                 f"{1e3 * max(first.clearance, other.clearance):.0f} mm have to stay free",
             )
             continue
-        fingers = [0.5 * max((opened.get(name, 0.0) for name in places[k].holds), default=0.0) for k in (j, i)]
         # a full circle: the fingers of a taught pose may stand in any direction
-        reach = max(fingers[0] + other.radius, fingers[1] + first.radius) + FINGER
-        free = math.dist(first.foot[:2], other.foot[:2]) - reach
-        if min(first.radius, other.radius, *fingers) > 0.0 and free < max(first.clearance, other.clearance):
+        reaches = [
+            0.5 * width + FINGER + neighbour.radius
+            for k, neighbour in ((j, other), (i, first))
+            if (width := max((opened.get(name, 0.0) for name in places[k].holds), default=0.0)) and neighbour.radius
+        ]
+        free = math.dist(first.foot[:2], other.foot[:2]) - max(reaches, default=-math.inf)
+        if free < max(first.clearance, other.clearance):
             yield (
                 i,
                 f"places '{first.place}' and '{other.place}' overlap when the gripper is open: its fingers would come "
@@ -325,6 +328,8 @@ def place_problems(
             )
         if texts := outside(np.array(foot.foot), spec):
             yield i, f"the foot of a vessel at '{place.name}' is {', '.join(texts)}"
+            continue
+        if place.use == "waste":
             continue
         carried = [vessels[role] for role in place.holds if role in vessels]
         try:

@@ -24,7 +24,7 @@ from actors.interfaces import (
     UnknownPourError,
 )
 from actors.laboratory_settings import LaboratorySettings
-from actors.places import CellVessel, PlaceSettings, RackSettings, UnattendedSettings, all_places
+from actors.places import CellVessel, ContainerSettings, PlaceSettings, RackSettings, UnattendedSettings, all_places
 from orchestrator.campaigns.file_loading import load_laboratory
 from sim_engine.action import DEG, Action
 from sim_engine.liquids import Liquid
@@ -105,6 +105,9 @@ async def dosed(
     source = DoseSource(f"source/{liquid}", held, 5e-4, fill, 11, vessel=f"source/{liquid}")
     target = DoseTarget(1e-3 * grams, 1e-3, cup, source, cup=cup, **about)
     return await stage.bench.pour(scene(liquid), ACTION, seed=5, dose=target)
+
+
+WASTE = place("waste", 0.75, -0.72, use="waste", holds=(), container=ContainerSettings(diameter=0.2, height=0.12))
 
 
 def played(
@@ -216,6 +219,41 @@ def test_a_cup_lost_on_its_way_is_unknown_and_an_interrupted_dose_leaves_an_unkn
     again = [question for question in stage.operator.heard if question.about == "vessels_laid_out"]
     assert len(again) == 2
     assert again[1].problem == "it is unknown where 'rack/A1' stands"
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_a_cup_is_emptied_at_the_waste_place_and_what_leaves_it_is_accounted(
+    open_stage: OpenStage, tmp_path: Path
+) -> None:
+    notes: list[dict[str, Any]] = []
+
+    async def play(stage: Stage, record: Watched) -> None:
+        record.content("rack/A1", 0.04, 1e-4, "water")
+        record.add_component("rack/A1", "", 0.186, 1e-4)
+        record.add_component("rack/A1", "water", 0.04, 1e-4, "source/water")
+        measured = await dosed(stage, 15, "water", "rack/A1", emptied=True)
+        notes.append(measured.notes["dose"])
+
+    stage, record = played(open_stage, tmp_path, play, places=(*spec().places, WASTE))
+    assert stage.heard == ["cups_kept", "vessels_laid_out", "unattended"]
+    assert record.held("waste") == (pytest.approx(0.04), pytest.approx(0.5e-3, rel=0.1))
+    assert list(record.composition("rack/A1")) == ["", "water"]
+    assert record.composition("rack/A1")["water"][0] == notes[0]["received"]
+    assert notes[0]["tare"][0] == pytest.approx(0.1864, abs=3e-4)  # with the film that the emptying has left
+    held = record.held("rack/A1")
+    assert held is not None
+    assert held[0] == pytest.approx(stage.contents.liquids["rack/A1"], abs=3e-4)
+
+
+def test_a_cup_is_emptied_only_where_there_is_waste_and_the_arm_reaches_over_it() -> None:
+    lab = spec()
+    assert lab.arm is not None
+    _, loads, _ = check_vessels(all_places((*lab.places, WASTE)), lab.vessels, lab.arm, GRIPPER)
+    assert "waste" not in loads
+    beside = WASTE.with_values(pose=Pose.of(0.66, -0.62, 0.08, TURN, TURN, TURN))
+    with pytest.raises(InvalidActionError, match="places 'source/ethanol' and 'waste' overlap"):
+        check_vessels(all_places((*lab.places, beside)), lab.vessels, lab.arm, GRIPPER)
 
 
 GRIPPER = GRIPPERS.get("robotiq")(model="2F-140")
