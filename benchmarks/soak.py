@@ -286,7 +286,7 @@ def texts(folder: Path) -> dict[str, tuple[str, Files]]:
         "plain": lambda campaign: None,
         "short": lambda campaign: short(campaign, 1),
         "paused": lambda campaign: short(campaign, 4),
-        "recorded": lambda campaign: short(campaign, 2, {"recorded_simulations": 1}),
+        "recorded": lambda campaign: short(campaign, 2, {"recording": True}),
     }
     found = {}
     for kind, change in changes.items():

@@ -37,10 +37,8 @@ from sim_engine.settings.model import (
     PourCount,
     Problems,
     Settings,
-    SimulationCount,
     Switch,
 )
-from sim_engine.settings.quantity import Quantity
 
 LEAST_TRAINING_POURS = 2
 """Least number of training pours with enough poured that a calibration can use."""
@@ -562,19 +560,13 @@ class OutputSettings(Settings):
     """Folder of the runs; 'runs' in the working directory unless given."""
 
     recording: Switch = True
-    """Write a recording for the viewer."""
+    """Write a recording for the viewer, with the particles of some simulations of each stage."""
 
     figures: Switch = True
     """Write figures at the end."""
 
     pour_recordings: Switch = False
     """Write each weighed pour and dose as a recorded pour into the folder 'recordings' of the run."""
-
-    frame_rate: Annotated[float, Quantity("1/s", "10 1/s", 0.0, 10.0)] = 10.0
-    """Frames of particles per simulated second."""
-
-    recorded_simulations: SimulationCount = 6
-    """Number of simulations that are recorded with their particles."""
 
     @property
     def folder(self) -> Path:

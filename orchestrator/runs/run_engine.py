@@ -48,6 +48,9 @@ from orchestrator.runs.run_folder import FIGURES, film_file, write_film, write_p
 from orchestrator.runs.stage_scheduler import StageScheduler
 from orchestrator.runs.stages import StageDefinition, recommended_pours, scenes_of, stage_seed, stages_of
 
+RECORDED_SIMULATIONS, FRAME_RATE = 6, 10.0
+"""Number of a stage's simulations that are recorded with their particles, and their frames per simulated second."""
+
 
 async def run_campaign(
     plan: CampaignPlan,
@@ -170,7 +173,7 @@ class _RunEngine:
             if isinstance(laboratory, Telling):
                 laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
-            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, self._plan.outputs.frame_rate)
+            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, FRAME_RATE)
             executor.speculation.changed = lambda running, waiting: self._journal.append(
                 SpeculationProgressed(running=running, waiting=waiting)
             )
@@ -219,7 +222,7 @@ class _RunEngine:
             journal=self._journal,
             executor=executor,
             capacity=self._plan.parallel_simulations,
-            recordings=self._plan.outputs.recorded_simulations if self._plan.outputs.frame_rate > 0.0 else 0,
+            recordings=RECORDED_SIMULATIONS if self._plan.outputs.recording else 0,
             on_pausing=lambda reason: self._enter(State.PAUSING, reason),
             on_stopping=lambda reason: self._enter(State.STOPPING, reason),
         )

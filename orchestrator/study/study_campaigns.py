@@ -69,9 +69,7 @@ def _task(study: StudyPlan, cell: StudyCell, load: Load, directory: Path) -> Run
         name=cell.id,
         seed=cell.seed,
         laboratory=base.laboratory.with_values(bench=bench),
-        outputs=OutputSettings(
-            directory=str(directory), recording=False, figures=False, frame_rate=0.0, recorded_simulations=0
-        ),
+        outputs=OutputSettings(directory=str(directory), recording=False, figures=False),
         on_unknown="repeat",
     )
     match cell.kind:

@@ -40,7 +40,7 @@ from tests.reliability.formula import LOG, Formula
 from tests.reliability.rig import PATIENCE, Life, Rig
 from tests.support.small_campaign import CAMPAIGN, write_campaign
 
-TEXT = CAMPAIGN.replace("recorded_simulations: 1", "figures: false, recording: false").replace(
+TEXT = CAMPAIGN.replace("directory: runs", "directory: runs, figures: false, recording: false").replace(
     "on_unknown: repeat", "on_unknown: ask"
 )
 

@@ -51,7 +51,7 @@ deployment:
   pours: 2
   simulations_per_pour: 2
 on_unknown: repeat
-outputs: {directory: runs, recorded_simulations: 1}
+outputs: {directory: runs}
 """
 
 GOOD_ACTION = ("--set", "angular_velocity=100", "--set", "x_offset=70")

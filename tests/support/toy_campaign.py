@@ -69,7 +69,7 @@ def toy_plan(directory: Path, **changes: Any) -> CampaignPlan:
         "parameters": THETA,
         "calibration": None,
         "deployment": deployment,
-        "outputs": OutputSettings(directory=str(directory), frame_rate=10.0, recorded_simulations=2),
+        "outputs": OutputSettings(directory=str(directory)),
         "parallel_simulations": 2,
     }
     return CampaignPlan(**(values | changes))

@@ -1,6 +1,4 @@
-"""`campaign_resolution`: `deployment.risk` and `deployment.window` as people write them: what they mean, what is
-wrong, what a run keeps.
-"""
+"""`campaign_resolution`: `deployment.risk` as people write it: what it means, what is wrong, what a run keeps."""
 
 from __future__ import annotations
 
@@ -50,7 +48,7 @@ RISK = {
 
 
 def test_a_risk_is_read_as_it_was_meant_and_can_be_read_again(tmp_path: Path) -> None:
-    path = written(tmp_path, {"risk": RISK, "window": {"tolerance": "2 %"}})
+    path = written(tmp_path, {"risk": RISK})
     jsonschema.validate(yaml.safe_load(path.read_text(encoding="utf-8")), campaign_schema())
     plan = load_campaign(path)
     assert plan.deployment is not None
@@ -60,8 +58,6 @@ def test_a_risk_is_read_as_it_was_meant_and_can_be_read_again(tmp_path: Path) ->
     assert risk is not None
     assert (risk.measure, risk.level, risk.tail, risk.theta) == ("cvar", 0.9, 0.9, "posterior")
     assert risk.errors == PoseError(3e-3, 3e-3, pytest.approx(0.5 * DEG), 0.02)  # type: ignore[arg-type]
-    assert settings.window is not None
-    assert settings.window.tolerance == pytest.approx(0.02)
     assert (settings.rounds, settings.simulations_per_iteration) == (30, 2)
     again = tmp_path / "again.yaml"
     again.write_text(json.dumps(plan.resolved), encoding="utf-8")
@@ -69,13 +65,13 @@ def test_a_risk_is_read_as_it_was_meant_and_can_be_read_again(tmp_path: Path) ->
     assert loaded.deployment == plan.deployment
 
 
-def test_a_run_may_not_be_gone_on_with_under_another_risk_or_window(tmp_path: Path) -> None:
-    plain, risky = (load_campaign(written(tmp_path, d)) for d in ({}, {"risk": RISK, "window": {"tolerance": "2 %"}}))
+def test_a_run_may_not_be_gone_on_with_under_another_risk(tmp_path: Path) -> None:
+    plain, risky = (load_campaign(written(tmp_path, d)) for d in ({}, {"risk": RISK}))
     assert fingerprint(risky)["deployment"]["settings"]["risk"]["measure"] == "cvar"
     assert plain.deployment is not None
     assert isinstance(plain.deployment.settings, D1Settings)
     assert (plain.deployment.settings.rounds, plain.deployment.settings.simulations_per_iteration) == (15, 2)
-    other = plain.deployment.with_settings(window=plans.window(0.02))
+    other = plain.deployment.with_settings(risk=plans.risk("cvar", 0.8, PoseError(x=3e-3, speed_factor=0.02)))
     assert fingerprint(replace(plain, deployment=other)) != fingerprint(plain)
 
 
@@ -89,10 +85,8 @@ def test_a_run_may_not_be_gone_on_with_under_another_risk_or_window(tmp_path: Pa
         ({"risk": {**RISK, "pose_error": {"x": "3 kg"}}}, "should be a length"),
         ({"risk": {**RISK, "theta": "all"}}, "posterior"),
         ({"risk": RISK, "simulations_per_iteration": 1}, "at least 2 are needed"),
-        ({"window": {}}, "tolerance"),
-        ({"window": {"tolerance": "2"}}, "outside 0.01 … 100 %"),
         ({"strategy": "D2", "pours": 5, "risk": RISK}, "belongs to D1, not to D2"),
-        ({"strategy": "D3", "pours": 5, "window": {"tolerance": "2 %"}}, "belongs to D1, not to D3"),
+        ({"strategy": "D3", "pours": 5, "risk": RISK}, "belongs to D1, not to D3"),
         ({"risk": RISK, "objectives": [{"name": "spilled"}]}, "can't be combined with 'objectives'"),
     ],
 )

@@ -281,8 +281,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
           initial_samples: 4
         on_unknown: repeat
         parallel_simulations: 5
-        outputs: {{directory: here, recording: false, figures: false, frame_rate: 4 1/s, recorded_simulations: 2,
-                  pour_recordings: true}}
+        outputs: {{directory: here, recording: false, figures: false, pour_recordings: true}}
         """)
     (tmp_path / "all.yaml").write_text(text)
     plan = load_campaign(tmp_path / "all.yaml")
@@ -291,7 +290,7 @@ def test_every_setting_reaches_the_plan_and_survives_its_resolved_form(tmp_path:
     assert deployment is not None
     assert bench is not None
     assert (plan.name, plan.seed, plan.parallel_simulations, plan.on_unknown) == ("everything", 41, 5, "repeat")
-    assert tuple(plan.outputs.model_dump().values()) == (str(tmp_path / "here"), False, False, True, 4.0, 2)
+    assert tuple(plan.outputs.model_dump().values()) == (str(tmp_path / "here"), False, False, True)
     lab = plan.laboratory
     assert (lab.name, lab.simulators, lab.in_process) == ("odd", 3, True)
     assert lab.ray == RaySettings(address="head.local:6379", bench_resource="left_bench")

@@ -132,7 +132,7 @@ def risky(folder: Path, **strategy: Any) -> Path:
         campaign[key] = str((ROOT / "configs/campaigns" / campaign[key]).resolve())
     kept = {key: campaign["deployment"][key] for key in ("receiver", "motion", "actions")}
     risk = {"measure": "expected", "pose_error": {"x": "3 mm"}, "theta": "posterior"}
-    campaign["deployment"] = {**kept, "strategy": "D1", "risk": risk, "window": {"tolerance": "2 %"}}
+    campaign["deployment"] = {**kept, "strategy": "D1", "risk": risk}
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "campaign.yaml").write_text(json.dumps(campaign), encoding="utf-8")
     data = read("quick")
@@ -145,8 +145,6 @@ def test_risk_of_the_campaign_is_that_of_d1_and_what_simulates_draws_from_the_po
     planned = study.deployment("D1-2").plan.settings
     assert isinstance(planned, D1Settings)
     assert planned.risk is not None
-    assert planned.window is not None
-    assert planned.window.tolerance == pytest.approx(0.02)
     known = {"calibration": plans.calibrated(study.base.parameters, [{"cohesion": 0.01 * i} for i in range(3)])}
     made = {}
     for cell in cells_of(study):
