@@ -148,12 +148,6 @@ class Controller:
         self.tell("key", f"program {program.name} started")
 
     @property
-    def control_line(self) -> int:
-        """Line of the program that moves the arm; 0 if none does."""
-        holder = self.robot.mover.holder
-        return 0 if self.program is None or holder is None else self.program.line_of(holder)
-
-    @property
     def local(self) -> bool:
         """Whether commands over the network are refused. CB3 controllers have no local mode."""
         return self.model.remote_control and not self.remote

@@ -11,7 +11,6 @@ inputs and outputs the guide gives no version; they are assumed to exist since t
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -105,12 +104,6 @@ class InputRecipe:
 _ZERO6 = (0.0,) * 6
 _RUNNING, _POWER_OFF, _IDLE = 253, 239, 255
 _TEMPERATURES = (31.0, 32.0, 32.0, 34.0, 35.0, 36.0)
-_DIGITAL_OUTPUTS, _SINKING = 0, 1
-"""Modes of the tool's outputs: digital outputs instead of power, and NPN."""
-
-_CURRENT_WINDOW = (5.0, 5.0, 4.0, 2.5, 2.5, 2.5)
-"""Allowed deviations from the target currents [A]. Plausible, not measured."""
-
 _DEVIATION_LIMIT = 0.2
 """Deviation of a joint from its target at which a real controller stops [rad]. Plausible, not measured."""
 
@@ -136,7 +129,6 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "actual_q": ("VECTOR6D", lambda: robot.q),
         "actual_qd": ("VECTOR6D", lambda: robot.qd),
         "actual_current": ("VECTOR6D", lambda: _ZERO6),
-        "actual_current_window": ("VECTOR6D", lambda: _CURRENT_WINDOW if power.powered else _ZERO6),
         "actual_moment": ("VECTOR6D", lambda: _ZERO6),
         "joint_control_output": ("VECTOR6D", lambda: _ZERO6),
         "actual_TCP_pose": ("VECTOR6D", lambda: robot.pose),
@@ -150,7 +142,6 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "robot_mode": ("INT32", lambda: power.mode),
         "joint_mode": ("VECTOR6INT32", joint_modes),
         "safety_mode": ("INT32", lambda: safety.mode),
-        "safety_status": ("INT32", lambda: safety.mode),
         "actual_tool_accelerometer": ("VECTOR3D", lambda: _accelerometer(robot)),
         "speed_scaling": ("DOUBLE", lambda: mover.scaling),
         "target_speed_fraction": ("DOUBLE", lambda: mover.slider),
@@ -165,46 +156,20 @@ def output_fields(controller: Controller) -> dict[str, Field]:
         "elbow_velocity": ("VECTOR3D", lambda: robot.elbow_velocity),
         "robot_status_bits": ("UINT32", status_bits),
         "safety_status_bits": ("UINT32", lambda: safety.status_bits),
-        "analog_io_types": ("UINT32", lambda: sum(int(v) << (2 + i) for i, v in enumerate(signals.analog_voltage))),
         "standard_analog_input0": ("DOUBLE", lambda: signals.analog_in[0]),
         "standard_analog_input1": ("DOUBLE", lambda: signals.analog_in[1]),
         "standard_analog_output0": ("DOUBLE", lambda: signals.analog_reading(0)),
         "standard_analog_output1": ("DOUBLE", lambda: signals.analog_reading(1)),
-        "io_current": ("DOUBLE", lambda: 0.0),
-        "euromap67_input_bits": ("UINT32", lambda: 0),
-        "euromap67_output_bits": ("UINT32", lambda: 0),
-        "euromap67_24V_voltage": ("DOUBLE", lambda: 0.0),
-        "euromap67_24V_current": ("DOUBLE", lambda: 0.0),
-        "tool_mode": ("UINT32", lambda: _RUNNING if power.powered else _POWER_OFF),
-        "tool_analog_input_types": ("UINT32", lambda: 0),
-        "tool_analog_input0": ("DOUBLE", lambda: 0.0),
-        "tool_analog_input1": ("DOUBLE", lambda: 0.0),
-        "tool_output_voltage": ("INT32", lambda: 0),
-        "tool_output_current": ("DOUBLE", lambda: 0.0),
-        "tool_temperature": ("DOUBLE", lambda: 33.0),
-        "tcp_force_scalar": ("DOUBLE", lambda: math.hypot(*robot.external_force[:3])),
         "output_bit_registers0_to_31": ("UINT32", lambda: registers.output_bits & 0xFFFFFFFF),
         "output_bit_registers32_to_63": ("UINT32", lambda: registers.output_bits >> 32 & 0xFFFFFFFF),
-        "input_bit_registers0_to_31": ("UINT32", lambda: registers.input_bits & 0xFFFFFFFF),
-        "input_bit_registers32_to_63": ("UINT32", lambda: registers.input_bits >> 32 & 0xFFFFFFFF),
         "payload": ("DOUBLE", lambda: robot.payload),
         "payload_cog": ("VECTOR3D", lambda: robot.cog),
         "payload_inertia": ("VECTOR6D", lambda: robot.inertia),
-        "script_control_line": ("UINT32", lambda: controller.control_line),
         "joint_position_deviation_ratio": ("DOUBLE", lambda: robot.deviation / _DEVIATION_LIMIT),
     }
     if controller.model.e_series:
-        readers |= {
-            "ft_raw_wrench": ("VECTOR6D", lambda: _wrench(robot)),
-            "tcp_offset": ("VECTOR6D", lambda: robot.tcp),
-            "tool_output_mode": ("UINT8", lambda: _DIGITAL_OUTPUTS),
-            "tool_digital_output0_mode": ("UINT8", lambda: _SINKING),
-            "tool_digital_output1_mode": ("UINT8", lambda: _SINKING),
-            "actual_configurable_digital_input_bits": ("UINT64", lambda: signals.digital_in >> 8 & 0xFF),
-            "actual_configurable_digital_output_bits": ("UINT64", lambda: signals.digital_out >> 8 & 0xFF),
-            "encoder0_raw": ("INT32", lambda: 0),
-            "encoder1_raw": ("INT32", lambda: 0),
-        }
+        readers["ft_raw_wrench"] = ("VECTOR6D", lambda: _wrench(robot))
+        readers["tcp_offset"] = ("VECTOR6D", lambda: robot.tcp)
     for i in range(REGISTERS):
         readers[f"output_int_register_{i}"] = ("INT32", _entry(registers.output_int, i))
         readers[f"output_double_register_{i}"] = ("DOUBLE", _entry(registers.output_double, i))

@@ -126,16 +126,6 @@ class Program:
                 raise ScriptError(_explain(error), self._line_of_error(error)) from error
         return True
 
-    def line_of(self, number: int) -> int:
-        """Current text line of a thread; 0 if there is no such thread."""
-        line, steps = 0, self._threads.get(number)
-        while steps is not None:
-            frame = getattr(steps, "gi_frame", None)
-            if frame is not None and frame.f_code.co_filename == "<program>":
-                line = frame.f_lineno
-            steps = getattr(steps, "gi_yieldfrom", None)
-        return line
-
     def _line_of_error(self, error: BaseException) -> int:
         frames = traceback.extract_tb(error.__traceback__)
         return next((frame.lineno or 0 for frame in reversed(frames) if frame.filename == "<program>"), 0)
