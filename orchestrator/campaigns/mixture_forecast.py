@@ -28,6 +28,11 @@ LARGEST_ERROR = 0.5
 """Error of a dose, as a share of its amount, from which on it is refused."""
 
 
+CARRIED_DOSE, CARRIED_CUP = 35.0, 25.0
+"""Time in which an arm takes and returns the source of a dose and weighs the cup, and carries a cup to the balance and
+back [s], as measured with `configs/laboratories/rack.yaml`."""
+
+
 class MixtureForecast:
     """What is expected of mixtures.
 
@@ -59,6 +64,9 @@ class MixtureForecast:
         bench, arm = plan.laboratory.bench, plan.laboratory.arm
         attended = plan.laboratory.operator.time + arm.warning_time if arm is not None else None
         self._handling = attended if attended is not None else bench.operator_time if bench is not None else 0.0
+        self._cup_time = 0.0
+        if plan.laboratory.places:
+            self._handling, self._cup_time = CARRIED_DOSE, CARRIED_CUP
         self.open_time = max(sum(self._duration(row.values())) - self._handling for row in self._cups.values())
 
     def _prediction(self, dose: PlannedDose, seed: int) -> DoseForecast:
@@ -113,13 +121,16 @@ class MixtureForecast:
         doses, first = self._series.doses, next(iter(self._cups.values()))
         changes = sum(a.liquid != b.liquid for a, b in itertools.pairwise(doses))
         expected, longer = self._duration(doses)
+        expected += self._cup_time * len(self._cups)
+        carried = f" and {self._cup_time:.0f} s a cup" if self._cup_time else ""
         return [
             f"{len(self._cups)} cups, {len(doses)} doses, {changes} changes of source; first cup: "
             + ", then ".join(f"{liquid} {1e3 * dose.amount:.4g} g" for liquid, dose in first.items()),
             *map(self._of_liquid, self._predicted),
             self._composition(),
             f"duration: {expected / 60.0:.0f} min, the doses ± {longer / 60.0:.1f} min (90 %), with "
-            f"{self._handling:.0f} s of handling a dose; a cup is open for up to {self.open_time / 60.0:.1f} min",
+            f"{self._handling:.0f} s of handling a dose{carried}; "
+            f"a cup is open for up to {self.open_time / 60.0:.1f} min",
         ]
 
     def _of_liquid(self, liquid: str) -> str:

@@ -79,16 +79,18 @@ def mixture_rows(dispensed: Dispensed, record: RunState) -> list[Row]:
     ]
 
 
-def write_mixtures(directory: Path, rows: Sequence[Row]) -> None:
-    """Write the table as CSV and JSON, and as .xlsx if a package for it is installed; times are local, ISO 8601.
+def write_mixtures(result: CampaignResult) -> None:
+    """Write the table of a run, if it has mixtures, into its folder: CSV, JSON, and .xlsx if a package for it is there.
 
-    Args:
-        directory: folder of the run.
-        rows: of `mixture_rows`.
+    Times are local, in the form of ISO 8601.
 
     Raises:
         OSError: a file can't be written.
+        RunError: the journal can't be read.
     """
+    if (mixtures := mixtures_of(result.results)) is None:
+        return
+    directory, rows = result.directory, mixture_rows(mixtures, read_record(result.directory))
     table = [
         {
             **row,

@@ -22,7 +22,7 @@ from orchestrator.records.journal_check import check_journal
 from orchestrator.records.run_record import CampaignResult, read_record, read_result
 from orchestrator.records.states import State
 from orchestrator.reports.html_report import REPORT_NAME, run_page
-from orchestrator.reports.mixture_report import mixture_rows, mixtures_of, with_unfinished, write_mixtures
+from orchestrator.reports.mixture_report import with_unfinished, write_mixtures
 from orchestrator.reports.run_figures import draw_figures
 from orchestrator.reports.run_summary import SUMMARY_NAME, RunFiles, RunSummary, Totals, write_summary
 from orchestrator.reports.stage_views import evaluation_of, theta_of
@@ -87,8 +87,7 @@ def publish(
                 _log.warning("not recorded: %s", reason)
     summary = summary_of(plan, result, RunFiles(figures=figures, recording=recording, dropped_events=dropped_events))
     write_summary(directory, summary)
-    if (mixtures := mixtures_of(result.results)) is not None:
-        write_mixtures(directory, mixture_rows(mixtures, read_record(directory)))
+    write_mixtures(result)
     best = theta_of(result.results)
     theta = None if best is None else directory / THETA_FILE
     if theta is not None and best is not None:
@@ -213,6 +212,7 @@ def report_on(
         RunError: the journal can't be read.
     """
     result = with_unfinished(plan, result)
+    write_mixtures(result)
     figures = draw_figures(result.directory / FIGURES, plan, result.results, formats) if draw else {}
     page = run_page(summary_of(plan, result, RunFiles(figures=figures)), plan.resolved)
     return _write_page(path or result.directory / REPORT_NAME, page), figures

@@ -18,7 +18,7 @@ from orchestrator.cli.app import app
 from orchestrator.learning.dispense import Dispensed, Dose, MixedCup
 from orchestrator.records.journal_file import Header
 from orchestrator.records.run_record import RunState
-from orchestrator.reports.mixture_report import draw_rack, mixture_lines, mixture_rows, mixture_table, write_mixtures
+from orchestrator.reports.mixture_report import draw_rack, mixture_lines, mixture_rows, mixture_table
 from tests.support import small_campaign
 
 MIXTURES = """\
@@ -119,7 +119,8 @@ def test_the_picture_shows_the_cups_where_they_stand_and_their_differences() -> 
 
 
 def test_a_line_for_each_cup_says_which_one_it_replaces(tmp_path: Path) -> None:
-    write_mixtures(tmp_path, mixture_rows(PARTLY, RunState(Header("mix", {}))))
+    rows = mixture_rows(PARTLY, RunState(Header("mix", {})))
+    (tmp_path / "mixtures.json").write_text(json.dumps(rows), encoding="utf-8")
     assert mixture_lines(tmp_path) == [
         "rack/A1  rejected: oil 13.0 of 10 g",
         "rack/C4  full, instead of rack/A1: oil 9.9 of 10 g",
@@ -144,8 +145,12 @@ def test_a_run_that_has_stopped_shows_the_cups_so_far(
         for table in ("event", "chain"):
             journal.execute(f"drop trigger {table}_is_never_deleted")
             journal.execute(f"delete from {table} where seq > ?", (last,))
-    table = decant.open_run(folder).mixtures
-    assert [*table["state"]] == states
+    for path in folder.glob("mixtures.*"):
+        path.unlink()
+    stopped = decant.open_run(folder)
+    assert [*stopped.mixtures["state"]] == states
+    stopped.report()
+    assert [row["state"] for row in csv.DictReader((folder / "mixtures.csv").open(encoding="utf-8"))] == states
 
 
 def test_a_cup_that_is_not_filled_has_no_share_and_a_replaced_one_is_marked() -> None:
