@@ -13,6 +13,7 @@ Limitations: standing vessels count as cylinders, links of the arm as capsules w
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -106,15 +107,16 @@ def standing_at(place: PlaceSettings, vessels: Mapping[str, Vessel], spec: UrArm
     return Standing(place.name, (x, y, z), radius, height, place.clearance)
 
 
+@functools.lru_cache(maxsize=512)
 def plan_way(
     place: PlaceSettings,
     spec: UrArmSettings,
-    carried: Sequence[Vessel],
-    others: Sequence[Standing],
+    carried: tuple[Vessel, ...],
+    others: tuple[Standing, ...],
     fastest: float = TOOL_SPEED,
     hardest: float = TOOL_ACCELERATION,
 ) -> PlaceWay:
-    """Plan and check the way from home to a place.
+    """Plan and check the way from home to a place; it is kept, since a rack has many that are checked repeatedly.
 
     Args:
         place: where it ends.
@@ -181,9 +183,9 @@ def way_to(
     Raises:
         InvalidActionError: as `plan_way`; or a vessel is too full to be carried.
     """
-    carried = [vessels[role] for role in place.holds if role in vessels]
+    carried = tuple(vessels[role] for role in place.holds if role in vessels)
     standing = [standing_at(each, vessels, spec) for each in places]
-    others = [each for each in standing if each.radius > 0.0]
+    others = tuple(each for each in standing if each.radius > 0.0)
     if volume is None:
         return plan_way(place, spec, carried, others)
     hardest = TOOL_ACCELERATION
@@ -331,8 +333,8 @@ def place_problems(
             continue
         if place.use == "waste":
             continue
-        carried = [vessels[role] for role in place.holds if role in vessels]
+        carried = tuple(vessels[role] for role in place.holds if role in vessels)
         try:
-            plan_way(place, spec, carried, [each for each in standing if each.radius > 0.0])
+            plan_way(place, spec, carried, tuple(each for each in standing if each.radius > 0.0))
         except InvalidActionError as error:
             yield i, str(error)
