@@ -15,6 +15,7 @@ moves are those of `actors.bench.vessel_carrying`, and so are their entries in t
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -527,6 +528,7 @@ class DoseHandling:
         assert self._tare is not None
         tare, content = self._tare.weight, self._tare.content
         self._record.add_component(cup, scene.liquid.name, *amount, source)
+        self._liquids.enter(cup, content[0] + amount[0], math.hypot(content[1], amount[1]), self._mixture(cup))
         self._liquids.spilled(*LOST)
         self._liquids.enter_tray(scene.liquid.name)
         carrier = self._carrier
@@ -543,7 +545,15 @@ class DoseHandling:
         return CarriedDose(cup, source, tare, gross, self._tare.missing)
 
     def forget(self) -> None:
-        """The dose was interrupted: the vessels are laid out again before the next one."""
+        """The dose was interrupted: the vessels are laid out again before the next one.
+
+        A cup whose motion was interrupted may have spilled: its content is UNKNOWN.
+        """
+        with contextlib.suppress(LaboratoryError):
+            moved = [name for name, place in self._record.stands().items() if place is None and name in self._vessels]
+            for name in moved:
+                if not self._vessels[name].liquid and self._mixture(name):
+                    self._liquids.enter(name, None, 0.0, self._mixture(name))
         self._carrier.forget()
         self._tare = None
 

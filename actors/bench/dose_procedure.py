@@ -40,6 +40,7 @@ from actors.interfaces import (
     DoseTarget,
     InvalidActionError,
     LaboratoryError,
+    Notice,
     OperatorQuestion,
     ProgressCallback,
     UnknownPourError,
@@ -134,10 +135,24 @@ class DoseProcedure(BenchProcedure):
             if result.amount is None:
                 raise UnknownPourError(unknown_amount(result))
             if setup.doses is not None:
-                amount = result.amount, result.deviation
-                carried = (await setup.doses.finish(self._consent, self._scene, self._dose, amount)).record
+                carried = await self._finish(setup.doses, (result.amount, result.deviation))
         self._report.enter("record", 1.0)
         return self._measurement(result, {**carried, **truth})
+
+    async def _finish(self, handling: DoseHandling, amount: tuple[float, float]) -> dict[str, Any]:
+        """Have the vessels put back. The dose is weighed: what goes wrong now does not make it unknown."""
+        try:
+            return (await handling.finish(self._consent, self._scene, self._dose, amount)).record
+        except LaboratoryError as error:
+            handling.forget()
+            if self._setup.night is not None:
+                self._setup.night.end(str(error))
+            text = (
+                f"the dose is weighed, and its vessels are not put back: {error}. They are laid out before the next one"
+            )
+            self._setup.tell(Notice("warning", text))
+            await self._consent.leave_safe()
+            return {}
 
     async def _refill(self) -> None:
         """Let the refill device fill the source, if there is one and the content is known."""

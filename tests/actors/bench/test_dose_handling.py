@@ -246,6 +246,41 @@ def test_a_cup_is_emptied_at_the_waste_place_and_what_leaves_it_is_accounted(
     assert held[0] == pytest.approx(stage.contents.liquids["rack/A1"], abs=3e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_a_source_is_filled_by_the_pump_and_a_dose_that_is_weighed_stays_known_whatever_follows(
+    open_stage: OpenStage, tmp_path: Path
+) -> None:
+    measured: list[Any] = []
+    vessels = (replace(spec().vessels[0], filled=False), *spec().vessels[1:])
+
+    async def play(stage: Stage, record: Watched) -> None:
+        record.content("source/water", 0.1, 5e-4, "water")
+        record.content("reservoir", 1.0, 1e-3, "water")
+
+        async def lose() -> None:
+            await stage.site.gripper_fault("lost")
+
+        record.once["source/water: the arm began to carry it to 'source/water'"] = lose
+        source = DoseSource("source/water", 0.3, 5e-4, True, 11, before=0.1, vessel="source/water")
+        target = DoseTarget(0.015, 1e-3, "A1", source, cup="rack/A1")
+        measured.append(await stage.bench.pour(scene(), ACTION, seed=5, dose=target))
+
+    stage, record = played(open_stage, tmp_path, play, vessels=vessels)
+    assert stage.heard == ["vessels_laid_out", "unattended", "recover", "home"]
+    assert record.held("reservoir") == (pytest.approx(0.8), pytest.approx(2e-3, abs=8e-3))
+    about = measured[0].notes["dose"]
+    assert about["received"] == pytest.approx(about["true"], abs=5e-4)
+    held, laid_out = record.held("rack/A1"), stage.operator.heard[0].text
+    assert held is not None
+    assert held[0] == pytest.approx(stage.contents.liquids["rack/A1"], abs=5e-4)
+    assert "'source/water' on 'source/water' as it is" in laid_out
+    assert stage.contents.liquids["source/water"] == pytest.approx(0.285, abs=0.02)
+    assert record.stands()["source/water"] is None
+    assert "the dose is weighed, and its vessels are not put back: the gripper may have lost" in stage.said("warning")
+    assert "unattended: the consent has ended" in stage.said("warning")
+
+
 def test_a_cup_is_emptied_only_where_there_is_waste_and_the_arm_reaches_over_it() -> None:
     lab = spec()
     assert lab.arm is not None
