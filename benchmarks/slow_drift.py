@@ -13,12 +13,19 @@ scatter:
 
 1. Is the mean loss of 40 pours with 0.5 and with 2 mm of drift in ten pours at most 1.3 times that without drift?
 2. Without drift: is it at most 1.02 times that of the program `still`?
+
+The level `viscosity` is a simulated bench: pours of 300 particles of an oil into a slim cup, 3 mm from where the arm
+takes it to be. A drift of 1 halves the oil's viscosity evenly in 40 pours. D3 makes 20 simulations before the first
+pour and none between pours.
+
+3. `--levels viscosity --drifts 0 1 --seeds 3`: is the mean loss with that drift at most 1.3 times that without?
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -32,15 +39,32 @@ from actors.optimizer.questions import PourQuery, Suggestion, SuggestionQuery
 from actors.optimizer.suggest import propose
 from orchestrator.learning.campaign_plan import DeploymentPlan
 from orchestrator.learning.deployment.d3 import D3Settings, Hybrid
-from orchestrator.learning.requests import Outcome, Request
-from sim_engine.liquids import SimulationParameters
-from sim_engine.outcome import Loss
+from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Simulate, Simulated
+from sim_engine.action import DEG, Action
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.outcome import Loss, PourMeasurement, PourOutcome
+from sim_engine.scene import PourTask, Scene
+from sim_engine.search_space import Axis, Space
+from sim_engine.simulator import PourSimulator
+from sim_engine.vessel.shapes import cylinder
 
 NEVER = 10**6
 """Number of pours from which a drift is considered by the program `still`."""
 
 TENTH = 1e-4
 """A millimetre in ten pours, per pour [m]."""
+
+VISCOSITY = "viscosity"
+OIL = SimulationParameters(particles=300)
+SLIM = Scene(
+    "slim",
+    cylinder("beaker", inner_radius=0.04, inner_height=0.1),
+    cylinder("slim", inner_radius=0.027, inner_height=0.11),
+    Liquid(name="oil", mass=0.18, density=920.0, dynamic_viscosity=0.08, surface_tension=0.033),
+    fixed={"max_angle": 120 * DEG, "height": 0.11},
+)
+AT_THE_CUP = Space((Axis("angular_velocity", 60 * DEG, 150 * DEG), Axis("x_offset", 0.07, 0.15)))
+"""Scene and searched actions of the simulated bench."""
 
 
 class Drifting(Valley):
@@ -57,6 +81,48 @@ class Drifting(Valley):
         return self._lost(moved, 1.0)
 
 
+class Oil:
+    """A simulated bench whose oil gets thinner by the same factor with every pour.
+
+    Attributes:
+        poured: weighed losses of the pours.
+    """
+
+    def __init__(self, seed: int, halvings: float) -> None:
+        self._seed, self._halvings = seed, halvings
+        self.poured: list[float] = []
+
+    def answer(self, request: Request) -> Outcome:
+        """Return the outcome of a simulation or a pour."""
+        assert isinstance(request, Simulate | Pour)
+        bench = isinstance(request, Pour)
+        parameters, seed = OIL, request.seed
+        if bench:
+            factor = 0.5 ** (self._halvings * len(self.poured) / 40)
+            parameters = OIL.model_copy(update={"receiver_x": 0.003, "viscosity_factor": factor})
+            seed = 1000 * self._seed + len(self.poured)
+        outcome = simulated_outcome(request.action, parameters, seed)
+        if not bench:
+            return Simulated(outcome)
+        self.poured.append(outcome.spilled + outcome.retained)
+        mass = SLIM.liquid.mass
+        return Poured(PourMeasurement(mass, mass * outcome.spilled, mass * outcome.retained))
+
+
+@cache
+def simulated_outcome(action: Action, parameters: SimulationParameters, seed: int) -> PourOutcome:
+    """Simulate a pour; repeated ones are not."""
+    outcome = simulator().simulate(PourTask(SLIM, action, parameters, seed)).outcome
+    assert outcome.invalid is None, outcome.invalid
+    return outcome
+
+
+@cache
+def simulator() -> PourSimulator:
+    """The engine, once in this process."""
+    return PourSimulator()
+
+
 def campaign(
     level: str, seed: int, drift: float, program: str, pours: int, answers: dict[Any, Suggestion]
 ) -> dict[str, Any]:
@@ -67,11 +133,17 @@ def campaign(
         program: 'drift' or 'still'.
         answers: of earlier campaigns on the same seed, whose beginnings are the same.
     """
-    valley, settings = Drifting(level, seed, TENTH * drift), D3Settings(pours=pours)
-    plan = DeploymentPlan(settings, (SCENE,), valley.space, Loss())
-    strategy = Hybrid(plan, SCENE, SimulationParameters(), seed)
-    world = Numbers(valley.space, valley.true, valley.observe, valley.simulated, valley.scatter)
-    world.true = lambda unit: valley.true(unit, len(world.poured))
+    world: Numbers | Oil
+    if level == VISCOSITY:
+        settings = D3Settings(pours=pours, prior_simulations=20, simulations_per_pour=0)
+        strategy = Hybrid(DeploymentPlan(settings, (SLIM,), AT_THE_CUP, Loss()), SLIM, OIL, seed)
+        world = Oil(seed, drift)
+    else:
+        valley, settings = Drifting(level, seed, TENTH * drift), D3Settings(pours=pours)
+        plan = DeploymentPlan(settings, (SCENE,), valley.space, Loss())
+        strategy = Hybrid(plan, SCENE, SimulationParameters(), seed)
+        world = numbers = Numbers(valley.space, valley.true, valley.observe, valley.simulated, valley.scatter)
+        numbers.true = lambda unit: valley.true(unit, len(numbers.poured))
     first = NEVER if program == "still" else model_discrepancy.DRIFTS_FROM
 
     def answer(query: SuggestionQuery) -> Suggestion:
@@ -82,11 +154,8 @@ def campaign(
                 answers[key] = propose(query)
         return answers[key]
 
-    def outcome(request: Request) -> Outcome:
-        return world.answer(request)
-
     with patch("players.propose", answer):
-        play(strategy, outcome)
+        play(strategy, world.answer)
     texts = [decision.text for decision in strategy.decisions]
     return {
         "level": level,
