@@ -308,6 +308,7 @@ class DoseHandling:
     async def _lay_out(self, consent: MotionConsent) -> None:
         """Have the operator lay out all vessels; afterwards it is known where they stand."""
         await self._carrier.let_go(consent)
+        self._lose_moved()
         vessels, held = self._vessels.values(), {name: self._record.held(name) for name in self._vessels}
         used = [vessel.name for vessel in vessels if not vessel.liquid and (held[vessel.name] or (0.0,))[0] > 0.0]
         new = {vessel.name for vessel in vessels if not vessel.liquid and not self._record.unknown(vessel.name)} - {
@@ -512,6 +513,9 @@ class DoseHandling:
         source, cup = self.names(scene, dose)
         self._record.add_component(cup, scene.liquid.name, None, 0.0, source)
         self._liquids.unknown((cup,), self._mixture(cup))
+        of, half = source_of(scene, dose), 0.5 * dose.amount  # until it is weighed, none or all of it may be gone
+        left = max(of.mass - half, 0.0), math.hypot(of.deviation, half)
+        self._liquids.enter(source, *left, scene.liquid.name)
 
     async def finish(
         self, consent: MotionConsent, scene: Scene, dose: DoseTarget, amount: tuple[float, float]
@@ -529,6 +533,9 @@ class DoseHandling:
         tare, content = self._tare.weight, self._tare.content
         self._record.add_component(cup, scene.liquid.name, *amount, source)
         self._liquids.enter(cup, content[0] + amount[0], math.hypot(content[1], amount[1]), self._mixture(cup))
+        of = source_of(scene, dose)
+        left = max(of.mass - amount[0] - LOST[0], 0.0), math.hypot(of.deviation, LOST[1])
+        self._liquids.enter(source, *left, scene.liquid.name)
         self._liquids.spilled(*LOST)
         self._liquids.enter_tray(scene.liquid.name)
         carrier = self._carrier
@@ -544,16 +551,16 @@ class DoseHandling:
                 await carrier.move(cup, self._vessels[cup].place, consent)
         return CarriedDose(cup, source, tare, gross, self._tare.missing)
 
-    def forget(self) -> None:
-        """The dose was interrupted: the vessels are laid out again before the next one.
+    def _lose_moved(self) -> None:
+        """A cup whose motion was interrupted, also by the end of the program, may have spilled: it is UNKNOWN."""
+        for name in [name for name, place in self._record.stands().items() if place is None]:
+            if name in self._vessels and not self._vessels[name].liquid and self._mixture(name):
+                self._liquids.enter(name, None, 0.0, self._mixture(name))
 
-        A cup whose motion was interrupted may have spilled: its content is UNKNOWN.
-        """
+    def forget(self) -> None:
+        """The dose was interrupted: the vessels are laid out again before the next one."""
         with contextlib.suppress(LaboratoryError):
-            moved = [name for name, place in self._record.stands().items() if place is None and name in self._vessels]
-            for name in moved:
-                if not self._vessels[name].liquid and self._mixture(name):
-                    self._liquids.enter(name, None, 0.0, self._mixture(name))
+            self._lose_moved()
         self._carrier.forget()
         self._tare = None
 

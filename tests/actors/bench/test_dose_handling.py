@@ -168,7 +168,10 @@ def test_no_liquid_is_dosed_into_a_cup_twice_and_an_unknown_cup_needs_a_person(
         record.add_component("rack/A1", "water", 0.0401, 1e-4, "source/water")
         with pytest.raises(InvalidActionError, match=r"'rack/A1' has 40.1 g of water already"):
             await dosed(stage, 10, "water", "rack/A1")
-        record.content("rack/A2", None, 0.0, "")
+        # the program was killed while the cup was carried with liquid
+        record.content("rack/A2", 0.02, 1e-4, "ethanol")
+        record.add_component("rack/A2", "ethanol", 0.02, 1e-4)
+        record.account.put("night/rack/A2", None, note="the arm began to carry it to 'rack/A2'")
 
         async def enter() -> None:
             record.account.weigh("night/rack/A2", 0.0, 0.0, by="me")
@@ -213,6 +216,8 @@ def test_a_cup_lost_on_its_way_is_unknown_and_an_interrupted_dose_leaves_an_unkn
         await stopping
         assert record.unknown("rack/A2")
         assert record.composition("rack/A2")["water"][0] is None
+        # between nothing and all of the 20 g may have left the source
+        assert record.held("source/water") == (pytest.approx(0.29), pytest.approx(0.01, abs=1e-3))
 
     stage, _ = played(open_stage, tmp_path, play)
     assert stage.unsafe == []
@@ -276,6 +281,9 @@ def test_a_source_is_filled_by_the_pump_and_a_dose_that_is_weighed_stays_known_w
     assert held[0] == pytest.approx(stage.contents.liquids["rack/A1"], abs=5e-4)
     assert "'source/water' on 'source/water' as it is" in laid_out
     assert stage.contents.liquids["source/water"] == pytest.approx(0.285, abs=0.02)
+    left = record.held("source/water")
+    assert left is not None
+    assert left[0] == pytest.approx(0.3 - about["received"], abs=5e-3)
     assert record.stands()["source/water"] is None
     assert "the dose is weighed, and its vessels are not put back: the gripper may have lost" in stage.said("warning")
     assert "unattended: the consent has ended" in stage.said("warning")
