@@ -333,6 +333,11 @@ def resolve_campaign(
             root.at("on_unknown"),
             f"'repeat' needs a virtual bench, and laboratory '{laboratory.name}' has none; use 'ask'",
         )
+    elif file.on_unknown == "repeat" and laboratory is not None and laboratory.places and dispense is not None:
+        text = (
+            f"'repeat' would dose twice: the vessels of laboratory '{laboratory.name}' keep what is in them; use 'ask'"
+        )
+        report.add(root.at("on_unknown"), text)
     if file.unattended is not None and laboratory is not None:
         if not (laboratory.places and laboratory.safeguard):
             missing = "'safeguard'" if laboratory.places else "'gripper' and 'places'"

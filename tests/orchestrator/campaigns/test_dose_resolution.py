@@ -7,8 +7,11 @@ import json
 from pathlib import Path
 
 import pytest
+from ruamel.yaml import YAML
 
+from decant import build_campaign
 from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.shipped import shipped
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.learning.campaign_plan import DispensePlan
 
@@ -198,3 +201,23 @@ def test_a_campaign_without_mixtures_still_needs_its_liquid(tmp_path: Path) -> N
     assert "key 'liquid' is missing; add for example" in refused(
         tmp_path, section, "dispense: {doses: [{amount: 9 g}]}"
     )
+
+
+def test_doses_are_not_repeated_where_the_vessels_keep_what_is_in_them() -> None:
+    document = YAML(typ="safe").load(shipped("campaigns/mixtures.yaml").read_text(encoding="utf-8"))
+    rack = str(shipped("laboratories/rack.yaml"))
+    assert build_campaign(document | {"laboratory": rack}).laboratory.vessels[0].name == "source/water"
+    with pytest.raises(ConfigError, match="'repeat' would dose twice: the vessels of laboratory 'rack' keep what"):
+        build_campaign(document | {"laboratory": rack, "on_unknown": "repeat"})
+
+
+def test_every_cup_and_source_needs_a_place_in_a_laboratory_with_places() -> None:
+    document = YAML(typ="safe").load(shipped("campaigns/mixtures.yaml").read_text(encoding="utf-8"))
+    document["laboratory"] = str(shipped("laboratories/rack.yaml"))
+    document["mixtures"]["wanted"]["E7"] = {"water": "20 g"}
+    document["mixtures"]["liquids"][0]["stands"] = ["source/brine"]
+    with pytest.raises(ConfigError) as caught:
+        build_campaign(document)
+    text = problems(caught.value)
+    assert "mixtures.wanted.E7: laboratory 'rack' has no place 'rack/E7'; there are pan, source/water" in text
+    assert "mixtures.liquids: laboratory 'rack' has no place 'source/brine'" in text
