@@ -16,7 +16,9 @@ from typer.testing import CliRunner
 
 import decant
 from actors.interfaces import LaboratoryError, RaySettings
+from actors.laboratory_settings import LaboratorySettings
 from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.shipped import shipped
 from orchestrator.cli.app import app
 from orchestrator.records.events import CampaignOpened, Event
 from orchestrator.records.journal import JOURNAL_NAME
@@ -298,3 +300,17 @@ def test_the_service_the_command_line_and_the_library_make_the_same_decisions(
     with pytest.warns(UserWarning, match="not simulated"):
         called = decant.run(plan).directory
     assert logical_record(handle.folder) == logical_record(typed) == logical_record(called)
+
+
+def test_a_resumed_run_does_not_ask_for_full_sources_again(tmp_path: Path) -> None:
+    plan = load_campaign(shipped("campaigns/mixtures.yaml"), shipped("laboratories/rack.yaml"))
+    opened: list[bool] = []
+
+    def laboratory(spec: LaboratorySettings, pours: bool) -> ToyLaboratory:
+        opened.append(any(vessel.filled for vessel in spec.vessels if vessel.liquid))
+        return ToyLaboratory()
+
+    for resume in (False, True):
+        request = replace(run_task(plan), folder=tmp_path, resume=resume)
+        RunService().start(request, RunResources(laboratory=laboratory)).close()
+    assert opened == [True, False]
