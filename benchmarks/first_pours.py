@@ -205,8 +205,8 @@ def wanted(asked: argparse.Namespace) -> Iterator[tuple[int, str, str, int]]:
 def first_pours(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return head and rows: first and later pours compared with their predictions, by bench and program."""
     table = []
-    for program, bench in itertools.product(("before", "first"), BENCHES):
-        some = [row["pours"] for row in rows if (row["program"], row["bench"]) == (program, bench)]
+    for program, bench in itertools.product(("before", "first"), (*BENCHES, "all")):
+        some = [row["pours"] for row in rows if row["program"] == program and bench in (row["bench"], "all")]
         for turn, pours in (
             ("first", [run[0] for run in some if run]),
             ("later", [p for run in some for p in run[1:]]),
