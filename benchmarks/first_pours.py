@@ -30,6 +30,9 @@ Questions, fixed before the first run on seeds from 62000 on; seeds from 52000 t
    doubtful simulator after it, in nine of ten campaigns? Is the mean loss of five pours at most that of `before`?
 3. `first` and `risk`: do at most 5 % of the first pours lose more than 10 %, with `risk_limit: {loss: 10 %,
    probability: 5 %}`?
+
+After 24 first pours of these seeds the remainder of D3 was changed, by pours of the other ones, and all were made again
+(docs/notes/deployment-tried.md).
 """
 
 from __future__ import annotations
