@@ -81,7 +81,10 @@ def _records(file: File) -> None:
         _in("virtual.yaml")(file)
 
 
-_places = _in("night.yaml")
+def _places(file: File) -> None:
+    _in("night.yaml")(file)
+    if "dispense" in file:
+        file["on_unknown"] = "ask"  # vessels of places keep what is in them, so that a dose is not repeated
 
 
 def _unattended(file: File) -> None:
