@@ -110,6 +110,16 @@ def test_pours_that_the_simulator_missed_widen_what_the_first_pour_may_lose():
     assert contradicted.discrepancy.uninformative > 0.5
 
 
+def test_after_a_calibration_errors_are_small_where_the_simulator_predicts_a_small_loss():
+    places = np.random.default_rng(5).random((400, 2))
+    small, larger = places[cup(places) < 0.002], places[(cup(places) > 0.1) & (cup(places) < 0.3)]
+    for calibration, least in ((calibrated(cup, power=1.0), 1.5), (None, 0.9)):
+        discrepancy = ModelDiscrepancy(PRIORS, pours_left=10, calibration=calibration)
+        deviations = averaged(asked(cup, [], discrepancy=discrepancy)).components
+        ratio = np.median(deviations(larger)[1]) / np.median(deviations(small)[1])
+        assert least < ratio < least + 1.0
+
+
 def test_pours_of_an_earlier_campaign_count_less_and_together_with_a_calibration_more():
     known, earlier = calibrated(cup), (replace(calibrated(cup)[0], misled=0.2),)
     without, doubted, trusted, both = (first_pour(pours) for pours in (None, earlier, known, known + earlier))
