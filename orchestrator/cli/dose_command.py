@@ -100,6 +100,11 @@ def _dose_request(
             hint = ", for example '50 g'" if plan.dispense is None else f"; 'decant run {path}' pours its own series"
             raise RefusalError(f"--amount: name the wanted amount{hint}")
         return dose_task(plan, as_left=as_left)
+    if plan.laboratory.vessels:
+        text = (
+            "single doses have one source; the cups and sources of these mixtures have places: 'decant run' pours them"
+        )
+        raise RefusalError(f"--amount: {text}")
     scenes = {scene.receiver.name: scene for scene in reversed(dose_scenes(plan))}
     if receiver is not None and receiver not in scenes:
         known = ", ".join(reversed(scenes))

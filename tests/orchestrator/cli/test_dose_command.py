@@ -158,6 +158,17 @@ def test_bad_input_is_refused_before_anything_is_written(campaign: Path, argumen
     assert not Path("runs").exists()
 
 
+def test_a_single_dose_of_a_cell_with_several_sources_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rack, mixtures = str(shipped("laboratories/rack.yaml")), str(shipped("campaigns/mixtures.yaml"))
+    result = decant("dose", mixtures, "--amount", "20 g", "--laboratory", rack)
+    assert result.exit_code == 2
+    assert "'decant run' pours them" in result.stderr
+    assert not Path("runs").exists()
+
+
 def test_a_balance_in_another_place_is_refused_before_anything_is_written(campaign: Path) -> None:
     text = campaign.read_text(encoding="utf-8").replace("on_unknown: repeat\n", "")
     campaign.write_text(text, encoding="utf-8")
