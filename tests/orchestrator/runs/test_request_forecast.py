@@ -52,10 +52,10 @@ def test_first_simulations_and_rivals_are_there_when_the_calibration_pours_are_m
     run(tmp_path / "run", bench, subscribers=[watch])
     # 4 places of the initial design; 3 random θ on 1 test pour; the uncalibrated θ on all 5
     assert made[POURS] == 4 + 3 + 5
-    # of 5 simulations the last one is left, and the first two are made anew: they keep their frames
-    assert made[CALIBRATION] - made[POURS] == 1 + 2
-    # θ* on all pours, those with frames among them, and five draws of θ on the test pour
-    assert made[EVALUATION] - made[CALIBRATION] == 5 + 5
+    # of 5 simulations the last one is left, and the 1st, 2nd and 4th are made anew: they keep their frames
+    assert made[CALIBRATION] - made[POURS] == 1 + 3
+    # θ* on all pours, those with frames among them; five draws of θ on the test pour; the 8th, of a rival, keeps frames
+    assert made[EVALUATION] - made[CALIBRATION] == 5 + 5 + 1
     with JournalReader(tmp_path / "run" / JOURNAL_NAME) as journal:
         notes = [entry.body["text"] for entry in journal.entries(kinds=[Kind.NOTE])]
     assert any("were made while the arm was pouring" in note for note in notes)
