@@ -40,7 +40,7 @@ def test_a_run_interrupted_before_its_report_is_published_by_decant_report(tmp_p
         assert command == ["report", str(run)]
         assert not (run / "summary.json").exists()
 
-        place.finish(*command)
+        place.succeed(*command)
         summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
         assert json.loads((run / "theta.json").read_text(encoding="utf-8"))["theta"] == summary["learning"]["theta"]
         assert "finished" in (run / "report.html").read_text(encoding="utf-8")

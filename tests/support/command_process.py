@@ -56,13 +56,17 @@ class Workplace:
             start_new_session=True,
         )
 
-    def finish(self, *arguments: str) -> dict[str, Any]:
-        """Run to the end, which must be a good one; returns what its last line says."""
-        process = self.start(*arguments, "--json")
+    def succeed(self, *arguments: str) -> str:
+        """Run to the end, which must be a good one; returns stdout."""
+        process = self.start(*arguments)
         with ended(process):
             output, errors = process.communicate(timeout=PATIENCE)
             assert process.returncode == 0, errors
-        (line,) = output.splitlines()
+        return output
+
+    def finish(self, *arguments: str) -> dict[str, Any]:
+        """Run to a good end with --json; returns what its last line says."""
+        (line,) = self.succeed(*arguments, "--json").splitlines()
         result: dict[str, Any] = json.loads(line)
         return result
 
