@@ -40,7 +40,7 @@ from orchestrator.runs.stages import (
     stage_seed,
     with_posterior,
 )
-from orchestrator.study.study_plan import FINAL, GRID, StudyCell, StudyPlan
+from orchestrator.study.study_plan import FINAL, GRID, StudyCell, StudyPlan, cells_of
 from orchestrator.study.study_strategies import AnsweredByTable, FinalPour, SimulatedTable
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
@@ -53,7 +53,7 @@ def campaign_of(study: StudyPlan, cell: StudyCell, load: Load, directory: Path) 
     """The task of a cell.
 
     Args:
-        load: loads the results of the cells that this cell needs.
+        load: loads the results of the cells that this cell needs, and of those that these need.
         directory: directory of its run.
     """
     request = _task(study, cell, load, directory)
@@ -93,9 +93,9 @@ def _task(study: StudyPlan, cell: StudyCell, load: Load, directory: Path) -> Run
             plan = _with_pours(study, cell, plan, load, directory)
             return single_task(plan, EVALUATION, lambda seed: _score_of_default(plan, seed))
         case "deployment":
-            return _deployment(study, cell, plan, cell.needs, load)
+            return _deployment(study, cell, plan, cell.needs, load, directory)
         case "final":
-            return _final(study, cell, plan, load)
+            return _final(study, cell, plan, load, directory)
 
 
 def calibration_actions(study: StudyPlan) -> list[tuple[float, ...]]:
@@ -178,21 +178,28 @@ def _score_of_default(plan: CampaignPlan, seed: int) -> Strategy:
 
 
 def _deployment(
-    study: StudyPlan, cell: StudyCell, plan: CampaignPlan, calibrations: Sequence[str], load: Load
+    study: StudyPlan, cell: StudyCell, plan: CampaignPlan, calibrations: Sequence[str], load: Load, directory: Path
 ) -> RunRequest:
     compared = study.deployment(cell.strategy).plan
     deployment = replace(compared, scenes=tuple(scene for scene in compared.scenes if scene.name == cell.receiver))
-    for calibration in calibrations:
-        calibrated = load(calibration)
+    calibrated: Results = {}
+    for calibration in (other for other in cells_of(study) if other.id in calibrations):
+        calibrated = load(calibration.id)
         deployment = with_posterior(deployment, calibrated)
+        plan = _with_pours(study, calibration, plan, load, directory)
         plan = replace(plan, parameters=deployed_theta(calibrated))
-    return deploy_task(replace(plan, deployment=deployment))
+
+    def informed(stage: StageDefinition) -> StageDefinition:
+        return replace(stage, build=lambda results, seed: stage.build({**calibrated, **results}, seed))
+
+    request = deploy_task(replace(plan, deployment=deployment))
+    return replace(request, stages=[informed(stage) for stage in request.stages])
 
 
-def _final(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load) -> RunRequest:
+def _final(study: StudyPlan, cell: StudyCell, plan: CampaignPlan, load: Load, directory: Path) -> RunRequest:
     """One pour of the recommended action, in the deployment's laboratory and with its loss."""
     deployed, *calibrations = cell.needs
-    request = _deployment(study, cell, plan, calibrations, load)
+    request = _deployment(study, cell, plan, calibrations, load, directory)
     plan = request.campaign
     assert plan.deployment is not None
     recommended = result_of(load(deployed), request.stages[0].name, Deployed).recommended

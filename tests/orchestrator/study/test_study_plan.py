@@ -14,6 +14,7 @@ from ruamel.yaml import YAML
 
 from orchestrator.campaigns.campaign_checks import touch
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
+from orchestrator.learning.calibration.pour_design import DesignPoured
 from orchestrator.learning.deployment.d1 import D1Settings, OneShotPlanning
 from orchestrator.learning.deployment.d2 import RealOnly
 from orchestrator.learning.deployment.d3 import Hybrid
@@ -145,7 +146,8 @@ def test_risk_of_the_campaign_is_that_of_d1_and_what_simulates_draws_from_the_po
     planned = study.deployment("D1-2").plan.settings
     assert isinstance(planned, D1Settings)
     assert planned.risk is not None
-    known = {"calibration": plans.calibrated(study.base.parameters, [{"cohesion": 0.01 * i} for i in range(3)])}
+    draws = [{"cohesion": 0.01 * i} for i in range(3)]
+    known = {"pours": DesignPoured(pours=()), "calibration": plans.calibrated(study.base.parameters, draws)}
     made = {}
     for cell in cells_of(study):
         if cell.kind == "deployment" and cell.repetition == 1 and cell.level == "small":

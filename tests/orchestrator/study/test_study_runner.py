@@ -21,6 +21,7 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.cli.app import app
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.requests import Failed, Poured, Slots
+from orchestrator.records.run_record import read_record
 from orchestrator.runs.run_service import RunResources
 from orchestrator.study.study_file import load_study
 from orchestrator.study.study_folder import (
@@ -142,6 +143,20 @@ def test_a_cell_that_fails_is_named_and_the_others_go_on(tmp_path: Path) -> None
     assert "not a journal" in status.failed["calibration.small.C4.01"]
     assert status.skipped == {"deployment.small.D3.deployment-narrow.01"}, "it needs the θ* that there is none of"
     assert len(status.finished) == len(cells_of(study)) - 2
+
+
+def test_d3_of_a_study_is_told_what_the_calibration_of_its_repetition_has_shown_as_in_a_campaign(
+    tmp_path: Path,
+) -> None:
+    calibration = {"C4": {"repetitions": 1, "simulations": 8, "initial_samples": 4}}
+    deployment = {"D3": {**read("quick")["deployment"]["D3"], "pours": 1, "repetitions": 1}}
+    levels = read("quick")["mismatch"][:1]
+    study = small(tmp_path, calibration=calibration, deployment=deployment, mismatch=levels, confirm=None)
+    for cell in cells_of(study):
+        run_cell(study, cell, study.folder, TOYS)
+    logged = read_record(run_folder(study.folder, "deployment.small.D3.deployment-narrow.01")).decisions
+    told = [decision.text for decision in logged if "calibration pours into" in decision.text]
+    assert any("the first predictions are based on this" in text for text in told), told
 
 
 def test_settings_may_not_change_under_a_study_but_repetitions_may_be_added(tmp_path: Path) -> None:
