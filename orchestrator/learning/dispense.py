@@ -369,10 +369,11 @@ class Dispense:
         knowledge = self._calibrated.get(name) if known.knowledge is None else _knowledge(known.knowledge)
         return DoseSource(name, known.mass, known.deviation, fill, self._constants, knowledge)
 
-    def take(self, pour: Pour, outcome: Outcome) -> None:
-        """Record a dose and its outcome without a request, for the result of a run that has stopped."""
+    def take(self, pour: Pour, outcome: Outcome | None) -> None:
+        """Record a dose without a request, for the result of a run that has not finished; None: it is under way."""
         self._pouring = pour
-        self.tell(pour, outcome)
+        if outcome is not None:
+            self.tell(pour, outcome)
 
     def tell(self, request: Request, outcome: Outcome) -> None:
         """Record the outcome of a dose.

@@ -155,8 +155,12 @@ class Mix(Dispense):
         self.decisions.append(Decision(text, urgent=urgent))
 
     def result(self) -> Dispensed:
-        """The doses so far, and the cups."""
-        return super().result().model_copy(update={"cups": tuple(self._cups)})
+        """The doses so far, and the cups. That of a dose under way is being filled."""
+        cups = tuple(self._cups)
+        if self._pouring is not None and self._pouring.dose is not None:
+            position, filling = self._pouring.dose.position, {"state": "filling"}
+            cups = tuple(cup.model_copy(update=filling) if cup.position == position else cup for cup in cups)
+        return super().result().model_copy(update={"cups": cups})
 
 
 def dose_strategy(

@@ -65,8 +65,8 @@ _FIGURES: dict[str, tuple[str, str]] = {
     ),
     "rack": (
         "The cups of the rack from above, each with a ring of its liquids and the differences from the wanted amounts.",
-        "Rings show the wanted shares, numbers the differences from the wanted amounts in g. Those "
-        "beyond the tolerance are bold.",
+        "Rings show the wanted shares, numbers the amounts and differences from the table in g. After a dose that "
+        "missed (bold), the others of its cup may be corrected, so that their ratio holds.",
     ),
     "dose ": (
         "Readings of the balance and tilt of the pourer over the time of a dose.",

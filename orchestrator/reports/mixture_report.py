@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
+from xml.etree.ElementTree import Element, SubElement, tostring
+
+import numpy as np
 
 from orchestrator.learning.campaign_plan import CampaignPlan
-from orchestrator.learning.dispense import Dispensed, MixedComponent
+from orchestrator.learning.dispense import CupState, Dispensed, MixedComponent
 from orchestrator.learning.mixtures import dose_strategy
 from orchestrator.learning.requests import Failed
 from orchestrator.records.codec import Results
@@ -27,7 +31,6 @@ from orchestrator.runs.stages import DOSES
 from sim_engine.resources import installed
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 FILE_NAME = "mixtures"
@@ -35,7 +38,12 @@ FILE_NAME = "mixtures"
 COLOURS = (style.POURER, style.PREDICTED, style.GOOD, style.POSTERIOR, style.FALLING, style.BEST, style.GREY)
 """Of the liquids, in the order of the campaign's table."""
 
-STATES = {"rejected": "rejected", "refused": "not poured", "unknown": "UNKNOWN", "waiting": "", "filling": "filling"}
+STATES: dict[CupState, str] = {
+    **{"waiting": "empty", "filling": "being filled", "full": "done"},
+    **{"rejected": "rejected", "refused": "not poured", "unknown": "UNKNOWN"},
+}
+
+PROBLEMS = ("missed", "missed, corrected", "rejected", "not poured", "UNKNOWN")
 
 
 def mixtures_of(results: Results) -> Dispensed | None:
@@ -43,21 +51,44 @@ def mixtures_of(results: Results) -> Dispensed | None:
     return next((dispensed for dispensed in all_of(results, Dispensed) if dispensed.cups), None)
 
 
+def tolerances(plan: CampaignPlan) -> dict[str, float]:
+    """Tolerances of the doses of mixtures by liquid, in the order of the campaign's liquids [g]."""
+    if plan.dispense is None:
+        return {}
+    limits = {dose.liquid or "": 1e3 * dose.limit for dose in plan.dispense.doses}
+    liquids = dict.fromkeys(scene.liquid.name for scene in plan.dispense.scenes)
+    return {liquid: limits[liquid] for liquid in liquids if liquid in limits}
+
+
+def mixtures_so_far(plan: CampaignPlan, record: RunState, *, live: bool = False) -> Dispensed | None:
+    """The mixtures of a run that has not closed their stage; None if its campaign has none.
+
+    Args:
+        plan: of the run.
+        record: of the run.
+        live: whether it is in progress; otherwise a dose that has begun and has no outcome makes its cup UNKNOWN.
+    """
+    if plan.dispense is None or plan.dispense.mixtures is None:
+        return None
+    strategy = dose_strategy(plan.dispense, plan.seed)
+    unknown = Failed("pour_unknown", "the run has stopped during the dose")
+    for pour in record.pours:
+        if pour.request.dose is not None and (pour.outcome is not None or pour.state in ("under way", "unknown")):
+            under_way = live and pour.state == "under way"
+            strategy.take(pour.request, None if under_way else pour.outcome or unknown)
+    return strategy.result()
+
+
 def with_unfinished(plan: CampaignPlan, result: CampaignResult) -> CampaignResult:
     """The result of a run with the mixtures so far, if it has stopped within them.
-
-    A dose that has begun and has no outcome makes its cup UNKNOWN.
 
     Raises:
         RunError: the journal can't be read.
     """
     if plan.dispense is None or plan.dispense.mixtures is None or mixtures_of(result.results) is not None:
         return result
-    strategy = dose_strategy(plan.dispense, plan.seed)
-    for pour in read_record(result.directory).pours:
-        if pour.request.dose is not None and (pour.outcome is not None or pour.state in ("under way", "unknown")):
-            strategy.take(pour.request, pour.outcome or Failed("pour_unknown", "the run has stopped during the dose"))
-    return replace(result, results={**result.results, DOSES: strategy.result()})
+    mixtures = mixtures_so_far(plan, read_record(result.directory))
+    return result if mixtures is None else replace(result, results={**result.results, DOSES: mixtures})
 
 
 def mixture_rows(dispensed: Dispensed, record: RunState) -> list[Row]:
@@ -152,35 +183,97 @@ def mixture_lines(directory: Path) -> list[str]:
 # ---- the rack from above
 
 
-def draw_rack(dispensed: Dispensed, limits: Mapping[str, float]) -> Figure:
-    """The rack from above: each cup with its liquids, and the difference of every amount from the table.
+@dataclass(frozen=True)
+class RackLine:
+    """A line through points (x, y), of a width [inch]."""
+
+    points: tuple[tuple[float, float], ...]
+    colour: str
+    width: float
+
+
+@dataclass(frozen=True)
+class RackText:
+    """A text that is centred vertically at a point [inch]; `side` is the end of it that is there."""
+
+    at: tuple[float, float]
+    text: str
+    colour: str = style.INK
+    bold: bool = False
+    size: float = 0.12
+    side: Literal["left", "center", "right"] = "center"
+
+
+@dataclass(frozen=True)
+class RackDrawing:
+    """The rack from above, which report, operator's page and live view show: x to the right, y down [inch]."""
+
+    width: float
+    height: float
+    lines: tuple[RackLine, ...]
+    texts: tuple[RackText, ...]
+
+    def svg(self) -> str:
+        """The drawing as an SVG file."""
+        size = {"width": f"{100 * self.width:.0f}", "height": f"{100 * self.height:.0f}"}
+        box = {**size, "viewBox": f"0 0 {size['width']} {size['height']}", "font-family": "sans-serif"}
+        root = Element("svg", {"xmlns": "http://www.w3.org/2000/svg", **box})
+        SubElement(root, "rect", {"width": "100%", "height": "100%", "fill": "white"})
+        for line in self.lines:
+            points = " ".join(f"{100 * x:.1f},{100 * y:.1f}" for x, y in line.points)
+            look = {"fill": "none", "stroke": line.colour, "stroke-width": f"{100 * line.width:.1f}"}
+            SubElement(root, "polyline", {"points": points, **look})
+        anchors = {"left": "start", "center": "middle", "right": "end"}
+        for text in self.texts:
+            place = {"x": f"{100 * text.at[0]:.1f}", "y": f"{100 * (text.at[1] + 0.35 * text.size):.1f}"}
+            look = {"font-size": f"{100 * text.size:.1f}", "text-anchor": anchors[text.side], "fill": text.colour}
+            look["font-weight"] = "bold" if text.bold else "normal"
+            SubElement(root, "text", {**place, **look}).text = text.text
+        return tostring(root, encoding="unicode")
+
+    def figure(self) -> Figure:
+        """The drawing as a figure."""
+        figure, axes = style.new_figure(size=(self.width, self.height), layout=None)
+        axes.set_position((0.0, 0.0, 1.0, 1.0))  # so that a unit of the axes is an inch
+        axes.set_xlim(0.0, self.width)
+        axes.set_ylim(self.height, 0.0)
+        axes.set_axis_off()
+        for line in self.lines:
+            axes.plot(*zip(*line.points, strict=True), color=line.colour, lw=72 * line.width, solid_capstyle="butt")
+        for text in self.texts:
+            look = {"color": text.colour, "fontsize": 72 * text.size, "fontweight": "bold" if text.bold else "normal"}
+            axes.text(*text.at, text.text, ha=text.side, va="center_baseline", **look)
+        return figure
+
+
+def draw_rack(dispensed: Dispensed, limits: Mapping[str, float]) -> RackDrawing:
+    """Each cup with its liquids, its state, and the amounts with their differences from the table.
 
     Args:
         dispensed: with cups.
-        limits: tolerances by liquid [g]; larger differences are bold.
+        limits: tolerances by liquid [g]. The difference of a dose that missed what was wanted of it is bold; after such
+            a dose, this may be a corrected amount instead of the table's.
     """
-    from matplotlib.patches import Patch
-
-    liquids = list(limits)
+    colours = {liquid: COLOURS[i % len(COLOURS)] for i, liquid in enumerate(limits)}
     places = _grid([cup.position for cup in dispensed.cups])
+    requested = {dose.number: dose.wanted_g for dose in dispensed.doses}
     columns, rows = (1 + max(place[k] for place in places.values()) for k in (0, 1))
-    size = (max(1.5 * columns + 0.8, 4.6), 1.75 * rows + 1.5)
-    figure, axes = style.new_figure(1, 1, size=size)
+    width, bottom = max(1.6 * columns + 0.1, 4.9), 0.5 + 2.0 * rows
     full = sum(cup.state == "full" for cup in dispensed.cups)
-    style.entitle(figure, f"{full} of {len(dispensed.cups)} cups are full: difference from the wanted amounts [g]")
-    colours = {liquid: COLOURS[i % len(COLOURS)] for i, liquid in enumerate(liquids)}
-    components = dispensed.components()
+    title = f"{full} of {len(dispensed.cups)} cups are full: amounts, and differences from the table [g]"
+    lines, texts = list[RackLine](), [RackText((0.1, 0.25), title, size=0.15, side="left")]
     for cup in dispensed.cups:
         column, row = places[cup.position]
-        own = [component for component in components if component.cup == cup.position]
-        _draw_cup(axes, (1.5 * column, -1.75 * row), cup.position.partition("/")[2], own, colours, limits)
-    axes.set_xlim(-0.85, 1.5 * (columns - 1) + 0.85)
-    axes.set_ylim(-1.75 * (rows - 1) - 0.95, 0.95)
-    axes.set_aspect("equal")
-    axes.set_axis_off()
-    handles = [Patch(color=colours[liquid], label=liquid) for liquid in liquids]
-    figure.legend(handles=handles, loc="outside lower center", ncols=4, fontsize=9, frameon=False)
-    return figure
+        own = [component for component in dispensed.components() if component.cup == cup.position]
+        _draw_cup(lines, texts, (0.85 + 1.6 * column, 1.55 + 2.0 * row), own, requested, colours, limits)
+    x, y = 0.15, bottom + 0.25
+    for liquid, colour in colours.items():
+        if x > 0.2 and x + 0.5 + 0.09 * len(liquid) > width:
+            x, y = 0.15, y + 0.25
+        lines.append(RackLine(((x, y), (x + 0.3, y)), colour, 0.12))
+        texts.append(RackText((x + 0.38, y), liquid, size=0.125, side="left"))
+        x += 0.65 + 0.09 * len(liquid)
+    return RackDrawing(width, y + 0.2, tuple(lines), tuple(texts))
 
 
 def _grid(positions: Sequence[str]) -> dict[str, tuple[int, int]]:
@@ -194,41 +287,43 @@ def _grid(positions: Sequence[str]) -> dict[str, tuple[int, int]]:
 
 
 def _draw_cup(
-    axes: Axes,
+    lines: list[RackLine],
+    texts: list[RackText],
     centre: tuple[float, float],
-    name: str,
     components: Sequence[MixedComponent],
+    requested: Mapping[int, float],
     colours: Mapping[str, str],
     limits: Mapping[str, float],
 ) -> None:
-    """One cup: a ring of its liquids by mass, its name, and the differences within."""
-    from matplotlib.patches import Circle, Wedge
-
+    """One cup: a ring of its liquids by mass, its name and state, and its amounts within."""
     x, y = centre
-    axes.add_patch(Circle(centre, 0.68, facecolor="white", edgecolor=style.GREY, linewidth=1.0))
-    total = sum(component.wanted_g for component in components)
-    start = 90.0
-    for component in components:
-        angle = 360.0 * component.wanted_g / total
-        poured = component.received_g is not None
-        axes.add_patch(
-            Wedge(
-                centre, 0.66, start - angle, start, width=0.13,
-                facecolor=colours[component.liquid] if poured else "white", edgecolor="white", linewidth=1.2,
-            )
-        )  # fmt: skip
-        start -= angle
-    state = components[0].state
-    axes.text(x, y + 0.8, name, ha="center", va="center", fontsize=9.5, color=style.INK)
-    if note := STATES.get(state, ""):
-        axes.text(x, y - 0.8, note, ha="center", va="center", fontsize=8, color=style.BEST)
+    name, start, total = components[0].cup.partition("/")[2], 0.0, sum(part.wanted_g for part in components)
+    step, missed, corrected = min(0.2, 0.9 / len(components)), False, False
     for i, component in enumerate(components):
-        if component.received_g is None:
-            text, beyond = "—", False
-        else:
-            error = component.received_g - component.wanted_g
-            text, beyond = f"{round(error, 2) + 0.0:+.2f}", abs(error) > limits[component.liquid]
-        axes.text(
-            x, y + 0.2 * (0.5 * (len(components) - 1) - i), text, ha="center", va="center", fontsize=8.5,
-            color=colours[component.liquid], fontweight="bold" if beyond else "normal",
-        )  # fmt: skip
+        end = start + component.wanted_g / total
+        colour = style.PALE if component.received_g is None else colours[component.liquid]
+        lines.append(RackLine(_arc(centre, 0.65, start + 0.004, end - 0.004), colour, 0.11))
+        level, start = y + step * (i - 0.5 * (len(components) - 1)), end
+        lines.append(RackLine(((x - 0.49, level), (x - 0.41, level)), colours[component.liquid], 0.08))
+        if component.received_g is None or component.dose is None:
+            texts.append(RackText((x - 0.02, level), "—" if component.dose is None else "?", side="right"))
+            continue
+        wanted = requested[component.dose]
+        error = component.received_g - component.wanted_g
+        beyond = abs(component.received_g - wanted) > limits[component.liquid]
+        missed, corrected = missed or beyond, corrected or wanted != component.wanted_g
+        texts.append(RackText((x - 0.02, level), f"{component.received_g:.1f}", side="right"))
+        texts.append(RackText((x + 0.47, level), f"{round(error, 2) + 0.0:+.2f}", bold=beyond, side="right"))
+    state = components[0].state
+    word = ("missed, corrected" if corrected else "missed") if missed and state == "full" else STATES[state]
+    colour = style.BEST if word in PROBLEMS else style.INK
+    edge = style.GREY if state == "waiting" else colour
+    lines.append(RackLine(_arc(centre, 0.74, 0.0, 1.0), edge, 0.01 if word in ("empty", "done") else 0.03))
+    texts.append(RackText((x, y - 0.87), name, size=0.135))
+    texts.append(RackText((x, y + 0.87), word, colour, bold=word not in ("empty", "done")))
+
+
+def _arc(centre: tuple[float, float], radius: float, start: float, end: float) -> tuple[tuple[float, float], ...]:
+    """Points of an arc, clockwise from the top, between two fractions of the circle."""
+    angles = np.linspace(2.0 * math.pi * start, 2.0 * math.pi * end, 2 + max(round(40 * (end - start)), 0))
+    return tuple((centre[0] + radius * math.sin(angle), centre[1] - radius * math.cos(angle)) for angle in angles)

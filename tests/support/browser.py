@@ -74,10 +74,10 @@ class OnPort:
 
 
 @contextlib.contextmanager
-def on_port(folder: Path, make: Make = held, **settings: Any) -> Iterator[OnPort]:
+def on_port(folder: Path, make: Make = held, campaign: str = PERSON, **settings: Any) -> Iterator[OnPort]:
     """Serve a daemon with a toy laboratory."""
     folder.mkdir(exist_ok=True)
-    write_campaign(folder, PERSON)
+    write_campaign(folder, campaign)
     ready: list[OnPort] = []
     up, problems = threading.Event(), []
     leave: list[Callable[[], None]] = []

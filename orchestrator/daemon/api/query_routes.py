@@ -32,7 +32,6 @@ from orchestrator.daemon.state.run_readout import REPORT, summary_of
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.run_errors import RunError
 from orchestrator.records.journal_file import free_space
-from orchestrator.reports.run_summary import PourSummary
 from sim_engine.settings.plugin_registry import DISTRIBUTION
 
 READERS = 400
@@ -105,29 +104,26 @@ async def campaign(daemon: Daemon, queue: Queue, person: Viewer, key: str) -> Ca
     """Return one campaign with its pours and its summary."""
     item = found_item(queue, key)
     summary: dict[str, Any] | None = None
-    pours: list[PourSummary] = []
-    night: list[dict[str, Any]] = []
+    seen: dict[str, Any] = {}
     if item.run is not None:
         directory = daemon.settings.runs / item.run
 
         # A process that was killed leaves a journal that ends in the middle of the pour.
         live = daemon.progress(item) is not None
 
-        def read() -> tuple[tuple[list[PourSummary], list[dict[str, Any]]], dict[str, Any] | None]:
+        def read() -> tuple[dict[str, Any], dict[str, Any] | None]:
             def plan() -> CampaignPlan:
                 return run_request(daemon.settings, item, daemon.settings.rig(item.rig)).campaign
 
             return daemon.pours.of(directory, plan, live=live), summary_of(directory)
 
         try:
-            (pours, night), summary = await asyncio.to_thread(read)
+            seen, summary = await asyncio.to_thread(read)
         except (ConfigError, RunError, KeyError):  # for example, a rig that the settings no longer contain
             summary = await asyncio.to_thread(summary_of, directory)
     table = campaign_out(daemon, queue, item).model_dump()
     audit = daemon.store.audit(item.id)
-    return CampaignDetailOut.model_validate(
-        {**table, "pours_made": pours, "night": night, "summary": summary, "audit": audit}
-    )
+    return CampaignDetailOut.model_validate({**table, **seen, "summary": summary, "audit": audit})
 
 
 @router.get(

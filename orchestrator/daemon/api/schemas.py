@@ -10,6 +10,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from orchestrator.daemon.rigs.pour_request import Moment, RequestModel
+from orchestrator.learning.dispense import MixedComponent
 from orchestrator.reports.run_summary import PourSummary
 
 
@@ -149,9 +150,15 @@ class NightEventOut(ResponseModel):
 class CampaignDetailOut(CampaignOut):
     """A submitted campaign with its results so far."""
 
-    pours_made: list[PourSummary]
-    night: list[NightEventOut]
+    pours_made: list[PourSummary] = []
+    night: list[NightEventOut] = []
     """Unattended pours since the first consent; empty without one."""
+
+    mixtures: list[MixedComponent] = []
+    """Each liquid of each cup of mixtures so far; empty without mixtures."""
+
+    rack: str = ""
+    """The rack of the mixtures from above, as SVG; '' without mixtures."""
 
     summary: dict[str, Any] | None
     """`summary.json` of its run, after publication."""

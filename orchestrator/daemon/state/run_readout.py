@@ -31,6 +31,7 @@ from orchestrator.records.codec import CodecError
 from orchestrator.records.journal_file import JournalError
 from orchestrator.records.run_record import RunState, read_record
 from orchestrator.reports.html_report import REPORT_NAME as REPORT
+from orchestrator.reports.mixture_report import draw_rack, mixtures_so_far, tolerances
 from orchestrator.reports.run_summary import PourSummary
 from orchestrator.reports.summarise import pour_summaries
 
@@ -65,10 +66,8 @@ class Pours:
         self._read: OrderedDict[Path, tuple[CampaignPlan, RunState]] = OrderedDict()
         self._guard = Lock()
 
-    def of(
-        self, directory: Path, plan: Callable[[], CampaignPlan], *, live: bool
-    ) -> tuple[list[PourSummary], list[dict[str, Any]]]:
-        """Return the requested pours of a run in order, with predictions and measurements; and its `night`.
+    def of(self, directory: Path, plan: Callable[[], CampaignPlan], *, live: bool) -> dict[str, Any]:
+        """Return the pours of a run and what follows from them, as fields of `CampaignDetailOut`.
 
         Args:
             directory: folder of the run.
@@ -81,12 +80,16 @@ class Pours:
             try:
                 record = read_record(directory, known=known)
             except (JournalError, CodecError, OSError):
-                return [], []  # being created, or of another version: read from its start at the next call
+                return {}  # being created, or of another version: read from its start at the next call
             self._read[directory] = planned, record
             if len(self._read) > self._keep:
                 self._read.popitem(last=False)
             pours = pour_summaries(planned, record, live=live)
-            return pours, night(record, pours)
+            seen: dict[str, Any] = {"pours_made": pours, "night": night(record, pours)}
+            if (mixtures := mixtures_so_far(planned, record, live=live)) is not None:
+                drawing = draw_rack(mixtures, tolerances(planned))
+                seen |= {"mixtures": mixtures.components(), "rack": drawing.svg()}
+            return seen
 
 
 _OF_NIGHT = ("consent", "end", "fault", "accounted")

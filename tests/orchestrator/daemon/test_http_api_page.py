@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import httpx
 import pytest
@@ -26,6 +27,8 @@ from orchestrator.campaigns.file_loading import load_laboratory
 from orchestrator.daemon.state.access_tokens import Role, token_of
 from orchestrator.daemon.state.daemon_settings import Rig
 from orchestrator.records.run_registry import VARIABLE, use_state_directory
+from tests.orchestrator.daemon.rigs.test_campaign_queue_doses import held_dose
+from tests.orchestrator.reports.test_mixture_report import MIXTURES
 from tests.support.browser import OnPort, browser, on_port
 from tests.support.hardware_laboratory import hardware_rig
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
@@ -415,6 +418,61 @@ def test_pours_stand_with_what_was_expected_and_what_was_spilled(page: Any, tmp_
         cells = page.locator("#pours tbody tr").first.locator("td").all_inner_texts()
         assert cells[0] == "cup"
         assert cells[5].split("\n")[-1].strip() == "(spilled + retained) / loaded"
+
+
+def rack_of(page: Any) -> dict[str, str]:
+    """The word at each cup of the rack's picture, by the cup's name, once the picture is shown."""
+    image = page.locator("#racks img")
+    wait_until(page, lambda: image.evaluate("(image) => image.complete && image.naturalWidth > 100"))
+    texts = re.findall(r">([^<>]+)</text>", unquote(image.get_attribute("src")))
+    names = [i for i, text in enumerate(texts) if re.fullmatch(r"[A-D][1-6]", text)]
+    return {texts[i]: texts[i + 1] for i in names}
+
+
+def test_the_rack_of_mixtures_fills_and_is_the_same_after_a_reload(page: Any, tmp_path: Path) -> None:
+    page.set_viewport_size({"width": 320, "height": 640})
+    with on_port(tmp_path, held_dose, campaign=MIXTURES) as lab:
+        page.goto(lab.address(Role.VIEWER))
+        page.get_by_text("Nothing runs here.").wait_for()
+        assert page.locator("#racks").is_hidden()
+        key = lab.do(lab.served.submit())
+        lab.do(lab.served.pouring()).bench.begun.clear()
+        page.locator("#racks img").wait_for()
+        assert rack_of(page) == {"B2": "being filled", "A1": "empty"}
+        page.get_by_text("As a table").click()
+        lab.served.laboratories[0].bench.go.set()
+        wait_until(page, lambda: rack_of(page) == {"B2": "done", "A1": "done"})
+        poured = lab.do(lab.served.get(f"/campaigns/{key}"))["mixtures"]
+        rows = page.locator("#racks tbody tr").all_inner_texts()  # the table is open as it was
+        for row, component in zip(rows, poured, strict=True):
+            assert f"{component['received_g']:.2f}" in row
+        assert page.evaluate("document.documentElement.scrollWidth") <= 320
+        page.reload()
+        wait_until(page, lambda: page.locator("#racks img").count() and rack_of(page) == {"B2": "done", "A1": "done"})
+
+
+@pytest.mark.slow
+def test_a_daemon_that_was_started_again_shows_the_cup_that_is_unknown(page: Any, tmp_path: Path) -> None:
+    with on_port(tmp_path, held_dose, campaign=MIXTURES) as lab:
+        key = lab.do(lab.served.submit())
+        lab.do(lab.served.pouring())
+        page.goto(lab.address())
+        page.locator("#racks img").wait_for()
+        assert rack_of(page) == {"B2": "being filled", "A1": "empty"}
+        for _ in range(2):
+            page.get_by_role("button", name="Stop the motion").click()
+        lab.do(lab.served.until(key, "unknown"))
+        wait_until(page, lambda: rack_of(page) == {"B2": "UNKNOWN", "A1": "empty"})
+    with on_port(tmp_path, held_dose, campaign=MIXTURES) as lab:
+        page.goto(lab.address())
+        page.locator("#racks img").wait_for()
+        assert rack_of(page) == {"B2": "UNKNOWN", "A1": "empty"}
+        lab.do(lab.served.post(f"/campaigns/{key}/resume"))
+        lab.do(lab.served.question())
+        page.get_by_role("button", name="Lost: outcome unknown").wait_for()
+        assert rack_of(page) == {"B2": "UNKNOWN", "A1": "empty"}
+        page.get_by_role("button", name="Lost: outcome unknown").click()
+        wait_until(page, lambda: rack_of(page) == {"B2": "UNKNOWN", "A1": "being filled"})
 
 
 class NightLaboratory(HeldLaboratory):

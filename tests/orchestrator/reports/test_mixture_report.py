@@ -9,6 +9,7 @@ import re
 import shutil
 import sqlite3
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from typer.testing import CliRunner
@@ -102,20 +103,48 @@ PARTLY = Dispensed(
 )
 
 
-def texts(dispensed: Dispensed) -> dict[str, tuple[float, float]]:
-    axes = draw_rack(dispensed, {"oil": 1.0}).axes[0]
-    return {text.get_text(): text.get_position() for text in axes.texts}
-
-
 def test_the_picture_shows_the_cups_where_they_stand_and_their_differences() -> None:
-    shown = texts(PARTLY)
-    assert {"A1", "C4", "A2", "+3.00", "-0.10", "rejected"} <= set(shown)
+    drawing = draw_rack(PARTLY, {"oil": 1.0})
+    shown = {text.text: text.at for text in drawing.texts}
+    assert {"A1", "C4", "A2", "13.0", "+3.00", "-0.10", "rejected", "done", "empty"} <= set(shown)
     assert shown["C4"][0] > shown["A2"][0] > shown["A1"][0]
-    assert shown["C4"][1] < shown["A1"][1] == shown["A2"][1]
-    bold = {
-        text.get_text() for text in draw_rack(PARTLY, {"oil": 1.0}).axes[0].texts if text.get_fontweight() == "bold"
+    assert shown["C4"][1] > shown["A1"][1] == shown["A2"][1]
+    assert {text.text for text in drawing.texts if text.bold} == {"+3.00", "rejected"}
+
+
+def test_figure_and_svg_have_the_same_texts_in_the_same_places() -> None:
+    drawing = draw_rack(PARTLY, {"oil": 1.0})
+    of_figure = {text.get_text(): text.get_position() for text in drawing.figure().axes[0].texts}
+    of_svg = {
+        text.text: (float(text.get("x")) / 100, float(text.get("y")) / 100)
+        for text in ElementTree.fromstring(drawing.svg()).iter("{http://www.w3.org/2000/svg}text")
     }
-    assert bold == {"+3.00"}
+    assert of_figure.keys() == of_svg.keys() == {text.text for text in drawing.texts}
+    for text, (x, y) in of_svg.items():
+        assert (x, y) == pytest.approx(of_figure[text], abs=0.06)  # y is of the baseline
+
+
+def test_a_cup_that_misses_a_tolerance_and_one_of_unknown_content_stand_out() -> None:
+    missed = PARTLY.cups[0].model_copy(update={"state": "full"})
+    lost = DOSES[1].model_copy(update={"received_g": None})
+    unknown = PARTLY.cups[1].model_copy(update={"state": "unknown"})
+    several = PARTLY.model_copy(update={"doses": (DOSES[0], lost), "cups": (missed, unknown)})
+    drawing = draw_rack(several, {"oil": 1.0})
+    assert {text.text for text in drawing.texts if text.bold} == {"+3.00", "missed", "UNKNOWN"}
+    assert "?" in {text.text for text in drawing.texts}
+
+
+def test_a_dose_of_a_corrected_amount_has_not_missed() -> None:
+    wanted = {"oil": 10.0, "water": 20.0}
+    corrected = DOSES[1].model_copy(
+        update={"wanted_g": 26.0, "received_g": 25.8, "liquid": "water", "position": "rack/A1"}
+    )
+    cup = MixedCup(position="rack/A1", wanted_g=wanted, state="full")
+    dispensed = PARTLY.model_copy(update={"doses": (DOSES[0], corrected), "cups": (cup,)})
+    texts = {text.text: text.bold for text in draw_rack(dispensed, {"oil": 1.0, "water": 1.0}).texts}
+    assert texts["+3.00"]
+    assert not texts["+5.80"]
+    assert texts["missed, corrected"]
 
 
 def test_a_line_for_each_cup_says_which_one_it_replaces(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 import { Refused, call, knownToken, listen, reach, saveReport, useToken } from "./talk.js";
 import {
-  button, cellLine, chartFigure, clock, draw, el, endedList, previousRuns, modeBadge, nightTimeline, poursTable, questionCard, queueList, rigCard,
+  button, cellLine, chartFigure, clock, draw, el, endedList, fillRack, previousRuns, modeBadge, nightTimeline, poursTable, questionCard, queueList, rackFigure, rigCard,
   stopCard, vesselsTable,
 } from "./show.js";
 
@@ -11,7 +11,7 @@ const RUNNING = ["preparing", "running", "pausing", "waiting for operator", "sto
 const BEAT = 2000, SILENCE = 6000;
 /* How often the daemon is called [ms], and after which silence the page no longer relies on it. */
 const PHYSICAL = "press the physical emergency stop: the red mushroom button on the teach pendant";
-const now = { status: null, campaigns: [], questions: [], pours: [], night: [], vessels: [], seen: 0, heard: 0, up: null, clearing: null };
+const now = { status: null, campaigns: [], questions: [], pours: [], racks: [], night: [], vessels: [], seen: 0, heard: 0, up: null, clearing: null };
 let wanted = 0, busy = false, begun = false, joined = false;
 
 // ---- what is known
@@ -30,6 +30,7 @@ async function refresh() {
     const stored = await call("materials").catch(() => ({ sources: now.vessels })); // of less weight than the rest
     if (away()) return;
     now.vessels = stored.sources.filter((one) => one.position);
+    now.racks = details.filter((one) => one.rack).map(({ name, rack, mixtures }) => ({ name, rack, mixtures }));
     now.night = details.flatMap((one) => one.night).sort((one, other) => one.time - other.time);
     now.pours = details.flatMap((one) => one.pours_made.map((pour) => ({ ...pour, campaign: one.name })))
       .filter((pour) => pour.state !== "asked").sort((one, other) => other.time - one.time).slice(0, 8);
@@ -153,6 +154,9 @@ function show() {
     status.ready || status.problems.length || stops().length ? null : el("p", { class: "quiet" }, "The simulators are starting."),
     rigs.map(([rig, campaign]) => rigCard(rig, campaign, acts)),
   ]);
+  $("racks").hidden = !now.racks.length;
+  draw(body("racks"), now.racks.map(({ name }) => name), () => now.racks.map(rackFigure));
+  now.racks.forEach((rack, index) => fillRack(body("racks").children[index], rack));
   draw(body("pours"), now.pours, poursTable);
   $("night").hidden = !now.night.length;
   draw(body("night"), now.night, (events) => events.length ? nightTimeline(events) : []);
@@ -322,7 +326,7 @@ function leave(why = "") {
   $("rest").hidden = true;
   showBar(false);
   $("questions").replaceChildren();
-  for (const section of [...["mode", "asked", "cells", "emergency"].map($), ...["rigs", "pours", "night", "charts", "queue", "ended"].map(body)]) {
+  for (const section of [...["mode", "asked", "cells", "emergency"].map($), ...["rigs", "racks", "pours", "night", "charts", "queue", "ended"].map(body)]) {
     draw(section, null, () => []);
   }
   $("lost").hidden = true;
@@ -330,7 +334,7 @@ function leave(why = "") {
   $("stop-all").disabled = true;
   document.title = "Decant";
   document.body.classList.remove("real", "stale");
-  Object.assign(now, { status: null, campaigns: [], questions: [], pours: [], night: [], vessels: [], up: null, clearing: null });
+  Object.assign(now, { status: null, campaigns: [], questions: [], pours: [], racks: [], night: [], vessels: [], up: null, clearing: null });
   latched = "";
   charted = 0;
   $("link").textContent = "not signed in";

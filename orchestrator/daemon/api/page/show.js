@@ -191,6 +191,27 @@ export function poursTable(pours) {
       cell("Spilled", pour.spilled_g === null ? "—" : `${pour.spilled_g.toFixed(1)} g`)))));
 }
 
+const CUPS = { waiting: "empty", filling: "being filled", full: "done", rejected: "rejected", refused: "not poured", unknown: "UNKNOWN" };
+
+/** A place for the rack of mixtures from above and the same as a table; `fillRack` fills it, and it stays as it was scrolled and opened. */
+export function rackFigure({ name }) {
+  const heads = ["Cup", "Liquid", "Wanted [g]", "Received [g]", "Cup is"].map((head) => el("th", { scope: "col" }, head));
+  return el("figure", { "aria-label": `rack of ${name}` }, el("figcaption", {}, el("b", {}, name)),
+    el("div", { class: "wide", tabindex: "0" }, el("img", { alt: "The rack from above. The table has the same.",
+      onload: ({ target }) => { target.style.minWidth = `${Math.round(0.68 * target.naturalWidth)}px`; } })),
+    el("details", {}, el("summary", {}, "As a table"), el("table", {}, el("thead", {}, el("tr", {}, heads)), el("tbody", {}))));
+}
+
+/** Show a rack in its figure. The picture is an image, in which nothing can be executed. */
+export function fillRack(figure, { rack, mixtures }) {
+  const grams = (mass) => mass === null ? "—" : mass.toFixed(2);
+  draw(figure.querySelector("tbody"), mixtures, (all) => {
+    figure.querySelector("img").src = `data:image/svg+xml,${encodeURIComponent(rack)}`;
+    return all.map((one) => el("tr", {}, cell("Cup", one.cup), cell("Liquid", one.liquid), cell("Wanted [g]", grams(one.wanted_g)),
+      cell("Received [g]", grams(one.received_g)), cell("Cup is", CUPS[one.state])));
+  });
+}
+
 /** Where the vessels stand that an arm carries, and what they hold. */
 export function vesselsTable(vessels) {
   return el("table", {},

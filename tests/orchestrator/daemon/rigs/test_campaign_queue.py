@@ -97,7 +97,7 @@ def test_pours_are_shown_as_they_are_now_from_one_reading_of_the_campaign(
             assert [pour["state"] for pour in found["pours_made"]] == ["weighed"] * 3
             settings, item = served.daemon.settings, served.supervisor.queue.item(key)
             plan = run_request(settings, item, settings.rig(item.rig)).campaign
-            afresh, _ = Pours().of(settings.runs / str(item.run), lambda: plan, live=False)
+            afresh = Pours().of(settings.runs / str(item.run), lambda: plan, live=False)["pours_made"]
             assert found["pours_made"] == [pour.model_dump() for pour in afresh]
 
     run(work())
