@@ -216,7 +216,7 @@ class DoseTarget:
         source: of the dose; None: a full pourer, about which nothing is known.
         cup: identity of the receiver ('rack/A1'); '': the only one, exchanged for an empty one before each dose.
         stays: the next dose is poured into this cup, too: it stays on the balance.
-        emptied: the cup is emptied at the waste place first.
+        emptied: the cup is emptied first, at the waste place or by the operator.
         held: what earlier doses of the same mixture have left in the receiver [kg]; None: it is empty.
     """
 
@@ -260,6 +260,19 @@ class Bench(Protocol):
             UnknownPourError: it began, and a person has to state its outcome.
             LaboratoryError: it failed after something had moved, and counts as failed.
             BenchLostError: the bench is lost; no further pour is possible.
+        """
+        ...
+
+
+@runtime_checkable
+class Answering(Protocol):
+    """A bench with an operator who decides how a campaign goes on."""
+
+    async def ask(self, question: OperatorQuestion) -> str:
+        """Ask the operator. A consent for unattended pours ends with it.
+
+        Raises:
+            LaboratoryError: no answer came.
         """
         ...
 
@@ -342,7 +355,7 @@ class Laboratory(Protocol):
     async def __aexit__(self, *exc: object) -> None: ...
 
 
-OperatorAnswer = Literal["done", "weight", "yes or no"]
+OperatorAnswer = Literal["done", "weight", "yes or no", "option"]
 
 
 @dataclass(frozen=True)
@@ -351,11 +364,12 @@ class OperatorQuestion:
 
     Attributes:
         text: what to do; whole sentences.
-        wants: 'done' when it is done, a 'weight' with its unit, or 'yes' or 'no'.
+        wants: 'done' when it is done, a 'weight' with its unit, 'yes' or 'no', or an 'option'.
         problem: why the question is repeated; '' the first time.
         about: its subject, for programs: a weighing's key, 'tare', 'start', 'recover' …
         hands: whether the operator reaches into the cell; then no program runs on the controller until the answer.
         details: numbers for screens and records; JSON-ready.
+        options: the possible answers, if it wants one of them.
     """
 
     text: str
@@ -364,6 +378,7 @@ class OperatorQuestion:
     about: str = ""
     hands: bool = True
     details: Mapping[str, float | str] = field(default_factory=dict)
+    options: tuple[str, ...] = ()
 
 
 AnswerTime = Annotated[float, Quantity("s", "30 min", 0.0, 7 * 86400.0, positive=True)]

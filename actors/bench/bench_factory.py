@@ -42,6 +42,7 @@ from actors.interfaces import (
     LaboratoryError,
     Notice,
     Operator,
+    OperatorQuestion,
     ProgressCallback,
     SimulatorPool,
 )
@@ -139,6 +140,12 @@ class PouringBench:
         finally:
             if isinstance(procedure, PourProcedure):
                 self._known[scene.pourer.name] = procedure.lasting
+
+    async def ask(self, question: OperatorQuestion) -> str:
+        """See `Answering.ask`."""
+        if self._setup.night is not None:
+            self._setup.night.agrees(question)
+        return await self._setup.questions.ask(question)
 
     async def stop(self) -> None:
         """Stop any motion, and the refill pump; the arm stays locked."""

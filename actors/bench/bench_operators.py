@@ -368,6 +368,8 @@ class VirtualOperator:
                 return self._hands.contents.typed(about, TYPED_STEP)
             case "done":
                 return "done"
+            case "option":
+                return question.options[0]
         return "yes"
 
     async def announce(self, text: str, seconds: float) -> None:

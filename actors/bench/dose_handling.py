@@ -7,7 +7,7 @@
 3. Take the source. After the dose put it back, and weigh the cup again.
 4. Put the cup back, unless the next dose goes into it.
 
-A cup may be emptied first, at the waste place; what leaves it is added to the content of that place.
+A cup may be emptied first: at the waste place, to whose content it is added, or by the operator.
 
 A cup whose content is UNKNOWN is not used before a person has entered it. No liquid is dosed into a cup twice. The
 moves are those of `actors.bench.vessel_carrying`, and so are their entries in the account of vessels.
@@ -153,6 +153,38 @@ def check_vessels(
     return tuple(at_places), loads, check_carrying(stops, at_places, spec, gripper, loads, _containers(places))
 
 
+def plan_waste(
+    places: Sequence[PlaceSettings], spec: ArmSettings, scene: Scene, cup: CellVessel, vessels: Mapping[str, Vessel]
+) -> PlannedPour | None:
+    """Plan to empty a cup at the waste place; None if there is none.
+
+    Args:
+        places: of the laboratory, each with the names of the vessels that may stand there.
+        spec: of the arm.
+        scene: of a dose into the cup.
+        cup: with its largest load.
+        vessels: by name, with the waste container.
+
+    Raises:
+        InvalidActionError: the arm can't; the text states why.
+    """
+    waste = next((place for place in places if place.container is not None), None)
+    if waste is None or waste.container is None:
+        return None
+    liquid = scene.liquid.model_copy(update={"mass": cup.mass, "density": cup.mass / cup.volume})
+    emptying = replace(scene, pourer=cup.spec, receiver=waste.container.vessel, liquid=liquid)
+    others = [place for place in places if place.name != waste.name]
+    try:
+        return plan_emptying(emptying, others, arm_kind(spec).pouring_at(waste), vessels)
+    except InvalidActionError as error:
+        raise InvalidActionError(f"'{cup.name}' cannot be emptied at '{waste.name}': {error}") from error
+
+
+def shapes_of(places: Sequence[PlaceSettings], loads: Mapping[str, Load]) -> dict[str, Vessel]:
+    """The vessels that are carried, and the containers at places, by name."""
+    return {name: load.vessel for name, load in loads.items()} | _containers(places)
+
+
 def _containers(places: Sequence[PlaceSettings]) -> dict[str, Vessel]:
     return {place.name: built(place.container.vessel) for place in places if place.container is not None}
 
@@ -244,25 +276,11 @@ class DoseHandling:
                 self._laid_out = False
             self._checked, self._vessels = (spec, vessels), known
         carrier.spec, carrier.loads, carrier.ways = spec, self._loads, self._ways
-        shapes = {name: load.vessel for name, load in self._loads.items()} | _containers(self._places)
-        self._emptying = self._plan_emptying(spec, scene, dose, shapes) if dose.emptied else None
+        shapes = shapes_of(self._places, self._loads)
+        cup_vessel = self._vessels[self.names(scene, dose)[1]]
+        self._emptying = plan_waste(self._at_places, spec, scene, cup_vessel, shapes) if dose.emptied else None
         if problems := arm_kind(spec).in_the_way(path, shapes[source_name], self._at_places, shapes):
             raise InvalidActionError("; ".join(problems))
-
-    def _plan_emptying(
-        self, spec: ArmSettings, scene: Scene, dose: DoseTarget, shapes: Mapping[str, Vessel]
-    ) -> PlannedPour:
-        waste = next((place for place in self._places if place.container is not None), None)
-        cup = self._vessels[self.names(scene, dose)[1]]
-        if waste is None or waste.container is None:
-            raise InvalidActionError(f"'{cup.name}' is to be emptied, and no place has 'use: waste'")
-        liquid = scene.liquid.model_copy(update={"mass": cup.mass, "density": cup.mass / cup.volume})
-        emptying = replace(scene, pourer=cup.spec, receiver=waste.container.vessel, liquid=liquid)
-        others = [place for place in self._at_places if place.name != waste.name]
-        try:
-            return plan_emptying(emptying, others, arm_kind(spec).pouring_at(waste), shapes)
-        except InvalidActionError as error:
-            raise InvalidActionError(f"'{cup.name}' cannot be emptied at '{waste.name}': {error}") from error
 
     # ---- before the dose
 
@@ -289,8 +307,11 @@ class DoseHandling:
             await self._exchange(cup, consent)
         self._carrier.require_known()
         await self._known(cup, consent)
-        if self._emptying is not None:
-            await self._empty_at_waste(cup, self._emptying, consent, seed)
+        if dose.emptied and any(self._record.composition(cup)):
+            emptying = self._emptying
+            await (
+                self._exchange(cup, consent) if emptying is None else self._empty_at_waste(cup, emptying, consent, seed)
+            )
         if scene.liquid.name in (composition := self._record.composition(cup)):
             mass = composition[scene.liquid.name][0]
             held = "an UNKNOWN mass" if mass is None else f"{1e3 * mass:.1f} g"
@@ -388,10 +409,12 @@ class DoseHandling:
             await carrier.put(cup, place)
 
     async def _exchange(self, cup: str, consent: MotionConsent) -> None:
-        """Have the only cup exchanged for an empty one."""
+        """Have a cup emptied by the operator, or exchanged for an empty one."""
         place = self._carrier.at[cup]
         question = OperatorQuestion(
-            f"Take '{cup}' from '{place}', and put an empty, dry one there.", "done", about="cup_exchanged"
+            f"Take '{cup}' from '{place}', and put it back there empty and dry, or another one.",
+            "done",
+            about="cup_exchanged",
         )
         await self._carrier.ask(question, consent)
         self._empty(cup)

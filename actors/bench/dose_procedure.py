@@ -192,7 +192,7 @@ class DoseProcedure(BenchProcedure):
                 )
             )
         place = f" {dose.position}" if dose.position else ""
-        receiver = f"the empty receiver{place}"
+        receiver = f"the receiver{place}, emptied and dry," if dose.emptied else f"the empty receiver{place}"
         if dose.held is not None:
             receiver = f"the receiver{place}, which holds {1e3 * dose.held:.0f} g,"
         problem = ""

@@ -162,6 +162,8 @@ class SimulatedOperator(OperatorQuestions):
 
     async def ask(self, question: OperatorQuestion) -> str:
         """See `Operator.ask`."""
+        if question.options:
+            return question.options[0]
         load = await self._bench.content(question.about)
         if load is not None and not question.problem:
             if question.about == "dry_pourer":

@@ -367,7 +367,7 @@ class _Checker:
             plan: of the doses.
             vessels: of mixtures; empty: the only source, and one cup after the other.
         """
-        from actors.bench.dose_handling import check_vessels, vessels_of
+        from actors.bench.dose_handling import check_vessels, plan_waste, shapes_of, vessels_of
 
         assert self.arm is not None
         assert self.gripper is not None
@@ -385,7 +385,10 @@ class _Checker:
             ]
         for each in series:
             try:
-                check_vessels(self.places, each, self.arm, self.gripper)
+                at_places, loads, _ = check_vessels(self.places, each, self.arm, self.gripper)
+                if plan.mixtures is not None and plan.mixtures.on_miss != "accept" and not plan.mixtures.spares:
+                    cup = next(vessel for vessel in each if not vessel.liquid)
+                    plan_waste(at_places, self.arm, plan.scenes[0], cup, shapes_of(self.places, loads))
             except InvalidActionError as error:
                 self.add((section,), str(error))
                 return

@@ -24,6 +24,7 @@ from orchestrator.learning.campaign_plan import (
     CalibrationSettings,
     DeploymentSettings,
     Design,
+    MissPolicy,
     OutputSettings,
     StrategySettings,
 )
@@ -403,7 +404,7 @@ class CupsSettings(Settings):
     """Name of their rack: cup A1 stands at 'rack/A1'."""
 
     spares: list[Text] | None = None
-    """Positions of empty cups for `on_miss: repeat`, such as [D5, D6]."""
+    """Empty cups into which mixtures are poured again, such as [D5, D6]; for `on_miss: repeat` or `ask`."""
 
 
 class MixturesSettings(DoseSeriesSettings):
@@ -426,9 +427,10 @@ class MixturesSettings(DoseSeriesSettings):
     total: DoseAmount | None = None
     """Mass of each mixture, if amounts are percentages of it."""
 
-    on_miss: Literal["accept", "repeat"] = "accept"
+    on_miss: MissPolicy = "accept"
     """What follows a dose beyond its tolerance. accept: the amounts that the cup still lacks are corrected so that the
-    ratios hold, if there is room; repeat: the mixture is poured again, into a spare cup."""
+    ratios hold, if there is room; repeat: the mixture is poured again, into a spare cup, or without spares up to twice
+    into the same one, which is emptied at the waste place or by the operator; ask: the operator decides."""
 
     order: list[Text] | None = None
     """Order of the liquids in every cup; the smallest amount first unless given."""
@@ -457,10 +459,8 @@ class MixturesSettings(DoseSeriesSettings):
         if self.order is not None and problems.valid("order", "liquids") and len(self.order) < len(names):
             missing = ", ".join(name for name in names if name not in self.order)
             problems.add(f"lacks {missing}; name every liquid, or remove it", "order")
-        if self.on_miss == "repeat" and not self.cups.spares and problems.valid("cups"):
-            problems.add("needs spare cups; add for example 'spares: [D5, D6]' to 'cups'", "on_miss")
-        if self.on_miss != "repeat" and self.cups.spares:
-            problems.add("belongs to 'on_miss: repeat'", "cups", "spares", key=True)
+        if self.on_miss == "accept" and self.cups.spares:
+            problems.add("belongs to 'on_miss: repeat' or 'on_miss: ask'", "cups", "spares", key=True)
 
 
 class SimulatorSettings(Settings):

@@ -79,7 +79,7 @@ class TerminalOperator:
     def _remind(self, question: OperatorQuestion, left: float) -> None:
         """Ring the bell and repeat the question; `left` is the time until the question is given up [s]."""
         self._reminded = asyncio.get_running_loop().time()
-        self._write(f"\a\nstill waiting, {_time(left)} left: {question.text}\n{_EXPECTED[question.wants]}\n> ")
+        self._write(f"\a\nstill waiting, {_time(left)} left: {question.text}\n{_answers(question)}\n> ")
 
     async def _count_down(self, seconds: float) -> None:
         end = asyncio.get_running_loop().time() + seconds
@@ -137,16 +137,14 @@ class TerminalOperator:
             digits = max(0, round(-math.log10(1e3 * weight.step)))
             self._write(f"  {1e3 * weight.mass:.{digits}f} g\n")
             return line.strip()
-        answer = _WORDS[question.wants].get(words)
+        answer = {option: option for option in question.options}.get(words) or _WORDS.get(question.wants, {}).get(words)
         if answer is None:
             unknown = f"'{line.strip()}' is not an answer; " if words else ""
-            self._write(f"{unknown}{_EXPECTED[question.wants]}\n> ")
+            self._write(f"{unknown}{_answers(question)}\n> ")
         return answer
 
     def _expected(self, question: OperatorQuestion) -> str:
-        return (
-            f"{_EXPECTED[question.wants]}; nothing moves before that" if question.hands else _EXPECTED[question.wants]
-        )
+        return f"{_answers(question)}; nothing moves before that" if question.hands else _answers(question)
 
     def _write(self, text: str) -> None:
         out = self._out or sys.stderr
@@ -221,6 +219,13 @@ def _is_terminal(descriptor: int) -> bool:
         return os.isatty(descriptor)
     except OSError:
         return False
+
+
+def _answers(question: OperatorQuestion) -> str:
+    """The possible answers of a question."""
+    if question.options:
+        return f"type {', '.join(map(repr, question.options))}, or '{GIVE_UP}'"
+    return _EXPECTED[question.wants]
 
 
 def _worded(question: OperatorQuestion) -> str:

@@ -487,8 +487,9 @@ class PlannedDose:
     liquid: str | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
-MissPolicy = Literal["accept", "repeat"]
-"""What follows a dose beyond its tolerance: the next components are corrected, or the mixture is poured again."""
+MissPolicy = Literal["accept", "repeat", "ask"]
+"""What follows a dose beyond its tolerance: the next components are corrected, the mixture is poured again, or the
+operator decides."""
 
 
 @dataclass(frozen=True)

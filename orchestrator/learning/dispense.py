@@ -158,7 +158,7 @@ CupState = Literal["waiting", "filling", "full", "rejected", "refused", "unknown
 
 
 class MixedCup(ResultPart):
-    """A cup of mixtures. What it contains follows from the doses with its position."""
+    """A cup of mixtures. What it contains follows from its doses."""
 
     position: str
     """Name of its position."""
@@ -172,6 +172,13 @@ class MixedCup(ResultPart):
 
     replaces: str = ""
     """Position of the rejected cup whose mixture it has."""
+
+    first_dose: int = 1
+    """Number of the first dose that it may contain: it was emptied after the earlier ones."""
+
+    def contains(self, dose: Dose) -> bool:
+        """Whether a dose was poured into it since it was empty."""
+        return dose.position == self.position and dose.number >= self.first_dose
 
 
 class MixedComponent(ResultPart):
@@ -230,7 +237,7 @@ class Dispensed(StageResult):
         return [component for cup in self.cups for component in self._of_cup(cup)]
 
     def _of_cup(self, cup: MixedCup) -> list[MixedComponent]:
-        doses = {dose.liquid: dose for dose in self.doses if dose.position == cup.position}
+        doses = {dose.liquid: dose for dose in self.doses if cup.contains(dose)}
         order = {liquid: dose.number for liquid, dose in doses.items()}
         masses = {liquid: dose.received_g for liquid, dose in doses.items()}
         known = cup.state == "full" and all(mass is not None for mass in masses.values())

@@ -2,22 +2,30 @@
 
 `Mix` is the strategy of `mixtures:`; its doses are those of `Dispense`. `pouring_order` has the rule of the order.
 
-A dose misses if it differs from its amount by more than its tolerance. With `on_miss: accept`, the amounts that the cup
-still lacks are multiplied by received / wanted of its doses so far, so that their ratio holds: as long as the cup and a
-full source have room for it. With `on_miss: repeat`, the cup is rejected, and its mixture is poured into the next spare
-cup. A cup with a dose of unknown amount gets no further liquid.
+A dose misses if it differs from its amount by more than its tolerance. Then `on_miss` decides:
+
+- accept: the amounts that the cup still lacks are multiplied by received / wanted of its doses so far, so that their
+  ratio holds, as long as the cup and a full source have room for it.
+- repeat: the mixture is poured again, into the next spare cup; without spare cups, into the same one, emptied before.
+- ask: the operator chooses one of these, or that the amounts stay as they are.
+
+A cup with a dose of unknown amount gets no further liquid.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from actors.interfaces import DoseKnowledge, DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.dispense import Dispense, Dispensed, Dose, KnownSource, MixedCup
-from orchestrator.learning.requests import Decision, Failed, Outcome, Poured
+from orchestrator.learning.requests import Answered, Ask, Decision, Failed, Outcome, Poured, Request, Slots
 from sim_engine.vessel.vessel import build_vessel
+
+REPEATS = 2
+"""How often the mixture of a cup is poured again into itself."""
 
 STEP = 1e-5
 """Corrected amounts are multiples of it [kg]."""
@@ -60,6 +68,9 @@ class Mix(Dispense):
         self._cups = [_cup(position, doses) for position, doses in plan.mixtures.cups.items()]
         self._planned = {position: dict(doses) for position, doses in plan.mixtures.cups.items()}
         self._remaining = {position: list(doses.values()) for position, doses in plan.mixtures.cups.items()}
+        self._emptied = Counter[str]()
+        self._miss: tuple[int, Dose, Ask] | None = None
+        self._asked = False
 
     def _next(self) -> PlannedDose | None:
         return next((self._remaining[cup.position][0] for cup in self._cups if self._open(cup)), None)
@@ -70,14 +81,43 @@ class Mix(Dispense):
     def _in_cup(self, target: DoseTarget) -> DoseTarget:
         cup, source = target.position, target.source
         assert source is not None
-        poured = [1e-3 * (dose.received_g or 0.0) for dose in self._doses if dose.position == cup]
+        poured = [
+            1e-3 * (d.received_g or 0.0) for mixed in self._cups for d in self._poured(mixed) if d.position == cup
+        ]
         return replace(
             target,
             source=replace(source, vessel=source.name),
             cup=cup,
             stays=len(self._remaining[cup]) > 1,
+            emptied=self._emptied[cup] > 0 and not poured,
             held=sum(poured) if poured else None,
         )
+
+    @property
+    def finished(self) -> bool:
+        """Whether all doses are completed, and no question is open."""
+        return self._miss is None and super().finished
+
+    def ask(self, slots: Slots) -> list[Request]:
+        """Return the next dose, if none is running and the operator has nothing to decide."""
+        if self._miss is None:
+            return super().ask(slots)
+        pending, self._asked = self._asked, True
+        return [] if pending else [self._miss[2]]
+
+    def tell(self, request: Request, outcome: Outcome) -> None:
+        """Record the outcome of a dose, or the operator's answer.
+
+        Raises:
+            ValueError: the request was not made, or has another kind of outcome.
+        """
+        if not isinstance(request, Ask):
+            super().tell(request, outcome)
+            return
+        if self._miss is None or request != self._miss[2] or not isinstance(outcome, Answered):
+            raise ValueError(f"this was not asked, or not answered: {request.question}")
+        (index, dose, _), self._miss, self._asked = self._miss, None, False
+        self._decide(index, dose, outcome.answer)
 
     @property
     def _count(self) -> int:
@@ -87,18 +127,11 @@ class Mix(Dispense):
         index = next(i for i, cup in enumerate(self._cups) if cup.position == dose.position)
         cup, remaining = self._cups[index], self._remaining[dose.position]
         planned = remaining.pop(0)
-        state = cup.state
+        state, missed = cup.state, False
         match outcome:
             case Poured() if dose.received_g is not None:
                 state = "filling" if remaining else "full"
                 missed = abs(1e-3 * dose.received_g - planned.amount) > planned.limit
-                if missed and self._mixtures.on_miss == "accept":
-                    self._correct(cup)
-                elif missed and self._spares:
-                    state = "rejected"
-                    self._pour_again(index, dose)
-                elif missed:
-                    self._say(f"{_missed(dose)}; no spare cup is left, the mixture stays as it is", urgent=True)
             case Failed(kind="invalid_action"):
                 state = "refused"
                 self._say(f"{cup.position}: a dose is impossible, the cup stays as it is: {dose.end}", urgent=True)
@@ -106,28 +139,57 @@ class Mix(Dispense):
                 state = "unknown"
                 self._say(f"{cup.position}: its content is UNKNOWN, nothing more is poured into it", urgent=True)
         self._cups[index] = cup.model_copy(update={"state": state})
+        if missed:
+            policy = self._mixtures.on_miss
+            self._decide(index, dose, "correct" if policy == "accept" else policy)
 
-    def _correct(self, cup: MixedCup) -> None:
-        """Multiply the amounts that a cup still lacks so that their ratio to its content holds, if there is room."""
-        poured = [dose for dose in self._doses if dose.position == cup.position]
-        remaining = self._remaining[cup.position]
-        received = sum(dose.received_g or 0.0 for dose in poured)
-        factor = received / sum(cup.wanted_g[dose.liquid] for dose in poured)
+    def _poured(self, cup: MixedCup) -> list[Dose]:
+        return [dose for dose in self._doses if cup.contains(dose)]
+
+    def _decide(self, index: int, dose: Dose, answer: str) -> None:
+        """Follow from a missed dose what the campaign or the operator has decided."""
+        cup, text = self._cups[index], _missed(dose)
+        corrected, correction = self._correction(cup)
+        repetition = self._repetition(cup)
+        if answer == "ask":
+            options = ["accept", *(["correct"] if corrected else []), *(["repeat"] if repetition else [])]
+            question = (
+                f"{text[0].upper()}{text[1:]}; {self._limit(dose):.3g} g are tolerated. accept: it stays as it is. "
+                f"{'correct: ' if corrected else 'No correction is possible: '}{correction}."
+                + (f" repeat: {repetition}." if repetition else "")
+            )
+            self._miss = index, dose, Ask(question, tuple(options))
+        elif answer == "repeat" and repetition:
+            self._say(f"{text}; {repetition}", urgent=True)
+            self._pour_again(index)
+        elif answer == "repeat":
+            reason = "no spare cup is left" if self._mixtures.spares else f"it was poured again {REPEATS} times"
+            self._say(f"{text}; {reason}, the mixture stays as it is", urgent=True)
+        elif answer == "correct":
+            self._remaining[cup.position] = corrected or self._remaining[cup.position]
+            self._say(f"{text}; {correction}")
+        else:
+            self._say(f"{text}; it is accepted")
+
+    def _limit(self, dose: Dose) -> float:
+        """Tolerance of a dose [g]."""
+        return 1e3 * self._planned[dose.position][dose.liquid].limit
+
+    def _correction(self, cup: MixedCup) -> tuple[list[PlannedDose], str]:
+        """The amounts that a cup still lacks, multiplied so that their ratio to its content holds, and their text; none
+        and the reason if they can't be poured."""
+        poured, remaining = self._poured(cup), self._remaining[cup.position]
         if not remaining:
-            self._say(f"{_missed(poured[-1])}; it was the last of its cup, and is accepted")
-            return
+            return [], "it was the last dose of its cup"
+        factor = sum(dose.received_g or 0.0 for dose in poured) / sum(cup.wanted_g[dose.liquid] for dose in poured)
         table = self._planned[cup.position]
         corrected = [
             replace(dose, amount=round(factor * table[dose.liquid or ""].amount / STEP) * STEP) for dose in remaining
         ]
         if (reason := self._no_room(poured, corrected)) is not None:
-            self._say(f"{_missed(poured[-1])}; the other amounts of {cup.position} stay as they are: {reason}")
-            return
-        self._remaining[cup.position] = corrected
+            return [], f"the other amounts of {cup.position} stay as they are: {reason}"
         amounts = ", ".join(f"{dose.liquid} {1e3 * dose.amount:g} g" for dose in corrected)
-        self._say(
-            f"{_missed(poured[-1])}; the other amounts of {cup.position} are multiplied by {factor:.3f}: {amounts}"
-        )
+        return corrected, f"the other amounts of {cup.position} are multiplied by {factor:.3f}: {amounts}"
 
     def _no_room(self, poured: Sequence[Dose], corrected: Sequence[PlannedDose]) -> str | None:
         """Why corrected amounts can't be poured; None if they can."""
@@ -143,13 +205,27 @@ class Mix(Dispense):
             volume += (dose.amount + dose.limit) / densities[liquid]
         return None if volume <= build_vessel(self._plan.scenes[0].receiver).capacity else "the cup has no room"
 
-    def _pour_again(self, index: int, dose: Dose) -> None:
-        """Pour the mixture of a rejected cup into the next spare one."""
-        rejected, spare = self._cups[index], self._spares.pop(0)
-        doses = {liquid: replace(d, position=spare) for liquid, d in self._planned[rejected.position].items()}
+    def _repetition(self, cup: MixedCup) -> str:
+        """How the mixture of a cup would be poured again; '' if it can't be."""
+        if self._spares:
+            return f"{cup.position} is rejected, its mixture is poured into {self._spares[0]}"
+        if self._mixtures.spares or self._emptied[cup.position] >= REPEATS:
+            return ""
+        return f"{cup.position} is emptied, and its mixture is poured again"
+
+    def _pour_again(self, index: int) -> None:
+        """Pour the mixture of a cup again: into the next spare one, or into itself."""
+        cup = self._cups[index]
+        if not self._spares:
+            self._emptied[cup.position] += 1
+            self._remaining[cup.position] = list(self._planned[cup.position].values())
+            self._cups[index] = cup.model_copy(update={"state": "filling", "first_dose": len(self._doses) + 1})
+            return
+        spare = self._spares.pop(0)
+        doses = {liquid: replace(d, position=spare) for liquid, d in self._planned[cup.position].items()}
         self._planned[spare], self._remaining[spare] = doses, list(doses.values())
-        self._cups.insert(index + 1, _cup(spare, doses, replaces=rejected.position))
-        self._say(f"{_missed(dose)}; {rejected.position} is rejected, its mixture is poured into {spare}", urgent=True)
+        self._cups[index] = cup.model_copy(update={"state": "rejected"})
+        self._cups.insert(index + 1, _cup(spare, doses, replaces=cup.position))
 
     def _say(self, text: str, *, urgent: bool = False) -> None:
         self.decisions.append(Decision(text, urgent=urgent))

@@ -1,6 +1,7 @@
 """Requests of strategies and their outcomes: immutable values without handles and without a clock.
 
-A strategy returns `Simulate`, `Pour` or `Suggest` and receives `Simulated`, `Poured`, `Suggested` or `Failed`.
+A strategy returns `Simulate`, `Pour`, `Suggest` or `Ask` and receives `Simulated`, `Poured`, `Suggested`, `Answered` or
+`Failed`.
 """
 
 from __future__ import annotations
@@ -116,7 +117,20 @@ class Suggest:
     purpose: str = "suggest"
 
 
-Request = Simulate | Pour | Suggest
+@dataclass(frozen=True)
+class Ask:
+    """Ask the operator at the bench for a decision. The answer is recorded; without one, a resumed run asks again.
+
+    Attributes:
+        question: includes the facts that the answer depends on.
+        options: the possible answers.
+    """
+
+    question: str
+    options: tuple[str, ...]
+
+
+Request = Simulate | Pour | Suggest | Ask
 
 
 @dataclass(frozen=True)
@@ -141,6 +155,13 @@ class Suggested:
 
 
 @dataclass(frozen=True)
+class Answered:
+    """Outcome of an `Ask`: one of its options."""
+
+    answer: str
+
+
+@dataclass(frozen=True)
 class Failed:
     """A failed request.
 
@@ -156,7 +177,7 @@ class Failed:
     reason: str
 
 
-Outcome = Simulated | Poured | Suggested | Failed
+Outcome = Simulated | Poured | Suggested | Answered | Failed
 
 
 @dataclass(frozen=True)

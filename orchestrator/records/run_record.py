@@ -18,7 +18,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 from actors.interfaces import PourProgress
-from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Request, Simulate, Simulated, Suggested
+from orchestrator.learning.requests import (
+    Answered,
+    Ask,
+    Failed,
+    Outcome,
+    Pour,
+    Poured,
+    Request,
+    Simulate,
+    Simulated,
+    Suggested,
+)
 from orchestrator.learning.stage_result import displayed_action, weighed_masses
 from orchestrator.learning.strategy import Progress
 from orchestrator.records.codec import Results
@@ -393,14 +404,14 @@ class RunState:
                 stage.pours += 1
                 self.checkpoint = ""
                 self._pour(event).finish(event)
+            case RequestFinished(request=Ask(text), outcome=Answered(answer)):
+                self._question(event, text).answer = answer
             case RequestFinished():
                 self._finished(stage, event)
             case PourCorrected():
                 self._pours[event.id].correct(event)
-            case OperatorAsked():
-                if event.id not in self._questions:
-                    self._questions[event.id] = RecordedQuestion(event.time, event.stage, event.question)
-                    self.questions.append(self._questions[event.id])
+            case Requested(request=Ask(text)) | OperatorAsked(question=text):
+                self._question(event, text)
             case OperatorAnswered():
                 for known in (self._questions.get(event.id), self._pours.get(event.id)):
                     if known is not None:
@@ -432,6 +443,12 @@ class RunState:
             self._pours[event.id] = RunPour(event.stage, event.id, event.request)
             self.pours.append(self._pours[event.id])
         return self._pours[event.id]
+
+    def _question(self, event: Requested | RequestFinished | OperatorAsked, text: str) -> RecordedQuestion:
+        if event.id not in self._questions:
+            self._questions[event.id] = RecordedQuestion(event.time, event.stage, text)
+            self.questions.append(self._questions[event.id])
+        return self._questions[event.id]
 
     def _finished(self, stage: RecordedStage, event: RequestFinished) -> None:
         match event.outcome:

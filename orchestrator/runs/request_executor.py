@@ -19,18 +19,31 @@ from dataclasses import dataclass
 from functools import partial
 
 from actors.interfaces import (
+    Answering,
     Bench,
     BenchLostError,
     InvalidActionError,
     Laboratory,
     LaboratoryError,
     NotPouredError,
+    OperatorQuestion,
     ProgressCallback,
     SimulationError,
     SimulatorPool,
     UnknownPourError,
 )
-from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Simulate, Simulated, Suggest, Suggested
+from orchestrator.learning.requests import (
+    Answered,
+    Ask,
+    Failed,
+    Outcome,
+    Pour,
+    Poured,
+    Simulate,
+    Simulated,
+    Suggest,
+    Suggested,
+)
 from orchestrator.learning.run_errors import RunError
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
@@ -363,6 +376,22 @@ class RequestExecutor:
                     "; see to the bench. Resuming asks for its outcome",
                 ) from None
         return Poured(measurement)
+
+    async def ask(self, request: Ask) -> Outcome:
+        """Ask the operator at the bench.
+
+        Raises:
+            RequestExecutorError: the bench has no operator.
+            PourNotMadeError: there is no answer.
+        """
+        if not isinstance(bench := self.bench, Answering):
+            raise RequestExecutorError(f"this bench has no operator to ask: {request.question}")
+        question = OperatorQuestion(request.question, "option", about="decision", hands=False, options=request.options)
+        try:
+            return Answered(await bench.ask(question))
+        except LaboratoryError as error:
+            _raise_if_cancelled()
+            raise PourNotMadeError(str(error), "; resuming the run asks again") from error
 
     async def suggest(
         self,

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 
-from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.learning.requests import Ask, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import Strategy
 from orchestrator.records.codec import Results
@@ -113,7 +113,7 @@ class RequestForecast:
         while not strategy.finished:
             simulations = sum(isinstance(request, Simulate) for request in pending)
             requests = strategy.ask(Slots(max(self.capacity - simulations, 0), 1))
-            if any(isinstance(request, Pour) for request in requests):
+            if any(isinstance(request, Pour | Ask) for request in requests):
                 return
             pending += requests
             for request in requests:

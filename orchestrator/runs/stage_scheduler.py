@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from actors.interfaces import PourProgress
-from orchestrator.learning.requests import Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
+from orchestrator.learning.requests import Ask, Outcome, Pour, Poured, Request, Simulate, Slots, Suggest
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.learning.strategy import Strategy
@@ -43,7 +43,7 @@ from orchestrator.runs.request_executor import RequestExecutor
 from orchestrator.runs.resume import StageHistory, replay, weighed_by_hand
 from sim_engine.outcome import RecordedFrames
 
-_DELIVERY_ORDER: dict[type[Request], int] = {Suggest: 0, Simulate: 1, Pour: 2}
+_DELIVERY_ORDER: dict[type[Request], int] = {Suggest: 0, Simulate: 1, Pour: 2, Ask: 3}
 """Order of delivery of pending requests: fast kinds first, so that a free slot does not wait for `ask`."""
 
 
@@ -266,6 +266,8 @@ class StageScheduler:
                     self._journal.log("warning", text, stage=self._stage, kept=True)
 
                 outcome = await self._executor.suggest(request, started=started, retrying=retrying)
+            case Ask():
+                outcome = await self._executor.ask(request)
         self._finish(pending, outcome, time.monotonic() - begin, frames)
 
     def _finish(self, pending: PendingRequest, outcome: Outcome, seconds: float, frames: RecordedFrames | None) -> None:

@@ -24,6 +24,8 @@ import numpy as np
 
 from actors.optimizer.suggest import propose
 from orchestrator.learning.requests import (
+    Answered,
+    Ask,
     Failed,
     Outcome,
     Pour,
@@ -152,7 +154,7 @@ class StrategyHarness:
 
     def _next(self, waiting: list[Request]) -> Request:
         """Questions first; a pour takes longer than the simulations next to it."""
-        rank: dict[type, int] = {Suggest: 0, Simulate: 1, Pour: 2}
+        rank: dict[type, int] = {Suggest: 0, Simulate: 1, Pour: 2, Ask: 3}
         if self.beside is not None and any(isinstance(r, Pour) for r in waiting):
             self._since_pour += 1
             if self._since_pour > self.beside:
@@ -162,6 +164,8 @@ class StrategyHarness:
         return candidates[0 if self.order == "first" else -1]
 
     def _outcome(self, request: Request) -> Outcome:
+        if isinstance(request, Ask):
+            return Answered(request.options[0])
         if isinstance(request, Suggest):
             return Suggested(replace(propose(request.query), seconds=0.0))
         parameters = request.parameters if isinstance(request, Simulate) else THETA
@@ -290,7 +294,7 @@ def failures(share: float, seed: int) -> Callable[[Request], Outcome | None]:
     rng, lost = np.random.default_rng(seed), math.nan
 
     def fail(request: Request) -> Outcome | None:
-        if isinstance(request, Suggest) or rng.random() >= share:
+        if isinstance(request, Suggest | Ask) or rng.random() >= share:
             return None
         if isinstance(request, Pour):
             return (

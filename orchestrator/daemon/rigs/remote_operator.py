@@ -100,7 +100,7 @@ def understood(question: QuestionOut, answer: str) -> str:
         AnswerError: the answer is not valid for the question.
     """
     words = " ".join(answer.split())
-    if question.kind != "bench":
+    if question.options:
         meant = next((o for o in question.options if o.lower() == words.lower()), None)
         if meant is not None:
             return meant
@@ -110,6 +110,8 @@ def understood(question: QuestionOut, answer: str) -> str:
                 return words
             except ValueError as error:
                 raise AnswerError(str(error)) from None
+        if words.lower() == GIVE_UP and question.kind == "bench":
+            return GIVE_UP
         raise AnswerError(f"'{words}' is not an answer; answer with one of: {'; '.join(question.options)}")
     if words.lower() == GIVE_UP:
         return GIVE_UP
@@ -151,7 +153,7 @@ class RemoteOperator:
             text=question.text,
             problem=question.problem,
             wants=question.wants,
-            options=(),
+            options=list(question.options),
             details=dict(question.details),
             hands=question.hands,
         )

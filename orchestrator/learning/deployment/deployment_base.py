@@ -180,6 +180,7 @@ class Deployment(ABC, Generic[S]):
             self._pouring = None
             self._ledger.take(outcome)
         else:
+            assert isinstance(request, Pour)
             self._ledger.add(request, outcome)
 
     def correct(self, request: Request, outcome: Outcome) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from actors.arm_geometry import Pose
-from actors.bench.dose_handling import check_vessels, vessels_of
+from actors.bench.dose_handling import check_vessels, plan_waste, shapes_of, vessels_of
 from actors.grippers.gripper_interface import GRIPPERS
 from actors.interfaces import (
     DoseSource,
@@ -253,6 +253,24 @@ def test_a_cup_is_emptied_at_the_waste_place_and_what_leaves_it_is_accounted(
 
 @pytest.mark.slow
 @pytest.mark.realtime
+def test_a_cup_is_emptied_by_the_operator_where_there_is_no_waste_place(open_stage: OpenStage, tmp_path: Path) -> None:
+    async def play(stage: Stage, record: Watched) -> None:
+        await dosed(stage, 10, "water", "rack/A1", stays=True)
+        assert stage.heard == ["vessels_laid_out", "unattended"]
+        await dosed(stage, 20, "water", "rack/A1", held=0.29, fill=False, emptied=True)
+
+    stage, record = played(open_stage, tmp_path, play)
+    exchanged = next(question for question in stage.operator.heard if question.about == "cup_exchanged")
+    assert exchanged.text == "Take 'rack/A1' from 'pan', and put it back there empty and dry, or another one."
+    assert "unattended: the consent has ended" in stage.said("warning")  # nobody was there to empty it
+    held = record.held("rack/A1")
+    assert held is not None
+    assert held[0] == pytest.approx(stage.contents.liquids["rack/A1"], abs=3e-4)
+    assert held[0] == pytest.approx(0.02, abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_a_source_is_filled_by_the_pump_and_a_dose_that_is_weighed_stays_known_whatever_follows(
     open_stage: OpenStage, tmp_path: Path
 ) -> None:
@@ -297,6 +315,15 @@ def test_a_cup_is_emptied_only_where_there_is_waste_and_the_arm_reaches_over_it(
     beside = WASTE.with_values(pose=Pose.of(0.66, -0.62, 0.08, TURN, TURN, TURN))
     with pytest.raises(InvalidActionError, match="places 'source/ethanol' and 'waste' overlap"):
         check_vessels(all_places((*lab.places, beside)), lab.vessels, lab.arm, GRIPPER)
+    high = WASTE.with_values(container=ContainerSettings(diameter=0.06, height=0.5))
+    for waste, problem in ((WASTE, ""), (high, "'rack/A1' cannot be emptied at 'waste': ")):
+        places, loads, _ = check_vessels(all_places((*lab.places, waste)), lab.vessels, lab.arm, GRIPPER)
+        shapes = shapes_of(all_places((*lab.places, waste)), loads)
+        if problem:
+            with pytest.raises(InvalidActionError, match=problem):
+                plan_waste(places, lab.arm, scene(), lab.vessels[2], shapes)
+        else:
+            assert plan_waste(places, lab.arm, scene(), lab.vessels[2], shapes) is not None
 
 
 GRIPPER = GRIPPERS.get("robotiq")(model="2F-140")

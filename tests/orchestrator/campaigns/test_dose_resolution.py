@@ -140,10 +140,10 @@ REFUSED = {
     "above the brim": ("40 g", "100 g", "11:5: mixtures.wanted.A1: with its tolerances the mixture has 121.3 mL, and"),
     "nothing": ("{water: 40 g, ethanol: 15 g}", "{water: 0 g}", "A1: has nothing to pour; name an amount, or remove"),
     "percentage of nothing": ("15 g", "25 %", "A1.ethanol: 25 % needs the mass of the mixture; add for example 'total"),
-    "no spare cups": (
+    "spare cups that nothing needs": (
         "  wanted:",
-        "  on_miss: repeat\n  wanted:",
-        "on_miss: needs spare cups; add for example 'spares",
+        "  cups: {spares: [D6]}\n  wanted:",
+        "cups.spares: belongs to 'on_miss: repeat' or 'on_miss: ask'",
     ),
     "a spare that is filled": (
         "  wanted:",

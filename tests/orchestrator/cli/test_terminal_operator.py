@@ -125,6 +125,18 @@ def test_yes_and_no_are_told_apart_from_anything_else(keyboard: Keyboard) -> Non
     played(scene)
 
 
+def test_a_decision_is_one_of_the_named_options(keyboard: Keyboard) -> None:
+    async def scene() -> None:
+        question = OperatorQuestion("It missed.", "option", hands=False, options=("accept", "repeat"))
+        asking = asyncio.create_task(keyboard.operator().ask(question))
+        await keyboard.shows("type 'accept', 'repeat', or 'give up'\n> ")
+        keyboard.type("yes\nRepeat\n")
+        assert await asking == "repeat"
+        assert "'yes' is not an answer; type 'accept', 'repeat', or 'give up'" in keyboard.screen.getvalue()
+
+    played(scene)
+
+
 def test_giving_up_ends_the_pour_with_the_question_that_it_was_given_up_at(keyboard: Keyboard) -> None:
     async def scene() -> None:
         asking = asyncio.create_task(keyboard.operator().ask(DONE))

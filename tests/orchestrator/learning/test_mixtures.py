@@ -9,7 +9,7 @@ import pytest
 from actors.interfaces import DoseTarget
 from orchestrator.learning.dispense import Dispensed, MixedComponent
 from orchestrator.learning.mixtures import Mix, pouring_order
-from orchestrator.learning.requests import Failed, Outcome
+from orchestrator.learning.requests import Answered, Ask, Failed, Outcome, Slots
 from orchestrator.records.codec import decode_request, decode_result, encode_request, encode_result
 from tests.support.mixtures import asked, plan, poured, scene
 
@@ -142,3 +142,79 @@ def test_a_sources_rest_decides_which_of_several_is_used() -> None:
     second = replace(second, pourer=second.pourer.model_copy(update={"name": "source/water-2"}), name="second")
     strategy = Mix(replace(two, scenes=(*two.scenes, second)), 5)
     assert [name for _, name, _ in steps(run(strategy))] == ["source/water", "source/water-2"]
+
+
+def test_a_missed_mixture_without_spare_cups_is_poured_again_into_the_emptied_cup() -> None:
+    strategy = Mix(plan(*TWO, on_miss="repeat"), 5)
+    doses = run(strategy, {2: -3.0})
+    assert steps(doses) == [
+        ("rack/A1", "source/oil", 10.0), ("rack/A1", "source/water", 40.0),
+        ("rack/A1", "source/oil", 10.0), ("rack/A1", "source/water", 40.0),
+        ("rack/A2", "source/water", 20.0), ("rack/A2", "source/oil", 30.0),
+    ]  # fmt: skip
+    assert [dose.emptied for dose in doses] == [False, False, True, False, False, False]
+    assert [dose.held for dose in doses][:4] == [None, pytest.approx(0.01), None, pytest.approx(0.01)]
+    result = strategy.result()
+    assert states(result) == {"rack/A1": "full", "rack/A2": "full"}
+    assert [c.dose for c in result.components() if c.cup == "rack/A1"] == [3, 4]  # what it contains now
+    assert "rack/A1 is emptied, and its mixture is poured again" in strategy.decisions[2].text
+
+
+def test_a_mixture_that_keeps_missing_is_poured_three_times_at_most() -> None:
+    strategy = Mix(plan({"water": 40.0}, on_miss="repeat"), 5)
+    assert len(run(strategy, dict.fromkeys(range(1, 9), 3.0))) == 3
+    assert strategy.decisions[-1].text.endswith("it was poured again 2 times, the mixture stays as it is")
+    assert states(strategy.result()) == {"rack/A1": "full"}
+
+
+def question(strategy: Mix) -> Ask:
+    (request,) = strategy.ask(Slots(0))
+    assert isinstance(request, Ask)
+    assert strategy.ask(Slots(0)) == []  # nothing is poured while it is open
+    assert not strategy.finished
+    return request
+
+
+def first_dose(strategy: Mix, error: float) -> Ask:
+    pour, dose = asked(strategy)
+    strategy.tell(pour, poured(pour, 1e3 * dose.amount + error))
+    return question(strategy)
+
+
+@pytest.mark.parametrize(
+    ("answer", "rest"),
+    [
+        ("accept", [("rack/A1", "source/water", 40.0)]),
+        ("correct", [("rack/A1", "source/water", 48.0)]),
+        ("repeat", [("rack/A1", "source/oil", 10.0), ("rack/A1", "source/water", 40.0)]),
+    ],
+)
+def test_the_operator_decides_about_a_missed_dose(answer: str, rest: list[tuple[str, str, float]]) -> None:
+    strategy = Mix(plan(*TWO, on_miss="ask"), 5)
+    request = first_dose(strategy, 2.0)
+    assert request.options == ("accept", "correct", "repeat")
+    assert "10 g of oil into rack/A1, missed its tolerance: 12.0 g; 1 g are tolerated." in request.question
+    assert "correct: the other amounts of rack/A1 are multiplied by 1.200: water 48 g." in request.question
+    assert "repeat: rack/A1 is emptied, and its mixture is poured again." in request.question
+    strategy.tell(request, Answered(answer))
+    assert steps(run(strategy))[: len(rest)] == rest
+
+
+def test_the_operator_is_not_offered_what_is_impossible() -> None:
+    full = Mix(plan({"water": 85.0, "oil": 20.0}, on_miss="ask"), 5)
+    request = first_dose(full, 2.0)
+    assert request.options == ("accept", "repeat")
+    assert (
+        "No correction is possible: the other amounts of rack/A1 stay as they are: the cup has no room."
+        in request.question
+    )
+    last = first_dose(Mix(plan({"water": 40.0}, on_miss="ask", spares=("rack/D6",)), 5), 2.0)
+    assert last.options == ("accept", "repeat")
+    assert "rack/A1 is rejected, its mixture is poured into rack/D6" in last.question
+
+
+def test_an_answer_to_another_question_is_refused() -> None:
+    strategy = Mix(plan(*TWO, on_miss="ask"), 5)
+    request = first_dose(strategy, 2.0)
+    with pytest.raises(ValueError, match="was not asked"):
+        strategy.tell(replace(request, question="another"), Answered("accept"))

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 
+from actors.interfaces import LaboratoryError, OperatorQuestion
 from actors.laboratory_settings import LaboratorySettings
 from orchestrator.learning.requests import Pour
 from orchestrator.learning.run_errors import RunError
@@ -25,13 +26,16 @@ from orchestrator.records.events import Event, RequestFinished, StageClosed
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.records.journal_file import JournalError
 from orchestrator.records.run_clock import run_time
-from orchestrator.records.run_record import read_record
+from orchestrator.records.run_record import CampaignResult, read_record
 from orchestrator.reports.progress_state import ProgressState
+from orchestrator.runs.run_engine import run_campaign
 from orchestrator.runs.stages import StageDefinition
-from tests.support import toy_campaign
+from sim_engine.outcome import PourMeasurement
+from sim_engine.scene import Scene
+from tests.support import mixtures, toy_campaign
 from tests.support.hypothesis_examples import THOROUGH
 from tests.support.killed_runs import SMALL, finished_times, killed_at, killed_when_last, run
-from tests.support.toy_campaign import ToyLaboratory, ToyStrategy, logical_record, toy_plan, toy_stages
+from tests.support.toy_campaign import ToyBench, ToyLaboratory, ToyStrategy, logical_record, toy_plan, toy_stages
 from tests.support.waiting import PATIENCE
 
 
@@ -237,3 +241,49 @@ def test_a_new_run_never_writes_over_an_old_one(tmp_path: Path) -> None:
     with pytest.raises(JournalError, match="holds a run already"):
         run(tmp_path / "run")
     assert logical_record(tmp_path / "run") == before
+
+
+class MissingBench(ToyBench):
+    """Its first dose gets 2 g too much. The operator leaves questions unanswered, or answers them all alike."""
+
+    def __init__(self, answer: str = "") -> None:
+        super().__init__()
+        self.answer, self.asked, self.amounts = answer, [], []
+
+    async def pour(self, scene: Scene, action: Any, *, dose: Any = None, **about: Any) -> PourMeasurement:
+        self.amounts.append(round(1e3 * dose.amount, 3))
+        received = dose.amount + (2e-3 if dose.held is None else 0.0)
+        held = dose.source.mass
+        about = {"received": received, "left": [held - received, 1e-3], "deviation": 1e-4}
+        return PourMeasurement(held, 0.0, held - received, {"dose": about})
+
+    async def ask(self, question: OperatorQuestion) -> str:
+        self.asked.append(question)
+        if not self.answer:
+            raise LaboratoryError("no answer within 1800 s")
+        return self.answer
+
+
+def test_a_question_about_a_missed_dose_waits_for_its_answer_which_counts_after_a_restart(tmp_path: Path) -> None:
+    plan = toy_plan(tmp_path, deployment=None, dispense=mixtures.plan({"water": 40.0, "oil": 10.0}, on_miss="ask"))
+
+    def run_with(bench: MissingBench, **about: Any) -> CampaignResult:
+        progress = ProgressState(plan)
+        result = asyncio.run(run_campaign(plan, ToyLaboratory(bench=bench), tmp_path, subscribers=[progress], **about))
+        assert [question.answer for question in progress.run.questions] == [bench.answer] * len(bench.asked)
+        return result
+
+    silent = MissingBench()
+    with pytest.raises(RunError, match="no answer within 1800 s; resuming the run asks again"):
+        run_with(silent)
+    assert silent.amounts == [10.0]
+    assert [q.answer for q in read_record(tmp_path).questions] == [None]
+    present = MissingBench("correct")
+    result = run_with(present, resume=True)
+    assert present.amounts == [48.0]  # the first dose is not poured again
+    assert present.asked[0].text == silent.asked[0].text
+    assert present.asked[0].options == ("accept", "correct", "repeat")
+    record = read_record(tmp_path)
+    assert [(q.text, q.answer) for q in record.questions] == [(silent.asked[0].text, "correct")]
+    again = run_with(MissingBench(), resume=True)  # the recorded answer counts
+    assert again.results == result.results

@@ -88,6 +88,23 @@ def test_a_weight_is_typed_with_its_unit(with_person: Path) -> None:
     run(work())
 
 
+def test_a_decision_is_answered_with_one_of_its_options(with_person: Path) -> None:
+    missed = OperatorQuestion("It missed.", "option", about="decision", hands=False, options=("accept", "repeat"))
+
+    async def work() -> None:
+        async with serving(with_person, asking(missed)) as served:
+            await served.submit()
+            question = await served.question()
+            assert (question["wants"], question["options"]) == ("option", ["accept", "repeat"])
+            where = f"/questions/{question['id']}/answer"
+            wrong = await served.post(where, {"answer": "yes"}, status=422)
+            assert wrong["detail"] == "'yes' is not an answer; answer with one of: accept; repeat"
+            assert (await served.post(where, {"answer": "Repeat"}))["answer"] == "repeat"
+            served.laboratories[0].bench.question = None
+
+    run(work())
+
+
 def test_a_question_that_nobody_needs_any_more_is_closed(with_person: Path) -> None:
     async def work() -> None:
         async with serving(with_person, asking(REFILL)) as served:
