@@ -13,9 +13,9 @@ Three benches with a calibration each, for every seed:
 
 - `first`: the deployment, `--pours` pours of it; it never stops before;
 - `before`: the same without the calibration's pours as evidence, which is the program before them;
-- `moved`, `other liquid`, `wrong wall`, and each with `, before`: five pours on the twin whose receiver has moved away
-  by 20 mm since the calibration, whose liquid is 2.4 times as cohesive and 5 times as viscous, or whose receiver is
-  4 mm narrower than its file says;
+- `moved`, `arm moved`, `other liquid`, `wrong wall`, and each with `, before`: five pours on the twin whose receiver
+  has moved away by 20 mm since the calibration, whose arm has moved by 20 mm, half forwards and half to the side, whose
+  liquid is 2.4 times as cohesive and 5 times as viscous, or whose receiver is 4 mm narrower than its file says;
 - `risk`: first pours of the calibrations of twin and 14 mm into three further receivers.
 
 Every simulated pour of a calibration is stored under `--into`, like all finished runs: an interrupted comparison
@@ -65,13 +65,15 @@ from sim_engine.prediction_band import LEVEL
 from sim_engine.vessel.shapes import cylinder
 
 BENCHES = ("twin", "14 mm", "worlds")
-MISLED = ("moved", "other liquid", "wrong wall")
+MISLED = ("moved", "arm moved", "other liquid", "wrong wall")
 BEFORE = ", before"
 PROGRAMS = ("calibrate", "first", "before", "risk", *(f"{kind}{end}" for kind in MISLED for end in ("", BEFORE)))
 FURTHER = ("cone", "mug", "bowl")
 """Receivers of `risk`."""
-MOVED, NARROWER = "18 mm", 0.023
-"""Place of the moved receiver, which was at −2 mm, and the inner radius [m] of the receiver with a wrong wall."""
+MOVED = {"moved": {"x": "18 mm"}, "arm moved": {"x": "-16 mm", "y": "15 mm"}}
+"""Where the receiver then stands for the arm; before, at −2 mm and 1 mm."""
+NARROWER = 0.023
+"""Inner radius of the receiver with a wrong wall [m]."""
 LIMIT = 0.10
 LIMITED = {"loss": "10 %", "probability": "5 %"}
 
@@ -94,9 +96,8 @@ def content_of(seed: int, bench: str, program: str, pours: int, folder: Path) ->
         laboratory = ROOT / "configs" / "laboratories" / "twin.yaml"
         content = on_numbers(seed, laboratory, str(folder), bench)
     truth = content["laboratory"]["bench"]
-    if program.startswith("moved"):
-        truth["pose_error"]["x"] = MOVED
-    elif program.startswith("other liquid"):
+    truth["pose_error"] |= MOVED.get(program.removesuffix(BEFORE), {})
+    if program.startswith("other liquid"):
         truth["liquid"] |= {"cohesion": "0.12 N/m", "xsph_rate": "30 1/s"}
     deployment = {key: value for key, value in content["deployment"].items() if key not in ("stop", "good_enough")}
     content["deployment"] = deployment | {"pours": pours, "risk_limit": LIMITED}

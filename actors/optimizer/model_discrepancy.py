@@ -27,10 +27,11 @@ predictions are therefore moved by Markov chains that keep the posterior.
 
 **After a calibration.** Its weighed pours have simulations c_i and a surrogate f̂_c of these in their own scene.
 Hypothesis j predicts them as clip(e^{g_j} (c_i + f̂_c(z_j(x_i)) − f̂_c(x_i)), 0, 1) + δ, with its noise. Its weight is
-prior times (1 − ε) L_j / Σ_k w_k L_k, L_j the likelihood of these pours to the power that they have for another
-receiver. Small losses have small errors in these hypotheses: v_j² has the further term (ρ min(μ_j(x), 0.1))², and σ_j
-may be smaller. With the probability ε the calibration misleads, and only the prior is known: every second hypothesis is
-one without these changes, of a bench that was never compared with its simulator. So it is after a change of the bench.
+prior times (1 − ε) L_j / Σ_k w_k L_k + ε, L_j the likelihood of these pours to the power that they have for another
+receiver: with the probability ε the calibration misleads, and only the prior is known, as after a change of the bench.
+δ then is a shift of the stream (`sim_engine.prediction_band`), which changes small losses little: instead of σ_j, its
+standard deviation is σ_j φ(Φ⁻¹(μ_j(x))) / φ(0). In the scene of the observations it is the same δ: pours there are
+earlier observations.
 
 **A bench that changes.** Once an observation lies outside its 99 % prediction interval, the hypotheses are weighed
 together with the start of the present segment: the observations before it were made on another bench, and say nothing
@@ -82,11 +83,6 @@ WIDTH = 0.25
 """Standard deviation of h."""
 RESTS = (0.02, 0.3)
 """Smallest and largest σ, in units of the largest cost; log-uniform, like ℓ."""
-CALIBRATED_RESTS, RELATIVE_REST, SMALL = (0.006, 0.3), 0.5, 0.1
-"""The same after a calibration, ρ, and the largest small loss: chosen by twelve first pours
-(docs/notes/deployment-tried.md)."""
-EXCLUDED = -700.0
-"""Logarithm of the prior weight of hypotheses that do not belong to a mixture's component."""
 LENGTHS = (0.15, 0.6)
 NEAR, FARTHER = (0.03, 0.4), (0.4, 3.0)
 """Ranges of a hypothesis' factor s on the standard deviations of its offset, and up to 1 of g and h, too; log-uniform.
@@ -158,7 +154,6 @@ class Hypotheses:
         contrary: (J,), whether the hypothesis reverses the simulator.
         drifts: (J, 2 dimension + 2), changes per observation of the shifts, of the factors' logarithms, of h and of g.
         fading: (J,), κ.
-        calibrated: (J,), whether by the hypothesis a calibration holds.
         centre: (dimension,), the simulated best.
         origin: (dimension,), about which a factor stretches, as negative coordinate.
     """
@@ -175,7 +170,6 @@ class Hypotheses:
     contrary: NDArray[np.bool_]
     drifts: Array
     fading: Array
-    calibrated: NDArray[np.bool_]
     centre: Array
     origin: Array
 
@@ -186,7 +180,6 @@ class Hypotheses:
         centre: Array,
         latent: Array,
         contrary: NDArray[np.bool_],
-        calibrated: NDArray[np.bool_],
     ) -> Hypotheses:
         """Return the hypotheses of latent variables (J, `latent_size`), a priori standard normal; with `drift_size`
         further ones the bench may drift.
@@ -201,7 +194,6 @@ class Hypotheses:
         beyond = (far - NEAR_SHARE) / (1.0 - NEAR_SHARE)
         spread = np.where(near, _evenly(NEAR, far / NEAR_SHARE), _evenly(FARTHER, beyond))
         less = np.minimum(spread, 1.0)
-        rests = np.where(calibrated, _evenly(CALIBRATED_RESTS, residual), _evenly(RESTS, residual))
         scales, shifts = np.ones((len(rows), dimension)), np.zeros((len(rows), dimension))
         if discrepancy.drawn:
             index = np.minimum((known / KNOWN_SHARE * len(discrepancy.drawn)).astype(int), len(discrepancy.drawn) - 1)
@@ -226,7 +218,7 @@ class Hypotheses:
             factors * shifts + moved,
             less * WIDTH * width,
             less * GAIN * gain,
-            np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), residual), rests),
+            np.where(contrary, _evenly((CONTRARY_REST, RESTS[1]), residual), _evenly(RESTS, residual)),
             _evenly(LENGTHS, length),
             _evenly(NOISES, noise),
             _evenly(NOISE_GROWTHS, growth),
@@ -234,7 +226,6 @@ class Hypotheses:
             contrary,
             drift[:, None] * pace * np.concatenate([shift, factor, (WIDTH, GAIN)]),
             drift,
-            calibrated,
             centre,
             origin,
         )
@@ -372,7 +363,13 @@ class ModelAveragedProcess:
             discrepancy: of the question.
         """
         self.simulated, self.points, self.worst = simulated, points, discrepancy.worst
-        self._costs = np.clip(costs / discrepancy.worst, 0.0, 1.0)
+        scenes = [_CalibratedScene.of(pours, self.worst) for pours in discrepancy.calibration or ()]
+        by_misled = dict.fromkeys(scene.misled for scene in scenes)
+        self._calibrations = {misled: [scene for scene in scenes if scene.misled == misled] for misled in by_misled}
+        same = [scene for scene in scenes if scene.power == 1.0]
+        self._points = np.concatenate([*(scene.points for scene in same), points])
+        self._costs = np.concatenate([*(scene.costs for scene in same), np.clip(costs / self.worst, 0.0, 1.0)])
+        self._earlier = len(self._points) - len(points)
         dimension, centre = len(discrepancy.offset_priors), _least(simulated)
         size, J, distrust = latent_size(dimension), HYPOTHESES + CONTRARY, discrepancy.uninformative
         rows = np.clip(qmc.Sobol(size, scramble=True, rng=np.random.default_rng(0)).random(HYPOTHESES), 1e-6, 1 - 1e-6)
@@ -383,22 +380,16 @@ class ModelAveragedProcess:
             rows = np.concatenate([rows, further], axis=1)
         latent = ndtri(np.concatenate([rows, rows[:CONTRARY]]))  # the same for the same question, and even
         contrary = np.arange(J) >= HYPOTHESES
-        self._ages = np.arange(len(points), 0.0, -1.0)
-        held = (np.arange(J) % 2 == 1) & ~contrary if discrepancy.calibration else np.zeros(J, dtype=bool)
-        self._all = Hypotheses.of(discrepancy, centre, latent, contrary, held)
-        scenes = [_CalibratedScene.of(pours, discrepancy.worst) for pours in discrepancy.calibration or ()]
-        by_misled = dict.fromkeys(scene.misled for scene in scenes)
-        self._calibrations = {misled: [scene for scene in scenes if scene.misled == misled] for misled in by_misled}
+        self._ages = np.arange(len(self._points), 0.0, -1.0)
+        self._all = Hypotheses.of(discrepancy, centre, latent, contrary)
         numbers = HYPOTHESES, CONTRARY, len(UNINFORMATIVE_LENGTHS)
         shares = 1.0 - distrust, CONTRARY_SHARE * distrust, (1.0 - CONTRARY_SHARE) * distrust
         prior = np.log(np.repeat(np.divide(shares, numbers), numbers))
         calibrated = np.concatenate([self._calibrated(self._all), self._calibrated(None)], axis=1)
-        anyway = np.append(contrary, np.ones(len(UNINFORMATIVE_LENGTHS), dtype=bool))  # calibrated or not
-        by_case = _shares(np.append(held, np.zeros(len(UNINFORMATIVE_LENGTHS), dtype=bool)), anyway)
-        self._calibrated_totals = [_log_sum(prior + by_case[0] + logs) for logs in calibrated]
-        unknown = prior + by_case[1] if self._calibrations else prior
-        segments = self._segments(unknown, prior + self._reliance(calibrated, by_case))
-        self.since, weights = segments.since, segments.weights
+        self._calibrated_totals = [_log_sum(prior + logs) for logs in calibrated]
+        segments = self._segments(prior, prior + self._reliance(calibrated))
+        self.since = None if segments.since is None else segments.since - self._earlier
+        weights = segments.weights
         informed, uninformative = weights[:, :J], weights[:, J:]
         self._trusting = np.where(self._all.contrary, 0.0, informed.sum(axis=0))
         self.uninformative = float(informed[:, self._all.contrary].sum() + uninformative.sum())
@@ -409,17 +400,17 @@ class ModelAveragedProcess:
         if len(points):
 
             def make(moved: Array) -> Hypotheses:
-                return Hypotheses.of(discrepancy, centre, moved, contrary[sample], held[sample])
+                return Hypotheses.of(discrepancy, centre, moved, contrary[sample])
 
             self._kept = self._resampled(latent[sample], self._kept, counting, make)
         self.mixture = np.concatenate([np.full(KEPT, informed.sum() / KEPT), uninformative.sum(axis=0)])
         self._kernel = self._kept.kernel.with_uninformative()
         self._least_noises = np.concatenate([self._kept.noises, UNINFORMATIVE_NOISES])
         self._growths = np.concatenate([self._kept.growths, UNINFORMATIVE_GROWTHS])
-        at_data = _joined(self._informed(self._kept, points, ages=self._ages), self._uninformative(points, self._costs))
+        at_data = self._prior_at_data(self._kept)
         counting = np.concatenate([counting, segments.counting[uninformative.argmax(axis=0)]])
         self._at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        self._inverses = np.linalg.inv(_factorised(self._at_data, self._kernel, points, self._ages))
+        self._inverses = np.linalg.inv(_factorised(self._at_data, self._kernel, self._points, self._ages))
         self._residuals = np.einsum("jik,jk->ji", self._inverses, self._costs - self._at_data.means)
         self._recent: dict[bytes, tuple[_Prior, Array]] = {}
 
@@ -444,12 +435,11 @@ class ModelAveragedProcess:
         )
         if scene is not None:
             mean = mean + scene.corrections
-        # μ_j = clip(e^{g_j} f̂_s(z_j(x)), 0, 1), contrary: 1 − f̂_s; v_j = √(σ_j² + e^{2 g_j} s_s²); noise n_j + m_j
-        # μ_j
+        # μ_j = clip(e^{g_j} f̂_s(z_j(x)), 0, 1), contrary: 1 − f̂_s; v_j = √(σ_j² + e^{2 g_j} s_s²); noise n_j + m_j μ_j
         gain = hypotheses.gains_at(ages) / self.worst
         means = np.clip(gain * np.where(hypotheses.contrary[:, None], self.worst - mean, mean), 0.0, 1.0)
-        relative = hypotheses.calibrated[:, None] * RELATIVE_REST * np.minimum(means, SMALL)
-        spreads = np.hypot(np.hypot(hypotheses.rests[:, None], gain * deviation), relative)
+        rests = hypotheses.rests[:, None] * (_steepness(means) if self._calibrations else 1.0)
+        spreads = np.hypot(rests, gain * deviation)
         return _Prior(means, spreads, hypotheses.noises[:, None] + hypotheses.growths[:, None] * means)
 
     def _uninformative(self, points: Array, seen: Array | float) -> _Prior:
@@ -459,6 +449,10 @@ class ModelAveragedProcess:
         # from observed costs, if any
         noises = UNINFORMATIVE_NOISES[:, None] + UNINFORMATIVE_GROWTHS[:, None] * np.broadcast_to(seen, shape)
         return _Prior(means, np.full(shape, UNINFORMATIVE_SIGNAL), noises)
+
+    def _prior_at_data(self, hypotheses: Hypotheses) -> _Prior:
+        informed = self._informed(hypotheses, self._points, ages=self._ages)
+        return _joined(informed, self._uninformative(self._points, self._costs))
 
     def _prior(self, points: Array) -> _Prior:
         return _joined(self._informed(self._kept, points), self._uninformative(points, UNINFORMATIVE_MEAN))
@@ -480,21 +474,12 @@ class ModelAveragedProcess:
                 logs[i] += scene.power * _sequential(prior, kernel, scene.points, scene.costs)[0].sum(axis=1)
         return logs
 
-    def _reliance(self, calibrated: Array, shares: Array) -> Array:
-        """Logarithms (J,) of the factors on prior weights by the calibrations.
-
-        Args:
-            calibrated: (calibrations, J), log-likelihoods of their pours.
-            shares: see `_shares`.
-        """
-        if not self._calibrations:
-            return np.zeros(calibrated.shape[1])
-        # Π_c ((1 − ε_c) L_jc / Σ_k w_k L_kc + ε_c), of which Π_c ε_c is the case that all of them mislead
-        misled = np.log(list(self._calibrations))
+    def _reliance(self, calibrated: Array) -> Array:
+        """Logarithms (J,) of the factors on prior weights by the log-likelihoods (calibrations, J) of their pours."""
+        # Π_c ((1 − ε_c) L_jc / Σ_k w_k L_kc + ε_c)
+        misled = np.log(list(self._calibrations))[:, None]
         relative = calibrated - np.array(self._calibrated_totals)[:, None]
-        factors = np.logaddexp(np.log1p(-np.exp(misled))[:, None] + relative, misled[:, None]).sum(axis=0)
-        holding = factors + np.log(np.maximum(-np.expm1(misled.sum() - factors), np.exp(EXCLUDED)))
-        return np.asarray(np.logaddexp(shares[0] + holding, shares[1] + misled.sum()))
+        return np.asarray(np.logaddexp(np.log1p(-np.exp(misled)) + relative, misled).sum(axis=0))
 
     def _resampled(self, latent: Array, sample: Hypotheses, counting: NDArray[np.bool_], make: Remake) -> Hypotheses:
         """Move drawn hypotheses (k) by Markov chains that keep the posterior: the drawn ones are few, and coarse.
@@ -524,13 +509,13 @@ class ModelAveragedProcess:
         """Log-likelihoods (k,) of the observations that count for each hypothesis, (k, n), and the weights after a
         change.
         """
-        at_data = self._informed(hypotheses, self.points, ages=self._ages)
+        at_data = self._informed(hypotheses, self._points, ages=self._ages)
         at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        chances = _sequential(at_data, hypotheses.kernel, self.points, self._costs, self._ages)[0]
+        chances = _sequential(at_data, hypotheses.kernel, self._points, self._costs, self._ages)[0]
         changed = ~counting[:, :1].all(axis=1)
-        weights = self._reliance(self._calibrated(hypotheses), _shares(hypotheses.calibrated, hypotheses.contrary))
+        weights = self._reliance(self._calibrated(hypotheses))
         weights = np.where(changed, np.where(hypotheses.near, np.log(NEAR_CHANGED), 0.0), weights)
-        return np.asarray(np.where(counting, chances, 0.0).sum(axis=1) + weights)
+        return np.asarray(np.where(counting, chances, 0.0)[:, self._earlier :].sum(axis=1) + weights)
 
     def _segments(self, prior: Array, calibrated: Array) -> _Segments:
         """Weigh the starts of the present segment together with the hypotheses.
@@ -541,9 +526,7 @@ class ModelAveragedProcess:
 
         If the observations after the likeliest change hold another one, they alone are weighed.
         """
-        informed = self._informed(self._all, self.points, ages=self._ages)
-        at_data = _joined(informed, self._uninformative(self.points, self._costs))
-        kernel = self._all.kernel.with_uninformative()
+        at_data, kernel = self._prior_at_data(self._all), self._all.kernel.with_uninformative()
         weighted = self._weighed(at_data, kernel, prior, calibrated, 0)
         while weighted.since is not None:
             later = self._weighed(at_data, kernel, prior, calibrated, weighted.since)
@@ -553,10 +536,12 @@ class ModelAveragedProcess:
         return weighted
 
     def _weighed(self, at_data: _Prior, kernel: _Kernel, prior: Array, calibrated: Array, begin: int) -> _Segments:
-        """Weights of the starts of a segment among the observations from `begin`, with at most one change there."""
-        n, m = len(self.points), len(self.points) - begin
-        order = np.arange(begin, n)
-        chances, residuals = _sequential(at_data, kernel, self.points, self._costs, self._ages, order)
+        """Weights of the starts of a segment among the observations from `begin`, with at most one change there: none
+        among a calibration's pours."""
+        n, skip = len(self._points), max(self._earlier - begin, 0)
+        order, m = np.arange(begin, n), n - begin - skip
+        sequence = _sequential(at_data, kernel, self._points, self._costs, self._ages, order)
+        chances, residuals = (values[:, skip:] for values in sequence)
         changed = prior + np.log(
             np.append(np.where(self._all.near, NEAR_CHANGED, 1.0), np.ones(len(UNINFORMATIVE_LENGTHS)))
         )
@@ -569,13 +554,14 @@ class ModelAveragedProcess:
         below = (so_far * ndtr(residuals)).sum(axis=0) / so_far.sum(axis=0)  # of each observation, given those before
         surprising = np.abs(below - 0.5) > 0.5 * SURPRISE
         counting, logs = [np.arange(n) >= begin], [before[:, m]]
+        starts = range(0 if skip else 1, m)
         if surprising.any():
-            backwards = _sequential(at_data, kernel, self.points, self._costs, self._ages, order[::-1])[0]
+            backwards = _sequential(at_data, kernel, self._points, self._costs, self._ages, order[skip:][::-1])[0]
             after = np.cumsum(backwards, axis=1)[:, ::-1]
             # Change before `start`: Σ_j of the old bench's evidence, times CHANGE, times w_j p_j(y_start … y_n) of the
             # new (Adams & MacKay 2007, with one change).
-            for start in range(1, m):
-                counting.append(np.arange(n) >= begin + start)
+            for start in starts:
+                counting.append(np.arange(n) >= begin + skip + start)
                 logs.append(changed + after[:, start] + _log_sum(before[:, start]) + np.log(CHANGE))
             if surprising[-1]:
                 counting.append(counting[0] & (np.arange(n) < n - 1))
@@ -584,8 +570,8 @@ class ModelAveragedProcess:
                 )
         weights = np.exp(np.array(logs) - np.max(logs))
         weights /= weights.sum()
-        starts = weights[1:m].sum(axis=1)
-        since = begin + 1 + int(np.argmax(starts)) if starts.sum() > NOTICED else None
+        changes = weights[1 : 1 + len(starts)].sum(axis=1)
+        since = begin + skip + starts[int(np.argmax(changes))] if changes.sum() > NOTICED else None
         since = None if since == n - 1 else since  # a single observation may be a mishap
         return _Segments(np.array(counting), weights, bool(surprising.any()), since)
 
@@ -606,7 +592,7 @@ class ModelAveragedProcess:
         key = points.tobytes()
         if key not in self._recent:
             prior = self._prior(points)
-            cross = self._kernel.correlation(self.points, points, self._ages[:, None])
+            cross = self._kernel.correlation(self._points, points, self._ages[:, None])
             cross *= self._at_data.spreads[:, :, None] * prior.spreads[:, None, :]
             if len(self._recent) == RECENT:
                 self._recent.pop(next(iter(self._recent)))
@@ -750,6 +736,11 @@ def drift_size(dimension: int) -> int:
     return 2 * dimension + 3
 
 
+def _steepness(costs: Array) -> Array:
+    """Change of costs with a shift of the stream, relative to that of half a load: φ(Φ⁻¹(c)) / φ(0)."""
+    return np.asarray(np.exp(-0.5 * ndtri(np.clip(costs, 0.5 * RESOLUTION, 1.0 - 0.5 * RESOLUTION)) ** 2))
+
+
 def clipped_moments(means: Array, deviations: Array) -> tuple[Array, Array]:
     """E clip(f, 0, 1) and E clip(f, 0, 1)² of normal f."""
     # With l = −m/s, u = (1 − m)/s: E c = m (Φ(u) − Φ(l)) + s (φ(l) − φ(u)) + 1 − Φ(u) and
@@ -786,17 +777,6 @@ def _evenly_drawn(weights: Array, count: int) -> NDArray[np.int_]:
     order = np.argsort(-weights, kind="stable")
     levels = (np.arange(count) + 0.5) / count * weights.sum()
     return np.asarray(order[np.searchsorted(np.cumsum(weights[order]), levels).clip(max=len(order) - 1)])
-
-
-def _shares(calibrated: NDArray[np.bool_], anyway: NDArray[np.bool_]) -> Array:
-    """Logarithms (2, J) of the factors on prior weights if a calibration holds, and if it does not.
-
-    Args:
-        calibrated: (J,), hypotheses by which it holds, every second one of those that are not `anyway`.
-        anyway: (J,), hypotheses of both cases.
-    """
-    twice = np.where(anyway, 0.0, np.log(2.0))
-    return np.array([np.where(calibrated | anyway, twice, EXCLUDED), np.where(calibrated, EXCLUDED, twice)])
 
 
 def _log_sum(logs: Array) -> float:

@@ -120,6 +120,23 @@ def test_after_a_calibration_errors_are_small_where_the_simulator_predicts_a_sma
         assert least < ratio < least + 1.0
 
 
+def test_pours_into_the_same_receiver_show_where_the_simulator_misses_and_another_one_does_not_share_it():
+    best = np.array([[0.4, 0.6]])
+
+    def spot(points):
+        """More is lost next to the best simulated action."""
+        return np.clip(cup(points) + 0.1 * np.exp(-(((points - best) / 0.15) ** 2).sum(axis=1)), 0.0, 1.0)
+
+    points = np.concatenate([np.random.default_rng(5).random((20, 2)), best])
+    expected = {}
+    for power in (1.0, 0.84):
+        pours = CalibrationPours(tuple(map(tuple, points)), tuple(spot(points)), tuple(cup(points)), power)
+        discrepancy = ModelDiscrepancy(PRIORS, pours_left=10, calibration=(pours,))
+        expected[power] = float(averaged(asked(cup, [], discrepancy=discrepancy)).predict(best)[0][0])
+    assert expected[1.0] == pytest.approx(spot(best)[0], abs=0.02)
+    assert expected[0.84] < 0.5 * spot(best)[0]
+
+
 def test_pours_of_an_earlier_campaign_count_less_and_together_with_a_calibration_more():
     known, earlier = calibrated(cup), (replace(calibrated(cup)[0], misled=0.2),)
     without, doubted, trusted, both = (first_pour(pours) for pours in (None, earlier, known, known + earlier))
