@@ -21,7 +21,7 @@ from dataclasses import replace
 from actors.interfaces import DoseKnowledge, DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.dispense import Dispense, Dispensed, Dose, KnownSource, MixedCup
-from orchestrator.learning.requests import Answered, Ask, Decision, Failed, Outcome, Poured, Request, Slots
+from orchestrator.learning.requests import Answered, Ask, Decision, Failed, Outcome, Pour, Poured, Request, Slots
 from sim_engine.vessel.vessel import build_vessel
 
 REPEATS = 2
@@ -118,6 +118,17 @@ class Mix(Dispense):
             raise ValueError(f"this was not asked, or not answered: {request.question}")
         (index, dose, _), self._miss, self._asked = self._miss, None, False
         self._decide(index, dose, outcome.answer)
+
+    def take(self, pour: Pour, outcome: Outcome | None) -> None:
+        """See `Dispense.take`. What was decided after a miss follows from the next dose."""
+        assert pour.dose is not None
+        if self._doses:
+            index = next(i for i, cup in enumerate(self._cups) if cup.position == self._doses[-1].position)
+            emptied = pour.dose.emptied and self._cups[index].first_dose <= self._doses[-1].number
+            if emptied or pour.dose.position in self._spares:
+                self._pour_again(index)
+        self._miss = None
+        super().take(pour, outcome)
 
     @property
     def _count(self) -> int:

@@ -37,6 +37,7 @@ def campaign_blueprint(
     theta_slices: bool = False,
     action_slices: bool = False,
     doses: bool = False,
+    rack: bool = False,
 ) -> rrb.Blueprint:
     """Return the layout of a campaign.
 
@@ -47,13 +48,15 @@ def campaign_blueprint(
         theta_slices: whether θ has more axes than one picture shows.
         action_slices: whether actions have more axes.
         doses: the campaign pours wanted amounts and does nothing else.
+        rack: they are mixtures.
     """
     if doses:
+        picture = rrb.Spatial2DView(origin="/rack", name="Rack: amounts, and differences [g]", background=BACKGROUND)
         dosing = rrb.Horizontal(
-            _cell(),
+            rrb.Tabs(picture, _cell()) if rack else _cell(),
             rrb.Vertical(*_dose(), row_shares=[5, 3]),
             rrb.Vertical(_status(), _log(), _activity(), row_shares=[5, 3, 3]),
-            column_shares=[5, 7, 4],
+            column_shares=[8, 5, 4] if rack else [5, 7, 4],
             name="Dosing",
         )
         # Doses have no films: their signals are on the wall clock, also after the end.

@@ -15,6 +15,8 @@ from orchestrator.reports import figure_style as style
 
 if TYPE_CHECKING:
     from actors.arm.arm_interface import ArmFigure
+    from orchestrator.live_view.recording_sink import RecordingSink
+    from orchestrator.reports.mixture_report import RackDrawing
     from sim_engine.vessel.shapes import VesselSpec
     from sim_engine.vessel.vessel import Vessel
 
@@ -110,6 +112,22 @@ def stances(ends: FloatArray) -> Columns:
     turns /= np.linalg.norm(turns, axis=-1, keepdims=True)
     columns = rr.Capsules3D.columns(translations=ends[..., 0, :].reshape(-1, 3), quaternions=turns.reshape(-1, 4))
     return columns_of(columns.partition([ends.shape[1]] * len(ends)))
+
+
+def rack(sink: RecordingSink, drawing: RackDrawing) -> None:
+    """Log the rack of mixtures from above, below '/rack': rings, texts of the cups, and legend."""
+    for entity, legend in (("rings", False), ("legend", True)):
+        lines = [line for line in drawing.lines if bool(line.liquid) is legend]
+        strips = rr.LineStrips2D(
+            [line.points for line in lines],
+            colors=[rgb(line.colour) for line in lines],
+            radii=[0.5 * line.width for line in lines],
+            labels=[line.liquid for line in lines] if legend else None,
+        )
+        sink.log(f"/rack/{entity}", strips)
+    places, colours = [text.at for text in drawing.labels], [rgb(text.colour) for text in drawing.labels]
+    labels = [text.text for text in drawing.labels]
+    sink.log("/rack/cups", rr.Points2D(places, colors=colours, labels=labels, radii=0.005, show_labels=True))
 
 
 def fates() -> Any:

@@ -17,7 +17,9 @@ import rerun.blueprint as rrb
 
 from actors.laboratory_settings import MODE_LABELS
 from orchestrator.learning.campaign_plan import CampaignPlan, receiver_names
+from orchestrator.learning.dispense import Dispensed
 from orchestrator.learning.requests import Failed, Pour, Poured, Request, Simulate, Simulated, Suggest, Suggested
+from orchestrator.live_view import rerun_shapes as shapes
 from orchestrator.live_view.balance_view import BalanceStage
 from orchestrator.live_view.blueprints import Moment, campaign_blueprint
 from orchestrator.live_view.cell_view import CellScene
@@ -41,6 +43,7 @@ from orchestrator.records.events import (
 )
 from orchestrator.records.run_clock import run_time
 from orchestrator.reports.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
+from orchestrator.reports.mixture_report import draw_rack, mixtures_so_far, tolerances
 from orchestrator.reports.progress_state import ProgressState
 from orchestrator.runs.stages import scenes_of
 
@@ -80,6 +83,7 @@ class CampaignRecording:
         )
         self._step = 0
         self._decided = ""
+        self._mixtures: Dispensed | None = None
 
     @property
     def wait(self) -> float | None:
@@ -148,6 +152,15 @@ class CampaignRecording:
             case LogLine():
                 self._say(event.text, event.level, event.stage)
         self._machine.status(status_page(self._progress, self._learning.trust))
+        if isinstance(event, CampaignOpened | CampaignClosed | RequestStarted | RequestFinished):
+            self._fill(live=not isinstance(event, CampaignClosed))
+
+    def _fill(self, *, live: bool) -> None:
+        """Show the rack of mixtures, if it has changed."""
+        mixtures = mixtures_so_far(self._plan, self._progress.run, live=live)
+        if mixtures is not None and mixtures != self._mixtures:
+            self._mixtures = mixtures
+            shapes.rack(self._sink, draw_rack(mixtures, tolerances(self._plan)))
 
     def _say(self, text: str, level: str = "info", source: str = "") -> None:
         self._machine.line(text, level, source or "campaign")
@@ -182,7 +195,9 @@ class CampaignRecording:
                 if pour.predicted is not None:
                     unit = unit_of_pour(self._plan, pour)
                     expected = f", predicted {unit.text(pour.predicted.mean, pour.predicted.deviation)}"
-                if (action := self._action(pour)) not in self._decided:  # most strategies have just logged it
+                if (
+                    pour.dose is None and (action := self._action(pour)) not in self._decided
+                ):  # most strategies have just logged it
                     self._say(f"pour {pour.number}: {action}{expected}", source=event.stage)
 
     def _finished(self, event: RequestFinished) -> None:
@@ -250,4 +265,5 @@ def blueprint_of(plan: CampaignPlan, moment: Moment) -> rrb.Blueprint:
         theta_slices=calibration is not None and calibration.parameters.dimension > MAPPED,
         action_slices=deployment is not None and deployment.actions.dimension > MAPPED,
         doses=plan.dispense is not None and calibration is None and deployment is None,
+        rack=plan.dispense is not None and plan.dispense.mixtures is not None,
     )

@@ -185,11 +185,12 @@ def mixture_lines(directory: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class RackLine:
-    """A line through points (x, y), of a width [inch]."""
+    """A line through points (x, y), of a width [inch]; `liquid` is what a line of the legend stands for."""
 
     points: tuple[tuple[float, float], ...]
     colour: str
     width: float
+    liquid: str = ""
 
 
 @dataclass(frozen=True)
@@ -206,12 +207,18 @@ class RackText:
 
 @dataclass(frozen=True)
 class RackDrawing:
-    """The rack from above, which report, operator's page and live view show: x to the right, y down [inch]."""
+    """The rack from above, which report, operator's page and live view show: x to the right, y down [inch].
+
+    Attributes:
+        labels: the texts of the cups in fewer pieces, for the live view, whose texts have one size and are below their
+            points.
+    """
 
     width: float
     height: float
     lines: tuple[RackLine, ...]
     texts: tuple[RackText, ...]
+    labels: tuple[RackText, ...]
 
     def svg(self) -> str:
         """The drawing as an SVG file."""
@@ -261,19 +268,20 @@ def draw_rack(dispensed: Dispensed, limits: Mapping[str, float]) -> RackDrawing:
     width, bottom = max(1.6 * columns + 0.1, 4.9), 0.5 + 2.0 * rows
     full = sum(cup.state == "full" for cup in dispensed.cups)
     title = f"{full} of {len(dispensed.cups)} cups are full: amounts, and differences from the table [g]"
-    lines, texts = list[RackLine](), [RackText((0.1, 0.25), title, size=0.15, side="left")]
+    lines, texts, labels = list[RackLine](), [RackText((0.1, 0.25), title, size=0.15, side="left")], list[RackText]()
     for cup in dispensed.cups:
         column, row = places[cup.position]
         own = [component for component in dispensed.components() if component.cup == cup.position]
-        _draw_cup(lines, texts, (0.85 + 1.6 * column, 1.55 + 2.0 * row), own, requested, colours, limits)
+        centre = (0.85 + 1.6 * column, 1.55 + 2.0 * row)
+        labels += _draw_cup(lines, texts, centre, own, requested, colours, limits)
     x, y = 0.15, bottom + 0.25
     for liquid, colour in colours.items():
         if x > 0.2 and x + 0.5 + 0.09 * len(liquid) > width:
             x, y = 0.15, y + 0.25
-        lines.append(RackLine(((x, y), (x + 0.3, y)), colour, 0.12))
+        lines.append(RackLine(((x, y), (x + 0.3, y)), colour, 0.12, liquid))
         texts.append(RackText((x + 0.38, y), liquid, size=0.125, side="left"))
         x += 0.65 + 0.09 * len(liquid)
-    return RackDrawing(width, y + 0.2, tuple(lines), tuple(texts))
+    return RackDrawing(width, y + 0.2, tuple(lines), tuple(texts), tuple(labels))
 
 
 def _grid(positions: Sequence[str]) -> dict[str, tuple[int, int]]:
@@ -294,9 +302,9 @@ def _draw_cup(
     requested: Mapping[int, float],
     colours: Mapping[str, str],
     limits: Mapping[str, float],
-) -> None:
-    """One cup: a ring of its liquids by mass, its name and state, and its amounts within."""
-    x, y = centre
+) -> list[RackText]:
+    """One cup: a ring of its liquids by mass, its name and state, and its amounts within. Returns its labels."""
+    (x, y), amounts = centre, list[str]()
     name, start, total = components[0].cup.partition("/")[2], 0.0, sum(part.wanted_g for part in components)
     step, missed, corrected = min(0.2, 0.9 / len(components)), False, False
     for i, component in enumerate(components):
@@ -306,14 +314,17 @@ def _draw_cup(
         level, start = y + step * (i - 0.5 * (len(components) - 1)), end
         lines.append(RackLine(((x - 0.49, level), (x - 0.41, level)), colours[component.liquid], 0.08))
         if component.received_g is None or component.dose is None:
-            texts.append(RackText((x - 0.02, level), "—" if component.dose is None else "?", side="right"))
+            amounts.append("—" if component.dose is None else "?")
+            texts.append(RackText((x - 0.02, level), amounts[-1], side="right"))
             continue
         wanted = requested[component.dose]
         error = component.received_g - component.wanted_g
         beyond = abs(component.received_g - wanted) > limits[component.liquid]
         missed, corrected = missed or beyond, corrected or wanted != component.wanted_g
-        texts.append(RackText((x - 0.02, level), f"{component.received_g:.1f}", side="right"))
-        texts.append(RackText((x + 0.47, level), f"{round(error, 2) + 0.0:+.2f}", bold=beyond, side="right"))
+        amount, difference = f"{component.received_g:.1f}", f"{round(error, 2) + 0.0:+.2f}"
+        amounts.append(f"{amount} {difference}")
+        texts.append(RackText((x - 0.02, level), amount, side="right"))
+        texts.append(RackText((x + 0.47, level), difference, bold=beyond, side="right"))
     state = components[0].state
     word = ("missed, corrected" if corrected else "missed") if missed and state == "full" else STATES[state]
     colour = style.BEST if word in PROBLEMS else style.INK
@@ -321,6 +332,8 @@ def _draw_cup(
     lines.append(RackLine(_arc(centre, 0.74, 0.0, 1.0), edge, 0.01 if word in ("empty", "done") else 0.03))
     texts.append(RackText((x, y - 0.87), name, size=0.135))
     texts.append(RackText((x, y + 0.87), word, colour, bold=word not in ("empty", "done")))
+    rows = [RackText((x, y + 0.27 * (i - 0.5 * len(amounts))), text) for i, text in enumerate(amounts)]
+    return [*rows, RackText((x, y + 0.72), f"{name} {word.partition(',')[0]}", colour)]
 
 
 def _arc(centre: tuple[float, float], radius: float, start: float, end: float) -> tuple[tuple[float, float], ...]:

@@ -128,6 +128,19 @@ def test_a_question_is_answered_with_one_press_and_the_pour_goes_on(page: Any, t
 
 
 @pytest.mark.slow
+def test_a_missed_dose_is_decided_with_one_press(page: Any, tmp_path: Path) -> None:
+    options = ("accept", "correct", "repeat")
+    decision = {"text": "Dose 3 missed its tolerance.", "wants": "option", "options": options, "about": "decision"}
+    with on_port(tmp_path, asking(**decision, hands=False)) as lab:
+        asked(lab)
+        page.goto(lab.address(Role.OPERATOR))
+        for name in ("Leave it as it is", "Pour it again"):
+            page.get_by_role("button", name=name).wait_for()
+        page.get_by_role("button", name="Correct the other amounts").click()
+        wait_until(page, lambda: lab.served.laboratories[0].bench.answers[:1] == ["correct"])
+
+
+@pytest.mark.slow
 def test_a_chart_out_of_control_is_a_picture_with_what_to_check(
     page: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,7 @@ import pytest
 from actors.interfaces import DoseTarget
 from orchestrator.learning.dispense import Dispensed, MixedComponent
 from orchestrator.learning.mixtures import Mix, pouring_order
-from orchestrator.learning.requests import Answered, Ask, Failed, Outcome, Slots
+from orchestrator.learning.requests import Answered, Ask, Failed, Outcome, Pour, Slots
 from orchestrator.records.codec import decode_request, decode_result, encode_request, encode_result
 from tests.support.mixtures import asked, plan, poured, scene
 
@@ -218,3 +218,26 @@ def test_an_answer_to_another_question_is_refused() -> None:
     request = first_dose(strategy, 2.0)
     with pytest.raises(ValueError, match="was not asked"):
         strategy.tell(replace(request, question="another"), Answered("accept"))
+
+
+@pytest.mark.parametrize("answer", ["accept", "correct", "repeat"])
+@pytest.mark.parametrize("spares", [(), ("rack/D6",)], ids=["emptied", "spare"])
+@pytest.mark.parametrize("policy", ["ask", "repeat"])
+def test_what_was_poured_so_far_gives_the_cups_without_the_answers(
+    policy: str, answer: str, spares: tuple[str, ...]
+) -> None:
+    series = plan(*TWO, on_miss=policy, spares=spares)
+    strategy, so_far = Mix(series, 5), Mix(series, 5)
+    while not strategy.finished:
+        (request,) = strategy.ask(Slots(0))
+        if isinstance(request, Ask):
+            strategy.tell(request, Answered(answer if answer in request.options else "accept"))
+            continue
+        assert isinstance(request, Pour)
+        assert request.dose is not None
+        so_far.take(request, None)
+        assert {cup.position for cup in so_far.result().cups if cup.state == "filling"} == {request.dose.cup}
+        outcome = poured(request, 1e3 * request.dose.amount + 3.0 * (request.number == 1))
+        strategy.tell(request, outcome)
+        so_far.take(request, outcome)
+    assert so_far.result() == strategy.result()

@@ -37,6 +37,7 @@ from orchestrator.runs.run_service import RunResources, RunService
 from orchestrator.runs.run_tasks import run_task
 from sim_engine.outcome import PourMeasurement
 from sim_engine.vessel.vessel import build_vessel
+from tests.orchestrator.reports.test_mixture_report import MIXTURES
 from tests.support.rerun_recordings import Contents, timeline, views
 from tests.support.small_campaign import series, write_campaign
 from tests.support.waiting import PATIENCE
@@ -153,3 +154,37 @@ def test_the_tab_dosing_shows_entities_that_the_recording_of_a_dose_has(tmp_path
         for entity in entities:
             there = [one for one in recorded.columns if f"{one}/".startswith(f"{entity.removesuffix('/**')}/")]
             assert there if entity.endswith("/**") else entity in there, f"'{name}' shows {entity}, not recorded"
+
+
+@pytest.mark.slow
+def test_the_rack_of_mixtures_fills_in_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DECANT_STATE", str(tmp_path / "state"))
+    plan = load_campaign(write_campaign(tmp_path, MIXTURES))
+    path = tmp_path / "mix.rrd"
+    monitor = RerunMonitor(path, plan)
+
+    async def scenario() -> Any:
+        resources = RunResources(in_process=True, subscribers=[monitor])
+        with contextlib.closing(RunService().start(run_task(plan), resources)) as handle:
+            return await handle.wait()
+
+    result = asyncio.run(scenario()).results["doses"]
+    assert monitor.close(timeout=PATIENCE)
+    assert (monitor.failed, monitor.dropped) == (0, 0)
+    recorded = Contents(path)
+    rows = zip(recorded.columns["/rack/cups"]["wall"], recorded.values("/rack/cups", "Points2D:labels"), strict=True)
+    labels = [texts for _, texts in sorted(rows)]  # type: ignore[type-var]
+    cups = [[text for text in texts if " " in text and text[0] in "AB"] for texts in labels]  # type: ignore[attr-defined]
+    shown = [cup for i, cup in enumerate(cups) if not i or cup != cups[i - 1]]
+    assert shown == [
+        ["B2 empty", "A1 empty"],
+        ["B2 being filled", "A1 empty"],
+        ["B2 done", "A1 empty"],
+        ["B2 done", "A1 being filled"],
+        ["B2 done", "A1 done"],
+    ]
+    for component in result.components():
+        difference = component.received_g - component.wanted_g
+        assert f"{component.received_g:.1f} {difference:+.2f}" in labels[-1]  # type: ignore[operator]
+    assert recorded.values("/rack/legend", "LineStrips2D:labels")[-1] == ["water", "ethanol"]
+    assert "Rack: amounts, and differences [g]" in views(path)

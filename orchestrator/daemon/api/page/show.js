@@ -124,7 +124,7 @@ function bar(what, done, of) {
   return el("label", { class: "bar" }, `${what} ${done} of ${of}`, el("progress", { value: Math.min(done, of), max: of }));
 }
 
-const NAMES = { done: "Done", yes: "Yes", no: "No", lost: "Lost: outcome unknown", repeat: "Pour it again" };
+const NAMES = { done: "Done", yes: "Yes", no: "No", lost: "Lost: outcome unknown", repeat: "Pour it again", accept: "Leave it as it is", correct: "Correct the other amounts" };
 
 /** A question with answers that a wet finger hits. `send` takes the answer and throws what is wrong with it. */
 export function questionCard(question, campaign, mode, send) {
