@@ -293,8 +293,8 @@ class _Prior:
     noises: Array
 
 
-def _joined(*parts: _Prior) -> _Prior:
-    return _Prior(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "spreads", "noises")))
+def _joined(*parts: _Prior, axis: int = 0) -> _Prior:
+    return _Prior(*(np.concatenate([getattr(p, n) for p in parts], axis) for n in ("means", "spreads", "noises")))
 
 
 @dataclass(frozen=True)
@@ -366,9 +366,9 @@ class ModelAveragedProcess:
         scenes = [_CalibratedScene.of(pours, self.worst) for pours in discrepancy.calibration or ()]
         by_misled = dict.fromkeys(scene.misled for scene in scenes)
         self._calibrations = {misled: [scene for scene in scenes if scene.misled == misled] for misled in by_misled}
-        same = [scene for scene in scenes if scene.power == 1.0]
-        self._points = np.concatenate([*(scene.points for scene in same), points])
-        self._costs = np.concatenate([*(scene.costs for scene in same), np.clip(costs / self.worst, 0.0, 1.0)])
+        self._same = [scene for scene in scenes if scene.power == 1.0]
+        self._points = np.concatenate([*(scene.points for scene in self._same), points])
+        self._costs = np.concatenate([*(scene.costs for scene in self._same), np.clip(costs / self.worst, 0.0, 1.0)])
         self._earlier = len(self._points) - len(points)
         dimension, centre = len(discrepancy.offset_priors), _least(simulated)
         size, J, distrust = latent_size(dimension), HYPOTHESES + CONTRARY, discrepancy.uninformative
@@ -450,9 +450,13 @@ class ModelAveragedProcess:
         noises = UNINFORMATIVE_NOISES[:, None] + UNINFORMATIVE_GROWTHS[:, None] * np.broadcast_to(seen, shape)
         return _Prior(means, np.full(shape, UNINFORMATIVE_SIGNAL), noises)
 
+    def _informed_at_data(self, hypotheses: Hypotheses) -> _Prior:
+        pours = [self._informed(hypotheses, scene.points, scene) for scene in self._same]
+        pours.append(self._informed(hypotheses, self.points, ages=self._ages[self._earlier :]))
+        return _joined(*pours, axis=1)
+
     def _prior_at_data(self, hypotheses: Hypotheses) -> _Prior:
-        informed = self._informed(hypotheses, self._points, ages=self._ages)
-        return _joined(informed, self._uninformative(self._points, self._costs))
+        return _joined(self._informed_at_data(hypotheses), self._uninformative(self._points, self._costs))
 
     def _prior(self, points: Array) -> _Prior:
         return _joined(self._informed(self._kept, points), self._uninformative(points, UNINFORMATIVE_MEAN))
@@ -509,7 +513,7 @@ class ModelAveragedProcess:
         """Log-likelihoods (k,) of the observations that count for each hypothesis, (k, n), and the weights after a
         change.
         """
-        at_data = self._informed(hypotheses, self._points, ages=self._ages)
+        at_data = self._informed_at_data(hypotheses)
         at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
         chances = _sequential(at_data, hypotheses.kernel, self._points, self._costs, self._ages)[0]
         changed = ~counting[:, :1].all(axis=1)

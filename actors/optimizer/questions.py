@@ -75,6 +75,7 @@ class CalibrationPours:
         costs: weighed.
         simulated: costs that the simulator predicts without the pour itself.
         power: exponent of the likelihood of these pours, 0 < power ≤ 1: how much they say about another scene.
+            1: made before the observations in their scene.
         misled: probability that they say nothing about the bench; pours with the same one are right or wrong together.
             None: of a calibration just before the observations.
     """

@@ -13,7 +13,8 @@ The pours enter with three corrections:
 
 Source: Golub, Heath & Wahba, Generalized cross-validation as a method for choosing a good ridge parameter,
 Technometrics 1979.
-Limitations: a simulated spillage is converted to a cost with the liquid that the weighed pour retained. Offsets that
+Limitations: a simulated spillage is converted to a cost with the liquid that the weighed pour retained. Of training
+pours into the receiver that is deployed into, the simulator's error is overstated by the same factor. Offsets that
 the posterior of θ has determined from the same pours enter the hypotheses separately.
 """
 
