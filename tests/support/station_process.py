@@ -59,7 +59,8 @@ def die_at(stage: str) -> None:
         case "submitted":
             CampaignQueue.submit = after(CampaignQueue.submit)  # type: ignore[method-assign]
         case "leased":
-            rig_worker.renew_load = after(rig_worker.renew_load)
+            running = rig_worker.Running
+            running._renew_order = _async_after(running._renew_order)  # type: ignore[method-assign]
         case "poured":
             rig_worker.RigWorker.settle = die  # type: ignore[method-assign]
         case "in the account":

@@ -62,12 +62,14 @@ class HeldBench(ToyBench):
         self.operator: Any = None
         self.question: OperatorQuestion | None = None
         self.answers: list[str] = []
+        self.dose: Any = None
 
     async def pour(
         self, scene: Scene, action: Any, *, seed: int, progress: ProgressCallback | None = None, dose: Any = None
     ) -> PourMeasurement:
         if progress is not None:
             progress(PourProgress(self.checkpoint, 0.5))
+        self.dose = dose
         self.begun.set()
         if self.question is not None:
             self.answers.append(await self.operator.ask(self.question))
@@ -83,6 +85,7 @@ class HeldBench(ToyBench):
 class HeldLaboratory(ToyLaboratory):
     bench: Any = field(default_factory=HeldBench)
     arm_stops: int = 0
+    spec: Any = None
 
     async def stop_arm(self) -> bool:
         self.arm_stops += 1
@@ -166,7 +169,7 @@ async def serving(folder: Path, make: Make = HeldLaboratory, **settings: Any) ->
 
     def open_laboratory(spec: Any, **arguments: Any) -> HeldLaboratory:
         laboratory = make()
-        laboratory.bench.operator = arguments["operator"]
+        laboratory.bench.operator, laboratory.spec = arguments["operator"], spec
         made.append(laboratory)
         return laboratory
 

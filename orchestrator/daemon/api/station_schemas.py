@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from actors.places import PlaceName
 from orchestrator.daemon.api.schemas import ResponseModel
 from orchestrator.daemon.rigs.pour_request import CallerId, Quantity, RequestModel
 
@@ -133,7 +134,9 @@ class LiquidIn(RequestModel):
 class PositionIn(RequestModel):
     """A place at a rig where one vessel can stand."""
 
-    id: ResourceId
+    id: PlaceName
+    """In a laboratory with places, the name of one of them, such as 'rack/A1'."""
+
     code: str = Field(default="", max_length=80)
     rig: str = Field(max_length=60)
     note: str = Field(default="", max_length=200)

@@ -8,6 +8,7 @@ checked before anything moves. A vessel `LABORATORY/VESSEL`, the source of a cam
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -29,6 +30,10 @@ from sim_engine.vessel.vessel import build_vessel
 
 SURE = ENOUGH
 """Number of standard deviations by which a content may be smaller than its estimate, and larger."""
+
+
+SAME = 0.5e-3
+"""Largest difference between two accounts of one vessel, beyond their uncertainty [kg]."""
 
 
 class MaterialError(RunError):
@@ -210,22 +215,27 @@ class Materials:
         return self.account.content(key) or VesselContent(key, 0.0, "weighed", 0.0, 0.0)
 
     def on_rig(self, rig: str) -> dict[str, str]:
-        """Return the ids of the vessels that may stand at a rig, by id and by code.
+        """Return the ids of the vessels that may stand at a rig, by id, by code and by position.
 
         A campaign's source with one of these names is that vessel.
         """
         rows = self._store.rows(
-            "select vessel.id, coalesce(vessel.code, '') as code from vessel left join position on "
-            "position.id = vessel.position where coalesce(position.rig, ?) = ?",
+            "select vessel.id, coalesce(vessel.code, '') as code, coalesce(position, '') as position from vessel "
+            "left join position on position.id = vessel.position where coalesce(position.rig, ?) = ?",
             *(rig, rig),
         )
-        return {name: row["id"] for row in rows for name in (row["code"], row["id"]) if name}
+        return {name: row["id"] for row in rows for name in (row["position"], row["code"], row["id"]) if name}
 
     # ---- look-up
 
     def vessel(self, key: str) -> RegisteredVessel:
-        """Return a vessel by its id or code. Raises MaterialError."""
-        row = self._row("vessel", key)
+        """Return a vessel by its id or code, or by the position where it stands. Raises MaterialError."""
+        standing = self._store.rows(
+            "select vessel.* from vessel join position on position.id = vessel.position where ? in (position.id, "
+            "position.code) and not exists (select 1 from vessel where ? in (id, code))",
+            *(key, key),
+        )
+        row = standing[0] if standing else self._row("vessel", key)
         return RegisteredVessel(
             row["id"], row["code"] or "", json.loads(row["shape"]), row["capacity"], row["position"] or ""
         )
@@ -356,6 +366,34 @@ class Materials:
             return (
                 f"{receiver.id}: holds {1e6 * receiver.capacity:.0f} ml up to the brim, and there could be "
                 f"{1e6 * most / density:.0f} ml in it afterwards"
+            )
+        return ""
+
+    def refusal_at(self, place: str, receiver: str, liquid: str) -> str:
+        """Return the reason why the cup at a place of a laboratory gets no more of a liquid; '' if it does.
+
+        Args:
+            place: 'LABORATORY/PLACE', under which the arm accounts for the cup that stands there.
+            receiver: id of that cup.
+            liquid: id of the liquid.
+        """
+        carried, held = self.account.content(place), self.content(receiver)
+        remedy = f"weigh it: decant materials weigh {place} MASS, or '0 g' if an empty one stands there"
+        if carried is None:
+            return ""
+        if carried.mass is None or held.mass is None:
+            return f"{receiver}: the content of the cup at {place} is UNKNOWN; {remedy}"
+        mass = next((c.mass for c in self.account.composition(place) if c.liquid == liquid and c.mass != 0.0), 0.0)
+        if mass != 0.0:
+            amount = "an UNKNOWN mass" if mass is None else f"{1e3 * mass:.1f} g"
+            return (
+                f"{receiver}: the cup at {place} has {amount} of {liquid} already, and no liquid is dosed into a cup "
+                f"twice; {remedy}"
+            )
+        if abs(carried.mass - held.mass) > SAME + SURE * math.hypot(carried.deviation, held.deviation):
+            return (
+                f"{receiver}: holds {1e3 * held.mass:.1f} g by the account of the station, and "
+                f"{1e3 * carried.mass:.1f} g by that of {place}; {remedy}"
             )
         return ""
 

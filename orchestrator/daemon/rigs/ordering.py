@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 from actors.interfaces import InvalidActionError, LaboratoryError
 from orchestrator.daemon.rigs.campaign_queue import CampaignQueue, RequestRefusedError
 from orchestrator.daemon.rigs.materials import SURE, Materials
-from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, settled_pour
+from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, carried_cup, settled_pour
 from orchestrator.daemon.rigs.pour_request import PourIn, SubmissionIn
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.rigs.submissions import Submission, planned_order, prepare
@@ -139,6 +139,9 @@ class Ordering:
         if reason := self._refusal(order):
             raise RequestRefusedError(reason)
         rig = self._rig(order, request.rig)
+        cup = carried_cup(order, settings.rig(rig).spec)
+        if cup and (reason := self.materials.refusal_at(cup, order.receiver, order.liquid)):
+            raise RequestRefusedError(reason)
         self._queue.refuse_new_work(rig)
         submission = Submission(
             task=POUR, rig=rig, priority=request.priority, order=order, not_before=request.not_before

@@ -27,6 +27,7 @@ from actors.arm.arm_settings import arm_kind
 from actors.interfaces import DoseSource, DoseTarget, SimulatorPool
 from actors.laboratory import predicted_dose
 from actors.laboratory_settings import LaboratorySettings
+from actors.places import all_places
 from orchestrator.campaigns.action_assignments import AssignmentError, assigned_action
 from orchestrator.campaigns.campaign_checks import touch
 from orchestrator.campaigns.file_loading import campaign_from, laboratory_record, load_laboratory, vessel_from
@@ -39,6 +40,7 @@ from orchestrator.daemon.state.daemon_store import QueueItem, Store
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.deployment.costing import Costing
 from orchestrator.learning.dispense import Dispense, KnownSource
+from orchestrator.learning.mixtures import dose_strategy
 from orchestrator.learning.requests import Failed, Simulated, Slots
 from orchestrator.learning.run_errors import RunError
 from orchestrator.learning.single_action import OnePour, RepeatedSimulation
@@ -114,6 +116,10 @@ class PourOrder(BaseModel):
     deviation: float = 1e-4
     """Its standard deviation."""
 
+    stand: str = ""
+    position: str = ""
+    """Positions of source and receiver; '' if they stand nowhere. In a laboratory with places, those of the arm."""
+
     @classmethod
     def of(cls, request: PourIn, materials: Materials) -> PourOrder:
         """The order of a request, with ids instead of bar codes, and with the present content of the source.
@@ -151,6 +157,8 @@ class PourOrder(BaseModel):
             pourer=source.shape,
             vessel=receiver.shape,
             load=content.mass or 0.0,
+            stand=source.position,
+            position=receiver.position,
         )
 
     @property
@@ -174,15 +182,40 @@ _USUAL = Action(angular_velocity=0.5, x_offset=0.1, height=HEIGHT).values()
 """Values of dimensions that an order may leave out; x_offset is searched."""
 
 
-def renew_load(snapshot: Path, mass: float, deviation: float) -> None:
-    """Set the load of an order that has not begun: other pours may have changed its source.
+def renewed(order: PourOrder, materials: Materials) -> PourOrder:
+    """An order that has not begun, with present load and positions: other pours may have changed or moved its vessels.
 
     Args:
-        snapshot: folder of the order.
-        mass: present content of the source [kg].
-        deviation: its standard deviation [kg].
+        order: the order.
+        materials: of the station.
     """
-    PourOrder.read(snapshot).model_copy(update={"load": mass, "deviation": deviation}).write(snapshot)
+    content = materials.content(order.source)
+    stand, position = (materials.vessel(vessel).position for vessel in (order.source, order.receiver))
+    update = {"load": content.mass or 0.0, "deviation": content.deviation, "stand": stand, "position": position}
+    return order.model_copy(update=update)
+
+
+def carried_cup(order: PourOrder, laboratory: LaboratorySettings | None) -> str:
+    """'LABORATORY/PLACE' of the cup that an arm carries for an order; '' if it carries none.
+
+    Args:
+        order: the order.
+        laboratory: of its rig.
+
+    Raises:
+        OrderError: a vessel stands at no place for it.
+    """
+    if laboratory is None or not laboratory.places or order.amount is None or not (order.stand or order.position):
+        return ""
+    known = [place.name for place in all_places(laboratory.places)]
+    for vessel, position in ((order.source, order.stand), (order.receiver, order.position)):
+        if position not in known or (vessel == order.receiver and "/" not in position):
+            stands = f"at '{position}'" if position else "nowhere"
+            raise OrderError(
+                f"{vessel}: stands {stands}, and the arm of laboratory '{laboratory.name}' pours from a source with a "
+                f"place into a cup in a rack; its places are {', '.join(known)}"
+            )
+    return f"{laboratory.name}/{order.position}"
 
 
 @dataclass(frozen=True)
@@ -216,12 +249,27 @@ class PlannedOrder:
             for name, dimension in ACTION_DIMENSIONS.items()
             if (value := action.values()[name]) is not None or dimension.switched_off
         }
-        wanted = {"amount": f"{order.amount!r} kg", "tolerance": f"{order.tolerance!r} kg"}
+        amount, tolerance = f"{order.amount!r} kg", f"{order.tolerance!r} kg"
+        loaded = {"name": "water", **order.properties, "mass": f"{liquid.mass!r} kg"}
+        poured: dict[str, Any] = {"liquid": loaded}
+        poured |= (
+            {"pour": True}
+            if order.amount is None
+            else {"dispense": {"doses": [{"amount": amount, "tolerance": tolerance}]}}
+        )
+        if carried_cup(order, rig.spec):
+            rack, _, cup = order.position.partition("/")
+            poured = {
+                "mixtures": {
+                    "liquids": [{"name": order.liquid, "liquid": loaded, "stands": [order.stand]}],
+                    **{"cups": {"rack": rack}, "wanted": {cup: {order.liquid: amount}}},
+                    **{"tolerance": tolerance, "start": "as_left"},
+                }
+            }
         record = {
             **{"name": POUR, "seed": order.seed, "laboratory": laboratory_record(rig.source or shipped(VIRTUAL))},
-            "liquid": {"name": "water", **order.properties, "mass": f"{liquid.mass!r} kg"},
             **{"pourer": order.pourer, "receiver": order.vessel, "motion": motion},
-            **({"pour": True} if order.amount is None else {"dispense": {"doses": [wanted]}}),
+            **poured,
             "outputs": {"recording": False, "figures": False},
         }
         plan = campaign_from(Document.parse(json.dumps(record), folder / ORDER))
@@ -255,7 +303,7 @@ class PlannedOrder:
         if self.plan.dispense is None:
             return OnePour(self.scene, self.action, seed)
         content = KnownSource(mass=self.scene.liquid.mass, deviation=self.order.deviation)
-        return Dispense(self.plan.dispense, seed, {self.scene.pourer.name: content})
+        return dose_strategy(self.plan.dispense, seed, {self.scene.pourer.name: content})
 
     def duration(self) -> float:
         """Return the expected time until the pour is weighed, without waiting for a person [s of bench time]."""

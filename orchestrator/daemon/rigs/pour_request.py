@@ -108,10 +108,10 @@ class PourIn(RequestModel):
     """Chosen by the caller. The same order with the same id is the same pour: it is never poured twice."""
 
     source: Key
-    """Vessel to pour from: its id or bar code."""
+    """Vessel to pour from: its id or bar code, or the position where it stands."""
 
     receiver: Key
-    """Vessel to pour into: its id or bar code."""
+    """Vessel to pour into: its id or bar code, or the position where it stands, such as 'rack/A1'."""
 
     liquid: str = Field(default="", max_length=80)
     """Liquid that the source has to hold, by id or bar code; '' for any."""

@@ -19,7 +19,7 @@ from actors.interfaces import DeviceCheck, LaboratoryError
 from actors.laboratory import WarmSimulators
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.rigs.materials import Materials
-from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, renew_load, settled_pour
+from orchestrator.daemon.rigs.pour_orders import OrderBook, OrderError, PourOrder, carried_cup, renewed, settled_pour
 from orchestrator.daemon.rigs.remote_operator import Asking, RemoteOperator, RunQuestions
 from orchestrator.daemon.rigs.submissions import run_request
 from orchestrator.daemon.state.daemon_settings import NO_RIG, DaemonSettings, Rig
@@ -220,8 +220,11 @@ class Running:
         margin = order.tolerance
         if reason := materials.refusal(order.source, order.receiver, order.liquid, order.amount, margin, pour=order.id):
             raise OrderError(f"{reason}. Nothing was poured")
-        content = materials.content(order.source)
-        await asyncio.to_thread(renew_load, folder, content.mass or 0.0, content.deviation)
+        order = renewed(order, materials)
+        cup = carried_cup(order, self._rig.spec)
+        if cup and (reason := materials.refusal_at(cup, order.receiver, order.liquid)):
+            raise OrderError(f"{reason}. Nothing was poured")
+        await asyncio.to_thread(order.write, folder)
 
     def _resources(self, request: RunRequest, checksum: str) -> RunResources:
         asking, key, rig = self._shared.asking, self.item.id, self._rig.name

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.campaigns.file_loading import load_campaign, load_laboratory
+from orchestrator.daemon.state.daemon_settings import Rig
+from orchestrator.materials.vessel_account import FILE_NAME, VesselAccount
 from orchestrator.records.journal import JOURNAL_NAME, JournalReader, Kind
 from orchestrator.runs.run_folder import RESOLVED
 from tests.support.station import content, order, rigs_in, set_up, until_pour
@@ -204,3 +206,85 @@ def _admin() -> object:
     from orchestrator.daemon.state.access_tokens import Role
 
     return Role.ADMIN
+
+
+RACK = Path(__file__).parents[4] / "configs" / "laboratories" / "rack.yaml"
+SOURCE = {"profile": {"unit": "mm", "inner": [[0, 0], [40, 0], [40, 100]], "wall": "4 mm", "floor": "4 mm"}}
+CUP = {"profile": {"unit": "mm", "inner": [[0, 0], [28, 0], [28, 80]], "wall": "3 mm", "floor": "3 mm"}}
+
+
+async def rack_set_up(served: Served) -> None:
+    for path, body in (
+        ("/materials/liquids", {"id": "water", "properties": {"name": "water"}}),
+        *(("/materials/positions", {"id": p, "rig": "left"}) for p in ("source/water", "rack/A1", "rack/B2", "shelf")),
+        (
+            "/materials/vessels",
+            {"id": "can", "position": "source/water", "shape": {**SOURCE, "grip": {"mass": "312 g"}}},
+        ),
+        ("/materials/vessels", {"id": "cup-1", "position": "rack/A1", "shape": {**CUP, "grip": {"mass": "90 g"}}}),
+        ("/materials/vessels", {"id": "cup-2", "position": "shelf", "shape": {**CUP, "grip": {"mass": "90 g"}}}),
+        ("/materials/vessels/can/weighed", {"mass": "300 g", "liquid": "water"}),
+    ):
+        await served.post(path, body)
+
+
+def test_an_order_names_the_positions_of_a_rack_whose_cup_the_arm_carries(tmp_path: Path) -> None:
+    rigs = (Rig("left", RACK, load_laboratory(RACK)),)
+
+    async def work() -> None:
+        async with serving(tmp_path, held, rigs=rigs) as served:
+            await rack_set_up(served)
+            wanted = order(source="source/water", receiver="rack/A1", amount="30 g")
+            tried = await served.post("/pours", wanted | {"predict": True, "dry_run": True})
+            assert tried["predicted"]["interval_g"][0] < 30.0 < tried["predicted"]["interval_g"][1]
+            assert (tried["source"], tried["receiver"]) == ("can", "cup-1")
+            placed = await served.post("/pours", wanted)
+            laboratory = await served.pouring()
+            assert [(v.place, v.liquid, v.filled) for v in laboratory.spec.vessels] == [
+                ("source/water", "water", False), ("rack/A1", "", True),
+            ]  # fmt: skip
+            dose = laboratory.bench.dose
+            assert (dose.cup, dose.source.vessel, dose.source.mass) == ("rack/A1", "source/water", 0.3)
+            laboratory.bench.go.set()
+            done = await until_pour(served, "order-1", "weighed")
+            assert placed["campaign"] == done["campaign"]
+            assert (await content(served, "cup-1"))["mass_g"] == pytest.approx(done["result"]["received_g"])
+
+    run(work())
+
+
+def test_a_cup_in_a_rack_that_is_unknown_or_has_the_liquid_is_refused(tmp_path: Path) -> None:
+    rigs = (Rig("left", RACK, load_laboratory(RACK)),)
+
+    async def work() -> None:
+        async with serving(tmp_path, held, rigs=rigs) as served:
+            await rack_set_up(served)
+            account = VesselAccount(tmp_path / "state" / FILE_NAME)
+
+            async def refused(status: int = 409, **changes: str) -> str:
+                body = order(source="can", receiver="rack/A1", amount="30 g") | changes
+                return str((await served.post("/pours", body, status=status))["detail"])
+
+            assert "there is no vessel 'rack/B2'" in await refused(422, receiver="rack/B2")
+            assert "cup-2: stands at 'shelf', and the arm of laboratory 'rack' pours" in await refused(
+                422, receiver="cup-2"
+            )
+            account.add_component("rack/rack/A1", "water", 0.02, 1e-4)
+            account.weigh("rack/rack/A1", 0.02, 1e-4, liquid="water")
+            assert "cup-1: the cup at rack/rack/A1 has 20.0 g of water already" in await refused()
+            account.add_component("rack/rack/A1", "", None, 0.0)
+            assert "holds 0.0 g by the account of the station, and 20.0 g by that of rack/rack/A1" in await refused()
+            account.lose("rack/rack/A1")
+            unknown = await refused()
+            assert "the content of the cup at rack/rack/A1 is UNKNOWN; weigh it: decant materials weigh" in unknown
+            account.weigh("rack/rack/A1", 0.0, 0.0, by="a person")
+            await served.post("/queue/pause")
+            await served.post("/pours", order(source="can", receiver="rack/A1", amount="30 g"))
+            account.lose("rack/rack/A1")  # while it waits
+            await served.post("/queue/resume")
+            stopped = await until_pour(served, "order-1", "failed", "paused")
+            assert "UNKNOWN" in stopped["reason"]
+            assert "Nothing was poured" in stopped["reason"]
+        assert begun(tmp_path) == 0
+
+    run(work())
