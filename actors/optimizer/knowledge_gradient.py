@@ -50,7 +50,13 @@ from scipy.special import ndtr
 
 from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
-from actors.optimizer.model_discrepancy import RESOLUTION, ModelAveragedProcess, clipped_mean, shortfall
+from actors.optimizer.model_discrepancy import (
+    LEAST_CHANCE,
+    RESOLUTION,
+    ModelAveragedProcess,
+    clipped_mean,
+    shortfall,
+)
 from actors.optimizer.questions import (
     BenchOffset,
     DiscrepancyFound,
@@ -139,9 +145,11 @@ def predicted_minimum(process: ModelAveragedProcess, places: Array, targets: Arr
         chances = np.diff(ndtr((edges[:, None] - place_means[:, i]) / spreads[:, i]), axis=0)  # (shown, components)
         slope = covariances[:, i] / spreads[:, i, None] ** 2
         posterior_deviations = np.sqrt(np.maximum(deviations**2 - slope * covariances[:, i], 1e-10))
-        moved = means + slope * (SHOWN[:, None] - place_means[:, i])[:, :, None]  # (shown, components, targets)
-        costs = clipped_mean(moved, np.broadcast_to(posterior_deviations, moved.shape))
-        minima.append(float(np.einsum("kc,c,kcm->km", chances, process.mixture, costs).min(axis=1).sum()))
+        weights = chances * process.mixture
+        k, c = np.nonzero(weights > LEAST_CHANCE)  # pairs (p,): most hypotheses expect only a few of the outcomes
+        moved = means[c] + slope[c] * (SHOWN[k] - place_means[c, i])[:, None]
+        costs = weights[k, c, None] * clipped_mean(moved, posterior_deviations[c])
+        minima.append(float(np.add.reduceat(costs, np.flatnonzero(np.diff(k, prepend=-1))).min(axis=1).sum()))
     return np.array(minima)
 
 

@@ -410,7 +410,8 @@ class ModelAveragedProcess:
         at_data = self._prior_at_data(self._kept)
         counting = np.concatenate([counting, segments.counting[uninformative.argmax(axis=0)]])
         self._at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        self._inverses = np.linalg.inv(_factorised(self._at_data, self._kernel, self._points, self._ages))
+        K = _covariances(self._at_data, self._kernel, self._points, self._ages)
+        self._inverses = np.linalg.inv(np.linalg.cholesky(K))
         self._residuals = np.einsum("jik,jk->ji", self._inverses, self._costs - self._at_data.means)
         self._recent: dict[bytes, tuple[_Prior, Array]] = {}
 
@@ -474,8 +475,8 @@ class ModelAveragedProcess:
                     prior, lengths = self._uninformative(scene.points, scene.costs), UNINFORMATIVE_LENGTHS
                 else:
                     prior, lengths = self._informed(hypotheses, scene.points, scene), hypotheses.lengths
-                kernel = _Kernel(lengths, np.zeros(len(lengths)))
-                logs[i] += scene.power * _sequential(prior, kernel, scene.points, scene.costs)[0].sum(axis=1)
+                K = _covariances(prior, _Kernel(lengths, np.zeros(len(lengths))), scene.points)
+                logs[i] += scene.power * _sequential(prior.means, K, scene.costs)[0].sum(axis=1)
         return logs
 
     def _reliance(self, calibrated: Array) -> Array:
@@ -515,7 +516,8 @@ class ModelAveragedProcess:
         """
         at_data = self._informed_at_data(hypotheses)
         at_data = replace(at_data, noises=np.where(counting, at_data.noises, FORGOTTEN))
-        chances = _sequential(at_data, hypotheses.kernel, self._points, self._costs, self._ages)[0]
+        K = _covariances(at_data, hypotheses.kernel, self._points, self._ages)
+        chances = _sequential(at_data.means, K, self._costs)[0]
         changed = ~counting[:, :1].all(axis=1)
         weights = self._reliance(self._calibrated(hypotheses))
         weights = np.where(changed, np.where(hypotheses.near, np.log(NEAR_CHANGED), 0.0), weights)
@@ -530,21 +532,22 @@ class ModelAveragedProcess:
 
         If the observations after the likeliest change hold another one, they alone are weighed.
         """
-        at_data, kernel = self._prior_at_data(self._all), self._all.kernel.with_uninformative()
-        weighted = self._weighed(at_data, kernel, prior, calibrated, 0)
+        at_data = self._prior_at_data(self._all)
+        K = _covariances(at_data, self._all.kernel.with_uninformative(), self._points, self._ages)
+        weighted = self._weighed(at_data.means, K, prior, calibrated, 0)
         while weighted.since is not None:
-            later = self._weighed(at_data, kernel, prior, calibrated, weighted.since)
+            later = self._weighed(at_data.means, K, prior, calibrated, weighted.since)
             if later.since is None:
                 return replace(later, since=weighted.since) if later.surprised else weighted
             weighted = later
         return weighted
 
-    def _weighed(self, at_data: _Prior, kernel: _Kernel, prior: Array, calibrated: Array, begin: int) -> _Segments:
+    def _weighed(self, means: Array, K: Array, prior: Array, calibrated: Array, begin: int) -> _Segments:
         """Weights of the starts of a segment among the observations from `begin`, with at most one change there: none
         among a calibration's pours."""
         n, skip = len(self._points), max(self._earlier - begin, 0)
-        order, m = np.arange(begin, n), n - begin - skip
-        sequence = _sequential(at_data, kernel, self._points, self._costs, self._ages, order)
+        earliest, m = begin + skip, n - begin - skip
+        sequence = _sequential(means[:, begin:], K[:, begin:, begin:], self._costs[begin:])
         chances, residuals = (values[:, skip:] for values in sequence)
         changed = prior + np.log(
             np.append(np.where(self._all.near, NEAR_CHANGED, 1.0), np.ones(len(UNINFORMATIVE_LENGTHS)))
@@ -560,12 +563,13 @@ class ModelAveragedProcess:
         counting, logs = [np.arange(n) >= begin], [before[:, m]]
         starts = range(0 if skip else 1, m)
         if surprising.any():
-            backwards = _sequential(at_data, kernel, self._points, self._costs, self._ages, order[skip:][::-1])[0]
+            last = slice(None, earliest - 1 if earliest else None, -1)
+            backwards = _sequential(means[:, last], K[:, last, last], self._costs[last])[0]
             after = np.cumsum(backwards, axis=1)[:, ::-1]
             # Change before `start`: Σ_j of the old bench's evidence, times CHANGE, times w_j p_j(y_start … y_n) of the
             # new (Adams & MacKay 2007, with one change).
             for start in starts:
-                counting.append(np.arange(n) >= begin + skip + start)
+                counting.append(np.arange(n) >= earliest + start)
                 logs.append(changed + after[:, start] + _log_sum(before[:, start]) + np.log(CHANGE))
             if surprising[-1]:
                 counting.append(counting[0] & (np.arange(n) < n - 1))
@@ -575,7 +579,7 @@ class ModelAveragedProcess:
         weights = np.exp(np.array(logs) - np.max(logs))
         weights /= weights.sum()
         changes = weights[1 : 1 + len(starts)].sum(axis=1)
-        since = begin + skip + starts[int(np.argmax(changes))] if changes.sum() > NOTICED else None
+        since = earliest + starts[int(np.argmax(changes))] if changes.sum() > NOTICED else None
         since = None if since == n - 1 else since  # a single observation may be a mishap
         return _Segments(np.array(counting), weights, bool(surprising.any()), since)
 
@@ -687,36 +691,23 @@ class ModelAveragedProcess:
         return self._kept, self.mixture[: len(self._kept.gains)]
 
 
-def _factorised(prior: _Prior, kernel: _Kernel, points: Array, ages: Array) -> Array:
-    """Lower Cholesky factors (J, n, n) of the observations' covariances."""
+def _covariances(prior: _Prior, kernel: _Kernel, points: Array, ages: Array | None = None) -> Array:
+    """Covariances (J, n, n) of the observations."""
     n = len(points)
-    if n == 0:
-        return np.zeros((len(kernel.lengths), 0, 0))
     # K_j = v_j(x) v_j(x′) M_{ℓ_j}(x, x′) e^{−κ_j |Δn|} + n_j(x)² 1
-    apart = np.abs(ages[:, None] - ages)
+    apart = None if ages is None else np.abs(ages[:, None] - ages)
     K = kernel.correlation(points, points, apart) * prior.spreads[:, :, None] * prior.spreads[:, None, :]
     K[:, np.arange(n), np.arange(n)] += prior.noises**2
-    return np.asarray(np.linalg.cholesky(K))
+    return np.asarray(K)
 
 
-def _sequential(
-    prior: _Prior,
-    kernel: _Kernel,
-    points: Array,
-    costs: Array,
-    ages: Array | None = None,
-    order: NDArray[np.int_] | slice = slice(None),
-) -> tuple[Array, Array]:
-    """Log probabilities (J, n) of observations given those before them in an order, and standardised residuals."""
-    if not len(points[order]):
-        return np.empty((len(kernel.lengths), 0)), np.empty((len(kernel.lengths), 0))
-    prior = _Prior(*(getattr(prior, name)[:, order] for name in ("means", "spreads", "noises")))
-    L = _factorised(prior, kernel, points[order], (np.zeros(len(points)) if ages is None else ages)[order])
-    costs = costs[order]
+def _sequential(means: Array, K: Array, costs: Array) -> tuple[Array, Array]:
+    """Log probabilities (J, n) of costs (n,), with covariances K, given those before them; standardised residuals."""
+    L = np.linalg.cholesky(K)
     # Residuals L⁻¹ (y − μ): the i-th is (y_i − E[y_i | y_<i]) / L_ii, L_ii its conditional deviation. The
     # probability of an interval [low, high] of it is Φ(high) − Φ(low), from the side on which it is not a
     # difference of numbers near 1.
-    residuals = np.linalg.solve(L, (costs - prior.means)[:, :, None])[:, :, 0]
+    residuals = np.linalg.solve(L, (costs - means)[:, :, None])[:, :, 0]
     deviations = np.diagonal(L, axis1=1, axis2=2)
     high = np.where(costs > TOTAL, np.inf, residuals + 0.5 * RESOLUTION / deviations)
     low = np.where(costs > TOTAL, residuals - (costs - TOTAL) / deviations, residuals - 0.5 * RESOLUTION / deviations)

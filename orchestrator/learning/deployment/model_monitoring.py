@@ -28,6 +28,9 @@ GO_ON: Final = "go on"
 ALARM = 0.9
 """Probability of an uninformative simulator from which an alarm is raised."""
 
+SAME_CHANGE = 10
+"""Number of pours after an announced change of the bench in which a later date of it is not announced again."""
+
 DOUBT = 0.3
 """Probability of an uninformative simulator from which it is in doubt."""
 
@@ -141,6 +144,7 @@ class SimulatorMonitor:
         self._after: list[Belief] = []
         self._latest: DiscrepancyFound | None = None
         self._changed: int | None = None
+        self._announced = -SAME_CHANGE
         self._alarmed = self._accepted = self._drifted = False
         self.decisions: list[Decision] = []
 
@@ -151,8 +155,9 @@ class SimulatorMonitor:
         known = [pour for pour in pours if pour.cost is not None]
         number = known[-1].number if known else 0
         self._latest, since = latest, latest.since_change
-        before, self._changed = self._changed, known[-since].number if since and since <= len(known) else None
-        if self._changed is not None and (before is None or self._changed > before + 1):
+        self._changed = known[-since].number if since and since <= len(known) else None
+        if self._changed is not None and not self._drifted and self._changed > self._announced + SAME_CHANGE:
+            self._announced = self._changed
             text = f"since pour {self._changed} the bench behaves differently: what was poured before no longer counts"
             self.decisions.append(Decision(text, {"changed_since": float(self._changed)}, urgent=True))
         if latest.drifts is not None and not self._drifted:

@@ -21,6 +21,7 @@ from orchestrator.learning.deployment.model_monitoring import (
     displacement,
     offset_priors,
 )
+from orchestrator.learning.deployment.real_pours import PourTrial
 from orchestrator.learning.requests import Suggest
 from orchestrator.learning.stage_result import StageResult
 from orchestrator.runs.stages import DEPLOYMENT, with_offsets
@@ -161,6 +162,31 @@ def test_a_drift_is_said_once_and_how_fast() -> None:
     assert [decision.text for decision in monitor.decisions if decision.urgent] == [
         "the bench drifts: with every pour, it is as if x_offset were about 0.2 mm more than before; "
         "older pours count less"
+    ]
+
+
+def test_on_a_drifting_bench_a_change_is_said_once_and_none_after_the_drift() -> None:
+    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0)
+    still = DiscrepancyFound(0.01, (0.0, 0.0), (0.1, 0.1), 1.0)
+    pours = [PourTrial(number, (0.5, 0.5), {}, None, 0.01, cost=0.1) for number in range(1, 41)]
+    # Since pour 21, dated again after an answer without a change; a drift; and a change that the drift explains.
+    answers = {22: (2, None), 23: (None, None), 25: (5, None), 27: (3, None), 30: (None, (0.0, 0.003)), 38: (2, None)}
+    for made, (since, drifts) in answers.items():
+        monitor.record(replace(still, since_change=since, drifts=drifts), pours[:made])
+    said = [decision.text for decision in monitor.decisions if not decision.text.startswith("after pour")]
+    assert [text.split(":")[0] for text in said] == ["since pour 21 the bench behaves differently", "the bench drifts"]
+    assert "since pour 37 the bench behaves differently" in monitor.text  # the present state is not concealed
+
+
+def test_a_second_change_long_after_the_first_is_said() -> None:
+    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0)
+    still = DiscrepancyFound(0.01, (0.0, 0.0), (0.1, 0.1), 1.0)
+    pours = [PourTrial(number, (0.5, 0.5), {}, None, 0.01, cost=0.1) for number in range(1, 41)]
+    for made, since in {6: 2, 20: 2}.items():
+        monitor.record(replace(still, since_change=since), pours[:made])
+    assert [decision.text[:13] for decision in monitor.decisions if decision.text.startswith("since")] == [
+        "since pour 5 ",
+        "since pour 19",
     ]
 
 
