@@ -19,7 +19,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_engine.settings.model import Problems, Settings
+from sim_engine.settings.model import WRITTEN_IF_SET, Problems, Settings
 from sim_engine.settings.quantity import Quantity
 
 
@@ -86,6 +86,7 @@ class PourOutcome:
         curve_spilled: fraction spilled at those times.
         invalid: why the outcome must not be used; None for a valid one.
         dribbled: ran down the outside of the pourer (`sim_engine.dribbling`); part of `received` and `spilled`.
+        mirrored: whether half of the particles were simulated, and the others are their mirror images.
     """
 
     received: float
@@ -105,6 +106,7 @@ class PourOutcome:
     curve_spilled: tuple[float, ...] = ()
     invalid: str | None = None
     dribbled: float = 0.0
+    mirrored: bool = field(default=False, metadata=WRITTEN_IF_SET)
 
     @property
     def fractions(self) -> Fractions:
@@ -120,6 +122,7 @@ class PourOutcome:
             "in_flight": self.in_flight,
             "escaped": self.escaped,
             "dribbled": self.dribbled,
+            "mirrored": self.mirrored,
             "particles": self.particles,
             "spacing_mm": self.spacing * 1e3,
             "density_error": self.density_error,

@@ -33,7 +33,7 @@ from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, SolidWalls
 from sim_engine.hydrostatics import GRAVITY, level
 from sim_engine.motion import Motion, plan_motion
 from sim_engine.outcome import ESCAPED_LIMIT, ParticleState, PourOutcome, RecordedFrames, SimulatedPour
-from sim_engine.scene import PoseError, PourTask, Scene
+from sim_engine.scene import MIRRORED_FROM, PoseError, PourTask, Scene
 from sim_engine.vessel.shapes import VesselError, VesselSpec
 from sim_engine.vessel.vessel import Vessel, build_vessel, check_holds, in_cavity
 from sim_engine.vessel.wall_correction import equivalent_distance, inside_mask
@@ -51,10 +51,36 @@ def spacing(volume: float, particles: int) -> float:
     return float((volume / particles) ** (1.0 / 3.0))
 
 
+SYMMETRIC = 0.1
+"""Largest `Vessel.asymmetry` of vessels that count as symmetric, in spacings."""
+
+
+def why_whole(vessel: Vessel, volume: float, particles: int) -> str:
+    """Why pours with a vessel are not simulated by half, as text; empty if its shape does not prevent it.
+
+    Args:
+        volume: of the liquid [m³].
+        particles: N.
+    """
+    allowed = SYMMETRIC * spacing(volume, particles)
+    if vessel.asymmetry <= allowed:
+        return ""
+    return (
+        f"it differs from its mirror image in the plane of the tilt by {1e3 * vessel.asymmetry:.2g} mm, more than "
+        f"{1e3 * allowed:.2g} mm: with {particles} particles whole pours are simulated, which takes twice as long"
+    )
+
+
 def fill(
-    vessel: Vessel, volume: float, particles: int, seed: int, wall_distance: float = 0.5, tilt: float = 0.0
+    vessel: Vessel,
+    volume: float,
+    particles: int,
+    seed: int,
+    wall_distance: float = 0.5,
+    tilt: float = 0.0,
+    mirrored: bool = False,
 ) -> NDArray[np.float32]:
-    """Positions of exactly `particles` particles of volume V/N each.
+    """Positions of exactly `particles` particles of volume V/N each, or of the half of them in y > 0.
 
     Args:
         vessel: filled from below.
@@ -64,23 +90,26 @@ def fill(
             it.
         tilt: of the vessel when it is filled, towards +x [rad].
         seed: shifts the lattice, jitters it, and selects places of the topmost layer.
+        mirrored: places half of the particles, on a lattice that is also turned at random about the vertical: along the
+            plane of symmetry it would form layers.
 
     Returns:
-        Shape (N, 3), float32, in the vessel's frame [m].
+        Shape (N, 3) or (N // 2, 3), float32, in the vessel's frame [m].
 
     Raises:
         InvalidSceneError: at this number of particles the liquid does not fit under the rim.
     """
     rng = np.random.default_rng(seed)
     d = spacing(volume, particles)
+    count = particles // 2 if mirrored else particles
     # In a narrow or brimful vessel the lattice may have too few places: then it is compressed, and the solver relaxes
     # it. Rims are lower for particles, so the uppermost spacing is used only if nothing else helps.
     for top in (vessel.rim_height - d, vessel.rim_height):
         for squeeze in (1.0, 0.98, 0.96, 0.94, 0.92, 0.9, 0.87, 0.84):
-            places = _lattice(vessel, d, d * squeeze, wall_distance, top, rng)
-            if len(places) >= particles:
+            places = _lattice(vessel, d, d * squeeze, wall_distance, top, rng, mirrored)
+            if len(places) >= count:
                 order = np.lexsort((rng.random(len(places)), np.round(_height(places, tilt) / (d * squeeze))))
-                chosen = places[order[:particles]]
+                chosen = places[order[:count]]
                 chosen += rng.uniform(-JITTER, JITTER, chosen.shape) * d
                 return chosen.astype(np.float32)
     raise InvalidSceneError(
@@ -96,14 +125,19 @@ def _height(places: NDArray[np.float64], tilt: float) -> NDArray[np.float64]:
 
 
 def _lattice(
-    vessel: Vessel, d: float, step: float, wall_distance: float, top: float, rng: np.random.Generator
+    vessel: Vessel, d: float, step: float, wall_distance: float, top: float, rng: np.random.Generator, mirrored: bool
 ) -> NDArray[np.float64]:
     """Places of a cubic lattice, shifted at random, in the cavity below `top`, shape (M, 3) [m]."""
-    reach = vessel.outer_radius + step
+    reach = (vessel.outer_radius + step) * (math.sqrt(2.0) if mirrored else 1.0)
     across = np.arange(-reach, reach, step)
     shift = rng.uniform(-0.5, 0.5, 2) * step
     z = np.arange(vessel.inner_floor + wall_distance * d, top, step)
     places = np.stack(np.meshgrid(across + shift[0], across + shift[1], z, indexing="ij"), axis=-1).reshape(-1, 3)
+    if mirrored:
+        angle = rng.uniform(0.0, 0.5 * math.pi)
+        cosine, sine = math.cos(angle), math.sin(angle)
+        places = places @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        places = places[places[:, 1] > 0.0]
     places = places[vessel.grid.sample(places) >= 0.9 * wall_distance * d]
     return places[in_cavity(vessel.grid, places)]
 
@@ -125,8 +159,9 @@ class TimeLoop:
     Attributes:
         task, motion: of the pour.
         start: time at which the simulation begins, a multiple of `SLICE`; the liquid lies level before [s].
+        mirrored: whether only the half y ≥ 0 is simulated.
         times, poured, spilled: recorded curve: [s], fractions.
-        frames: time, positions (N, 3) [m], states (N,).
+        frames: time, positions (N, 3) [m], states (N,), of the simulated particles.
         dribbling: what runs down the outside of the pourer; None if that is not simulated.
         states: of the particles at the times of the curve, (N,) each, if `dribbling` is set.
         slices: time reached, in `SLICE`.
@@ -140,6 +175,7 @@ class TimeLoop:
     task: PourTask
     motion: Motion
     start: float
+    mirrored: bool = False
     times: list[float] = field(default_factory=lambda: [0.0])
     poured: list[float] = field(default_factory=lambda: [0.0])
     spilled: list[float] = field(default_factory=lambda: [0.0])
@@ -157,7 +193,13 @@ class TimeLoop:
         if abs(self.start - self.clock) > 1e-9:
             raise ValueError(f"a pour is simulated from a multiple of {SLICE:g} s on, not from {self.start:.6g} s")
         if self.dribbling is not None:
-            self.states.append(np.full(self.task.parameters.particles, int(ParticleState.IN_POURER), np.uint8))
+            self.states.append(np.full(self.particles, int(ParticleState.IN_POURER), np.uint8))
+
+    @property
+    def particles(self) -> int:
+        """Number of simulated particles."""
+        n = self.task.parameters.particles
+        return n // 2 if self.mirrored else n
 
     @property
     def clock(self) -> float:
@@ -171,7 +213,7 @@ class TimeLoop:
             fluid: the engine.
             counts: particles in each state, shape (5,).
         """
-        n = self.task.parameters.particles
+        n = int(counts.sum())
         now = fluid.time()
         if self.task.frame_rate > 0.0 and self.clock >= self._next_frame:
             self.frames.append((now, *fluid.particles()))
@@ -224,7 +266,7 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
         course: of a pour that has ended.
         loading: CPU time of its setup [s].
     """
-    n = course.task.parameters.particles
+    n = course.particles
     counts, spilled_then, dribbled = fluid.census(), course.spilled, 0
     if course.dribbling is not None:
         states = np.array(course.states)
@@ -254,8 +296,8 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
         retained=retained,
         in_flight=in_flight,
         escaped=escaped,
-        particles=n,
-        spacing=spacing(course.task.scene.liquid.volume, n),
+        particles=course.task.parameters.particles,
+        spacing=spacing(course.task.scene.liquid.volume, course.task.parameters.particles),
         density_error=fluid.mean_compression(),
         simulated_time=fluid.time(),
         steps=fluid.steps(),
@@ -266,6 +308,7 @@ def outcome(fluid: FluidEngine, course: TimeLoop, loading: float) -> PourOutcome
         curve_spilled=tuple(map(float, spilled_then)),
         invalid=invalid,
         dribbled=dribbled / n,
+        mirrored=course.mirrored,
     )
 
 
@@ -469,17 +512,33 @@ class PourSimulator:
     ) -> SimulatedPour:
         begun = time.process_time()
         start = calm_until(motion, self.vessel(task.scene.pourer), task.scene.liquid.volume)
-        fluid.load([self._setup(task, motion, start)])
+        mirrored = self.mirrors(task, motion)
+        fluid.load([self._setup(task, motion, start, mirrored)])
         loading = time.process_time() - begun
-        course = TimeLoop(task, motion, start, dribbling=self._dribbling(task, motion))
+        course = TimeLoop(task, motion, start, mirrored, dribbling=self._dribbling(task, motion))
         follow(fluid, course, cancelled)
         if task.frame_rate > 0.0:
-            course.frames[:0] = self._level_frames(task, motion, course.start)
+            course.frames[:0] = self._level_frames(course)
             if course.dribbling is not None:
                 dribbling = course.dribbling.select(np.array(course.states))
                 times = np.array(course.times)
                 course.frames = rivulet_frames(course.dribbling, dribbling, motion, times, course.frames)
         return SimulatedPour(outcome(fluid, course, loading), recorded_frames(course, motion))
+
+    def mirrors(self, task: PourTask, motion: Motion) -> bool:
+        """Whether only the half y ≥ 0 of a pour is simulated, and the other half is its mirror image.
+
+        This requires a scene that allows it, `MIRRORED_FROM` particles, a motion and a receiver without a sideways
+        displacement, and vessels that are symmetric about the plane of the tilt within `SYMMETRIC` spacings.
+        """
+        parameters, scene = task.parameters, task.scene
+        if not scene.mirrored or parameters.particles < MIRRORED_FROM or task.placement.y != 0.0:
+            return False
+        sideways = motion.sample(np.arange(0.0, motion.duration, SLICE))[:, [1, 4, 6]]  # y, and turns about x and z
+        vessels = (self.vessel(scene.pourer), self.vessel(scene.receiver))
+        return not (
+            sideways.any() or any(why_whole(each, scene.liquid.volume, parameters.particles) for each in vessels)
+        )
 
     def _dribbling(self, task: PourTask, motion: Motion) -> DribblingCourse | None:
         """What runs down the outside of the pourer; None if nothing does."""
@@ -496,27 +555,26 @@ class PourSimulator:
         )
         return course if course is not None and course.dribbles.any() else None
 
-    def _laid(self, task: PourTask, motion: Motion, at: float) -> NDArray[np.float32]:
-        """Positions of the liquid at rest in the pourer in its pose at a time [s], (N, 3) in the world [m]."""
+    def _laid(self, task: PourTask, motion: Motion, at: float, mirrored: bool) -> NDArray[np.float32]:
+        """Simulated particles at rest in the pourer in its pose at a time [s], (N, 3) in the world [m]."""
         # The lattice is laid into the upright cup; a tilt error of the grip then moves cup and liquid together.
         tilt = float(motion.tilt(np.array([at]))[0]) if at > 0.0 else 0.0
         pourer, parameters = self.vessel(task.scene.pourer), task.parameters
         volume = task.scene.liquid.volume
-        local = fill(pourer, volume, parameters.particles, task.seed, parameters.wall_distance, tilt)
+        local = fill(pourer, volume, parameters.particles, task.seed, parameters.wall_distance, tilt, mirrored)
         (pose,) = motion.sample(np.array([at]))
         (rotation,) = rotations(pose[None])
         placed: NDArray[np.float32] = (local @ rotation.T + pose[:3]).astype(np.float32)
         return placed
 
-    def _level_frames(
-        self, task: PourTask, motion: Motion, start: float
-    ) -> list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]]:
+    def _level_frames(self, course: TimeLoop) -> list[tuple[float, NDArray[np.float32], NDArray[np.uint8]]]:
         """Frames from before the simulation began, when the liquid lay level: time, positions, states."""
-        homes = np.full(task.parameters.particles, int(ParticleState.IN_POURER), np.uint8)
-        times = np.arange(0.0, start - 0.5 / task.frame_rate, 1.0 / task.frame_rate)
-        return [(float(t), self._laid(task, motion, float(t)), homes) for t in times]
+        task, motion = course.task, course.motion
+        homes = np.full(course.particles, int(ParticleState.IN_POURER), np.uint8)
+        times = np.arange(0.0, course.start - 0.5 / task.frame_rate, 1.0 / task.frame_rate)
+        return [(float(t), self._laid(task, motion, float(t), course.mirrored), homes) for t in times]
 
-    def _setup(self, task: PourTask, motion: Motion, start: float) -> SceneSetup:
+    def _setup(self, task: PourTask, motion: Motion, start: float, mirrored: bool) -> SceneSetup:
         """The scene for the engine, from the time at which its simulation begins [s]."""
         from sim_engine.fluid.state import SUPPORT
 
@@ -526,7 +584,7 @@ class PourSimulator:
         d = spacing(liquid.volume, parameters.particles)
         drift = liquid_velocity(motion, pourer, start) if start > 0.0 else np.zeros(3)
         return SceneSetup(
-            positions=self._laid(task, motion, start),
+            positions=self._laid(task, motion, start, mirrored),
             spacing=d,
             density=liquid.density,
             parameters=parameters,
@@ -541,6 +599,7 @@ class PourSimulator:
             viscosity=liquid.kinematic_viscosity * parameters.viscosity_factor if liquid.is_thick else 0.0,
             tension=liquid.surface_tension if liquid.is_thick else None,
             contact_angle=liquid.contact_angle,
+            mirrored=mirrored,
         )
 
     def _walls(self, spec: VesselSpec, support: float) -> SolidWalls:
@@ -563,9 +622,12 @@ class PourSimulator:
 
 
 def recorded_frames(course: TimeLoop, motion: Motion) -> RecordedFrames | None:
-    """The frames, if any were requested."""
+    """The frames of the whole liquid, if any were requested."""
     if not course.frames:
         return None
     times = np.array([t for t, _, _ in course.frames])
     positions, states = [p for _, p, _ in course.frames], [s for _, _, s in course.frames]
+    if course.mirrored:
+        positions = [np.concatenate([p, p * np.array([1, -1, 1], np.float32)]) for p in positions]
+        states = [np.concatenate([s, s]) for s in states]
     return RecordedFrames(times, positions, states, motion.sample(times))

@@ -104,6 +104,7 @@ async def true_pour(spec: BenchSettings, simulators: SimulatorPool, task: PourTa
         LaboratoryError: the liquid could not be simulated.
     """
     reason = None
+    task = replace(task, scene=replace(task.scene, mirrored=None))  # real liquid is not its own mirror image
     for liquid_seed in np.random.default_rng(stream(seed, "liquid")).integers(0, 2**31, ATTEMPTS):
         try:
             simulated = await simulators.simulate(replace(task, parameters=spec.theta, seed=int(liquid_seed)))

@@ -16,13 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_engine.search_space import Space
+from sim_engine.settings.model import WRITTEN_IF_SET as WRITTEN_IF_SET  # noqa: PLC0414  others import it from here
 
 Array = NDArray[np.float64]
 
 Numbers = tuple[float, ...]
-
-WRITTEN_IF_SET = {"written": "if set"}
-"""Metadata of a field that journal and events leave out while it is None."""
 
 
 @dataclass(frozen=True)

@@ -34,8 +34,9 @@ from sim_engine.collision import contact_during, describe_contact
 from sim_engine.hydrostatics import level
 from sim_engine.lip_flow import flow_course
 from sim_engine.motion import plan_motion
-from sim_engine.scene import Scene
+from sim_engine.scene import MIRRORED_FROM, Scene
 from sim_engine.search_space import Axis, Space
+from sim_engine.simulator import why_whole
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import VesselError, VesselSpec
 from sim_engine.vessel.vessel import Vessel, check_holds
@@ -231,6 +232,7 @@ class _Checker:
     document: Document | None = None
     warn: Callable[[Problem], None] = _ignore
     doing: Callable[[str], None] = _ignore
+    particles: int = MIRRORED_FROM
     problems: list[Problem] = field(default_factory=list)
     vessels: dict[VesselSpec, Vessel | None] = field(default_factory=dict)
     landings: dict[tuple[object, ...], float | None] = field(default_factory=dict)
@@ -286,6 +288,9 @@ class _Checker:
             except VesselError as error:
                 ok = False
                 self.add(places[name], f"{role.text}: {name} can't hold {purpose if less else load}: {error}")
+        for vessel, name in ((pourer, "pourer"), (receiver, "receiver")):
+            if scene.mirrored and (why := why_whole(vessel, scene.liquid.volume, self.particles)):
+                self.warn(self.problem(places[name], f"vessel '{vessel.name}': {why}"))
         if ok and less and not dosed and scene.liquid.volume > receiver.capacity:
             text = (
                 f"{role.text}: the receiver holds {1e6 * receiver.capacity:.4g} mL, enough for what is asked for, not "
@@ -604,7 +609,9 @@ def check_campaign(
     except ConfigError:
         document = None  # a plan without a file
     lab = plan.laboratory
-    checker = _Checker(plan.source, lab.arm, lab.gripper, all_places(lab.places), document, warn, doing)
+    checker = _Checker(
+        plan.source, lab.arm, lab.gripper, all_places(lab.places), document, warn, doing, plan.parameters.particles
+    )
     at: Loc
     if (problem := why_not_writable(plan.outputs.folder)) is not None:
         checker.add((("outputs", "directory"),), problem)

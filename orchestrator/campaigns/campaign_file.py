@@ -29,8 +29,9 @@ from orchestrator.learning.campaign_plan import (
     StrategySettings,
 )
 from orchestrator.learning.strategy_registry import OBJECTIVES, STRATEGIES, calibrations, deployments
-from sim_engine.liquids import LiquidSettings
+from sim_engine.liquids import LiquidSettings, SimulationParameters
 from sim_engine.outcome import Loss
+from sim_engine.scene import MIRRORED_FROM
 from sim_engine.settings.model import (
     Example,
     FilePath,
@@ -468,6 +469,17 @@ class SimulatorSettings(Settings):
 
     parameters: Parameters | None = None
     """Parameters θ: a value fixes one, a range makes calibration search it; the others have their defaults."""
+
+    symmetry: Literal["auto", "off"] = "auto"
+    """auto: one half is simulated of a pour that is its own mirror image, from 10000 particles on; off: always all."""
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether pours may be mirrored: every θ has enough particles, and no sideways displacement is searched."""
+        theta = Parameters() if self.parameters is None else self.parameters
+        searched, values = theta.searched(), SimulationParameters().model_dump() | theta.fixed()
+        fewest = searched["particles"].lower if "particles" in searched else values["particles"]
+        return self.symmetry == "auto" and fewest >= MIRRORED_FROM and "receiver_y" not in searched
 
 
 class CampaignFile(Settings):

@@ -45,7 +45,7 @@ def record_of(base: Mapping[str, Any], plan: CampaignPlan) -> dict[str, Any]:
         "on_unknown": plan.on_unknown,
         "outputs": written(plan.outputs),
         "laboratory": _laboratory(base["laboratory"], plan),
-        "simulator": {"parameters": _parameters(plan)},
+        "simulator": {**base["simulator"], "parameters": _parameters(plan)},
     }
     if plan.memory is None:
         record.pop("prior", None)  # it belongs to a stage that is left out

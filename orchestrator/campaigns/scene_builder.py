@@ -191,7 +191,8 @@ class SceneBuilder:
                 )
         if pourer is None or receiver is None or self.liquid is None or not ok:
             return None
-        return Scene(name, pourer, receiver, self.liquid, pivot, fixed, max_hold_time)
+        mirrored = True if self.file.simulator.mirrors and fixed.get("y_offset") == 0.0 else None
+        return Scene(name, pourer, receiver, self.liquid, pivot, fixed, max_hold_time, mirrored)
 
     def pourer(self, value: Any, place: Place) -> VesselSpec | None:
         """A section's pourer, or the campaign's."""

@@ -88,6 +88,9 @@ class SimulateOutput(CommandOutput):
     dribbled: float
     """Fraction that ran down the outside of the pourer; part of received and spilled."""
 
+    mirrored: bool
+    """Whether half of the particles were simulated, and the others are their mirror images."""
+
     particles: int
     spacing_mm: float
     density_error: float

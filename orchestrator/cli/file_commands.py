@@ -68,10 +68,12 @@ def _checked(path: Path, doing: WaitingIndicator) -> tuple[str, list[str]]:
     doing(f"reading {path}")
     match kind_of(Document.read(resolved(path)).data):
         case "vessel":
+            from sim_engine.scene import MIRRORED_FROM
+            from sim_engine.simulator import why_whole
             from sim_engine.vessel.vessel import build_vessel
 
             built = build_vessel(load_vessel(path))
-            for text in built.warnings:
+            for text in filter(None, (*built.warnings, why_whole(built, built.capacity, MIRRORED_FROM))):
                 print_warning(f"{path}: {text}")
             return f"vessel, holds {1e6 * built.capacity:.4g} mL to the brim", []
         case "laboratory":

@@ -185,7 +185,8 @@ def told(outcomes: list[PourOutcome], over_seeds: Mapping[str, SampleStatistics]
         "1 seed, so no spread; --seeds 5 would tell it" if valid == 1 else f"mean ± standard deviation, {valid} seeds"
     )
     cpu_s = sum(outcome.cpu_s for outcome in outcomes)
-    particles = f"{first.particles} particles, {1e3 * first.spacing:.2f} mm apart, {cpu_s:.1f} CPU s"
+    half = " (half of them simulated, mirrored)" if first.mirrored else ""
+    particles = f"{first.particles} particles{half}, {1e3 * first.spacing:.2f} mm apart, {cpu_s:.1f} CPU s"
     return f"{fractions or 'no outcome that could be used'}   ({seeds}; {particles})"
 
 

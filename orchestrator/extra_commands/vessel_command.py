@@ -440,6 +440,8 @@ def _written_mesh(
 
     from orchestrator.reports import figure_style
     from orchestrator.reports.pour_figures import draw_solid
+    from sim_engine.scene import MIRRORED_FROM
+    from sim_engine.simulator import why_whole
     from sim_engine.vessel.mesh import rim_tilt
     from sim_engine.vessel.mesh_shape import MeshShape
     from sim_engine.vessel.shapes import VesselError, VesselSpec
@@ -460,6 +462,8 @@ def _written_mesh(
             f"its rim is {tilt:.1f}° off level, and the capacity is that to its lowest point: turn the mesh so that "
             "the vessel stands upright"
         )
+    if why := why_whole(built, built.capacity, MIRRORED_FROM):
+        notes.append(why)
     held, deviation = vessel.brimful_volume(), 0.01 * built.capacity
     if held is not None and abs(held - built.capacity) > DOUBTFUL * deviation:
         doubts.append(

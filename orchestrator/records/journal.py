@@ -440,7 +440,12 @@ class Journal(JournalReader):
     def _check_same_campaign(self, header: Header) -> None:
         if digest(self.header.fingerprint) == digest(header.fingerprint):
             return
-        difference = first_difference(self.header.fingerprint, header.fingerprint)
+        difference = first_difference(self.header.fingerprint, header.fingerprint) or ""
+        if difference.endswith("mirrored: nothing became true"):
+            raise JournalError(
+                f"{self.path}: this run simulated whole pours, and now one half would be simulated. Write 'symmetry: "
+                "off' under 'simulator' in the campaign's file to resume it, or begin a new run"
+            )
         raise JournalError(
             f"{self.path}: this run was begun with other settings, and its next steps depend on them: {difference}. "
             "Set that back to resume it, or begin a new run"

@@ -19,7 +19,7 @@ integral: after Bender et al. 2019 (volume maps), see `sim_engine/vessel/wall_co
 
 from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.kernels import SIGMA, dot, length, slope, square, turned, wall_density, wall_slope, weight
-from sim_engine.fluid.neighbours import measure_pairs
+from sim_engine.fluid.neighbours import POLAR, measure_pairs, reflect
 from sim_engine.fluid.state import SUPPORT, VESSELS
 from sim_engine.fluid.walls import to_vessel
 
@@ -177,6 +177,7 @@ def measure_before(f: ti.template(), s):
     volume = SIGMA * inv_h * inv_h * inv_h * d * d * d / PACKING
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.density[i] = 1.0
+    reflect(f, s, f.x0, POLAR)
     # The same sums at the positions x0; the lists' skin covers the displacement since then.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x0[i]
@@ -223,6 +224,7 @@ def displace(f: ti.template(), s):
                 f.push[i][b] = f.push[i][b] + push
         f.move[i] = ti.Vector([move[0], move[1], move[2], 0.0])
         f.place[i] = ti.Vector([f.x[i][0], f.x[i][1], f.x[i][2], scale * pi])
+    reflect(f, s, f.place, POLAR)
     # Δx_i = −Σ_j (Δλ_i + Δλ_j) V ∇W_ij (Macklin & Müller 2013, equation 12, with λ ≥ 0 for compression).
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.place[i]

@@ -20,7 +20,8 @@ with imports(NAME):
     from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
 
 POOL, MOST_SCENES = 50_000, 64
-"""Capacity of a process: particles and scenes. The largest scene has 50,000 particles."""
+"""Capacity of a process: particles, and scenes. The largest scene has 50,000 particles, or half of them and their
+images."""
 
 FAULTS = {
     0: None,
@@ -46,7 +47,7 @@ class FluidEngine:
         self._cavities = np.zeros(1, np.uint8)
         self._poses = np.zeros((1, 7), np.float32)
         self._thick: list[bool] = []
-        self._begins = [0]
+        self._ranges: list[tuple[int, int]] = []
         self._facts = np.zeros((0, len(FACTS)))
 
     def load(self, setups: Sequence[SceneSetup]) -> None:
@@ -55,8 +56,9 @@ class FluidEngine:
         Raises:
             ValueError: they have more particles than there is room for.
         """
-        if (particles := sum(len(s.positions) for s in setups)) > self.pool:
-            raise ValueError(f"{particles} particles; at most {self.pool}")
+        blocks = [len(setup.positions) * (1 + setup.mirrored) for setup in setups]
+        if sum(blocks) > self.pool:
+            raise ValueError(f"{sum(blocks)} particles; at most {self.pool}")
         values, planes = _Pool[np.float32](), _Pool[np.float32]()
         insides = _Pool[np.uint8]()
         begin, row = 0, 0
@@ -98,19 +100,24 @@ class FluidEngine:
                     "time": setup.start - setup.settling,
                     "start": setup.start,
                     "drift": setup.drift,
+                    "mirrored": setup.mirrored,
+                    "apart": setup.apart,
                     "moving": count,
                     "stale": 1,
                     "dt": LONGEST_STEP,
                 }
             )
-            begin += count
+            begin += blocks[s]
             row += len(setup.poses)
         self._grids, self._planes, self._cavities = values.array(), planes.array(), insides.array()
         self._poses = np.concatenate([s.poses for s in setups]).astype(np.float32)
         self.scenes = len(setups)
-        self._begins = [0, *np.cumsum([len(setup.positions) for setup in setups]).tolist()]
+        begins = np.cumsum([0, *blocks])
+        self._ranges = [(int(first), len(setup.positions)) for first, setup in zip(begins, setups, strict=False)]
         self._thick = [setup.viscosity > 0.0 for setup in setups]
-        positions = np.concatenate([s.positions for s in setups]).astype(np.float32)
+        positions = np.zeros((begin, 3), np.float32)
+        for (first, count), setup in zip(self._ranges, setups, strict=True):
+            positions[first : first + count] = setup.positions
         self._load(self.state.table.rows(scenes), positions)
         self._facts = np.full((self.scenes, len(FACTS)), np.nan)
 
@@ -176,8 +183,7 @@ class FluidEngine:
         return counted
 
     def _copies(self, scene: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-        begin, end = self._begins[scene : scene + 2]
-        n = end - begin
+        begin, n = self._ranges[scene]
         copies = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty(n, np.uint8)
         self._get(begin, n, *copies)
         return copies

@@ -18,7 +18,7 @@ clusters, for the same reason).
 
 from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.kernels import square
-from sim_engine.fluid.state import EIGHT, NEIGHBOURS, STRETCHES, SUPPORT
+from sim_engine.fluid.state import EIGHT, NEIGHBOURS, STRETCHES, SUPPORT, VESSELS
 from sim_engine.outcome import ParticleState
 
 SPILLED = int(ParticleState.SPILLED)
@@ -28,9 +28,89 @@ LAYERS = 3.0
 search then reads little more of it than it needs."""
 
 
+NEAR_PLANE = SUPPORT + 2.0
+"""Distance from the plane of symmetry within which particles have images, in spacings: the support and a step."""
+
+GOLDEN = 0.61803399
+"""Fractional parts of its multiples are evenly spread over [0, 1) (Weyl 1916)."""
+
+POLAR, AXIAL, SCALAR = (1.0, -1.0, 1.0), (-1.0, 1.0, -1.0), ()
+"""Factors of the components of a velocity, a rotation and a number in the mirror image by the plane y = 0."""
+
+
 @ti.func
-def cover(f: ti.template(), s, reach):
-    """Cover all moving particles with cells of at least this width: their lowest corner, edges and numbers."""
+def reflect(f: ti.template(), s, values: ti.template(), signs: ti.template()):
+    """Give values of the particles near the plane of symmetry to their images.
+
+    Args:
+        values: of all particles; a fourth component is a number.
+        signs: `POLAR`, `AXIAL` or `SCALAR`.
+    """
+    if f.mirrored[s] == 1:
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            if f.x[i][1] < NEAR_PLANE * f.spacing[s]:
+                value = values[i]
+                for c in ti.static(range(len(signs))):
+                    value[c] *= signs[c]
+                values[i + f.particles[s]] = value
+
+
+@ti.func
+def change_places(f: ti.template(), s, i):
+    """Replace a particle behind the plane of symmetry by its image. The plane is no wall: momentum along it remains."""
+    if f.mirrored[s] == 1 and f.x[i][1] < 0.0:
+        for vector in ti.static((f.x, f.x0, f.v)):
+            vector[i][1] = -vector[i][1]
+        for b in ti.static(range(VESSELS)):
+            f.normal[i][b, 1] = -f.normal[i][b, 1]
+        f.stale[s] = 1
+
+
+@ti.func
+def part_from_own(f: ti.template(), s):
+    """Lengthen the distance of each particle from its own image, squared in `pair`."""
+    # r² = 4 y² + (a d)², a between 0 and `apart` for each particle: how near it may come to the plane differs.
+    if f.mirrored[s] == 1:
+        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
+            k = ti.max(f.first[i] + f.count[i] - 1, 0)  # its own image is listed last
+            if f.count[i] > 0 and f.neighbour[k] == i + f.particles[s]:
+                share = GOLDEN * f.name[i]
+                f.pair[k] = f.pair[k] + (f.apart[s] * f.spacing[s] * (share - ti.floor(share))) ** 2
+
+
+@ti.func
+def list_images(f: ti.template(), s, i, entries, reach, low, edge, size):
+    """List the images within `reach` of a particle, its own last, and return the end of its list."""
+    table = f.cells_begin[s]
+    x = f.x[i]
+    a0 = ti.max(ti.cast((x[0] - low[0] - reach) / edge[0], ti.i32), 0)
+    a1 = ti.min(ti.cast((x[0] - low[0] + reach) / edge[0], ti.i32), size[0] - 1)
+    b1 = ti.min(ti.cast((reach - x[1] - low[1]) / edge[1], ti.i32), size[1] - 1)
+    c0 = ti.max(ti.cast((x[2] - low[2] - reach) / edge[2], ti.i32), 0)
+    c1 = ti.min(ti.cast((x[2] - low[2] + reach) / edge[2], ti.i32), size[2] - 1)
+    for a in range(a0, a1 + 1):
+        for b in range(0, b1 + 1):
+            column = table + (a * size[1] + b) * size[2]
+            j0 = f.begin[s]
+            if column + c0 > table:
+                j0 = f.cell_start[column + c0 - 1]
+            for j in range(j0, f.cell_start[column + c1]):
+                image = j + f.particles[s]
+                f.neighbour[entries] = image
+                entries += ti.cast(square(x - f.x[image]) < reach * reach and i != j, ti.i32)
+    if 2.0 * x[1] < reach:
+        f.neighbour[entries] = i + f.particles[s]
+        entries += 1
+    return entries
+
+
+@ti.func
+def cover(f: ti.template(), s, reach, depth):
+    """Cover all moving particles with cells of at least this width: their lowest corner, edges and numbers.
+
+    Args:
+        depth: of the images behind the plane of symmetry that are covered too [m].
+    """
     low = ti.Vector([1e9, 1e9, 1e9])
     high = ti.Vector([-1e9, -1e9, -1e9])
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -41,6 +121,8 @@ def cover(f: ti.template(), s, reach):
     # one cell.
     # The number of cells is Π (⌊(high − low) / edge⌋ + 1) ≤ f.cells.
     low = ti.min(low, high)
+    if depth > 0.0:
+        low[1] = -depth
     edge = ti.Vector([reach, reach, reach / LAYERS])
     size = ti.cast((high - low) / edge, ti.i32) + 1
     while ti.cast(size[0], ti.f32) * size[1] * size[2] > f.cells[s]:
@@ -69,9 +151,12 @@ def begin_cells(f: ti.template(), table, cells, begin):
 
 @ti.func
 def rebuild(f: ti.template(), s, skin):
-    """Sort the moving particles by cell, with the others last, and list all pairs within h + skin·d, each once."""
+    """Sort the moving particles by cell, with the others last, and list all pairs within h + skin·d, each once.
+
+    Pairs with images are listed at both particles: they add to the particle alone."""
     reach = (SUPPORT + skin) * f.spacing[s]
     low, edge, size = sort(f, s, reach)
+    reflect(f, s, f.x, POLAR)
     list_pairs(f, s, reach, low, edge, size)
 
 
@@ -85,7 +170,7 @@ def sort(f: ti.template(), s, reach):
     begin = f.begin[s]
     end = begin + f.moving[s]
     table = f.cells_begin[s]
-    low, edge, size = cover(f, s, reach)
+    low, edge, size = cover(f, s, reach, 0.0)
     cells = size[0] * size[1] * size[2]
     for c in range(table, table + cells + 1):
         f.cell_start[c] = 0
@@ -143,6 +228,8 @@ def list_pairs(f: ti.template(), s, reach, low, edge, size):
                     r = xi - f.x[j]
                     f.neighbour[entries] = j
                     entries += ti.cast(square(r) < reach2, ti.i32)
+        if f.mirrored[s] == 1 and xi[1] < reach:
+            entries = list_images(f, s, i, entries, reach, low, edge, size)
         f.count[i] = entries - f.first[i]
         if entries > last:
             f.fault[s] = 1
@@ -155,16 +242,20 @@ def list_pairs(f: ti.template(), s, reach, low, edge, size):
 @ti.func
 def measure_pairs(f: ti.template(), s):
     """Distances of all listed pairs, squared, to `pair`."""
+    reflect(f, s, f.x, POLAR)
     # r² = |x_i − x_j|² [m²]; the pair's index k runs through the rows of all i, which are adjacent.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x[i]
         for k in range(f.first[i], f.first[i] + f.count[i]):
             f.pair[k] = square(xi - f.x[f.neighbour[k]])
+    part_from_own(f, s)
 
 
 @ti.func
 def take_seats(f: ti.template(), s, reach):
     """Seat the moving particles of a scene, and find each one's stretches for pairs within `reach`.
+
+    Images of particles within `reach` of the plane of symmetry have seats, too.
 
     Returns:
         The first seat and the one after the last.
@@ -172,8 +263,13 @@ def take_seats(f: ti.template(), s, reach):
     begin = f.begin[s]
     end = begin + f.moving[s]
     seats = begin + EIGHT * s
+    behind = seats + f.moving[s]
+    n = f.particles[s]
     table = f.cells_begin[s]
-    low, edge, size = cover(f, s, reach)
+    for i in range(begin, end):
+        change_places(f, s, i)
+    reflect(f, s, f.x, POLAR)
+    low, edge, size = cover(f, s, reach, reach * f.mirrored[s])
     cells = size[0] * size[1] * size[2]
     for c in range(table, table + cells + 1):
         f.cell_start[c] = 0
@@ -182,6 +278,10 @@ def take_seats(f: ti.template(), s, reach):
         c = cell_at(table, f.x[i], low, edge, size)
         f.cell[i] = c
         f.cell_start[c] = f.cell_start[c] + 1
+        if f.mirrored[s] == 1 and f.x[i][1] < reach:
+            c = cell_at(table, f.x[i + n], low, edge, size)
+            f.cell_start[c] = f.cell_start[c] + 1
+            behind += 1
     begin_cells(f, table, cells, seats)
     for i in range(begin, end):
         c = f.cell[i]
@@ -189,7 +289,13 @@ def take_seats(f: ti.template(), s, reach):
         f.cell_start[c] = k + 1
         f.seated[k] = i
         f.seat[k] = f.x[i] / reach
-    behind = seats + f.moving[s]
+        f.cell[i] = k  # its seat, for its image
+        if f.mirrored[s] == 1 and f.x[i][1] < reach:
+            c = cell_at(table, f.x[i + n], low, edge, size)
+            k = f.cell_start[c]
+            f.cell_start[c] = k + 1
+            f.seated[k] = i + n
+            f.seat[k] = f.x[i + n] / reach
     for k in range(behind, behind + EIGHT):
         f.seat[k] = ti.Vector([0.0, 0.0, 0.0])
         f.lean[k] = ti.Vector([0.0, 0.0, 0.0])  # a diverged pour may have left NaN there, and NaN times 0 is NaN
@@ -202,12 +308,14 @@ def take_seats(f: ti.template(), s, reach):
         q = ti.cast((x - low) / edge, ti.i32)
         c0 = ti.max(ti.cast((x[2] - low[2] - reach) / edge[2], ti.i32), 0)
         c1 = ti.min(ti.cast((x[2] - low[2] + reach) / edge[2], ti.i32), size[2] - 1)
-        n = k * STRETCHES
+        # The first row of cells holds images alone, unless cells had to become larger: they need no pairs there.
+        b0 = ti.cast(f.mirrored[s] == 1 and q[1] == 0 and edge[1] == reach, ti.i32)
+        c = k * STRETCHES
         for a in range(q[0], q[0] + 2):
             for b in range(q[1] - 1 + ti.cast(a == q[0], ti.i32), q[1] + 2):
                 first = seats
                 last = seats
-                if a < size[0] and b >= 0 and b < size[1]:
+                if a < size[0] and b >= b0 and b < size[1]:
                     column = table + (a * size[1] + b) * size[2]
                     first = k + 1
                     last = f.cell_start[column + c1]
@@ -215,8 +323,8 @@ def take_seats(f: ti.template(), s, reach):
                         first = seats
                         if column + c0 > table:
                             first = f.cell_start[column + c0 - 1]
-                f.stretch[n] = ti.Vector([first, last])
-                n += 1
+                f.stretch[c] = ti.Vector([first, last])
+                c += 1
     return seats, behind
 
 

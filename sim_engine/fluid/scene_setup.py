@@ -26,6 +26,9 @@ SURFACE = 0.66
 frequency of drops (`sim_engine.validation.capillarity`)."""
 CAPILLARY = 0.56
 """Longest interval of cohesion, as a fraction of the capillary time; at 0.9 of it drops heat up."""
+APART = 0.6
+"""Particles and their own images add up to this distance to theirs, in spacings, each another one. Without it they keep
+0.4 spacings from the plane of symmetry, and form layers as at a wall."""
 LONGEST_WAIT = 0.01
 """Longest interval of viscosity [s]."""
 
@@ -71,6 +74,8 @@ class SceneSetup:
         no_slip: whether such a liquid sticks to walls.
         tension: surface tension that replaces θ's cohesion [N/m].
         contact_angle: on both vessels [rad].
+        mirrored: whether the positions are the half y ≥ 0 of a liquid that is symmetric about the plane y = 0.
+        apart: largest distance that is added to that of a particle from its own image, in spacings.
     """
 
     positions: NDArray[np.float32]
@@ -91,6 +96,8 @@ class SceneSetup:
     no_slip: bool = True
     tension: float | None = None
     contact_angle: float = 0.5 * math.pi
+    mirrored: bool = False
+    apart: float = APART
 
 
 def pose_at(poses: NDArray[np.float64], time: float) -> NDArray[np.float64]:

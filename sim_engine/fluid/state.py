@@ -111,6 +111,10 @@ class FluidState:
     A scene s owns the particles from `begin[s]` to `begin[s] + particles[s]`; moving ones come first, sorted by cell.
     Indices in lists and cells are those of the pool.
 
+    A **mirrored** scene holds the half y ≥ 0 of a liquid that is symmetric about the plane y = 0. Particles near the
+    plane have images on its other side: that of particle i is i + particles[s]. Passes over pairs read images as they
+    read particles; what they add to images is not used.
+
     Values of each particle:
 
     Attributes:
@@ -184,6 +188,8 @@ class FluidState:
         self.begin = ti.field(ti.i32, shape=scenes)
         self.list_begin = ti.field(ti.i32, shape=scenes)
         self.list_end = ti.field(ti.i32, shape=scenes)  # end of the written part of the lists
+        self.mirrored = ti.field(ti.i32, shape=scenes)  # 1: only the half y ≥ 0 is simulated
+        self.apart = ti.field(ti.f32, shape=scenes)  # largest addition to distances from own images, in spacings
         self.cells_begin = ti.field(ti.i32, shape=scenes)
         self.cells = ti.field(ti.i32, shape=scenes)
         # … constants of the liquid …

@@ -13,7 +13,7 @@ Source: Macklin & Müller 2013; adaptive steps by displacement (CFL).
 from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.density import displace, measure, measure_before, measure_first, multiply, multiply_first
 from sim_engine.fluid.kernels import dot, length, square, turned, turned_back
-from sim_engine.fluid.neighbours import rebuild
+from sim_engine.fluid.neighbours import change_places, rebuild
 from sim_engine.fluid.state import VESSELS, FluidState
 from sim_engine.fluid.tension import pull
 from sim_engine.fluid.viscosity import STIFFEST, flow, relax, yield_to_shear
@@ -139,6 +139,7 @@ class Stepper:
                         x = to_world(f, s, b, y)
             f.x[i] = x
             f.push[i] = ti.Vector([0.0, 0.0])
+            change_places(f, s, i)
             # Lists reach SKIN · d beyond h: while each particle has moved by less than half of it, no pair is missing.
             if square(x - f.x_listed[i]) > limit * limit:
                 f.stale[s] = 1

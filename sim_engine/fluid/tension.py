@@ -101,6 +101,13 @@ def look_at_surface(f: ti.template(), s, seats, behind, inv_h):
         f.lean[k] = (g / (size * PLANE * energy)) * lean
         f.missing[k] = ALONE**2 * lacking / (WHOLE * energy)
         f.pulled[k] = ti.Vector([0.0, 0.0, 0.0])
+    # Images see only part of their neighbours: they have the values of their particles.
+    images = f.begin[s] + f.particles[s]
+    for k in range(seats, behind):
+        if f.seated[k] >= images:
+            i = f.cell[f.seated[k] - f.particles[s]]
+            f.lean[k] = ti.Vector([f.lean[i][0], -f.lean[i][1], f.lean[i][2]])
+            f.missing[k] = f.missing[i]
 
 
 @ti.func

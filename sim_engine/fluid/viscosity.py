@@ -79,6 +79,7 @@ Source: derived here; gradients that are exact for linear functions: Randles & L
 from sim_engine.fluid.compiler import ti
 from sim_engine.fluid.density import PACKING
 from sim_engine.fluid.kernels import SIGMA, decayed, dot, length, slope, square, turned, wall_slope, weight
+from sim_engine.fluid.neighbours import AXIAL, POLAR, SCALAR, part_from_own, reflect
 from sim_engine.fluid.state import SUPPORT, VESSELS
 from sim_engine.fluid.walls import to_vessel
 
@@ -149,6 +150,9 @@ def survey(f: ti.template(), s, dt):
         f.dx[i] = ti.Vector([0.0, 0.0, 0.0])
         for b in ti.static(range(VESSELS)):
             f.push[i][b] = 0.0
+    reflect(f, s, f.x, POLAR)
+    reflect(f, s, f.v, POLAR)
+    reflect(f, s, f.phi, SCALAR)
     # Sums over neighbours: squares = Σ W, dp = Σ W e² with the rate e = v_ij · r / r² at which a pair separates [1/s],
     # dx = −Σ W r, push = Σ W(distance along the wall) · membership of the partner in the layer next to it.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -195,11 +199,13 @@ def survey(f: ti.template(), s, dt):
             film = ti.min(ti.max(ALONE * f.squares[i] / BESIDE, THINNEST), 1.0)
             # The wall's part of dt L, dimensionless: push = dt ν/d² drag.
             f.push[i][b] = f.no_slip[s] * dt * nu / (d * d) * drag(q, film, ti.max(cover, SPARSEST), above)
+    reflect(f, s, f.dp, SCALAR)
 
 
 @ti.func
 def rub(f: ti.template(), s, dt, v: ti.template(), out: ti.template()):
     """out = dt L v, walls at rest."""
+    reflect(f, s, v, POLAR)
     d = f.spacing[s]
     inv_h = 1.0 / (SUPPORT * d)
     # (dt L v)_i = push_i v_i + Σ_j dt PAIRS/d² ½ (ν_i + ν_j) u³ (v_i − v_j), u = 1 − r/h; without the rotation ω.
@@ -241,6 +247,8 @@ def turn_along(f: ti.template(), s, dt):
         f.sums[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
         f.place[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
         f.move[i] = ti.Vector([0.0, 0.0, 0.0, 0.0])
+    reflect(f, s, f.v, POLAR)
+    reflect(f, s, f.v_copy, POLAR)
     # Least squares: the rotation ω of Δv = v − v_copy minimises Σ_j u³ |Δv_ij − ω × r_ij|², hence
     #     ω = J⁻¹ Σ_j u³ r × Δv_ij,    J = Σ_j u³ (|r|² 1 − r ⊗ r), an inertia, r in units of h.
     # Second moments Σ u³ r ⊗ r go to sums (xx, xy, xz, yy), move[3] (yz) and place[0] (zz), the moment to move[0 … 2].
@@ -267,6 +275,7 @@ def turn_along(f: ti.template(), s, dt):
         low = LEAST_INERTIA * (xx + yy + zz) + 1e-9
         inertia = ti.Matrix([[yy + zz + low, -xy, -xz], [-xy, xx + zz + low, -yz], [-xz, -yz, xx + yy + low]])
         f.gradient[i] = inv_h * (inertia.inverse() @ ti.Vector([f.move[i][0], f.move[i][1], f.move[i][2]]))
+    reflect(f, s, f.gradient, AXIAL)
     # dv_i += Σ_j dt PAIRS/d² ½ (ν_i + ν_j) u³ ½ (ω_i + ω_j) × r_ij: the residual of the solution that turns along.
     scale = dt * PAIRS / (d * d) * 0.25
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -378,6 +387,8 @@ def relax(f: ti.template(), s, dt):
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         f.dx[i] = ti.Vector([0.0, 0.0, 0.0])  # drift towards the neighbours' velocities
         f.squares[i] = 0.0
+    reflect(f, s, f.x, POLAR)
+    reflect(f, s, f.v, POLAR)
     # r² and |v_ij · r| of all pairs, then their weights, eight at a time:
     # W (1 − exp(−(xsph_rate + eddies |e|) dt)), e = v_ij · r / r² [1/s].
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -386,6 +397,7 @@ def relax(f: ti.template(), s, dt):
             r = xi - f.x[f.neighbour[k]]
             f.pair[k] = square(r)
             f.share[k] = ti.abs(dot(f.v[f.neighbour[k]] - vi, r))
+    part_from_own(f, s)
     for k in range(f.list_begin[s], f.list_end[s]):
         r2 = f.pair[k]
         w = weight(ti.max(1.0 - ti.sqrt(r2) * inv_h, 0.0))
@@ -442,6 +454,8 @@ def yield_to_shear(f: ti.template(), s, dt):
                 n = ti.Vector([f.normal[i][b, 0], f.normal[i][b, 1], f.normal[i][b, 2]])
                 push += f.pressure[i] * wall_slope(q) * inv_h * n
         f.dx[i] = push
+    reflect(f, s, f.x, POLAR)
+    reflect(f, s, f.pressure, SCALAR)
     # With g = −V ∇W = V (σ/h⁵) slope r, r = x_i − x_j: M = Σ g ⊗ r, gradient = Σ (λ_j − λ_i) g = −Σ (λ_j − λ_i) V ∇W,
     # dx = Σ (λ_i + λ_j) g, as in `density.displace`.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
@@ -481,6 +495,7 @@ def yield_to_shear(f: ti.template(), s, dt):
         f.gradient[i] = change
         f.dx[i] = change
         f.squares[i] = 1.0
+    reflect(f, s, f.gradient, POLAR)
     # v_i += (Δv_i + Σ_j W Δv_j) / (1 + Σ_j W): Shepard's average (Shepard 1968), W(0) = 1.
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         for k in range(f.first[i], f.first[i] + f.count[i]):

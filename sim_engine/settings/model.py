@@ -52,6 +52,9 @@ class FieldMark:
     meaning: str
 
 
+WRITTEN_IF_SET = {"written": "if set"}
+"""Metadata of a field that journal and events leave out while it has its default."""
+
 NOT_IN_FINGERPRINT = FieldMark("decides no request")
 """The field may change when a run is resumed: no request depends on it."""
 

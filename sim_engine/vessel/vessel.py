@@ -126,6 +126,17 @@ class Vessel:
         centre = (low + high) / 2.0
         return centre, float(np.linalg.norm(self.solid_vertices - centre, axis=1).max())
 
+    @cached_property
+    def asymmetry(self) -> float:
+        """How far the shape is from its mirror image in the plane of the tilt, y = 0: the largest difference of the
+        signed distances of points near its surface and of their images [m]; 0 for a surface of revolution."""
+        if self.spec.shape.outline() is not None:
+            return 0.0
+        grid = self.grid
+        nodes = np.argwhere(np.abs(grid.values) < 2.0 * grid.spacing)
+        points = grid.origin + grid.spacing * nodes
+        return float(np.abs(grid.sample(points) - grid.sample(points * np.array([1.0, -1.0, 1.0]))).max())
+
     def cavity_points(self) -> tuple[Floats, float]:
         """Midpoint quadrature of the cavity below the rim, upright.
 

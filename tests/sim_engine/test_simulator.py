@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from actors.runtime.child_process import child_environment
 from sim_engine.action import DEG, Action
 from sim_engine.errors import SimulationCancelled
 from sim_engine.liquids import Liquid, SimulationParameters
-from sim_engine.scene import PourTask, Scene
-from sim_engine.simulator import PourSimulator
-from sim_engine.vessel.shapes import cylinder
+from sim_engine.scene import MIRRORED_FROM, PoseError, PourTask, SampledMotion, Scene
+from sim_engine.simulator import PourSimulator, why_whole
+from sim_engine.vessel.mesh_shape import MeshShape
+from sim_engine.vessel.shapes import VesselSpec, cylinder
 from tests.support.waiting import PATIENCE
 
+ROOT = Path(__file__).parents[2]
 SCENE = Scene(
     "batch",
     cylinder("cup", inner_radius=0.04, inner_height=0.1),
@@ -72,6 +79,84 @@ def test_a_scene_larger_than_the_pool_says_so(simulator: PourSimulator, monkeypa
     monkeypatch.setattr(engine(), "pool", 200)
     with pytest.raises(ValueError, match="300 particles; at most 200"):
         simulator.simulate(task(1))
+
+
+SYMMETRIC = dataclasses.replace(SCENE, mirrored=True)
+
+
+def mirrors(simulator: PourSimulator, whole: PourTask) -> bool:
+    return simulator.mirrors(whole, simulator.prepare(whole))
+
+
+@given(
+    speed=st.floats(10.0, 200.0),
+    x=st.floats(-0.004, 0.004),
+    tilt=st.floats(-0.1, 0.1),
+    particles=st.integers(MIRRORED_FROM, 50_000),
+)
+@settings(max_examples=20, deadline=None)
+def test_a_pour_that_is_its_own_mirror_image_is_simulated_by_half(
+    simulator: PourSimulator, speed: float, x: float, tilt: float, particles: int
+) -> None:
+    error = PoseError(x=x, tilt=tilt)
+    half = dataclasses.replace(task(1, speed=speed, particles=particles, scene=SYMMETRIC), pose_error=error)
+    assert mirrors(simulator, half)
+    assert not mirrors(simulator, dataclasses.replace(half, scene=SCENE))  # symmetry: off, or searched sideways
+
+
+@given(st.floats(1e-6, 0.01) | st.floats(-0.01, -1e-6), st.sampled_from(["action", "theta", "error", "motion", "turn"]))
+@settings(max_examples=30, deadline=None)
+def test_a_pour_with_anything_sideways_is_simulated_whole(simulator: PourSimulator, aside: float, where: str) -> None:
+    half = task(1, particles=MIRRORED_FROM, scene=SYMMETRIC, **({"receiver_y": aside} if where == "theta" else {}))
+    if where == "action":
+        half = dataclasses.replace(half, action=half.action.with_values(y_offset=aside))
+    elif where == "error":
+        half = dataclasses.replace(half, pose_error=PoseError(y=aside))
+    elif where in ("motion", "turn"):
+        times = np.linspace(0.0, 2.0, 50)
+        poses = simulator.prepare(half).sample(times)
+        poses[20:, 1 if where == "motion" else 4] += aside
+        half = dataclasses.replace(half, motion=SampledMotion(times, poses))
+    assert not mirrors(simulator, half)
+
+
+def test_few_particles_are_simulated_whole(simulator: PourSimulator) -> None:
+    assert not mirrors(simulator, task(1, particles=MIRRORED_FROM - 1, scene=SYMMETRIC))
+    assert not simulator.simulate(task(1, scene=SYMMETRIC)).outcome.mirrored
+
+
+def test_a_mug_is_symmetric_with_its_handle_in_the_plane_of_the_tilt_alone(
+    simulator: PourSimulator, tmp_path: Path
+) -> None:
+    mesh = trimesh.load(ROOT / "configs" / "vessels" / "meshes" / "mug.stl")
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(0.5 * np.pi, (0, 0, 1)))
+    mesh.export(tmp_path / "turned.stl")
+    before, turned = (
+        VesselSpec(name="mug", shape=MeshShape(path=path, unit="mm"))
+        for path in (ROOT / "configs" / "vessels" / "meshes" / "mug.stl", tmp_path / "turned.stl")
+    )
+    scene = dataclasses.replace(SYMMETRIC, receiver=before)
+    assert mirrors(simulator, task(1, particles=MIRRORED_FROM, scene=scene))
+    aside = dataclasses.replace(scene, receiver=turned)
+    assert not mirrors(simulator, task(1, particles=MIRRORED_FROM, scene=aside))
+    assert re.search(
+        r"differs from its mirror image in the plane of the tilt by \d+ mm, .* which takes twice as long",
+        why_whole(simulator.vessel(turned), 2e-4, MIRRORED_FROM),
+    )
+
+
+def test_recorded_frames_of_a_mirrored_pour_show_the_whole_liquid(
+    simulator: PourSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sim_engine.simulator.MIRRORED_FROM", 300)
+    shown = simulator.simulate(dataclasses.replace(task(1, scene=SYMMETRIC), frame_rate=20.0))
+    assert (shown.outcome.mirrored, shown.outcome.particles) == (True, 300)
+    assert shown.frames is not None
+    for positions, states in zip(shown.frames.positions, shown.frames.states, strict=True):
+        assert positions.shape == (300, 3)
+        assert positions[150:] == pytest.approx(positions[:150] * [1.0, -1.0, 1.0])
+        assert list(states[150:]) == list(states[:150])
+        assert np.abs(positions[:, 1]).max() > 0.02  # the cup's radius is 40 mm
 
 
 def test_recorded_frames_show_the_liquid_from_the_start_of_a_slow_pour(simulator: PourSimulator) -> None:

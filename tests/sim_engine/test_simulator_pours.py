@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +45,7 @@ def task(
         **action,
     }
     theta = SimulationParameters.from_values({"particles": particles, "xsph_rate": 1.0, **(parameters or {})})
-    scene = Scene("test", pourer, receiver, liquid)
+    scene = Scene("test", pourer, receiver, liquid, mirrored=True)
     return PourTask(scene, Action.compose({}, values), theta, seed, frame_rate, pose_error)
 
 
@@ -52,8 +53,16 @@ def run(simulator: PourSimulator, **kwargs: object) -> SimulatedPour:
     return simulator.simulate(task(**kwargs))  # type: ignore[arg-type]
 
 
+@pytest.fixture(scope="module", params=[False, True], ids=["whole", "mirrored"], autouse=True)
+def mirrored(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Every pour is simulated as a whole, and by half where it is symmetric: the criteria are the same."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sim_engine.simulator.MIRRORED_FROM", 0 if request.param else 10**9)
+        yield
+
+
 @pytest.fixture(scope="module")
-def plain(simulator: PourSimulator) -> SimulatedPour:
+def plain(simulator: PourSimulator, mirrored: None) -> SimulatedPour:
     return run(simulator, frame_rate=20.0)
 
 

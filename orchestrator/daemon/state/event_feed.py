@@ -68,7 +68,7 @@ def plain(value: Any) -> Any:
         return plain(value.model_dump(mode="python"))
     if dataclasses.is_dataclass(value):
         values = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
-        table = {f.name: plain(v) for f, v in values.items() if v is not None or f.metadata != WRITTEN_IF_SET}
+        table = {f.name: plain(v) for f, v in values.items() if f.metadata != WRITTEN_IF_SET or v != f.default}
         return {"type": type(value).__name__, **table}
     if isinstance(value, Mapping):
         return {str(key): plain(entry) for key, entry in value.items()}

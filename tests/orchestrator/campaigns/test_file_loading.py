@@ -26,6 +26,7 @@ from orchestrator.records.run_registry import state_directory
 from orchestrator.runs.run_folder import create_run
 from orchestrator.study.study_file import load_study
 from sim_engine.action import DEG
+from tests.support.campaign_files import CAMPAIGN, report, write, write_good
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 
@@ -398,3 +399,33 @@ def test_unusual_files_are_errors_and_no_tracebacks(tmp_path: Path) -> None:
         load_campaign(tmp_path / "absent.yaml")
     with pytest.raises(ConfigError, match="is a directory"):
         load_campaign(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("simulator", "actions", "mirrored"),
+    [
+        ("parameters: {particles: 10000, cohesion: [0 N/m, 0.1 N/m]}", "", True),
+        ("parameters: {particles: [10000, 20000]}", "", True),
+        ("parameters: {particles: 10000, cohesion: [0 N/m, 0.1 N/m]}\n  symmetry: off", "", None),
+        ("parameters: {particles: 9999, cohesion: [0 N/m, 0.1 N/m]}", "", None),
+        ("parameters: {particles: [5000, 20000]}", "", None),  # no comparison mixes halves and whole pours
+        ("parameters: {particles: 10000, receiver_y: [-5 mm, 5 mm]}", "", None),
+        ("parameters: {particles: 10000, cohesion: [0 N/m, 0.1 N/m]}", ", y_offset: [-5 mm, 5 mm]", None),
+    ],
+)
+def test_pours_of_a_campaign_are_simulated_by_half_if_none_is_sideways(
+    tmp_path: Path, simulator: str, actions: str, mirrored: bool | None
+) -> None:
+    text = CAMPAIGN.replace("parameters:\n    cohesion: [0 N/m, 0.1 N/m]", simulator)
+    text = text.replace("120 deg/s]}", f"120 deg/s]{actions}}}")
+    plan = load_campaign(write(write_good(tmp_path), "campaign.yaml", text))
+    assert plan.calibration is not None
+    assert plan.calibration.scene.mirrored is mirrored
+    assert ("mirrored" in fingerprint(plan)["calibration"]["scene"]) == bool(mirrored)
+
+
+def test_symmetry_can_not_be_forced(tmp_path: Path) -> None:
+    bad = CAMPAIGN.replace("simulator:\n", "simulator:\n  symmetry: on\n")
+    assert "campaign.yaml:8:13: simulator.symmetry: 'on' is not known here; should be 'auto' or 'off'" in report(
+        write(write_good(tmp_path), "campaign.yaml", bad)
+    )

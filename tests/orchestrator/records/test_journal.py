@@ -210,6 +210,12 @@ def test_other_settings_are_refused_by_name(path: Path) -> None:
     Journal.resume(path, HEADER).close()  # and the refusal left no lock behind
 
 
+def test_a_run_of_whole_pours_says_how_it_is_resumed(path: Path) -> None:
+    Journal.create(path, Header("toy", {"scene": {"name": "cup"}})).close()
+    with pytest.raises(JournalError, match=r"simulated whole pours.* Write 'symmetry: off' under 'simulator'"):
+        Journal.resume(path, Header("toy", {"scene": {"name": "cup", "mirrored": True}}))
+
+
 @pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
 def test_a_journal_of_another_format_is_refused_and_stays_as_it_is(path: Path, other: int) -> None:
     journal = Journal.create(path, HEADER)

@@ -1,0 +1,46 @@
+"""`neighbours`: images of a mirrored scene: half of a symmetric liquid moves as beside the other half."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim_engine.action import DEG, Action
+from sim_engine.fluid.engine import engine
+from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.scene import PourTask, Scene
+from sim_engine.simulator import PourSimulator
+from sim_engine.vessel.shapes import cylinder
+
+MIRROR = np.array([1.0, -1.0, 1.0], np.float32)
+SCENE = Scene(
+    "scene",
+    cylinder("cup", inner_radius=0.03, inner_height=0.08),
+    cylinder("glass", inner_radius=0.045, inner_height=0.09),
+    Liquid(mass=0.15),
+)
+FAST = Action(angular_velocity=200 * DEG, max_angle=110 * DEG, x_offset=0.1, height=0.12, angular_acceleration=None)
+
+
+@pytest.mark.parametrize(
+    ("cohesion", "viscosity", "time", "agreement"),
+    [(0.0, 0.0, 0.02, 2e-4), (0.07, 0.0, 0.02, 2e-4), (0.07, 0.2, 0.01, 2e-3)],
+)
+def test_half_of_a_symmetric_liquid_moves_as_it_does_beside_the_other_half(
+    simulator: PourSimulator, cohesion: float, viscosity: float, time: float, agreement: float
+) -> None:
+    """In every pass over pairs: density, displacements, viscosity of thin and of thick liquids, cohesion. The two
+    halves of the whole liquid differ by as much, by rounding."""
+    liquid = SCENE.liquid.model_copy(update={"dynamic_viscosity": viscosity} if viscosity else {})
+    task = PourTask(replace(SCENE, liquid=liquid), FAST, SimulationParameters(particles=600, cohesion=cohesion), 1)
+    half = replace(simulator._setup(task, simulator.prepare(task), 0.0, True), apart=0.0, settling=0.0)
+    whole = replace(half, positions=np.concatenate([half.positions, half.positions * MIRROR]), mirrored=False)
+    fluid, n = engine(), len(half.positions)
+    fluid.load([half, whole])
+    for scene in (0, 1):
+        fluid.advance(time, scene)
+    assert fluid.steps(0) == fluid.steps(1) >= 3
+    assert np.abs(fluid.particles(0)[0] - fluid.particles(1)[0][:n]).max() < agreement * half.spacing
+    assert np.abs(fluid.velocities(0) - fluid.velocities(1)[:n]).max() < agreement  # of 0.5 m/s
