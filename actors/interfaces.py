@@ -12,7 +12,7 @@ None of these depends on strategies.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
@@ -56,7 +56,16 @@ class PourFailedError(LaboratoryError):
 
 
 class InvalidActionError(LaboratoryError):
-    """The vessels would touch, or the motion is impossible: refused before anything moved or was simulated."""
+    """The vessels would touch, or the motion is impossible: refused before anything moved or was simulated.
+
+    Args:
+        text: the reason.
+        problems: all reasons, if there are several.
+    """
+
+    def __init__(self, text: str = "", problems: Sequence[str] = ()) -> None:
+        super().__init__(text)
+        self.problems = tuple(problems) or (text,)
 
 
 class UnreachablePlaceError(InvalidActionError):

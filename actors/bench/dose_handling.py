@@ -139,7 +139,7 @@ def check_vessels(
             problems.append(f"two vessels belong to place '{vessel.place}': {homes[vessel.place]} and {vessel.name}")
         homes.setdefault(vessel.place, vessel.name)
     if problems:
-        raise InvalidActionError("; ".join(problems))
+        raise InvalidActionError("; ".join(problems), problems)
     loads = {vessel.name: Load(built(vessel.spec), vessel.mass, vessel.volume) for vessel in vessels}
     cups = [vessel.name for vessel in vessels if not vessel.liquid]
     # of several cups with one shape, the fullest stands for all of them

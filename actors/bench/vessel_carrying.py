@@ -110,11 +110,18 @@ def check_carrying(
         InvalidActionError: it cannot; the text states why, for all places.
     """
     kind = arm_kind(spec)
-    widths = {load: _check_load(load, spec, gripper) for load in set(loads.values())}
+    widths, unfit = dict[Load, float](), list[str]()
+    for load in dict.fromkeys(loads.values()):
+        try:
+            widths[load] = _check_load(load, spec, gripper)
+        except InvalidActionError as error:
+            unfit.append(str(error))
+    if unfit:
+        raise _refused(unfit)
     vessels = {name: load.vessel for name, load in loads.items()} | dict(others)
     opened = {name: widths[load] for name, load in loads.items()}
     if problems := [text for _, text in kind.place_problems(places, vessels, opened)]:
-        raise InvalidActionError(_joined(problems))
+        raise _refused(problems)
     ways, impossible = Ways(), list[str]()
     for place in stops:
         largest = max((loads[name].volume for name in place.holds if name in loads), default=0.0)
@@ -124,14 +131,14 @@ def check_carrying(
             except InvalidActionError as error:
                 impossible.append(str(error))
     if impossible:
-        raise InvalidActionError(_joined([*dict.fromkeys(impossible)]))
+        raise _refused([*dict.fromkeys(impossible)])
     return ways
 
 
-def _joined(problems: Sequence[str]) -> str:
-    """Problems as one text; of a rack with many, the first ones."""
+def _refused(problems: Sequence[str]) -> InvalidActionError:
+    """The error with all problems; of a rack with many, its text has the first ones."""
     more = f"; and {len(problems) - SHOWN} more" if len(problems) > SHOWN else ""
-    return "; ".join(problems[:SHOWN]) + more
+    return InvalidActionError("; ".join(problems[:SHOWN]) + more, problems)
 
 
 def _check_load(load: Load, spec: ArmSettings, gripper: GripperSettings) -> float:

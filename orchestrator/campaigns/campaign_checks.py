@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,6 +50,9 @@ LEAST = 1.0 / 3.0
 
 MOST_TRIED = 9
 """Maximum number of pours whose streams are computed, in all dimensions other than x_offset."""
+
+DOSE_TILTS = Space((Axis("angular_velocity", math.radians(5.0), math.radians(40.0)),))
+"""Speeds of the tilt within which most of a dose flows."""
 
 Senseless = tuple[tuple[Loc, ...], str]
 """Keys that the finding may concern, the most specific first, and the message."""
@@ -373,6 +377,7 @@ class _Checker:
             vessels: of mixtures; empty: the only source, and one cup after the other.
         """
         from actors.bench.dose_handling import check_vessels, plan_waste, shapes_of, vessels_of
+        from actors.bench.vessel_carrying import SHOWN
 
         assert self.arm is not None
         assert self.gripper is not None
@@ -395,7 +400,10 @@ class _Checker:
                     cup = next(vessel for vessel in each if not vessel.liquid)
                     plan_waste(at_places, self.arm, plan.scenes[0], cup, shapes_of(self.places, loads))
             except InvalidActionError as error:
-                self.add((section,), str(error))
+                for text in error.problems[:SHOWN]:
+                    self.add((*_named(plan, text), section), text)
+                if len(error.problems) > SHOWN:
+                    self.add((section,), f"and {len(error.problems) - SHOWN} more problems of the same kind")
                 return
 
     def _payload(self, scene: Scene) -> None:
@@ -473,8 +481,10 @@ class _Checker:
             largest = max((planned.amount + planned.limit for planned in doses), default=0.0)
             role = _Role(f"doses from '{scene.pourer.name}' into '{scene.receiver.name}'", section)
             self._payload(scene)
-            if self.scene(scene, role, largest / scene.liquid.density, dosed=True) is None:
+            if (vessels := self.scene(scene, role, largest / scene.liquid.density, dosed=True)) is None:
                 continue
+            if missed := _misses(DOSE_TILTS, scene, *vessels, self.landings):
+                self.add(role.places(*missed[0]), f"{role.text}: {missed[1]}")
             if simulated:
                 from actors.dosing.simulated_dose import check_straight
 
@@ -655,11 +665,25 @@ def check_campaign(
                 "write 'balance: {placement: receiver}' and set it up so"
             )
             checker.add((dose_section(plan.dispense), ("laboratory",)), text)
+        before = len(checker.problems)
         checker.doses(plan.dispense, simulated=plan.laboratory.arm is None)
         checker.display(plan.dispense, lab)
-        if plan.dispense.mixtures is not None and not checker.problems:
+        if plan.dispense.mixtures is not None and len(checker.problems) == before:
             checker.mixtures(plan, tell)
     return list(dict.fromkeys(checker.problems))
+
+
+def _named(plan: DispensePlan, text: str) -> tuple[Loc, ...]:
+    """Keys of the mixtures' file that describe the vessel which a problem names first."""
+    cups = () if plan.mixtures is None else (*plan.mixtures.cups, *plan.mixtures.spares)
+    liquids = list(dict.fromkeys(map(plan.liquid, plan.sources)))
+    for name in re.findall(r"'([^']+)'", text):
+        if name in plan.sources and plan.mixtures is not None:
+            i = liquids.index(plan.liquid(name))
+            return ("mixtures", "liquids", i, "source"), ("mixtures", "liquids", i, "stands"), ("pourer",)
+        if name in cups or name == plan.scenes[0].receiver.name:
+            return ("mixtures", "cups", "vessel"), ("receiver",)
+    return ()
 
 
 def dose_section(plan: DispensePlan) -> Loc:

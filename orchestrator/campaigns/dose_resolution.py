@@ -16,6 +16,7 @@ from actors.places import CellVessel, all_places
 from orchestrator.campaigns.campaign_file import (
     DispenseSettings,
     DoseSeriesSettings,
+    MixedLiquidSettings,
     MixturesSettings,
     parse_amount,
 )
@@ -145,7 +146,7 @@ def resolve_mixtures(
     cups = {name: masses.of_cup(name, row) for name, row in amounts.items()}
     positions = _positions(section, list(cups), builder, place, complain)
     if laboratory is not None and laboratory.places:
-        _check_places(laboratory, sources, positions, place, builder, complain)
+        _check_places(laboratory, section, positions, place, builder, complain)
     if cup is not None:
         _check_brim(cup, cups, liquids, section, complain)
     if report.problems or laboratory is None or cup is None:
@@ -186,7 +187,7 @@ def _liquids(
         )
         if liquid is not None and entry.name is not None:
             liquids[entry.name] = liquid.model_copy(update={"name": entry.name})
-        for j, stand in enumerate([f"source/{entry.name}"] if entry.stands is None else entry.stands):
+        for j, stand in enumerate(_stands(entry)):
             if stand in taken:
                 builder.report.add(at.at("stands", j), f"another source is called '{stand}'; each stand holds one")
             taken.add(stand)
@@ -195,6 +196,10 @@ def _liquids(
         if entry.stands == []:
             builder.report.add(at.at("stands"), "is empty; name at least one, or remove it")
     return liquids, sources
+
+
+def _stands(entry: MixedLiquidSettings) -> list[str]:
+    return [f"source/{entry.name}"] if entry.stands is None else entry.stands
 
 
 def _in_file(builder: SceneBuilder, place: Place) -> Complain:
@@ -367,7 +372,7 @@ def _position(section: MixturesSettings, cup: str) -> str:
 
 def _check_places(
     laboratory: LaboratorySettings,
-    sources: list[tuple[str, VesselSpec]],
+    section: MixturesSettings,
     positions: Mapping[str, str],
     place: Place,
     builder: SceneBuilder,
@@ -376,14 +381,18 @@ def _check_places(
     """Check that every source and cup has a place in the laboratory."""
     known = [position.name for position in all_places(laboratory.places)]
     lacks = f"laboratory '{laboratory.name}' has no place"
+    ends = [[position.name for position in each.each] for each in laboratory.places]
+    named = ", ".join(f"{names[0]} … {names[-1]}" if len(names) > 1 else names[0] for names in ends)
     for name, position in positions.items():
         if position not in known and name.startswith("spare "):
             builder.report.add(place.at("cups", "spares"), f"{lacks} '{position}'")
         elif position not in known:
-            complain(name, "", f"{lacks} '{position}'; there are {', '.join(known)}")
-    for _, source in sources:
-        if source.name not in known:
-            builder.report.add(place.at("liquids"), f"{lacks} '{source.name}'; there are {', '.join(known)}")
+            complain(name, "", f"{lacks} '{position}'; there are {named}")
+    for i, entry in enumerate(section.liquids or ()):
+        for j, stand in enumerate(_stands(entry)):
+            at = place.at("liquids", i, "name") if entry.stands is None else place.at("liquids", i, "stands", j)
+            if stand not in known:
+                builder.report.add(at, f"{lacks} '{stand}'; there are {named}")
 
 
 def cell_vessels(plan: DispensePlan) -> tuple[CellVessel, ...]:

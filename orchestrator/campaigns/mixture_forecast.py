@@ -138,8 +138,8 @@ class MixtureForecast:
         planned = [dose for dose in self._series.doses if dose.liquid == liquid]
         sources, limit = self._series.sources_of(planned[0]), planned[0].limit
         full = 1e3 * self._series.scene(sources[0], planned[0].receiver).liquid.mass
-        times = {1: "once", 2: "twice"}
-        filled = [f"{name} filled {times.get(count := self.fills[name], f'{count} times')}" for name in sources]
+        times = {0: "not needed", 1: "filled once", 2: "filled twice"}
+        filled = [f"{name} {times.get(count := self.fills[name], f'filled {count} times')}" for name in sources]
         total = 1e3 * sum(dose.amount for dose in planned)
         texts = [f"{liquid}: {total:.4g} g in {len(planned)} doses; {', '.join(filled)}, {full:.4g} g each time"]
         for amount, predicted in self._predicted[liquid]:

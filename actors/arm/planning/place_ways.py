@@ -277,6 +277,11 @@ def _too_near(thing: str, apart: float, each: Standing, when: str) -> str:
     return f"{thing} would {how} a vessel at '{each.place}', {when}; {1e3 * each.clearance:.0f} mm have to stay free"
 
 
+def _gap(distance: float) -> str:
+    """A distance between two things [m], which is negative if they would take the same room."""
+    return f"{1e3 * distance:.0f} mm apart" if distance >= 0.0 else f"{-1e3 * distance:.0f} mm within each other"
+
+
 def place_problems(
     places: Sequence[PlaceSettings],
     spec: UrArmSettings,
@@ -298,7 +303,7 @@ def place_problems(
         if apart < max(first.clearance, other.clearance):
             yield (
                 i,
-                f"places '{first.place}' and '{other.place}' overlap: what stands there is {1e3 * apart:.0f} mm apart, "
+                f"places '{first.place}' and '{other.place}' overlap: what stands there is {_gap(apart)}, "
                 f"{1e3 * max(first.clearance, other.clearance):.0f} mm have to stay free",
             )
             continue
@@ -312,9 +317,8 @@ def place_problems(
         if free < max(first.clearance, other.clearance):
             yield (
                 i,
-                f"places '{first.place}' and '{other.place}' overlap when the gripper is open: its fingers would come "
-                f"within {1e3 * free:.0f} mm of the neighbour, {1e3 * max(first.clearance, other.clearance):.0f} mm "
-                "have to stay free",
+                f"places '{first.place}' and '{other.place}' overlap when the gripper is open: its fingers and the "
+                f"neighbour are {_gap(free)}, {1e3 * max(first.clearance, other.clearance):.0f} mm have to stay free",
             )
     for i, (place, foot) in enumerate(zip(places, standing, strict=True)):
         axis = vessel_at(place, spec).rotation[:, 2]

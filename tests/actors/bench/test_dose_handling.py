@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import pickle
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from pathlib import Path
@@ -315,8 +316,8 @@ def test_a_cup_is_emptied_only_where_there_is_waste_and_the_arm_reaches_over_it(
     beside = WASTE.with_values(pose=Pose.of(0.66, -0.62, 0.08, TURN, TURN, TURN))
     with pytest.raises(InvalidActionError, match="places 'source/ethanol' and 'waste' overlap"):
         check_vessels(all_places((*lab.places, beside)), lab.vessels, lab.arm, GRIPPER)
-    high = WASTE.with_values(container=ContainerSettings(diameter=0.06, height=0.5))
-    for waste, problem in ((WASTE, ""), (high, "'rack/A1' cannot be emptied at 'waste': ")):
+    far = WASTE.with_values(pose=Pose.of(0.99, -0.89, 0.08, TURN, TURN, TURN))
+    for waste, problem in ((WASTE, ""), (far, "'rack/A1' cannot be emptied at 'waste': ")):
         places, loads, _ = check_vessels(all_places((*lab.places, waste)), lab.vessels, lab.arm, GRIPPER)
         shapes = shapes_of(all_places((*lab.places, waste)), loads)
         if problem:
@@ -348,6 +349,22 @@ def test_vessels_that_cannot_be_carried_are_refused(change: Callable[[Any], Any]
     assert lab.arm is not None
     with pytest.raises(InvalidActionError, match=message):
         check_vessels(all_places(lab.places), tuple(change(lab.vessels)), lab.arm, GRIPPER)
+
+
+def test_positions_that_overlap_are_all_refused_also_where_only_open_fingers_do() -> None:
+    lab = load_laboratory(LABORATORIES / "rack.yaml")
+    assert lab.arm is not None
+    for radius, text in (
+        (0.048, "places 'rack/A1' and 'rack/A2' overlap: what stands there is 2 mm within each other, 15 mm have to"),
+        (0.037, "places 'rack/A1' and 'rack/A2' overlap when the gripper is open: its fingers and the neighbour are"),
+    ):
+        wide = carried(cylinder("cup", inner_radius=radius, inner_height=0.08, wall=0.003), 0.09)
+        cups = tuple(CellVessel(f"rack/A{i}", wide, "", 0.08, 0.08e-3) for i in range(1, 7))
+        with pytest.raises(InvalidActionError) as caught:
+            check_vessels(all_places(lab.places), cups, lab.arm, GRIPPER)
+        assert text in str(caught.value)
+        assert len(caught.value.problems) >= 5  # each pair of neighbours
+        assert set(caught.value.problems) == set(pickle.loads(pickle.dumps(caught.value)).problems)
 
 
 def test_rows_of_a_rack_stand_as_on_stairs_if_the_gripper_reaches_over_them() -> None:

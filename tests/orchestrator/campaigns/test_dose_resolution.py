@@ -220,4 +220,4 @@ def test_every_cup_and_source_needs_a_place_in_a_laboratory_with_places() -> Non
         build_campaign(document)
     text = problems(caught.value)
     assert "mixtures.wanted.E7: laboratory 'rack' has no place 'rack/E7'; there are pan, source/water" in text
-    assert "mixtures.liquids: laboratory 'rack' has no place 'source/brine'" in text
+    assert "mixtures.liquids[0].stands[0]: laboratory 'rack' has no place 'source/brine'" in text

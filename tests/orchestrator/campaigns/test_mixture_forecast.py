@@ -81,3 +81,43 @@ def test_later_doses_cost_no_further_predictions(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(mixture_forecast, "predicted_dose", lambda *a: calls.append(a) or original(*a))
     MixtureForecast(load_campaign(path))
     assert len(calls) == 4
+
+
+RACK = Path(__file__).parents[3] / "configs" / "laboratories" / "rack.yaml"
+
+
+def test_vessels_places_and_amounts_that_are_impossible_are_refused_at_once(tmp_path: Path) -> None:
+    """The cup has no empty mass, both sources are too heavy when full, and the balance does not support one amount."""
+    text = CAMPAIGN.replace(
+        "{name: bench, mode: virtual, bench: {liquid: {particles: 400}, operator_time: 60 s}}", str(RACK)
+    )
+    text = text.replace("floor: 4 mm}}", "floor: 4 mm}, grip: {mass: 1400 g}}").replace(
+        "ethanol: 20 g}\n    A2", "ethanol: 1.5 g}\n    A2"
+    )
+    path = tmp_path / "mix.yaml"
+    path.write_text(text, encoding="utf-8")
+    problems = [f"{p.line}: {p.where}: {p.message}" for p in check_campaign(load_campaign(path))]
+    assert [problem.partition(";")[0] for problem in problems] == [
+        "3: pourer: 'source/water' is too heavy when full: 1700 g without the gripper, and arm.payload is 1600 g",
+        "3: pourer: 'source/ethanol' is too heavy when full: 1650 g without the gripper, and arm.payload is 1600 g",
+        "4: receiver: 'cup' is carried between places: its vessel file needs its empty mass, 'grip: {mass: 312 g}'",
+        problems[3].partition(";")[0],
+    ]
+    assert re.match(r"12: mixtures.wanted.A1.ethanol: ethanol into rack/A1: .* support ([\d.]+) g", problems[3])
+
+
+def test_a_source_whose_stream_misses_the_cups_is_refused_with_distances_that_hit(tmp_path: Path) -> None:
+    _, problems = checked(tmp_path, "x_offset: 90 mm", "x_offset: 160 mm")
+    assert (
+        "5:20: motion.x_offset: doses from 'source/water' into 'cup': from this x_offset no stream can hit" in problems
+    )
+    low, high = map(int, re.findall(r"comes down in it from an x_offset of (\d+) … (\d+) mm", problems)[0])
+    assert low < 90 < high < 160
+
+
+def test_a_source_that_is_not_needed_is_stated(tmp_path: Path) -> None:
+    lines, problems = checked(
+        tmp_path, "{name: water, mass: 300 g}}", "{name: water, mass: 400 g}, stands: [source/a, source/b]}"
+    )
+    assert problems == ""
+    assert "water: 300 g in 3 doses; source/a filled once, source/b not needed, 400 g each time" in "\n".join(lines)
