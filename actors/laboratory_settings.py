@@ -230,12 +230,12 @@ class LaboratorySettings(Settings):
         )
 
     def in_real_time(self) -> Self:
-        """The laboratory for wanted amounts: an arm over its wires then moves in real time.
+        """The laboratory for wanted amounts: an arm over its wires that carries nothing then moves in real time.
 
         A virtual operator needs as much time of the clock as before.
         """
         scale = 1.0 if self.bench is None else self.bench.time_scale
-        if self.arm is None or self.bench is None or scale == 1.0:
+        if self.arm is None or self.bench is None or scale == 1.0 or self.places:
             return self
         return self.with_values(
             bench=self.bench.with_values(time_scale=1.0),

@@ -434,9 +434,7 @@ def find(name: str) -> tuple[KnownLiquid, float] | None:
     for liquid in KNOWN:
         if liquid.name == plain.lower():
             if liquid.share is None:
-                if share is None:
-                    return liquid, 0.0
-                raise ValueError(f"{liquid.name} is not a solution: write '{liquid.name}'")
+                return (liquid, 0.0) if share is None else None  # its solutions have other properties
             if share is None:
                 raise ValueError(f"how much {liquid.name}? Write for example '{liquid.name} 60 %' (by mass)")
             if not liquid.share[0] <= share <= liquid.share[1]:

@@ -61,9 +61,9 @@ class DeviceArm:
         """Make sure that no program runs on the controller and that the arm stands still, and read both back."""
         await self.device.call("hands_in", deadline=CALL_TIMEOUT)
 
-    async def release(self) -> None:
-        """Allow the arm to move, after an operator's consent."""
-        await self.device.call("release", deadline=CALL_TIMEOUT, urgent=True)
+    async def release(self, *, warned: bool = False) -> None:
+        """Allow the arm to move, after an operator's consent; `warned`: at once (arms that carry vessels)."""
+        await self.device.call("release", *([True] if warned else []), deadline=CALL_TIMEOUT, urgent=True)
 
     async def move_to_start(self, path: PlannedPour, follow: Follow = _ignore) -> None:
         """Move from home to the pour's start. `follow` is called periodically with the arm's state."""
@@ -128,6 +128,11 @@ class DeviceArm:
         """The arm's present state."""
         state: ArmState = await self.device.call("state", deadline=CALL_TIMEOUT, urgent=True)
         return state
+
+    async def pace(self, time_scale: float) -> None:
+        """Set the controller seconds per second of the clock; emulated UR arms only."""
+        self._spec = self._spec.with_values(time_scale=time_scale)
+        await self.device.call("pace", time_scale, deadline=CALL_TIMEOUT, urgent=True)
 
     async def close(self) -> None:
         """Disconnect from the controller."""

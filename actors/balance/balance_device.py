@@ -74,6 +74,11 @@ class DeviceBalance:
         counts: dict[str, int] = await self.device.call("statistics", deadline=ANSWER_DEADLINE, urgent=True)
         return counts
 
+    async def pace(self, time_scale: float) -> None:
+        """Set the bench seconds per second of the clock; emulated serial balances only."""
+        self._scale = time_scale
+        await self.device.call("pace", time_scale, deadline=ANSWER_DEADLINE, urgent=True)
+
     async def resume(self) -> None:
         """See `BalanceDriver.resume`."""
         await self.device.call("resume", deadline=ANSWER_DEADLINE, urgent=True)

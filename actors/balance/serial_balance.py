@@ -66,7 +66,7 @@ class Conversation:
 
     def __init__(self, spec: SerialBalanceSettings, interrupted: threading.Event, tap: Tap | None = None) -> None:
         self._spec, self._interrupted, self._tap = spec, interrupted, tap
-        self.counters = Counters()
+        self.counters, self.time_scale = Counters(), spec.time_scale
         self.found: Detected | None = None
         """The detected balance; kept when the port vanishes."""
         self.refused: bytes | None = None
@@ -89,7 +89,7 @@ class Conversation:
     def interval(self) -> float:
         """Time between two queries [s of the clock]."""
         gap = self.found.dialect.gap if self.found is not None else 0.0
-        return max(self._spec.interval, gap) / self._spec.time_scale
+        return max(self._spec.interval, gap) / self.time_scale
 
     def open(self) -> None:
         """Open the port; the first time, detect the settings that are not given.
@@ -429,6 +429,11 @@ class SerialBalance:
     def resume(self) -> None:
         """See `BalanceDriver.resume`."""
         self._interrupted.clear()
+
+    def pace(self, time_scale: float) -> None:
+        """Set the bench seconds per second of the clock, of a virtual bench."""
+        self._spec, self._conversation.time_scale = self._spec.with_values(time_scale=time_scale), time_scale
+        self._rule = self._spec.settling.scaled(time_scale)
 
     def close(self) -> None:
         """Close the port; the next call opens it again."""

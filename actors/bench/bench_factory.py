@@ -54,9 +54,6 @@ from sim_engine.action import Action
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
 
-FASTEST_DOSE = 2.0
-"""Largest time scale of a dose, whose commands and readings follow each other in tenths of a second."""
-
 
 class PouringBench:
     """The `Bench` interface for every kind of bench. The arm moves only after all checks, weighings and confirmations.
@@ -172,8 +169,6 @@ class PouringBench:
     ) -> DoseProcedure:
         if not arm_kind(self._arm_spec).doses:
             raise InvalidActionError(f"an arm of the kind '{self._arm_spec.kind}' can't pour wanted amounts")
-        if self._arm_spec.time_scale > FASTEST_DOSE:
-            raise InvalidActionError("wanted amounts are poured in real time; write 'bench: {time_scale: 1}'")
         return DoseProcedure(self._setup, scene, dose, path, seed=seed, settings=self._dosing, progress=progress)
 
     def _checked(self, scene: Scene, action: Action) -> PlannedPour:
@@ -364,7 +359,8 @@ async def _open_devices(
         contents = BenchContents(balance_spec.position)
         hands = Hands(contents, None if balance is None else emulators.put, None if held is None else emulators.hold)
         if isinstance(true_arm, UrArmSettings):
-            ground_truth = FollowedBench(spec.bench, true_arm, emulators, hands, liquid)
+            drivers: list[DeviceArm | DeviceBalance] = [arm, *([] if balance is None else [balance])]
+            ground_truth = FollowedBench(spec.bench, true_arm, emulators, hands, liquid, drivers)
         else:
             ground_truth = VirtualBench(spec.bench, arm_spec.time_scale, emulators, hands, liquid)
         operator = _operator(spec, hands, operator, arm_spec.time_scale)

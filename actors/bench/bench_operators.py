@@ -333,7 +333,8 @@ class Hands:
         self.contents.stands = {name: place for name, place in details.items() if isinstance(place, str)}
         for name in self.contents.stands:
             if (load := details.get(f"{name} filled_g")) is not None:
-                self.contents.liquids[name] = max(1e-3 * float(load) + float(self._rng.normal(0.0, FILLED)), 0.0)
+                error = float(self._rng.normal(0.0, FILLED)) if float(load) > 0.0 else 0.0  # an empty one is dry
+                self.contents.liquids[name] = max(1e-3 * float(load) + error, 0.0)
             self.contents.liquids.setdefault(name, 1e-3 * float(details.get(f"{name} held_g", 0.0)))
 
 
@@ -370,7 +371,7 @@ class VirtualOperator:
                 return "done"
             case "option":
                 return question.options[0]
-        return "yes"
+        return "no" if about == "cups_kept" and question.details["begins"] else "yes"  # a new series has new cups
 
     async def announce(self, text: str, seconds: float) -> None:
         """See `Operator.announce`."""

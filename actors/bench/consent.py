@@ -206,11 +206,18 @@ class Consent:
     async def given(self, question: OperatorQuestion) -> None:
         """Ask for consent to a motion, announce the motion, and release the arm.
 
+        With a consent for a night, a person has been warned once, when the consent was given.
+
         Raises:
             LaboratoryError: the operator refused.
         """
+        night = self._setup.night
+        alone = night is not None and night.in_force
         if not await self._agreed(question):
             raise LaboratoryError("the operator did not let the arm move")
+        if alone and night is not None and night.in_force:
+            await self._setup.arm.release(warned=True)
+            return
         spec = self._setup.spec
         text = f"The arm moves in {spec.warning_time:g} s. Keep out of its way."
         # The driver waits for the same time between the release and the first movement.

@@ -3,7 +3,8 @@
 `DoseHandling` takes the place of the operator's hands around one dose of `actors.bench.dose_procedure`:
 
 1. Have the vessels laid out: once, and again after an interruption.
-2. Put the cup on the balance, unless it stands there. Weigh it: that is its tare, and has to be what the account says.
+2. Put the cup on the balance, unless it stands there. Weigh it, unless nothing has happened since: that is its tare,
+   and has to be what the account says.
 3. Take the source. After the dose put it back, and weigh the cup again.
 4. Put the cup back, unless the next dose goes into it.
 
@@ -239,6 +240,7 @@ class DoseHandling:
         self._laid_out = False
         self._filled: set[str] = set()
         self._tare: _Tare | None = None
+        self._stayed: tuple[str, PourMasses] | None = None
         self.placed: tuple[DoseReading, ...] = ()
 
     # ---- checks
@@ -337,11 +339,13 @@ class DoseHandling:
         }
         if used:
             content = ", ".join(f"{name} ({1e3 * (held[name] or (0.0,))[0]:.1f} g)" for name in used)
+            begins = not self._laid_out and any(vessel.filled for vessel in vessels if vessel.liquid)
             question = OperatorQuestion(
                 f"By the account of vessels these cups hold something: {content}. Are they these, with what they hold? "
                 "'no': you have put empty, dry ones in their place.",
                 "yes or no",
                 about="cups_kept",
+                details={"begins": float(begins)},
             )
             if (await self._carrier.ask(question, consent)).strip().lower() not in ("yes", "y"):
                 new |= {*used}
@@ -474,6 +478,7 @@ class DoseHandling:
         source, cup = self.names(scene, dose)
         carrier = self._carrier
         other = next((name for name, place in carrier.at.items() if place == self._pan and name != cup), None)
+        stayed, self._stayed = None if carrier.asked else self._stayed, None
         steps = [f"put {label(other)} back"] if other is not None else []
         steps += [f"put {label(cup)} on the balance"] if carrier.at[cup] != self._pan else []
         async with carrier.driving(consent, " and ".join([*steps, f"take {label(source)}"])):
@@ -483,7 +488,7 @@ class DoseHandling:
                 begin = len(readings())
                 await carrier.move(cup, self._pan, consent)
                 self.placed = _step(readings()[begin:], 0.5 * self._loads[cup].empty_mass)
-            tare = await self._weigh()
+            tare = stayed[1] if stayed is not None and stayed[0] == cup else await self._weigh()
             missing = await self._closed(cup, tare, source, consent)
             self._tare = _Tare(tare, self._record.held(cup) or (0.0, 0.0), missing)
             await carrier.take(source, consent)
@@ -570,6 +575,7 @@ class DoseHandling:
             carrier.mass[cup] = content[0] + gross.mass - tare.mass
             spread = math.hypot(content[1], tare.uncertainty, gross.uncertainty)
             self._liquids.enter(cup, carrier.mass[cup], spread, self._mixture(cup))
+            self._stayed = (cup, gross) if dose.stays else None  # the tare of the next dose, unless a person is asked
             if not dose.stays:
                 await carrier.move(cup, self._vessels[cup].place, consent)
         return CarriedDose(cup, source, tare, gross, self._tare.missing)
@@ -585,7 +591,7 @@ class DoseHandling:
         with contextlib.suppress(LaboratoryError):
             self._lose_moved()
         self._carrier.forget()
-        self._tare = None
+        self._tare = self._stayed = None
 
     async def _weigh(self) -> PourMasses:
         weight = await self._carrier.balance.weigh()

@@ -31,6 +31,7 @@ from actors.balance.balance_interface import BalanceError
 from actors.balance.weighing_plan import GRIP, Placement
 from actors.bench.consent import Setup, grams, start_question
 from actors.bench.dose_handling import DoseHandling
+from actors.bench.ground_truth import FASTEST_DOSE
 from actors.bench.pour_procedure import BenchProcedure, PourReport, largest_tilt
 from actors.dosing.dose_controller import DoseController, DoseOrder, DoseResult, check_display
 from actors.dosing.dose_estimator import DoseReading
@@ -108,7 +109,7 @@ class DoseProcedure(BenchProcedure):
             "dose": 10.0,
             "record": path.retreat_time,
         }
-        super().__init__(setup, scene, path, seed, PourReport(progress, parts, 10.0), LOOK_INTERVAL)
+        super().__init__(setup, scene, path, seed, PourReport(progress, parts, 10.0), LOOK_INTERVAL, FASTEST_DOSE)
         self._series: DoseSeries | None = None
         self._placed: tuple[DoseReading, ...] = ()
         self._zero = self._at = self._duration = 0.0
@@ -126,7 +127,11 @@ class DoseProcedure(BenchProcedure):
         await setup.ground_truth.prepare_dose(self._scene, self._dose, self._seed, names)
         carried: dict[str, Any] = {}
         async with self._readings.running():
-            await (self._prepare() if setup.doses is None else self._carry(setup.doses))
+            if setup.doses is not None:
+                await self._carry(setup.doses)
+            else:
+                async with setup.ground_truth.slowed():
+                    await self._prepare()
             await self._consent.given(start_question(setup.spec, self._path))
             self._moves = True
             async with setup.ground_truth.followed():
@@ -260,7 +265,8 @@ class DoseProcedure(BenchProcedure):
         self._begun = True
         self._report.enter("dose")
         try:
-            result = await self._controlled()
+            async with setup.ground_truth.slowed():
+                result = await self._controlled()
         except STUCK as error:
             await self._upright(error)
             await self._home()
@@ -321,11 +327,11 @@ class DoseProcedure(BenchProcedure):
         return controller.result
 
     def _now(self) -> float:
-        """The clock in bench time [s]."""
-        return self._setup.spec.time_scale * time.monotonic()
+        """The clock in bench time [s], as it passes in a dose."""
+        return self._scale * time.monotonic()
 
     async def _sleep(self, seconds: float) -> None:
-        await asyncio.sleep(seconds / self._setup.spec.time_scale)
+        await asyncio.sleep(seconds / self._scale)
 
     # ---- results
 

@@ -29,6 +29,10 @@ T = TypeVar("T")
 WATCHED_RATE = 10.0
 """Frame rate of the ground truth's particles for the live view [1/s]."""
 
+FASTEST_DOSE = 1.0
+"""Largest time scale of a dose, whose commands and readings follow each other in tenths of a second: at 2, delays of a
+busy machine cost first doses of 2.5 g another 2 to 5 g."""
+
 ATTEMPTS = 3
 """Number of initial particle positions to try before the simulation of the liquid fails."""
 
@@ -252,6 +256,11 @@ class GroundTruth:
         Raises:
             InvalidActionError: a virtual bench has no such cup.
         """
+
+    @contextlib.asynccontextmanager
+    async def slowed(self) -> AsyncIterator[None]:
+        """Context in which the clock of a virtual bench runs at most `FASTEST_DOSE` times as fast as a real one."""
+        yield
 
     async def flows(self) -> None:
         """Called when the arm is about to tilt for a dose: from now on the liquid follows its motion."""

@@ -156,11 +156,11 @@ class BalanceReadings:
         setup: parts of the bench.
         report: receives the display.
         interval: pause between two readings [s of the clock].
+        scale: bench seconds per second of the clock, while readings are used.
     """
 
-    def __init__(self, setup: Setup, report: PourReport, interval: float) -> None:
-        self._balance, self._report, self._interval = setup.balance, report, interval
-        self._scale = setup.spec.time_scale
+    def __init__(self, setup: Setup, report: PourReport, interval: float, scale: float) -> None:
+        self._balance, self._report, self._interval, self._scale = setup.balance, report, interval, scale
         self._kept: list[DoseReading] = []
         self._taken = 0
         self.step = 0.0
@@ -213,16 +213,25 @@ class BenchProcedure(ABC):
         seed: of a virtual bench's randomness.
         report: receives the progress.
         interval: pause between two readings of the balance [s of the clock].
+        fastest: largest time scale while its times are recorded.
     """
 
     name = "pour"
 
     def __init__(
-        self, setup: Setup, scene: Scene, path: PlannedPour, seed: int, report: PourReport, interval: float
+        self,
+        setup: Setup,
+        scene: Scene,
+        path: PlannedPour,
+        seed: int,
+        report: PourReport,
+        interval: float,
+        fastest: float = math.inf,
     ) -> None:
         self._setup, self._scene, self._path, self._seed, self._report = setup, scene, path, seed, report
         self._consent = Consent(setup, path)
-        self._readings = BalanceReadings(setup, report, interval)
+        self._scale = min(setup.spec.time_scale, fastest)
+        self._readings = BalanceReadings(setup, report, interval, self._scale)
         self._begun = self._moves = False
         self._executed: Executed | None = None
         self._facts: ArmFacts | None = None

@@ -180,6 +180,7 @@ class VesselCarrier:
     Attributes:
         at: place of each vessel that was laid out; `IN_GRIPPER` for the one in the gripper.
         mass: liquid in them as last weighed [kg].
+        asked: whether a person was asked something since the last sequence began.
         loads, ways: of the vessels that are carried now, see `check_carrying`.
     """
 
@@ -203,7 +204,7 @@ class VesselCarrier:
         self._motion: tuple[str, str] | None = None
         self._away = False
         self._agreed: tuple[str, ...] = ()
-        self._asked = False
+        self.asked = False
 
     # ---- where they stand
 
@@ -246,7 +247,7 @@ class VesselCarrier:
 
     async def ask(self, question: OperatorQuestion, consent: MotionConsent) -> str:
         """Ask a person, who may reach into the cell: motions that follow are agreed to again."""
-        self._agreed, self._asked = (), True
+        self._agreed, self.asked = (), True
         return await consent.asked(question)
 
     # ---- moves
@@ -266,10 +267,10 @@ class VesselCarrier:
         """
         if does not in self._agreed:
             await consent.given(move_question("; once the balance is read, ".join((does, *then))))
-        self._agreed, self._asked = (), False
+        self._agreed, self.asked = (), False
         try:
             yield
-            self._agreed = () if self._asked else then
+            self._agreed = () if self.asked else then
         except LaboratoryError as error:
             self.forget()
             if self._motion is not None:
@@ -384,12 +385,14 @@ class VesselCarrier:
             raise LaboratoryError(f"'{place}' may not be free: where does '{taken[0]}' stand?")
         self._note_motion(name, f"the arm began to carry it to '{place}'")
         await self._drive(place, full=self.mass.get(name, 0.0) > FILMED, homewards=False)
-        await self.held.open_at(self.loads[name].vessel)
-        await self._truth.placed(name, place, on_balance=place == self._on_balance)
-        self.at[name] = place
-        self.record.put(name, place)
-        self._motion = None
-        await self._drive(place, full=False, homewards=True)
+        on_balance = place == self._on_balance
+        async with self._truth.slowed() if on_balance else contextlib.nullcontext():  # the balance shows its lag
+            await self.held.open_at(self.loads[name].vessel)
+            await self._truth.placed(name, place, on_balance=on_balance)
+            self.at[name] = place
+            self.record.put(name, place)
+            self._motion = None
+            await self._drive(place, full=False, homewards=True)
 
     def _note_motion(self, name: str, note: str) -> None:
         self.record.put(name, None, note)

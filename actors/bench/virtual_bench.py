@@ -12,13 +12,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.arm.arm_device import DeviceArm
 from actors.arm.arm_interface import Executed
 from actors.arm.arm_settings import ArmEmulator, ArmSettings, History, arm_kind
 from actors.arm.ur_settings import UrArmSettings
@@ -27,7 +28,7 @@ from actors.balance.balance_settings import BalanceEmulator, BalanceSettings, ba
 from actors.balance.scale_model import Load
 from actors.bench.bench_operators import Hands
 from actors.bench.flowing_liquid import FlowEnd, FlowingLiquid, FlowOrder
-from actors.bench.ground_truth import GroundTruth, PourAsk, draw_pose_error, spill_of, stream, true_pour
+from actors.bench.ground_truth import FASTEST_DOSE, GroundTruth, PourAsk, draw_pose_error, spill_of, stream, true_pour
 from actors.dosing.dose_series import source_of
 from actors.dosing.simulated_dose import true_cup
 from actors.grippers.gripper_interface import GripperEmulator, GripperSettings
@@ -151,6 +152,11 @@ class BenchEmulators:
         """See `ArmEmulator.fault`."""
         return self._arm_emulator.fault(name, arguments)
 
+    def pace(self, scale: float) -> None:
+        """Set the bench seconds per second of the clock of arm and balance."""
+        self._arm_emulator.fault("pace", {"scale": scale})
+        self.order("pace", {"scale": scale})
+
     def flow(self, order: FlowOrder) -> None:
         """Let liquid follow the arm from now on; the load on the balance follows it.
 
@@ -249,6 +255,10 @@ class DeviceEmulators:
         """Send a command to the balance emulator."""
         answer: dict[str, Any] = await self.device.call("order", kind, values, deadline=DEADLINE, urgent=True)
         return answer
+
+    async def pace(self, time_scale: float) -> None:
+        """Set the bench seconds per second of the clock of arm and balance."""
+        await self.device.call("pace", time_scale, deadline=DEADLINE, urgent=True)
 
     async def flow(self, order: FlowOrder) -> None:
         """Let liquid follow the arm."""
@@ -430,6 +440,7 @@ class FollowedBench(VirtualBench):
     Args:
         spec, emulators, hands, simulators: as for `VirtualBench`.
         arm: the cell as configured, which may differ from the ground truth, with the true geometry of the arm.
+        drivers: of arm and balance, whose waits follow the bench's clock.
     """
 
     def __init__(
@@ -439,9 +450,10 @@ class FollowedBench(VirtualBench):
         emulators: DeviceEmulators,
         hands: Hands,
         simulators: SimulatorPool,
+        drivers: Sequence[DeviceArm | DeviceBalance],
     ) -> None:
         super().__init__(spec, arm.time_scale, emulators, hands, simulators)
-        self._arm = arm
+        self._arm, self._paced = arm, (emulators, *drivers)
         self._noting = asyncio.Lock()
         self._times: list[float] = []
         self._joints: list[tuple[float, ...]] = []
@@ -491,6 +503,21 @@ class FollowedBench(VirtualBench):
         self._hands.prepare(source.mass if carried else contents.in_pourer, stream(seed, "arm"))
         await self.emulators.prepare(stream(seed, "balance"))
         await self.emulators.put(self.contents.carried)
+
+    @contextlib.asynccontextmanager
+    async def slowed(self) -> AsyncIterator[None]:
+        """See `GroundTruth.slowed`."""
+        if self._time_scale <= FASTEST_DOSE:
+            yield
+            return
+        try:
+            for device in self._paced:
+                await device.pace(FASTEST_DOSE)
+            yield
+        finally:
+            for device in self._paced:
+                with contextlib.suppress(LaboratoryError):  # a driver that was lost starts with the bench's own clock
+                    await device.pace(self._time_scale)
 
     async def flows(self) -> None:
         """See `GroundTruth.flows`."""

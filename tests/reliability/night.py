@@ -226,7 +226,7 @@ async def strike(stage: Stage, fault: Fault) -> None:
 
     async def tilts() -> bool:
         state = await stage.bench.arm.state()
-        return state.phase == "tilt" and state.time > 0.3
+        return state.time > 0.3 if state.phase == "tilt" else state.phase == "dose" and (state.tilt or 0.0) > 0.3
 
     with contextlib.suppress(LaboratoryError):
         if fault.when != "at once":

@@ -1,6 +1,7 @@
 """The daemon of an unattended campaign is killed at random points of the cycle.
 
 python -m tests.reliability.night_kills --kills 30    # some twenty minutes; writes build/night-kills.jsonl
+python -m tests.reliability.night_kills --mixtures    # the same for doses; writes build/mixture-kills.jsonl
 python -m tests.reliability.night_kills --write       # no kill: the table of docs/evidence/reliability.md
 
 The daemon is in a process of its own; a client answers its questions over HTTP, and resumes the campaign. Arm, gripper
@@ -10,7 +11,11 @@ truly stood where and what it held:
 
 - a vessel stands where the account says, or that says UNKNOWN; likewise its content, within `ACCOUNTED`;
 - the next life moves nothing before its own consent was given;
-- no pour is made twice, and no process of a killed daemon is left.
+- no pour is made twice, no liquid is dosed into a cup twice, and no process of a killed daemon is left.
+
+With `--mixtures` the campaign is that of `tests.reliability.mixture_night`. Vessels keep what they truly hold from one
+life to the next, except the cup and the source of a dose that was killed while liquid flowed; their cup has to be
+UNKNOWN, and the source right within three of its stated deviations, here and everywhere.
 """
 
 from __future__ import annotations
@@ -33,8 +38,9 @@ from typing import Any, NoReturn
 from ruamel.yaml import YAML
 
 from actors.arm.arm_device import DeviceArm
-from actors.bench.bench_operators import BenchContents
+from actors.bench.bench_operators import BenchContents, Hands
 from actors.bench.liquid_supply import LiquidSupply
+from actors.bench.virtual_bench import FollowedBench
 from actors.laboratory import WarmSimulators
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.daemon.api.daemon_client import Client, DaemonError
@@ -42,18 +48,21 @@ from orchestrator.daemon.rigs.submissions import pack
 from orchestrator.daemon.server_process import serve
 from orchestrator.daemon.state.daemon_settings import load_settings
 from orchestrator.materials.vessel_account import FILE_NAME, VesselAccount
-from tests.reliability import strikes
+from tests.reliability import mixture_night, strikes
 from tests.reliability.formula import LOG, Formula
 from tests.reliability.night import ACCOUNTED, PAGE, ROOT, write
 from tests.reliability.rig import LEAVING, PATIENCE, leftovers, warm_up
 
-RESULTS = ROOT / "build" / "night-kills.jsonl"
+RESULTS, MIXTURES = ROOT / "build" / "night-kills.jsonl", ROOT / "build" / "mixture-kills.jsonl"
 
 MOTIONS = 61
-"""Motions of the arm from the first consent to the end of the second pour."""
+"""Motions of the arm from the first consent to the end of the second pour, or of the fifth dose."""
 
 LATEST = 0.5
-"""Longest time from the begin of a motion to the kill [s]: on an idle machine a motion takes a third of it."""
+"""Longest time from the begin of a motion to the kill [s]: on an idle machine a motion takes a third of it. A dose
+takes longer: times `DOSED`."""
+
+DOSED = 14.0
 
 SEED = 11
 
@@ -65,7 +74,7 @@ class Killed:
     Attributes:
         motion: number of the motion that had begun.
         during: what it was.
-        places, contents: of pourer and receiver: 'right', 'UNKNOWN', or 'wrong'.
+        places, contents: of the vessels: 'right', 'UNKNOWN', or 'wrong'.
         wrong: what should not be.
     """
 
@@ -81,12 +90,14 @@ class KilledNight:
 
     Args:
         place: folder to work in.
+        write: writes the campaign there.
     """
 
-    def __init__(self, place: Path) -> None:
+    def __init__(self, place: Path, write: Callable[[Path], Path] | None = None) -> None:
         self.place, self.state, self._log = place, place / "state", place / "log"
         (place / "tmp").mkdir()
-        self._campaign = _write_campaign(place)
+        self._log.touch()
+        self._campaign = (write or _write_campaign)(place)
         self.plan = load_campaign(self._campaign)
 
     def kill(self, motion: int, delay: float) -> Killed:
@@ -110,10 +121,34 @@ class KilledNight:
         twice = [f"a pour was made twice: {seed}" for seed in self._twice()]
         return self._look(motion, [*wrong, *twice, *self._left()])
 
+    @property
+    def finished(self) -> bool:
+        """Whether the campaign ended in the last life."""
+        return any(line == ["finished", ""] for line in self._lines()[-3:])
+
+    def _lines(self) -> list[list[Any]]:
+        return [json.loads(line) for line in self._log.read_text("utf-8").splitlines()]
+
     def _twice(self) -> list[str]:
         poured = self.place / "poured"
         made = Counter(poured.read_text("utf-8").split()) if poured.exists() else Counter[str]()
+        made.update(f"{flow[1]} into {flow[2]}" for what, flow in self._lines() if what == "flows")
         return [seed for seed, count in made.items() if count > 1]
+
+    def _true(self) -> dict[str, float]:
+        """What vessels truly hold [kg]; those that liquid flowed from or into at a kill are absent."""
+        held: dict[str, float] = {}
+        flowing: set[str] = set()
+        for what, value in self._lines():
+            if what == "flows":
+                flowing = {value[0], value[2]}
+            elif what == "life":
+                held = {name: mass for name, mass in held.items() if name not in flowing}
+                flowing = set()
+            elif what == "true":
+                held |= value[1]
+                flowing = flowing if value[2] else set()
+        return {name: mass for name, mass in held.items() if name not in flowing}
 
     def _note(self, what: str, value: Any) -> None:
         with self._log.open("a", encoding="utf-8") as file:
@@ -128,11 +163,23 @@ class KilledNight:
             client.post("/campaigns", {"text": text, "files": files})
             return
         for question in client.get("/questions"):
+            if question["about"] == "cup_unknown":
+                self._weigh_unknown()
             answer = {"done": "done", "yes or no": "yes", "option": "lost"}[question["wants"]]
             self._note("answered", question["about"])
             client.post(f"/questions/{question['id']}/answer", {"answer": answer})
         if items[0]["state"] in ("failed", "paused", "unknown") and not items[0]["progress"]:
             client.post(f"/campaigns/{items[0]['id']}/resume")
+        if items[0]["state"] == "finished" and not self.finished:
+            self._note("finished", "")
+
+    def _weigh_unknown(self) -> None:
+        """A person weighs the cups whose content is UNKNOWN, and enters what they hold."""
+        account, true = VesselAccount(self.state / FILE_NAME), self._true()
+        for content in account.all():
+            if content.mass is None:
+                mass = true.get(content.vessel.partition("/")[2], 0.0)
+                account.weigh(content.vessel, mass, 1e-4, liquid="mixture" if mass else "", by="somebody")
 
     # ---- the daemon's process
 
@@ -152,14 +199,18 @@ class KilledNight:
     def _follow_truth(self) -> None:
         """Write down each change of what truly stands where and what it holds."""
 
+        flowing = False
+
         def tell(contents: BenchContents) -> None:
-            self._note("true", [contents.stands, contents.in_pourer, contents.in_receiver])
+            self._note("true", [contents.stands, contents.liquids, flowing])
 
         for name in ("move", "pour_back", "receive", "do"):
             change: Callable[..., Any] = getattr(BenchContents, name)
 
             def told(contents: BenchContents, *values: Any, _change: Any = change, **named: Any) -> None:
+                nonlocal flowing
                 _change(contents, *values, **named)
+                flowing = flowing and _change.__name__ != "receive"
                 tell(contents)
 
             setattr(BenchContents, name, told)
@@ -172,11 +223,25 @@ class KilledNight:
             return done
 
         LiquidSupply.top_up = topped  # type: ignore[method-assign]
+        flows, lay_out, before = FollowedBench.flows, Hands._lay_out, self._true()
+
+        async def flown(bench: FollowedBench) -> None:
+            nonlocal flowing
+            assert bench._flow is not None
+            flowing = True
+            self._note("flows", [bench.contents.pourer, bench._flow.liquid.name, bench.contents.receiver])
+            await flows(bench)
+
+        def laid_out(hands: Hands, details: Any) -> None:
+            lay_out(hands, details)
+            hands.contents.liquids |= {name: m for name, m in before.items() if f"{name} filled_g" not in details}
+
+        FollowedBench.flows, Hands._lay_out = flown, laid_out  # type: ignore[method-assign]
 
     def _count_motions(self, motion: int, delay: float) -> None:
         """Write down each motion when it begins, and end this process in one of them."""
         count = 0
-        for name in ("carry", "move_to_start", "execute", "retreat"):
+        for name in ("carry", "move_to_start", "execute", "dose", "retreat"):
             move: Callable[..., Any] = getattr(DeviceArm, name)
 
             async def moved(
@@ -187,7 +252,8 @@ class KilledNight:
                 where = f" {'from' if path.homewards else 'to'} '{path.place}'" if _name == "carry" else ""
                 self._note("motion", f"{_name}{where}{' with a vessel' if named.get('loaded') else ''}")
                 if count == motion:
-                    threading.Timer(delay, os.kill, (os.getpid(), 9)).start()
+                    wait = delay * (DOSED if _name == "dose" else 1.0)
+                    threading.Timer(wait, os.kill, (os.getpid(), 9)).start()
                 return await _move(arm, path, *values, **named)
 
             setattr(DeviceArm, name, moved)
@@ -195,24 +261,26 @@ class KilledNight:
     # ---- afterwards
 
     def _look(self, motion: int, wrong: list[str]) -> Killed:
-        lines = [json.loads(line) for line in self._log.read_text("utf-8").splitlines()]
+        lines = self._lines()
         life = lines[max(n for n, (what, _) in enumerate(lines) if what == "life") :]
         moved = next((n for n, (what, _) in enumerate(life) if what == "motion"), len(life))
         if ["answered", "unattended"] not in life[:moved]:
             wrong.append("the arm moved before a consent")
         motions = [value for what, value in life if what == "motion"]
-        stands, in_pourer, in_receiver = next(value for what, value in reversed(life) if what == "true")
-        account = VesselAccount(self.state / FILE_NAME)
+        stands, true, flowing = next((value for what, value in reversed(life) if what == "true"), ({}, {}, False))
+        account, prefix = VesselAccount(self.state / FILE_NAME), f"{self.plan.laboratory.name}/"
         places: dict[str, str] = {}
         contents: dict[str, str] = {}
-        for vessel, true in (("pourer", in_pourer), ("receiver", in_receiver)):
-            name = f"{self.plan.laboratory.name}/{vessel}"
-            place, held = account.places()[name].place, account.content(name)
-            places[vessel] = "UNKNOWN" if place is None else "right" if place == stands.get(vessel) else "wrong"
-            mass = None if held is None else held.mass
-            contents[vessel] = "UNKNOWN" if mass is None else "right" if abs(mass - true) <= ACCOUNTED else "wrong"
+        for vessel, at in stands.items():
+            place, held = account.places()[prefix + vessel].place, account.content(prefix + vessel)
+            places[vessel] = "UNKNOWN" if place is None else "right" if place == at else "wrong"
+            mass, mixed = None if held is None else held.mass, flowing and vessel.startswith("rack/")
+            mixed = mixed and vessel == next(value[2] for what, value in reversed(life) if what == "flows")
+            allowed = ACCOUNTED if held is None or vessel.startswith("rack/") else max(ACCOUNTED, 3.0 * held.deviation)
+            right = mass is not None and not mixed and abs(mass - true.get(vessel, 0.0)) <= allowed
+            contents[vessel] = "UNKNOWN" if mass is None else "right" if right else "wrong"
             if "wrong" in (places[vessel], contents[vessel]):
-                wrong.append(f"the {vessel}: {place}, {mass}; in truth {stands.get(vessel)}, {true}")
+                wrong.append(f"the {vessel}: {place}, {mass}; in truth {at}, {true.get(vessel)}")
         return Killed(motion, motions[-1] if motions else "", places, contents, wrong)
 
     def _left(self) -> list[str]:
@@ -221,6 +289,16 @@ class KilledNight:
             time.sleep(0.1)
         strikes.kill([process.pid for process in left])
         return [f"left running: {[process.cmdline() for process in left]}"] if left else []
+
+
+def _write_mixtures(folder: Path) -> Path:
+    """The campaign of a night of mixtures, with a person at its laboratory."""
+    yaml, path = YAML(), mixture_night.write_campaign(folder, 24, SEED)
+    laboratory, campaign = yaml.load(folder / "rack.yaml"), yaml.load(path)
+    laboratory["operator"] = {"answers": "person"}
+    yaml.dump(laboratory, folder / "rack.yaml")
+    yaml.dump(campaign | {"on_unknown": "ask"}, path)
+    return path
 
 
 def _write_campaign(folder: Path) -> Path:
@@ -244,7 +322,7 @@ def table(results: Path) -> list[str]:
     moments = {
         "the arm carried a vessel": lambda text: "with a vessel" in text,
         "the arm moved to a vessel, or away from it": lambda text: text.startswith("carry") and "with" not in text,
-        "the arm poured, or poured back": lambda text: not text.startswith("carry"),
+        "the arm poured, dosed, or poured back": lambda text: not text.startswith("carry"),
     }
     lines = [
         "| killed while or after | kills | places right, UNKNOWN | contents right, UNKNOWN | wrong |",
@@ -265,20 +343,25 @@ def table(results: Path) -> list[str]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=30)
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--results", type=Path)
+    parser.add_argument("--mixtures", action="store_true")
+    parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
+    options.results = options.results or (MIXTURES if options.mixtures else RESULTS)
     if options.write:
-        write(PAGE, "night kills", table(options.results))
+        write(PAGE, "mixture kills" if options.mixtures else "night kills", table(options.results))
         return 0
     options.results.parent.mkdir(exist_ok=True)
     place = Path(tempfile.mkdtemp(prefix="n", dir="/tmp"))
-    rng, found = random.Random(SEED), list[Killed]()
+    rng, found = random.Random(options.seed), list[Killed]()
     try:
-        night = KilledNight(place)
+        night = KilledNight(place, _write_mixtures if options.mixtures else None)
         warm_up(load_campaign(_small(place)))
         with options.results.open("w", encoding="utf-8") as out:
             for _ in range(options.kills):
+                if night.finished:
+                    break
                 found.append(night.kill(rng.randint(1, MOTIONS), rng.uniform(0.0, LATEST)))
                 out.write(json.dumps(asdict(found[-1])) + "\n")
                 out.flush()

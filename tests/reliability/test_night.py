@@ -14,8 +14,10 @@ from ruamel.yaml import YAML
 
 from actors.runtime.child_process import child_environment
 from orchestrator.campaigns.file_loading import load_campaign
+from orchestrator.records.run_registry import VARIABLE
 from orchestrator.runs.run_engine import run_campaign
 from tests.reliability.afterwards import record
+from tests.reliability.mixture_night import KINDS, MixtureNight, night_plan
 from tests.reliability.night import FAULTS, ROOT, Night, chosen
 from tests.reliability.program import Optimizer
 from tests.support.toy_campaign import ToyLaboratory
@@ -36,9 +38,28 @@ def test_each_fault_of_a_night_ends_in_a_safe_state_with_one_message_and_a_perso
 
 @pytest.mark.slow
 @pytest.mark.realtime
-def test_a_daemon_that_is_killed_in_a_night_moves_nothing_again_without_consent(tmp_path: Path) -> None:
+def test_a_fault_in_a_night_of_mixtures_ends_safe_with_one_message_and_every_cup_is_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    lost = next(fault for fault in KINDS if fault.kind == "lost while moving" and "{cup}" in fault.at)
+    night = MixtureNight(tmp_path, night_plan(tmp_path, 2, 3, ("water", "oil")), [(1, lost)])
+    result = asyncio.run(night.run())
+    assert night.wrong == []
+    assert [(attempt.outcome, attempt.messages) for attempt in night.tries if attempt.fault] == [("weighed", 1)]
+    assert night.runs == 2
+    assert [cup.state for cup in result.cups] == ["full", "full"]
+    assert all(abs(share - true) <= 2.0 * half for share, half, true in night.shares(result))
+
+
+@pytest.mark.slow
+@pytest.mark.realtime
+@pytest.mark.parametrize(("series", "kills"), [([], 3), (["--mixtures"], 2)], ids=["pours", "mixtures"])
+def test_a_daemon_that_is_killed_in_a_night_moves_nothing_again_without_consent(
+    series: list[str], kills: int, tmp_path: Path
+) -> None:
     """In a process of its own: the daemons are forked from it."""
-    command = [sys.executable, "-m", "tests.reliability.night_kills", "--kills", "3"]
+    command = [sys.executable, "-m", "tests.reliability.night_kills", *series, "--kills", str(kills)]
     ended = subprocess.run(
         [*command, "--results", str(tmp_path / "kills.jsonl")],
         check=False,

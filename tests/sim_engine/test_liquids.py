@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sim_engine.liquids import KNOWN, look_up
+from sim_engine.liquids import KNOWN, LiquidSettings, look_up
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,6 @@ def test_every_liquid_is_thinner_and_lighter_when_it_is_warm(known) -> None:  # 
     [
         ("glycerol", 20.0, "how much glycerol? Write for example 'glycerol 60 %'"),
         ("sugar syrup 90 %", 20.0, "sugar syrup is known from 0 to 78 %"),
-        ("ethanol 50 %", 20.0, "ethanol is not a solution: write 'ethanol'"),
         ("ethanol", 90.0, "ethanol is known from 0 to 75 °C, not at 90 °C"),
     ],
 )
@@ -54,3 +53,8 @@ def test_what_the_table_does_not_know_is_refused(name: str, temperature: float, 
 
 def test_other_names_are_nobody_s_business() -> None:
     assert look_up("shampoo") is None
+
+
+def test_a_solution_of_a_liquid_that_the_table_has_pure_is_poured_with_its_own_properties() -> None:
+    liquid = LiquidSettings(name="ethanol 70 %", mass=0.3, density=868.0, viscosity=2.21e-3).load()
+    assert (liquid.name, liquid.density, liquid.dynamic_viscosity) == ("ethanol 70 %", 868.0, 2.21e-3)

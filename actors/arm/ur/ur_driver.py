@@ -150,9 +150,13 @@ class UrArm:
         rx, ry, rz = map(float, Rotation.from_matrix(rotation[0] @ tool.rotation).as_rotvec())
         return ArmPose(Pose.of(x, y, z, rx, ry, rz), joints, self._spec.home.angles)
 
-    def release(self) -> None:
-        """See `Arm.release`."""
-        self._released_at = time.monotonic()
+    def pace(self, time_scale: float) -> None:
+        """Set the controller seconds per second of the clock, of a virtual bench."""
+        self._spec = self._spec.with_values(time_scale=time_scale)
+
+    def release(self, warned: bool = False) -> None:
+        """See `Arm.release`; `warned`: the next motion begins at once."""
+        self._released_at = time.monotonic() - (self._spec.warning_time if warned else 0.0)
         self._stopped = False
 
     def lock(self) -> None:

@@ -217,6 +217,8 @@ class Emulation:
                 self._waiting = self._repeat_at = self._following = None
             case {"do": "faults", **changes}:
                 self._display.set(changes)
+            case {"do": "pace", "scale": scale}:
+                self._time_scale = float(scale)
             case {"do": "advance", "seconds": seconds}:
                 self._scale.advance(float(seconds))
             case {"do": "power cycle"}:

@@ -68,11 +68,10 @@ class UrEmulator:
             LaboratoryError: the controller does not reply.
         """
         try:
-            now = float(self._controller.fault("state")["time"])
             answer = self._controller.fault("history", since=since)
         except VirtualControllerError as error:
             raise LaboratoryError(f"what the virtual arm did is not known: {error}") from error
-        return History(tuple(answer["times"]), tuple(tuple(q) for q in answer["joints"]), now)
+        return History(tuple(answer["times"]), tuple(tuple(q) for q in answer["joints"]), float(answer["now"]))
 
     def fault(self, name: str, arguments: dict[str, Any]) -> dict[str, Any]:
         """See `ArmEmulator.fault`, and docs/reference/virtual-devices.md."""

@@ -130,7 +130,7 @@ class Host:
         self._opening: asyncio.Task[None] | None = None
         self._clock: asyncio.TimerHandle | None = None
         self._next = 0.0
-        self._worked = self._woke = 0.0
+        self._worked = self._woke = self._wall = 0.0
         self._prioritised = prioritised and controller.time_scale <= 1.0
 
     # ---- ports
@@ -228,12 +228,12 @@ class Host:
                 self._next += period
                 if not self.halted:
                     self.timing.ticks += 1
+                    self._wall += controller.dt / max(1.0, controller.time_scale)
                     controller.tick()
             if not self.halted:
                 self.connections.uploads.work(0.5 * max(period, SLOWEST_WAKE))
-                clock = controller.now / max(1.0, controller.time_scale)
-                self.rtde.publish(clock)
-                self.primary.publish(clock)
+                self.rtde.publish(self._wall)
+                self.primary.publish(self._wall)
         except Exception:
             # A defect in this program: ending is better than a clock that silently stands still.
             traceback.print_exc()

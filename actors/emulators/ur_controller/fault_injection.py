@@ -87,6 +87,12 @@ class ControllerFaults:
                 watcher = _once(lambda: robot.q[number] <= low, do)
         self._controller.watchers.append(watcher)
 
+    def pace(self, scale: float) -> None:
+        """Set the controller seconds per second of the clock from now on."""
+        if not 0.0 < scale <= 1000.0:
+            raise ValueError("0 < scale <= 1000")
+        self._controller.time_scale = float(scale)
+
     # ---- safety
 
     def protective_stop(self, reason: str = "fault port", code: int = 157, **when: Any) -> None:
@@ -298,11 +304,12 @@ class ControllerFaults:
         }
 
     def history(self, since: float = 0.0) -> dict[str, Any]:
-        """Return the executed joint positions since a controller time, without noise."""
+        """Return the executed joint positions since a controller time, without noise, and the time now."""
         start = _finite(since)
         newest = itertools.takewhile(lambda one: one[0] >= start, reversed(self._controller.robot.history))
         entries = list(newest)[::-1]
-        return {"times": [t for t, _ in entries], "joints": [list(q) for _, q in entries]}
+        joints = [list(q) for _, q in entries]
+        return {"times": [t for t, _ in entries], "joints": joints, "now": self._controller.now}
 
     def clear(self) -> None:
         """End stalls and refusals, and cancel pending faults."""

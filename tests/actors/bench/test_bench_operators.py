@@ -12,7 +12,7 @@ import pytest
 
 from actors.arm.planned_pour import ExecutedPath, pack, unpack
 from actors.balance.weighing_plan import Placement, weighings
-from actors.bench.bench_operators import DRY, BenchContents, Hands, OperatorQuestions, PlayedOperator
+from actors.bench.bench_operators import DRY, BenchContents, Hands, OperatorQuestions, PlayedOperator, VirtualOperator
 from actors.bench.virtual_bench import LONGEST_REST, executed_pour
 from actors.interfaces import LaboratoryError, Notice, OperatorQuestion, OperatorSettings
 
@@ -120,6 +120,24 @@ def test_questions_and_answers_are_written_down_with_their_times():
     (kept,) = questions.take_log()
     assert kept == {"about": "tray_wiped", "answer": "done", "after": pytest.approx(0.1, abs=0.09)}
     assert questions.take_log() == []
+
+
+def test_a_virtual_operator_begins_a_series_with_new_cups_and_goes_on_with_those_that_are_there() -> None:
+    operator = VirtualOperator(Hands(BenchContents(Placement.RECEIVER), None), 0.0)
+    for begins, answer in ((1.0, "no"), (0.0, "yes")):
+        question = OperatorQuestion("Are they these?", "yes or no", about="cups_kept", details={"begins": begins})
+        assert asyncio.run(operator.ask(question)) == answer
+
+
+def test_an_empty_cup_that_is_laid_out_is_dry_and_a_source_is_filled_as_well_as_a_person_can() -> None:
+    contents = BenchContents(Placement.RECEIVER)
+    hands = Hands(contents, None)
+    hands.prepare(0.3, (1,))
+    details: dict[str, float | str] = {"rack/A1": "rack/A1", "rack/A1 filled_g": 0.0}
+    details |= {"source/oil": "source/oil", "source/oil filled_g": 300.0}
+    asyncio.run(hands.do(OperatorQuestion("Lay out.", "done", about="vessels_laid_out", details=details)))
+    assert contents.liquids["rack/A1"] == 0.0
+    assert 0.0 < abs(contents.liquids["source/oil"] - 0.3) < 2e-3
 
 
 def test_a_question_that_nobody_answers_is_repeated_and_then_given_up():

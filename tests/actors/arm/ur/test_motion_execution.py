@@ -107,6 +107,17 @@ def test_movement_begins_after_the_announced_delay(make_rig: Make) -> None:
 
 
 @pytest.mark.realtime
+def test_movement_of_which_everybody_was_warned_begins_at_once(make_rig: Make) -> None:
+    rig = make_rig(warning_time=30.0)
+    began = rig.now
+    rig.arm.release(warned=True)
+    rig.arm.move_to_start(rig.path)
+    times, joints = rig.history(began)
+    moving = times[np.abs(joints - joints[0]).max(axis=1) > 1e-4]
+    assert moving[0] - began < 20.0  # of the controller's seconds; uploading the program takes some
+
+
+@pytest.mark.realtime
 def test_a_stop_while_movement_is_announced_keeps_the_arm_still(make_rig: Make) -> None:
     rig = make_rig(warning_time=30.0)
     began = rig.now

@@ -122,6 +122,15 @@ def test_a_pour_whose_time_passes_by_order_weighs_the_same_to_the_bit_however_th
     assert masses[0] == pytest.approx(5.7e-3, abs=5e-4)
 
 
+def test_bench_time_goes_on_from_where_it_is_when_its_pace_changes():
+    balance = Emulation("kern-swt", ScaleSettings(), 30.0, 0.0, (0,))
+    balance.control({"do": "advance", "seconds": 0.0}, 10.0)
+    before = balance.control({"do": "state"}, 11.0)["time"]
+    balance.control({"do": "pace", "scale": 1.0}, 11.0)
+    after = balance.control({"do": "state"}, 13.0)["time"]
+    assert (before, after - before) == (pytest.approx(30.0), pytest.approx(2.0))
+
+
 @pytest.mark.realtime
 def test_noise_of_a_seed_is_the_same_over_the_line_and_another_with_another_seed():
     far = VirtualSerialBalance.start(
