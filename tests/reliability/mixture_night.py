@@ -15,7 +15,8 @@ Questions, as they stood before the first counted night:
 1. Each liquid flows into each cup at most once.
 2. No vessel is put where another one stands, and each stands where the account says, or that says UNKNOWN.
 3. Of each dose, the reported amount differs from the true one by at most 0.5 g; likewise the account of each cup,
-   unless it is UNKNOWN. The content of a source is a sum of estimates: it is right within 0.5 g or three of its deviations.
+   unless it is UNKNOWN. The content of a source is a sum of estimates: it is right within 0.5 g or three of its
+   deviations.
 4. At least 95 % of the shares of full cups are within their stated intervals (of 90 %).
 5. Each fault ends with the arm at rest and exactly one message; without a fault there is none. The arm does not move
    again before a person has agreed.
@@ -256,7 +257,7 @@ class MixtureNight:
     wrong: list[str] = field(default_factory=list)
     flowed: Counter[tuple[str, str]] = field(default_factory=Counter)
     """How often a liquid truly flowed into a cup."""
-    truth: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    truth: dict[str, dict[str, float]] = field(default_factory=lambda: defaultdict(lambda: defaultdict(float)))
     """True masses of the liquids in each cup [kg]."""
     receiver: Receiver = field(default_factory=Receiver)
     runs: int = 0

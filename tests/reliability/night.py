@@ -226,7 +226,9 @@ async def strike(stage: Stage, fault: Fault) -> None:
 
     async def tilts() -> bool:
         state = await stage.bench.arm.state()
-        return state.time > 0.3 if state.phase == "tilt" else state.phase == "dose" and (state.tilt or 0.0) > 0.3
+        if state.phase == "dose":
+            return bool((state.tilt or 0.0) > 0.3)
+        return bool(state.phase == "tilt" and state.time > 0.3)
 
     with contextlib.suppress(LaboratoryError):
         if fault.when != "at once":
