@@ -478,7 +478,8 @@ class DoseHandling:
         source, cup = self.names(scene, dose)
         carrier = self._carrier
         other = next((name for name, place in carrier.at.items() if place == self._pan and name != cup), None)
-        stayed, self._stayed = None if carrier.asked else self._stayed, None
+        stayed = None if carrier.asked or carrier.at[cup] != self._pan else self._stayed
+        self._stayed = None
         steps = [f"put {label(other)} back"] if other is not None else []
         steps += [f"put {label(cup)} on the balance"] if carrier.at[cup] != self._pan else []
         async with carrier.driving(consent, " and ".join([*steps, f"take {label(source)}"])):
