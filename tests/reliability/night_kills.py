@@ -55,8 +55,8 @@ from tests.reliability.rig import LEAVING, PATIENCE, leftovers, warm_up
 
 RESULTS, MIXTURES = ROOT / "build" / "night-kills.jsonl", ROOT / "build" / "mixture-kills.jsonl"
 
-MOTIONS = 61
-"""Motions of the arm from the first consent to the end of the second pour, or of the fifth dose."""
+MOTIONS, DOSES = 61, 33
+"""Motions of the arm from the first consent to the end of the second pour, and of the third dose."""
 
 LATEST = 0.5
 """Longest time from the begin of a motion to the kill [s]: on an idle machine a motion takes a third of it. A dose
@@ -362,7 +362,8 @@ def main() -> int:
             for _ in range(options.kills):
                 if night.finished:
                     break
-                found.append(night.kill(rng.randint(1, MOTIONS), rng.uniform(0.0, LATEST)))
+                motions = DOSES if options.mixtures else MOTIONS
+                found.append(night.kill(rng.randint(1, motions), rng.uniform(0.0, LATEST)))
                 out.write(json.dumps(asdict(found[-1])) + "\n")
                 out.flush()
                 print(found[-1], flush=True)
