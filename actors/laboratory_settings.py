@@ -119,7 +119,7 @@ class BenchSettings(Settings):
     """The balance of a simulated bench; a laboratory with an arm has a separate section for it."""
 
     time_scale: Annotated[float, Quantity("1", "30", 0.0, 1e6)] = 30.0
-    """Bench seconds per wall second; 0 means no waiting (not with an arm)."""
+    """Bench seconds per wall second; 0 means no waiting (not with an arm). An arm pours doses in real time."""
 
     operator_time: Duration = 85.0
     """Time to refill, place and wipe between two pours, in bench time; with an arm see 'operator'."""
