@@ -321,7 +321,9 @@ class DoseHandling:
                 f"'{cup}' has {held} of {scene.liquid.name} already, and no liquid is dosed into a cup twice"
             )
         await self._liquids.room_for_spills(scene.liquid, MOST_SPILLED, consent)
-        source, fresh = source_of(scene, dose), source_name in self._filled
+        source, content = source_of(scene, dose), self._record.held(source_name)
+        resumed = not self._vessels[source_name].filled  # a source that the run has filled, and not used, is still full
+        fresh = source_name in self._filled or (resumed and content is not None and content[0] >= source.mass)
         self._filled.discard(source_name)
         if source.fill and not fresh:
             source = await self._refilled(source, source_name, scene.liquid, consent, seed)

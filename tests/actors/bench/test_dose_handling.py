@@ -316,6 +316,23 @@ def test_a_source_is_filled_by_the_pump_and_a_dose_that_is_weighed_stays_known_w
     assert "unattended: the consent has ended" in stage.said("warning")
 
 
+@pytest.mark.realtime
+@pytest.mark.parametrize(("grams", "asked"), [(300.0, False), (100.0, True)])
+def test_a_resumed_series_has_a_source_filled_only_if_it_is_not_full(
+    open_stage: OpenStage, tmp_path: Path, grams: float, asked: bool
+) -> None:
+    vessels = (replace(spec().vessels[0], filled=False), *spec().vessels[1:])
+
+    async def play(stage: Stage, record: Watched) -> None:
+        record.content("source/water", 1e-3 * grams, 5e-4, "water")
+        stage.answers = {"unattended": ["no"], "move": ["no"]}
+        with pytest.raises(NotPouredError, match="did not let the arm move"):
+            await dosed(stage, 10, "water", "rack/A1")
+
+    stage, _ = played(open_stage, tmp_path, play, vessels=vessels)
+    assert ("source_refill" in stage.heard) is asked
+
+
 def test_a_cup_is_emptied_only_where_there_is_waste_and_the_arm_reaches_over_it() -> None:
     lab = spec()
     assert lab.arm is not None
