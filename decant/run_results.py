@@ -130,7 +130,7 @@ class Run:
     @property
     def mixtures(self) -> pd.DataFrame:
         """One row for each liquid of each cup of `mixtures`: wanted and received mass [g] and share, with half of their
-        90 % intervals, dose, source, time [s since 1970] and state of the cup; empty without mixtures.
+        90 % intervals, dose, source, batch, time [s since 1970] and state of the cup; empty without mixtures.
         """
         mixtures = mixtures_of(with_unfinished(self.campaign, self.result).results)
         return _frame(iter([] if mixtures is None else mixture_rows(mixtures, read_record(self.directory))))

@@ -394,6 +394,9 @@ class MixedLiquidSettings(Settings):
     tolerance: DoseAmount | None = None
     """Tolerance of its doses; that of all mixtures unless given."""
 
+    batch: Text | None = None
+    """Its batch or lot, for the table of results, such as 'L-2026-117'."""
+
 
 class CupsSettings(Settings):
     """The cups that mixtures are poured into."""

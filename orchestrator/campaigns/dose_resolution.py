@@ -160,7 +160,8 @@ def resolve_mixtures(
         for name, row in cups.items()
     }
     spares = tuple(_position(section, spare) for spare in section.cups.spares or ())
-    mixtures = MixturePlan(planned, section.on_miss, spares, section.max_open)
+    batches = {liquid.name: liquid.batch for liquid in section.liquids if liquid.batch is not None}
+    mixtures = MixturePlan(planned, section.on_miss, spares, section.max_open, batches)
     scenes = [
         _scene(section, replace(builder, liquid=liquids[liquid]), place, "mixtures", source, cup)
         for liquid, source in sources

@@ -501,12 +501,14 @@ class MixturePlan:
         on_miss: see `MissPolicy`.
         spares: positions of empty cups that replace one whose mixture is poured again.
         max_open: longest time from the first dose into a cup to its last one [s]; None: unlimited.
+        batches: of the liquids, by name, if they are stated.
     """
 
     cups: dict[str, dict[str, PlannedDose]]
     on_miss: MissPolicy = "accept"
     spares: tuple[str, ...] = ()
     max_open: float | None = None
+    batches: dict[str, str] = field(default_factory=dict, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)

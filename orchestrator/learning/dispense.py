@@ -136,6 +136,9 @@ class Dose(ResultPart):
     liquid: str = ""
     """Name of the liquid in a mixture."""
 
+    batch: str = ""
+    """Batch of the liquid, if the campaign states it."""
+
     filled: bool = False
     """Whether the source was filled before the dose."""
 
@@ -214,6 +217,9 @@ class MixedComponent(ResultPart):
     source: str
     """Name of the source."""
 
+    batch: str
+    """Batch of the liquid, if the campaign states it."""
+
     state: CupState
     """State of the cup."""
 
@@ -263,6 +269,7 @@ class Dispensed(StageResult):
                     else NINETY_PERCENT * share_deviation(liquid, share, errors, total),
                     dose=None if dose is None else dose.number,
                     source="" if dose is None else dose.source,
+                    batch="" if dose is None else dose.batch,
                     state=cup.state,
                 )
             )
@@ -409,6 +416,7 @@ class Dispense:
                 end = f"{kind}: {reason}"
             case _:
                 raise ValueError(f"a dose can't be answered by {type(outcome).__name__}")
+        liquid = "" if self._plan.mixtures is None else self._plan.liquid(pour.dose.source.name)
         dose = Dose(
             number=pour.number,
             wanted_g=1e3 * pour.dose.amount,
@@ -419,7 +427,8 @@ class Dispense:
             end=end,
             position=pour.dose.position,
             source=pour.dose.source.name,
-            liquid="" if self._plan.mixtures is None else self._plan.liquid(pour.dose.source.name),
+            liquid=liquid,
+            batch="" if self._plan.mixtures is None else self._plan.mixtures.batches.get(liquid, ""),
             filled=pour.dose.source.fill,
             left_g=None if left is None else 1e3 * left.mass,
             left_deviation_g=None if left is None else 1e3 * left.deviation,

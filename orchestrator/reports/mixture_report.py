@@ -1,6 +1,7 @@
 """Mixtures of a run: their table, its files, and the picture of the rack.
 
-Rows are the components of the cups: wanted and reached amounts, shares with their uncertainty, dose, time and source.
+Rows are the components of the cups: wanted and reached amounts, shares with their uncertainty, dose, time, source and
+batch of the liquid.
 """
 
 from __future__ import annotations
@@ -154,7 +155,8 @@ def mixture_table(dispensed: Dispensed) -> ResultTable:
         shares = (component.wanted_share, component.share, component.share_half_interval)
         cells = [component.cup, component.liquid, *("—" if grams is None else f"{grams:.2f}" for grams in masses)]
         cells += ["—" if share is None else f"{100.0 * share:.2f}" for share in shares]
-        cells += ["—" if component.dose is None else str(component.dose), component.source or "—", component.state]
+        source = component.source + (f", batch {component.batch}" if component.batch else "")
+        cells += ["—" if component.dose is None else str(component.dose), source or "—", component.state]
         rows.append(ResultRow(cells, "" if component.state in ("full", "waiting", "filling") else "bad"))
     header = ["cup", "liquid", "wanted [g]", "received [g]", "difference [g]", "± (90 %) [g]"]
     header += ["wanted share [%]", "share [%]", "± (90 %) [%]", "dose", "source", "cup is"]

@@ -13,6 +13,10 @@ from sim_engine.liquids import KNOWN, LiquidSettings, look_up
         ("water", 20.0, 1.002e-3, 998.2),  # IAPWS
         ("water", 60.0, 0.466e-3, 983.2),
         ("ethanol", 20.0, 1.19e-3, 789.3),
+        ("ethanol 70 %", 20.0, 2.37e-3, 867.7),
+        ("ethanol 45 %", 20.0, 2.88e-3, 924.7),
+        ("ethanol 40 %", 25.0, 2.35e-3, 931.5),
+        ("ethanol 100 %", 20.0, 1.19e-3, 789.3),
         ("isopropanol", 20.0, 2.4e-3, 785.5),
         ("glycerol 50 %", 20.0, 6.0e-3, 1126.0),  # Glycerine Producers' Association 1963
         ("glycerol 80 %", 20.0, 60.1e-3, 1208.0),
@@ -29,7 +33,7 @@ def test_the_table_is_what_handbooks_print(name: str, temperature: float, viscos
     assert 0.02 < found.surface_tension < 0.08
 
 
-@pytest.mark.parametrize("known", KNOWN, ids=lambda known: known.name)
+@pytest.mark.parametrize("known", KNOWN, ids=lambda known: f"{known.name}{' in water' * (known.share is not None)}")
 def test_every_liquid_is_thinner_and_lighter_when_it_is_warm(known) -> None:  # type: ignore[no-untyped-def]
     share = 0.0 if known.share is None else known.share[1]
     cold, warm = (known.at(t, share) for t in known.temperatures)
@@ -43,6 +47,7 @@ def test_every_liquid_is_thinner_and_lighter_when_it_is_warm(known) -> None:  # 
     [
         ("glycerol", 20.0, "how much glycerol? Write for example 'glycerol 60 %'"),
         ("sugar syrup 90 %", 20.0, "sugar syrup is known from 0 to 78 %"),
+        ("ethanol 50 %", 60.0, "ethanol is known from 10 to 40 °C, not at 60 °C"),
         ("ethanol", 90.0, "ethanol is known from 0 to 75 °C, not at 90 °C"),
     ],
 )

@@ -33,7 +33,7 @@ mixtures:
   tolerance: 2 g
   liquids:
     - {name: water, liquid: {name: water, mass: 100 g}}
-    - {name: ethanol, liquid: {name: ethanol, mass: 90 g}}
+    - {name: ethanol, liquid: {name: ethanol, mass: 90 g}, batch: L-117}
   wanted:
     B2: {water: 30 g, ethanol: 20 g}
     A1: {water: 25 g}
@@ -61,6 +61,7 @@ def test_the_table_has_every_component_with_what_was_weighed(run: decant.Run) ->
         assert 0.0 < float(row["half_interval_g"]) < 1.0
         assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4}", row["time"])
         assert (row["source"], row["state"]) == (f"source/{row['liquid']}", "full")
+        assert row["batch"] == {"ethanol": "L-117", "water": ""}[row["liquid"]]
     assert sum(float(row["share"]) for row in rows[:2]) == pytest.approx(1.0)
 
 
