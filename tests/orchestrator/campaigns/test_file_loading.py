@@ -105,7 +105,10 @@ def test_a_liquid_s_properties_are_checked_like_all_quantities(written: str, mes
     ("name", "message"),
     [
         ("glycerin 80 %", "'glycerin 80 %' is not in the table of liquids. Did you mean 'glycerol 80 %'?"),
-        ("ethanol 70 %", "'ethanol 70 %' is not in the table of liquids. Did you mean 'ethanol'? The table has"),
+        (
+            "isopropanol 70 %",
+            "'isopropanol 70 %' is not in the table of liquids. Did you mean 'isopropanol'? The table has",
+        ),
         ("ethanoll", "'ethanoll' is not in the table of liquids. Did you mean 'ethanol'?"),
         ("honey 80 %", "'honey 80 %' is not in the table of liquids. The table has 'water', "),
         ("honey", "'honey' is not in the table of liquids. The table has 'water', "),
