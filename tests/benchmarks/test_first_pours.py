@@ -7,6 +7,8 @@ from types import ModuleType
 
 import pytest
 
+from actors.laboratory_settings import BenchSettings
+
 
 @pytest.fixture
 def first_pours(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
@@ -23,3 +25,22 @@ def test_first_pours_are_compared_with_their_predictions(first_pours: ModuleType
     numbers = ["first", "2", "2.0", "2.5", "1.5", "2.5", "50 %", "0.125"]
     assert shown["rows"] == [["with evidence", bench, *numbers] for bench in ("14 mm", "all")]
     assert len(shown["head"]) == len(numbers) + 2
+
+
+@pytest.mark.parametrize(
+    ("program", "x", "y"),
+    [
+        ("first", -0.002, 0.001),
+        ("wrong wall", -0.002, 0.001),
+        ("moved", 0.018, 0.001),
+        ("moved, before", 0.018, 0.001),
+        ("arm moved", -0.016, 0.015),
+        ("arm moved, before", -0.016, 0.015),
+    ],
+)
+def test_only_what_was_moved_since_the_calibration_stands_elsewhere(
+    first_pours: ModuleType, program: str, x: float, y: float, tmp_path: Path
+) -> None:
+    content = first_pours.content_of(62000, "twin", program, 5, tmp_path)
+    truth = BenchSettings.model_validate(content["laboratory"]["bench"]).pose_error
+    assert (truth.x, truth.y) == pytest.approx((x, y))
