@@ -105,27 +105,27 @@ class Run:
     @property
     def pours(self) -> pd.DataFrame:
         """One row for each pour: action in display units, masses [g], spillage r, loss in its own unit."""
-        return _frame(self._pours())
+        return table_of(self._pours())
 
     @property
     def simulations(self) -> pd.DataFrame:
         """One row for each simulation: action in display units, θ, fractions of the load, CPU seconds."""
-        return _frame(self._simulations())
+        return table_of(self._simulations())
 
     @property
     def decisions(self) -> pd.DataFrame:
         """The reasons for the strategies' requests, in words and numbers."""
-        return _frame(self._decisions())
+        return table_of(self._decisions())
 
     @property
     def curves(self) -> pd.DataFrame:
         """Progress of each stage: the loss of every pour and the discrepancy of every θ, with the best so far."""
-        return _frame(self._curves())
+        return table_of(self._curves())
 
     @property
     def outflows(self) -> pd.DataFrame:
         """Outflow of every simulation over time: fractions of the load that have been poured and spilled."""
-        return _frame(self._outflows())
+        return table_of(self._outflows())
 
     @property
     def mixtures(self) -> pd.DataFrame:
@@ -133,7 +133,7 @@ class Run:
         90 % intervals, dose, source, batch, time [s since 1970] and state of the cup; empty without mixtures.
         """
         mixtures = mixtures_of(with_unfinished(self.campaign, self.result).results)
-        return _frame(iter([] if mixtures is None else mixture_rows(mixtures, read_record(self.directory))))
+        return table_of([] if mixtures is None else mixture_rows(mixtures, read_record(self.directory)))
 
     def figures(self) -> dict[str, Figure]:
         """All figures that its results allow, by name."""
@@ -277,7 +277,8 @@ def _least(best: float | None, value: float | None) -> float | None:
     return best if value is None else value if best is None else min(best, value)
 
 
-def _frame(rows: Iterator[Row]) -> pd.DataFrame:
+def table_of(rows: Iterable[Row]) -> pd.DataFrame:
+    """Rows as a table, with the units of its columns in `attrs`."""
     require("pandas", "A table")
     import pandas as pd
 

@@ -13,14 +13,14 @@ import html
 import json
 import tempfile
 import warnings
-from collections.abc import Coroutine, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from decant.run_results import Run
+from decant.run_results import Run, table_of
 from orchestrator.campaigns import file_loading
 from orchestrator.campaigns.file_loading import campaign_from, load_laboratory, load_vessel
 from orchestrator.campaigns.shipped import shipped, starting_set
@@ -30,15 +30,20 @@ from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.learning.calibration.calibration_scores import calibration_residual
 from orchestrator.learning.calibration.campaign_memory import CampaignMemory
 from orchestrator.learning.campaign_plan import CampaignPlan
+from orchestrator.learning.mixtures import NO_MORE
 from orchestrator.live_view.rerun_subscriber import recorder_of
 from orchestrator.records.events import Subscriber as Watch
+from orchestrator.records.journal_file import Header
 from orchestrator.records.run_clock import run_time
+from orchestrator.records.run_record import RunState
+from orchestrator.reports.mixture_report import mixture_rows, mixtures_so_far
 from orchestrator.reports.progress_state import ProgressState
 from orchestrator.reports.publishing import publish_run
 from orchestrator.reports.stage_views import evaluation_of
 from orchestrator.reports.validity_warnings import not_simulated
 from orchestrator.runs.bench_check import BenchReport, check_bench
 from orchestrator.runs.motion_approval import read_record
+from orchestrator.runs.resume import OperatorNeededError
 from orchestrator.runs.run_folder import create_run
 from orchestrator.runs.run_service import CheckReport, RunHandle, RunRequest, RunResources, RunService
 from orchestrator.runs.run_tasks import (
@@ -118,6 +123,7 @@ def run(
     watch: Sequence[Watch] = (),
     resume: Path | str | None = None,
     in_process: bool = True,
+    propose: Propose | None = None,
 ) -> Run:
     """Run a campaign on its virtual bench, or go on with a run of it, and publish it.
 
@@ -126,6 +132,8 @@ def run(
         watch: called with every event (`decant.events`), in the order in which things happen. They must not wait.
         resume: folder of the run to go on with; a new one is begun otherwise.
         in_process: everything in this process, without Ray; else simulations run side by side.
+        propose: of a campaign with `cups: {proposals: …}`, called when all mixtures are poured. Its argument is the
+            table of `Run.mixtures` so far; it returns the next mixtures, such as `[{"water": "30 g"}]`, or none.
 
     What is suspicious about the campaign, or not simulated, is issued as `UserWarning` before it begins. A recording
     is written if the campaign has `outputs: {recording: true}` and Rerun is installed.
@@ -137,10 +145,33 @@ def run(
         RunError: the run can't begin, go on or end; the text says what is kept, and what to do.
     """
     request = run_task(campaign)
-    resources = checked(request, RunResources(in_process=in_process, subscribers=watch))
+    proposals = None if propose is None else _Proposals(campaign, propose)
+    watch = (*watch, *([] if proposals is None else [proposals.record.take]))
+    ask = None if proposals is None else proposals.answer
+    resources = checked(request, RunResources(in_process=in_process, subscribers=watch, ask_operator=ask))
     if resume is not None:
         request = replace(request, folder=Path(resume).expanduser(), resume=True)
     return _run(request, resources)
+
+
+Propose = Callable[[Any], Sequence[Mapping[str, str]]]
+
+
+class _Proposals:
+    """Answers a run's question for further mixtures by a function of the caller."""
+
+    def __init__(self, campaign: CampaignPlan, propose: Propose) -> None:
+        self.record = RunState(Header(campaign.name, {}))
+        self._campaign, self._propose = campaign, propose
+
+    async def answer(self, question: str, options: Sequence[str]) -> str:
+        """See `AskOperator`. Raises OperatorNeededError: another question, or mixtures that are impossible."""
+        if NO_MORE not in options or "Refused: " in question:
+            raise OperatorNeededError(question)
+        mixtures = mixtures_so_far(self._campaign, self.record)
+        assert mixtures is not None
+        table = table_of(mixture_rows(mixtures, self.record))
+        return json.dumps([dict(row) for row in await asyncio.to_thread(self._propose, table)])
 
 
 def check(campaign: CampaignPlan, task: Task = "run") -> CheckReport:

@@ -1,7 +1,7 @@
 """The recipes of docs/recipes, each executed with the real package in an environment of its own.
 
-$DECANT_PREFECT_PYTHON and $DECANT_BLUESKY_PYTHON name interpreters with those packages. The queue server needs Redis:
-`redis-server` on the path, or $DECANT_REDIS_SERVER.
+$DECANT_PREFECT_PYTHON, $DECANT_BLUESKY_PYTHON and $DECANT_AX_PYTHON name interpreters with those packages. The queue
+server needs Redis: `redis-server` on the path, or $DECANT_REDIS_SERVER.
 """
 
 from __future__ import annotations
@@ -92,17 +92,22 @@ def test_the_script_pours_once_and_waits_for_the_operator_after_the_daemon_was_k
     assert poured(tmp_path) == 1
 
 
-def test_the_closed_loop_pours_what_its_optimiser_proposes_and_learns_from_what_was_reached(tmp_path: Path) -> None:
-    script = str(RECIPES / "mixtures_loop.py")
+@pytest.mark.parametrize("optimiser", ["stand-in", "Ax"])
+def test_the_closed_loop_pours_what_its_optimiser_proposes_within_one_run(tmp_path: Path, optimiser: str) -> None:
+    """With Ax, $DECANT_AX_PYTHON needs Decant, too."""
+    python = sys.executable if optimiser == "stand-in" else python_with("ax", "AX")
     process = subprocess.run(
-        [sys.executable, script, "2"], capture_output=True, text=True, timeout=600, check=False, cwd=tmp_path,
-        env=child_environment({"XDG_STATE_HOME": str(tmp_path / "state")}),
+        [python, str(RECIPES / "mixtures_loop.py"), "2"], capture_output=True, text=True, timeout=600, check=False,
+        cwd=tmp_path, env=child_environment({"XDG_STATE_HOME": str(tmp_path / "state")}),
     )  # fmt: skip
     assert process.returncode == 0, process.stderr[-3000:]
-    first, second = map(json.loads, process.stdout.splitlines())
-    assert 0.0 < first["best"] < second["best"] <= 1.0
-    assert sum(second["shares"]) == pytest.approx(1.0, abs=0.01)
-    assert len(list((tmp_path / "runs").glob("loop-*/mixtures.csv"))) == 2
+    lines = [json.loads(line) for line in process.stdout.splitlines() if line.startswith("{")]
+    assert lines[0]["cups"] == 4
+    assert lines[-1]["cups"] == 8
+    assert 0.0 < lines[0]["best"] <= lines[-1]["best"] <= 1.0
+    assert sum(lines[-1]["shares"]) == pytest.approx(1.0, abs=0.01)
+    (table,) = (tmp_path / "runs").glob("loop-*/mixtures.csv")
+    assert len(table.read_text().splitlines()) == 1 + 8 * 3
 
 
 def test_a_flow_of_prefect_fills_vials_and_pours_nothing_again_in_its_second_run(tmp_path: Path) -> None:

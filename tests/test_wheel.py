@@ -225,7 +225,7 @@ def test_without_extras_one_simulates_and_plans(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_without_extras_a_table_says_what_to_install(tmp_path: Path) -> None:
-    code = f"{BLOCKED}\nfrom decant.run_results import _frame\n_frame(iter([]))"
+    code = f"{BLOCKED}\nfrom decant.run_results import table_of\ntable_of([])"
     done = run(code, tmp_path)
     assert "pip install 'decant-pouring[tables]'" in done.stderr
 

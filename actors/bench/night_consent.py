@@ -63,9 +63,11 @@ class NightConsent:
         names = ", ".join(f"'{place.name}'" for place in self._places)
         moves = f"pours over the balance, pouring back, and carrying pourer and receiver between {names}"
         if self._vessels:
-            sources = ", ".join(f"'{vessel.name}' ({vessel.liquid})" for vessel in self._vessels if vessel.liquid)
-            cups = ", ".join(f"'{vessel.name}'" for vessel in self._vessels if not vessel.liquid)
+            sources = ", ".join(f"{vessel.name} ({vessel.liquid})" for vessel in self._vessels if vessel.liquid)
+            cups = ", ".join(vessel.name for vessel in self._vessels if not vessel.liquid)
             moves = f"doses over the balance from the sources {sources}, into the cups {cups}, and carrying them"
+            waste = [place.name for place in self._places if place.container is not None]
+            moves += f", also to empty cups at {', '.join(waste)}" if waste else ""
         return OperatorQuestion(
             f"Unattended: up to {self._spec.pours} pours until {self._spec.until}, with nobody in the cell. The arm "
             f"({self._arm}) and its gripper will move without further questions: {moves}. Safeguard: "

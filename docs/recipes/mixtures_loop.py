@@ -1,7 +1,7 @@
-"""A closed loop: an optimiser proposes four mixtures, Decant pours them, a property is measured, and again.
+"""A closed loop: Ax proposes four mixtures, Decant pours them, a property is measured, and again: one run, one consent.
 
-Run from a checkout: python docs/recipes/mixtures_loop.py [ROUNDS]. The optimiser has `ask` and `tell`, as Ax and BayBE
-do; put yours in its place. The property is synthetic. Every round is one run, with one consent of its own.
+Run from a checkout: python docs/recipes/mixtures_loop.py [ROUNDS]. Needs `pip install ax-platform`. Without it a small
+stand-in with the same interface proposes random mixtures. The property is synthetic.
 """
 
 import json
@@ -9,51 +9,119 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, WhiteKernel
 
 import decant
 
 LIQUIDS = ("water", "ethanol", "oil")
 CONFIGS = Path(__file__).parents[2] / "configs"
-TOTAL = 60.0  # g
+TOTAL, SMALLEST = 60.0, 0.15  # g; smallest share
+
+try:
+    from ax.api.client import Client
+    from ax.api.configs import RangeParameterConfig
+except ImportError:
+
+    class RangeParameterConfig(dict):
+        """A searched share."""
+
+    class Client:
+        """Stands in for the client of Ax: random shares that keep the constraint."""
+
+        def __init__(self, random_seed=None):
+            self._rng, self._trials = np.random.default_rng(random_seed), 0
+
+        def configure_experiment(self, parameters, parameter_constraints):
+            """See Ax."""
+
+        def configure_optimization(self, objective):
+            """See Ax."""
+
+        def get_next_trials(self, max_trials):
+            """Return parameters by the index of the trial."""
+            first, self._trials = self._trials, self._trials + max_trials
+            shares = SMALLEST + (1.0 - 3.0 * SMALLEST) * self._rng.dirichlet(np.ones(3), max_trials)
+            return {first + i: {"water": float(row[0]), "ethanol": float(row[1])} for i, row in enumerate(shares)}
+
+        def complete_trial(self, trial_index, raw_data):
+            """See Ax."""
+
+        def attach_trial(self, parameters):
+            """Return the index of a trial with parameters of the caller."""
+            self._trials += 1
+            return self._trials - 1
+
+        def mark_trial_abandoned(self, trial_index):
+            """See Ax."""
 
 
-class Optimiser:
-    """Largest mean + 2 deviations of a Gaussian process over the shares of a mixture, on random candidates."""
+class Loop:
+    """Asks for four mixtures at a time, and tells what was reached.
 
-    def __init__(self, seed: int) -> None:
-        self._rng, self._shares, self._values = np.random.default_rng(seed), [], []
+    Args:
+        cups: number of all mixtures.
+        seed: of the optimiser.
+    """
 
-    def ask(self, count: int) -> list[np.ndarray]:
-        """Propose shares of this many mixtures, each as if the ones before it had given what is expected."""
-        candidates = 0.15 + 0.55 * self._rng.dirichlet(np.ones(len(LIQUIDS)), 500)  # every share is 15 % or more
-        shares, values = [*self._shares], [*self._values]
-        while values and len(shares) < len(self._shares) + count:
-            model = GaussianProcessRegressor(RBF(0.2) + WhiteKernel(1e-3, "fixed"), normalize_y=True)
-            mean, deviation = model.fit(shares, values).predict(candidates, return_std=True)
-            best = int(np.argmax(mean + 2.0 * deviation))
-            shares.append(candidates[best])
-            values.append(mean[best])
-        return shares[len(self._shares) :] or list(candidates[:count])
+    def __init__(self, cups, seed):
+        self.cups = cups
+        largest = 1.0 - 2.0 * SMALLEST
+        self.client = Client(random_seed=seed)
+        self.client.configure_experiment(
+            parameters=[
+                RangeParameterConfig(name=liquid, parameter_type="float", bounds=(SMALLEST, largest))
+                for liquid in LIQUIDS[:2]
+            ],
+            parameter_constraints=[f"water + ethanol <= {1.0 - SMALLEST}"],  # the rest is oil
+        )
+        self.client.configure_optimization(objective="property")
+        self.proposed, self.told, self.best = [], 0, (0.0, [])
 
-    def tell(self, shares: np.ndarray, value: float) -> None:
-        """Learn from the shares that were reached, not those that were proposed."""
-        self._shares.append(shares)
-        self._values.append(value)
+    def ask(self):
+        """Up to four mixtures as Decant takes them; none if all cups are used."""
+        mixtures, left = [], self.cups - len(self.proposed)
+        trials = self.client.get_next_trials(max_trials=min(4, left)) if left else {}
+        for index, shares in trials.items():
+            self.proposed.append(index)
+            amounts = [shares["water"], shares["ethanol"], 1.0 - shares["water"] - shares["ethanol"]]
+            mixtures.append({name: f"{TOTAL * share:.2f} g" for name, share in zip(LIQUIDS, amounts, strict=True)})
+        return mixtures
+
+    def tell(self, table):
+        """Measure the new cups of a run's table, and tell the shares that were reached instead of those proposed."""
+        for _, rows in list(table.groupby("cup", sort=False))[self.told :]:
+            index, self.told = self.proposed[self.told], self.told + 1
+            if not (rows["state"] == "full").all():  # a cup that is not full tells nothing
+                self.client.mark_trial_abandoned(trial_index=index)
+                continue
+            shares = rows.set_index("liquid")["share"][list(LIQUIDS)].to_numpy()
+            value = measured(shares)
+            try:
+                reached = self.client.attach_trial({"water": float(shares[0]), "ethanol": float(shares[1])})
+                self.client.mark_trial_abandoned(trial_index=index)
+            except ValueError:  # just outside of the searched shares
+                reached = index
+            self.client.complete_trial(trial_index=reached, raw_data={"property": value})
+            self.best = max(self.best, (value, [round(float(share), 3) for share in shares]))
+        print(json.dumps({"cups": self.told, "best": round(self.best[0], 3), "shares": self.best[1]}), flush=True)
+
+    def propose(self, table):
+        """The next mixtures, from the table of those that were poured."""
+        self.tell(table)
+        return self.ask()
 
 
-def measured(shares: np.ndarray) -> float:
+def measured(shares):
     """The property: largest, 1, at 50 % water, 30 % ethanol and 20 % oil."""
     return float(np.exp(-20.0 * np.sum((shares - [0.5, 0.3, 0.2]) ** 2)))
 
 
-def poured(proposals: list[np.ndarray], number: int) -> list[np.ndarray]:
-    """Pour mixtures; returns the shares that were reached. A cup that is not full tells nothing, and is left out."""
-    campaign = decant.build_campaign(
+def campaign(first, rounds):
+    """The first mixtures, and empty cups for the others."""
+    cups = [f"{row}{i}" for row in "ABCDEFGH"[:rounds] for i in range(1, 5)]
+    return decant.build_campaign(
         {
-            "name": f"loop-{number}",
-            "seed": number,
+            "name": "loop",
+            "seed": 1,
             "laboratory": "laboratories/twin.yaml",
             "pourer": "vessels/beaker.yaml",
             "receiver": "vessels/tumbler.yaml",
@@ -65,25 +133,17 @@ def poured(proposals: list[np.ndarray], number: int) -> list[np.ndarray]:
                     {"name": "ethanol", "liquid": {"name": "ethanol", "mass": "280 g"}},
                     {"name": "oil", "liquid": {"name": "rapeseed oil", "mass": "320 g"}},
                 ],
-                "wanted": {
-                    f"A{i}": {liquid: f"{TOTAL * share:.2f} g" for liquid, share in zip(LIQUIDS, shares, strict=True)}
-                    for i, shares in enumerate(proposals, start=1)
-                },
+                "wanted": dict(zip(cups, first, strict=False)),
+                "cups": {"proposals": cups[len(first) :]},
             },
             "outputs": {"directory": str(Path("runs").absolute()), "recording": False},
         },
         CONFIGS,
     )
-    table = decant.run(campaign).mixtures
-    full = table[table["state"] == "full"]
-    return [rows.set_index("liquid")["share"][list(LIQUIDS)].to_numpy() for _, rows in full.groupby("cup")]
 
 
 if __name__ == "__main__":
-    optimiser, best = Optimiser(seed=1), (0.0, None)
-    for number in range(1, 1 + int(sys.argv[1] if len(sys.argv) > 1 else 3)):
-        for shares in poured(optimiser.ask(4), number):
-            value = measured(shares)
-            optimiser.tell(shares, value)
-            best = max(best, (value, [round(float(share), 3) for share in shares]))
-        print(json.dumps({"round": number, "best": round(best[0], 3), "shares": best[1]}), flush=True)
+    rounds = int(sys.argv[1] if len(sys.argv) > 1 else 3)
+    loop = Loop(cups=4 * rounds, seed=1)
+    run = decant.run(campaign(loop.ask(), rounds), propose=loop.propose)
+    loop.tell(run.mixtures)

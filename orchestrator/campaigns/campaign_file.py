@@ -410,6 +410,9 @@ class CupsSettings(Settings):
     spares: list[Text] | None = None
     """Empty cups into which mixtures are poured again, such as [D5, D6]; for `on_miss: repeat` or `ask`."""
 
+    proposals: list[Text] | None = None
+    """Empty cups for further mixtures, such as [B1, B2], which an optimiser proposes when the others are poured."""
+
 
 class MixturesSettings(DoseSeriesSettings):
     """Mixtures: several liquids in each cup. All doses of a cup follow each other, the smallest amount first."""

@@ -159,9 +159,12 @@ def resolve_mixtures(
         }
         for name, row in cups.items()
     }
-    spares = tuple(_position(section, spare) for spare in section.cups.spares or ())
+    spares, proposals = (
+        tuple(_position(section, cup) for cup in cups or ()) for cups in (section.cups.spares, section.cups.proposals)
+    )
+    order = None if section.order is None or not proposals else tuple(section.order)
     batches = {liquid.name: liquid.batch for liquid in section.liquids if liquid.batch is not None}
-    mixtures = MixturePlan(planned, section.on_miss, spares, section.max_open, batches)
+    mixtures = MixturePlan(planned, section.on_miss, spares, section.max_open, batches, proposals or None, order)
     scenes = [
         _scene(section, replace(builder, liquid=liquids[liquid]), place, "mixtures", source, cup)
         for liquid, source in sources
@@ -356,11 +359,12 @@ def _positions(
         if other is not None:
             complain(cup, "", f"'{cup}' is '{other}', which is named before; a cup is filled once")
         positions[cup] = position
-    for i, spare in enumerate(section.cups.spares or ()):
-        position, at = _position(section, spare), place.at("cups", "spares", i)
-        if position in positions.values():
-            builder.report.add(at, f"'{spare}' is named before; a spare cup is empty")
-        positions[f"spare {i}"] = position
+    for key in ("spares", "proposals"):
+        for i, cup in enumerate(getattr(section.cups, key) or ()):
+            position = _position(section, cup)
+            if position in positions.values():
+                builder.report.add(place.at("cups", key, i), f"'{cup}' is named before; such a cup is empty")
+            positions[f"{key} {i}"] = position
     return positions
 
 
@@ -385,8 +389,9 @@ def _check_places(
     ends = [[position.name for position in each.each] for each in laboratory.places]
     named = ", ".join(f"{names[0]} … {names[-1]}" if len(names) > 1 else names[0] for names in ends)
     for name, position in positions.items():
-        if position not in known and name.startswith("spare "):
-            builder.report.add(place.at("cups", "spares"), f"{lacks} '{position}'")
+        key, _, number = name.partition(" ")
+        if position not in known and key in ("spares", "proposals"):
+            builder.report.add(place.at("cups", key, int(number)), f"{lacks} '{position}'")
         elif position not in known:
             complain(name, "", f"{lacks} '{position}'; there are {named}")
     for i, entry in enumerate(section.liquids or ()):
@@ -410,10 +415,8 @@ def cell_vessels(plan: DispensePlan) -> tuple[CellVessel, ...]:
     mass = max(sum(dose.amount + dose.limit for dose in row) for row in rows)
     volume = max(sum((dose.amount + dose.limit) / densities[dose.liquid or ""] for dose in row) for row in rows)
     cup = plan.scenes[0].receiver
-    return (
-        *vessels,
-        *(CellVessel(name, cup, "", mass, volume) for name in (*plan.mixtures.cups, *plan.mixtures.spares)),
-    )
+    names = (*plan.mixtures.cups, *plan.mixtures.spares, *(plan.mixtures.proposals or ()))
+    return (*vessels, *(CellVessel(name, cup, "", mass, volume) for name in names))
 
 
 def _check_brim(

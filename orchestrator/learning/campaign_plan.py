@@ -502,6 +502,8 @@ class MixturePlan:
         spares: positions of empty cups that replace one whose mixture is poured again.
         max_open: longest time from the first dose into a cup to its last one [s]; None: unlimited.
         batches: of the liquids, by name, if they are stated.
+        proposals: positions of empty cups for mixtures that are proposed while the run goes on.
+        order: of the liquids in every cup; None: the smallest amount first.
     """
 
     cups: dict[str, dict[str, PlannedDose]]
@@ -509,6 +511,8 @@ class MixturePlan:
     spares: tuple[str, ...] = ()
     max_open: float | None = None
     batches: dict[str, str] = field(default_factory=dict, metadata=WRITTEN_IF_SET)
+    proposals: tuple[str, ...] | None = field(default=None, metadata=WRITTEN_IF_SET)
+    order: tuple[str, ...] | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,14 @@ A dose misses if it differs from its amount by more than its tolerance. Then `on
 - ask: the operator chooses one of these, or that the amounts stay as they are.
 
 A cup with a dose of unknown amount gets no further liquid.
+
+With `cups: {proposals: …}`, further mixtures are asked for when all cups are poured, until these cups are used: an
+optimiser closes the loop within one run.
 """
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,6 +26,7 @@ from actors.interfaces import DoseKnowledge, DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.dispense import Dispense, Dispensed, Dose, KnownSource, MixedCup
 from orchestrator.learning.requests import Answered, Ask, Decision, Failed, Outcome, Pour, Poured, Request, Slots
+from sim_engine.settings.quantity import parse_quantity
 from sim_engine.vessel.vessel import build_vessel
 
 REPEATS = 2
@@ -29,6 +34,12 @@ REPEATS = 2
 
 STEP = 1e-5
 """Corrected amounts are multiples of it [kg]."""
+
+HEAVIER = 1e-4
+"""Mass by which a proposed mixture may exceed the largest one of the table, whose cup was checked [kg]."""
+
+NO_MORE = "[]"
+"""The answer that ends the proposals."""
 
 
 def pouring_order(amounts: Mapping[str, float], fixed: Sequence[str] | None = None) -> list[str]:
@@ -44,6 +55,22 @@ def pouring_order(amounts: Mapping[str, float], fixed: Sequence[str] | None = No
     if fixed is None:
         return sorted(amounts, key=lambda liquid: amounts[liquid])
     return sorted(amounts, key=fixed.index)
+
+
+def parse_proposals(answer: str) -> list[dict[str, float]]:
+    """Mixtures as an answer in JSON proposes them: masses by liquid [kg].
+
+    Raises:
+        ValueError: it has another form; the text says which.
+    """
+    form = 'a list in JSON, such as [{"water": "30 g", "oil": "8 g"}]'
+    try:
+        rows = json.loads(answer)
+    except ValueError:
+        raise ValueError(f"the mixtures should be {form}") from None
+    if not isinstance(rows, list) or not all(isinstance(row, dict) and row for row in rows):
+        raise ValueError(f"the mixtures should be {form}")
+    return [{liquid: parse_quantity(text, "kg", "30 g") for liquid, text in row.items()} for row in rows]
 
 
 class Mix(Dispense):
@@ -71,6 +98,7 @@ class Mix(Dispense):
         self._emptied = Counter[str]()
         self._miss: tuple[int, Dose, Ask] | None = None
         self._asked = False
+        self._free, self._refused = list(plan.mixtures.proposals or ()), ""
 
     def _next(self) -> PlannedDose | None:
         return next((self._remaining[cup.position][0] for cup in self._cups if self._open(cup)), None)
@@ -96,17 +124,30 @@ class Mix(Dispense):
     @property
     def finished(self) -> bool:
         """Whether all doses are completed, and no question is open."""
-        return self._miss is None and super().finished
+        return self._question is None and super().finished
+
+    @property
+    def _question(self) -> Ask | None:
+        """What has to be decided before the next dose; None: nothing."""
+        if self._miss is not None:
+            return self._miss[2]
+        if not self._free or self._pouring is not None or self._next() is not None:
+            return None
+        text = f"Which mixtures are poured next, into at most {len(self._free)} cups ({', '.join(self._free)})? "
+        text += (
+            f'Answer in JSON, such as [{{"water": "30 g", "oil": "8 g"}}]; {NO_MORE} ends the series.{self._refused}'
+        )
+        return Ask(text, (NO_MORE,), len(self._free))
 
     def ask(self, slots: Slots) -> list[Request]:
-        """Return the next dose, if none is running and the operator has nothing to decide."""
-        if self._miss is None:
+        """Return the next dose, if none is running and there is nothing to decide."""
+        if (question := self._question) is None:
             return super().ask(slots)
         pending, self._asked = self._asked, True
-        return [] if pending else [self._miss[2]]
+        return [] if pending else [question]
 
     def tell(self, request: Request, outcome: Outcome) -> None:
-        """Record the outcome of a dose, or the operator's answer.
+        """Record the outcome of a dose, or an answer.
 
         Raises:
             ValueError: the request was not made, or has another kind of outcome.
@@ -114,10 +155,50 @@ class Mix(Dispense):
         if not isinstance(request, Ask):
             super().tell(request, outcome)
             return
-        if self._miss is None or request != self._miss[2] or not isinstance(outcome, Answered):
+        if request != self._question or not isinstance(outcome, Answered):
             raise ValueError(f"this was not asked, or not answered: {request.question}")
-        (index, dose, _), self._miss, self._asked = self._miss, None, False
+        self._asked = False
+        if self._miss is None:
+            self.propose(outcome.answer)
+            return
+        (index, dose, _), self._miss = self._miss, None
         self._decide(index, dose, outcome.answer)
+
+    def propose(self, answer: str) -> None:
+        """Add the mixtures of an answer. If one of them is impossible, none is added, and the question is repeated."""
+        cups: dict[str, dict[str, PlannedDose]] = {}
+        try:
+            rows = parse_proposals(answer)
+            if len(rows) > len(self._free):
+                raise ValueError(f"{len(rows)} mixtures, and {len(self._free)} cups are empty")
+            for position, row in zip(self._free, rows, strict=False):
+                cups[position] = self._proposed(position, row)
+        except ValueError as error:
+            self._refused = f"\nRefused: {error}"
+            self._say(f"the proposed mixtures are refused: {error}", urgent=True)
+            return
+        self._free, self._refused = self._free[len(rows) :] if rows else [], ""
+        self._say(f"proposed: {', '.join(cups)}" if rows else "no further mixtures are proposed")
+        self._planned |= cups
+        self._remaining |= {position: list(doses.values()) for position, doses in cups.items()}
+        self._cups += [_cup(position, doses) for position, doses in cups.items()]
+
+    def _proposed(self, position: str, row: Mapping[str, float]) -> dict[str, PlannedDose]:
+        """The doses of a proposed mixture. Raises ValueError: it can't be poured."""
+        known = {dose.liquid: dose for dose in self._plan.doses}
+        if unknown := [liquid for liquid in row if liquid not in known]:
+            raise ValueError(f"{position}: the table has no {', '.join(unknown)}")
+        doses = {
+            liquid: replace(known[liquid], amount=round(row[liquid], 5), position=position)
+            for liquid in pouring_order(row, self._mixtures.order)
+        }
+        reason = self._no_room([], list(doses.values()))
+        largest = max(sum(dose.amount for dose in cup.values()) for cup in self._mixtures.cups.values())
+        if reason is None and sum(dose.amount for dose in doses.values()) > largest + HEAVIER:
+            reason = f"it is heavier than {1e3 * largest:.4g} g, the largest mixture of the table"
+        if reason is not None:
+            raise ValueError(f"{position}: {reason}")
+        return doses
 
     def take(self, pour: Pour, outcome: Outcome | None) -> None:
         """See `Dispense.take`. What was decided after a miss follows from the next dose."""

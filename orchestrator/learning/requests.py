@@ -124,10 +124,12 @@ class Ask:
     Attributes:
         question: includes the facts that the answer depends on.
         options: the possible answers.
+        proposals: the program or person who started the run is asked instead, for at most so many mixtures.
     """
 
     question: str
     options: tuple[str, ...]
+    proposals: int | None = field(default=None, metadata=WRITTEN_IF_SET)
 
 
 Request = Simulate | Pour | Suggest | Ask

@@ -225,12 +225,14 @@ class RecordedStage:
 
 @dataclass
 class RecordedQuestion:
-    """A question to the operator. `answer` is None while there is none."""
+    """A question to the operator, or to the program that `proposes` mixtures. `answer` is None while there is none."""
 
+    id: int
     time: float
     stage: str
     text: str
     answer: str | None = None
+    proposes: bool = False
 
 
 @dataclass(frozen=True)
@@ -404,8 +406,9 @@ class RunState:
                 stage.pours += 1
                 self.checkpoint = ""
                 self._pour(event).finish(event)
-            case RequestFinished(request=Ask(text), outcome=Answered(answer)):
-                self._question(event, text).answer = answer
+            case RequestFinished(request=Ask(text) as request, outcome=Answered(answer)):
+                question = self._question(event, text)
+                question.answer, question.proposes = answer, request.proposals is not None
             case RequestFinished():
                 self._finished(stage, event)
             case PourCorrected():
@@ -446,7 +449,7 @@ class RunState:
 
     def _question(self, event: Requested | RequestFinished | OperatorAsked, text: str) -> RecordedQuestion:
         if event.id not in self._questions:
-            self._questions[event.id] = RecordedQuestion(event.time, event.stage, text)
+            self._questions[event.id] = RecordedQuestion(event.id, event.time, event.stage, text)
             self.questions.append(self._questions[event.id])
         return self._questions[event.id]
 

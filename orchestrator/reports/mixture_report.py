@@ -21,10 +21,10 @@ import numpy as np
 
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.dispense import CupState, Dispensed, MixedComponent
-from orchestrator.learning.mixtures import dose_strategy
+from orchestrator.learning.mixtures import Mix
 from orchestrator.learning.requests import Failed
 from orchestrator.records.codec import Results
-from orchestrator.records.run_record import CampaignResult, Row, RunState, read_record
+from orchestrator.records.run_record import CampaignResult, RecordedQuestion, Row, RunPour, RunState, read_record
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.stage_views import all_of
 from orchestrator.reports.wording import ResultRow, ResultTable
@@ -71,10 +71,14 @@ def mixtures_so_far(plan: CampaignPlan, record: RunState, *, live: bool = False)
     """
     if plan.dispense is None or plan.dispense.mixtures is None:
         return None
-    strategy = dose_strategy(plan.dispense, plan.seed)
+    strategy = Mix(plan.dispense, plan.seed)
     unknown = Failed("pour_unknown", "the run has stopped during the dose")
-    for pour in record.pours:
-        if pour.request.dose is not None and (pour.outcome is not None or pour.state in ("under way", "unknown")):
+    entries: list[RunPour | RecordedQuestion] = [*record.pours, *record.questions]
+    for pour in sorted(entries, key=lambda entry: entry.id):
+        if isinstance(pour, RecordedQuestion):
+            if pour.answer is not None and pour.proposes:
+                strategy.propose(pour.answer)
+        elif pour.request.dose is not None and (pour.outcome is not None or pour.state in ("under way", "unknown")):
             under_way = live and pour.state == "under way"
             strategy.take(pour.request, None if under_way else pour.outcome or unknown)
     return strategy.result()

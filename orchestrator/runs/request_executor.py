@@ -11,6 +11,7 @@ same request gives the same outcome at any time, so wrong predictions are discar
 from __future__ import annotations
 
 import asyncio
+import inspect
 import os
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -45,6 +46,7 @@ from orchestrator.learning.requests import (
     Suggested,
 )
 from orchestrator.learning.run_errors import RunError
+from orchestrator.runs.resume import AskOperator
 from sim_engine.outcome import RecordedFrames, SimulatedPour
 from sim_engine.scene import PourTask, Scene
 
@@ -251,9 +253,14 @@ class RequestExecutor:
     """Runs requests on a laboratory and converts errors of single requests into outcomes."""
 
     def __init__(
-        self, laboratory: Laboratory, scenes: Mapping[str, Scene], deadlines: Deadlines, frame_rate: float
+        self,
+        laboratory: Laboratory,
+        scenes: Mapping[str, Scene],
+        deadlines: Deadlines,
+        frame_rate: float,
+        ask_operator: AskOperator | None = None,
     ) -> None:
-        self._laboratory = laboratory
+        self._laboratory, self._ask_operator = laboratory, ask_operator
         self._scenes = scenes
         self.deadlines = deadlines
         self._frame_rate = frame_rate
@@ -378,12 +385,17 @@ class RequestExecutor:
         return Poured(measurement)
 
     async def ask(self, request: Ask) -> Outcome:
-        """Ask the operator at the bench.
+        """Ask the operator at the bench, or for proposals the program or person who started the run.
 
         Raises:
             RequestExecutorError: the bench has no operator.
             PourNotMadeError: there is no answer.
         """
+        if request.proposals is not None:
+            if self._ask_operator is None:
+                raise PourNotMadeError(request.question, "; nobody is here to be asked, resuming the run asks again")
+            answer = self._ask_operator(request.question, request.options)
+            return Answered(await answer if inspect.isawaitable(answer) else answer)
         if not isinstance(bench := self.bench, Answering):
             raise RequestExecutorError(f"this bench has no operator to ask: {request.question}")
         question = OperatorQuestion(request.question, "option", about="decision", hands=False, options=request.options)

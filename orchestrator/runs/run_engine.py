@@ -73,7 +73,7 @@ async def run_campaign(
         laboratory: not opened yet. It is opened here, after all checks that do not need it, and closed here.
         run_directory: the directory of the journal.
         resume: continue with the journal in `run_directory`; otherwise there must be none.
-        ask_operator: called for pours whose outcome is unknown; None if no operator is present.
+        ask_operator: called for pours whose outcome is unknown, and for further mixtures; None if nobody is present.
         stages: replaces the stages of the plan.
         deadlines: replaces the default deadlines.
 
@@ -173,7 +173,7 @@ class _RunEngine:
             if isinstance(laboratory, Telling):
                 laboratory.listen(self._on_notice)
             self._check_bench(laboratory, histories)
-            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, FRAME_RATE)
+            executor = RequestExecutor(laboratory, self._scenes, self._deadlines, FRAME_RATE, self._ask_operator)
             executor.speculation.changed = lambda running, waiting: self._journal.append(
                 SpeculationProgressed(running=running, waiting=waiting)
             )

@@ -109,7 +109,7 @@ class RunResources:
         ray: cluster on which the shared pool runs. The cluster of the campaign's laboratory is then not used.
         optimizer: a shared one instead of the laboratory's own.
         operator: answers the questions of the bench, where a person does.
-        ask_operator: asked about pours whose outcome is unknown; None: the run pauses.
+        ask_operator: asked about pours whose outcome is unknown, and for further mixtures; None: the run pauses.
         approved_checksum: of the safety settings that were accepted for the controller of hardware.
         subscribers: receive every event.
         recorder: makes the recorder of a plan and a run's folder, or None if there is no recording.

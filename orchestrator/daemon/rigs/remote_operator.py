@@ -16,6 +16,7 @@ from actors.balance.readings import typed_weight
 from actors.interfaces import LaboratoryError
 from actors.interfaces import OperatorQuestion as BenchQuestion
 from orchestrator.daemon.state.daemon_store import QuestionOut, Store
+from orchestrator.learning.mixtures import NO_MORE, parse_proposals
 from orchestrator.runs.resume import parse_answer
 
 GIVE_UP = "give up"
@@ -104,6 +105,12 @@ def understood(question: QuestionOut, answer: str) -> str:
         meant = next((o for o in question.options if o.lower() == words.lower()), None)
         if meant is not None:
             return meant
+        if question.kind == "mixtures":
+            try:
+                parse_proposals(words)
+                return words
+            except ValueError as error:
+                raise AnswerError(str(error)) from None
         if question.kind == "unknown":
             try:
                 parse_answer(words, question.options, 1e-3 * float(question.details[LOAD]))
@@ -185,19 +192,14 @@ class RunQuestions:
     async def __call__(self, text: str, options: Sequence[str]) -> str:
         """Ask a question with its options."""
         question, _, problem = text.partition("\n")
+        asked = {"campaign": self._campaign, "rig": self._rig, "text": question, "problem": problem, "wants": "option"}
+        if options[0] == NO_MORE:
+            proposals = {"kind": "mixtures", "about": "mixtures", "options": [NO_MORE], "details": {}, "hands": False}
+            return await self._asking.ask(**asked, **proposals)
         details: dict[str, float | str] = {LOAD: 1e3 * self._load, **await asyncio.to_thread(self._look)}
         before = [q for q in self._store.questions(only_open=False, campaign=self._campaign) if q.text == question]
         if before and before[0].answer and not problem:
             details["answered before"] = f"'{before[0].answer}' by {before[0].by}; check whether it was used"
         return await self._asking.ask(
-            campaign=self._campaign,
-            rig=self._rig,
-            kind="unknown",
-            about="unknown pour",
-            text=question,
-            problem=problem,
-            wants="option",
-            options=list(options),
-            details=details,
-            hands=False,
+            **asked, kind="unknown", about="unknown pour", options=list(options), details=details, hands=False
         )

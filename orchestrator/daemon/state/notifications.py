@@ -177,6 +177,8 @@ class Notifier:
                 news.mode = str(data.get("mode", ""))
             case "QuestionAsked":
                 question = data["question"]
+                if question.get("kind") == "mixtures":
+                    return None  # a program answers
                 if news is not None:
                     news.question = str(question["text"])
                 lines = [str(question["text"]), str(question.get("problem") or "")]

@@ -142,7 +142,7 @@ def test_a_cup_gets_two_liquids_alone_and_every_gram_is_accounted(open_stage: Op
     stage, record = played(open_stage, tmp_path, play)
     assert stage.heard == ["vessels_laid_out", "unattended"]
     consent = stage.operator.heard[-1].text
-    assert "from the sources 'source/water' (water), 'source/ethanol' (ethanol), into the cups 'rack/A1'" in consent
+    assert "from the sources source/water (water), source/ethanol (ethanol), into the cups rack/A1" in consent
     assert stage.unsafe == []
     assert stage.contents.stands == {name: name for name in ("source/water", "source/ethanol", "rack/A1", "rack/A2")}
     assert record.stands() == stage.contents.stands

@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
+from actors.bench.night_consent import NightConsent
+from actors.interfaces import Notice
+from actors.places import ContainerSettings
 from decant import build_campaign
 from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.shipped import shipped
@@ -148,7 +151,7 @@ REFUSED = {
     "a spare that is filled": (
         "  wanted:",
         "  on_miss: repeat\n  cups: {spares: [a1]}\n  wanted:",
-        "cups.spares[0]: 'a1' is named before; a spare cup is empty",
+        "cups.spares[0]: 'a1' is named before; such a cup is empty",
     ),
     "a stand with two sources": ("ethanol-1, source", "ethanol-2, source", "stands[1]: another source is called 'sou"),
     "unknown liquid in the order": (
@@ -221,3 +224,28 @@ def test_every_cup_and_source_needs_a_place_in_a_laboratory_with_places() -> Non
     text = problems(caught.value)
     assert "mixtures.wanted.E7: laboratory 'rack' has no place 'rack/E7'; there are pan, source/water" in text
     assert "mixtures.liquids[0].stands[0]: laboratory 'rack' has no place 'source/brine'" in text
+
+
+def test_the_consent_names_all_liquids_sources_and_cups_also_those_for_proposals() -> None:
+    document = YAML(typ="safe").load(shipped("campaigns/mixtures.yaml").read_text(encoding="utf-8"))
+    document["mixtures"]["cups"] = {"proposals": ["C1", "C2"]}
+    unattended = {"unattended": {"pours": 40, "until": "07:00"}}
+    rack = str(shipped("laboratories/rack.yaml"))
+    spec = build_campaign(document | unattended | {"laboratory": rack}).laboratory
+    assert spec.unattended is not None
+    waste = spec.places[0].model_copy(
+        update={"name": "waste", "container": ContainerSettings(diameter=0.2, height=0.1)}
+    )
+    told: list[Notice] = []
+    consent = NightConsent(
+        spec.unattended, spec.safeguard, "the arm", [*spec.places, waste], told.append, vessels=spec.vessels
+    )
+    question = consent.question()
+    for text in (
+        "up to 40 pours until 07:00",
+        "from the sources source/water (water), source/ethanol (ethanol), source/oil (oil),",
+        "into the cups rack/A1, rack/A2, rack/A3, rack/B1, rack/B2, rack/B3, rack/C1, rack/C2,",
+        "also to empty cups at waste",
+        "Safeguard: fence with an interlocked gate",
+    ):
+        assert text in question.text

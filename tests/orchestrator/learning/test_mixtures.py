@@ -241,3 +241,57 @@ def test_what_was_poured_so_far_gives_the_cups_without_the_answers(
         strategy.tell(request, outcome)
         so_far.take(request, outcome)
     assert so_far.result() == strategy.result()
+
+
+def poured_until_asked(strategy: Mix) -> Ask:
+    """Pour all that is known; the question after it."""
+    while True:
+        (request,) = strategy.ask(Slots(0))
+        if isinstance(request, Ask):
+            assert strategy.ask(Slots(0)) == []  # it is asked once
+            return request
+        assert isinstance(request, Pour)
+        assert request.dose is not None
+        strategy.tell(request, poured(request, 1e3 * request.dose.amount))
+
+
+def test_proposed_mixtures_are_poured_into_the_empty_cups() -> None:
+    strategy = Mix(plan(*TWO, proposals=("rack/B1", "rack/B2", "rack/B3")), 5)
+    question = poured_until_asked(strategy)
+    assert question.proposals == 3
+    assert "at most 3 cups (rack/B1, rack/B2, rack/B3)" in question.question
+    assert not strategy.finished
+    assert decode_request(encode_request(question)) == question
+    strategy.tell(question, Answered('[{"water": "20 g", "oil": "5 g"}, {"oil": "0.03 kg"}]'))
+    again = poured_until_asked(strategy)
+    result = strategy.result()
+    assert [(c.cup, c.liquid, c.wanted_g, c.state) for c in result.components()][4:] == [
+        ("rack/B1", "oil", 5.0, "full"), ("rack/B1", "water", 20.0, "full"), ("rack/B2", "oil", 30.0, "full"),
+    ]  # fmt: skip
+    assert "at most 1 cups (rack/B3)" in again.question
+    strategy.tell(again, Answered("[]"))
+    assert strategy.finished
+    assert len(strategy.result().cups) == 4
+
+
+@pytest.mark.parametrize(
+    ("answer", "reason"),
+    [
+        ("lost", "should be a list in JSON"),
+        ('[{"water": "20"}]', "g"),
+        ('[{"milk": "20 g"}]', "rack/B1: the table has no milk"),
+        ('[{"water": "0.5 g"}]', "rack/B1: 0.5 g of water would be within its tolerance"),
+        ('[{"water": "40 g", "oil": "11 g"}]', "rack/B1: it is heavier than 50 g, the largest mixture of the table"),
+        ('[{"oil": "5 g"}, {"oil": "5 g"}, {"oil": "5 g"}]', "3 mixtures, and 2 cups are empty"),
+        ('[{"oil": "5 g"}, {"oil": "0.1 g"}]', "rack/B2: 0.1 g of oil would be within its tolerance"),
+    ],
+)
+def test_impossible_proposals_are_refused_together_and_asked_for_again(answer: str, reason: str) -> None:
+    strategy = Mix(plan(*TWO, proposals=("rack/B1", "rack/B2")), 5)
+    strategy.tell(poured_until_asked(strategy), Answered(answer))
+    assert len(strategy.result().cups) == 2
+    (question,) = strategy.ask(Slots(0))
+    assert isinstance(question, Ask)
+    assert reason in question.question.partition("\nRefused: ")[2]
+    strategy.tell(question, Answered('[{"oil": "5 g"}]'))
+    assert "Refused" not in poured_until_asked(strategy).question

@@ -9,6 +9,7 @@ import re
 import shutil
 import sqlite3
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
@@ -18,8 +19,8 @@ import decant
 from orchestrator.cli.app import app
 from orchestrator.learning.dispense import Dispensed, Dose, MixedCup
 from orchestrator.records.journal_file import Header
-from orchestrator.records.run_record import RunState
-from orchestrator.reports.mixture_report import draw_rack, mixture_lines, mixture_rows, mixture_table
+from orchestrator.records.run_record import RunState, read_record
+from orchestrator.reports.mixture_report import draw_rack, mixture_lines, mixture_rows, mixture_table, mixtures_so_far
 from tests.support import small_campaign
 
 MIXTURES = """\
@@ -83,7 +84,7 @@ def test_the_report_begins_with_the_rack_and_runs_show_lists_it(run: decant.Run)
     page = (run.directory / "report.html").read_text(encoding="utf-8")
     assert page.index('alt="rack: ') < page.index("<h2>Summary</h2>")
     assert "2 mixtures" in page
-    shown = CliRunner().invoke(app, ["runs", "show", run.directory.name], catch_exceptions=False).output
+    shown = CliRunner().invoke(app, ["runs", "show", str(run.directory)], catch_exceptions=False).output
     assert re.search(r"rack/B2  full: ethanol [\d.]+ of 20 g, water [\d.]+ of 30 g", shown)
 
 
@@ -187,3 +188,60 @@ def test_a_cup_that_is_not_filled_has_no_share_and_a_replaced_one_is_marked() ->
     rejected, full, waiting = PARTLY.components()
     assert (rejected.share, full.share, waiting.share) == (None, 1.0, None)
     assert [row.look for row in mixture_table(PARTLY).rows] == ["bad", "", ""]
+
+
+PROPOSING = MIXTURES.replace("  wanted:\n", "  cups: {proposals: [B1, C1]}\n  wanted:\n").replace(
+    "name: mix\n", "name: loop\n"
+)
+
+
+def test_a_function_proposes_the_next_mixtures_within_one_run(tmp_path: Path) -> None:
+    campaign = decant.load_campaign(small_campaign.write_campaign(tmp_path, PROPOSING))
+    tables: list[Any] = []
+
+    def propose(table: Any) -> list[dict[str, str]]:
+        tables.append(table)
+        if len(tables) == 1:
+            raise RuntimeError("the optimiser is away")
+        assert (table["state"] == "full").all()
+        return [{"water": f"{24 + len(tables)} g"}]
+
+    with pytest.raises(RuntimeError, match="is away"):
+        decant.run(campaign, propose=propose)
+    (folder,) = (tmp_path / "runs").iterdir()
+    run = decant.run(campaign, propose=propose, resume=folder)
+    assert [list(dict.fromkeys(table["cup"])) for table in tables] == [
+        ["rack/B2", "rack/A1"], ["rack/B2", "rack/A1"], ["rack/B2", "rack/A1", "rack/B1"]
+    ]  # fmt: skip
+    assert list(run.mixtures["cup"]) == ["rack/B2", "rack/B2", "rack/A1", "rack/B1", "rack/C1"]
+    assert list(run.mixtures["wanted_g"])[-2:] == [26.0, 27.0]
+    assert list(run.mixtures["dose"]) == [1, 2, 3, 4, 5]  # nothing was poured again
+    assert len(list((tmp_path / "runs").iterdir())) == 1
+    plan, record = run.campaign, read_record(run.directory)
+    so_far = mixtures_so_far(plan, record)
+    assert so_far is not None
+    assert so_far.components() == run.results["doses"].components()
+
+
+def test_an_impossible_proposal_stops_the_run_with_the_reason(tmp_path: Path) -> None:
+    campaign = decant.load_campaign(small_campaign.write_campaign(tmp_path, PROPOSING))
+    with pytest.raises(decant.RunError, match="Refused: rack/B1: the table has no milk"):
+        decant.run(campaign, propose=lambda table: [{"milk": "20 g"}])
+
+
+def test_without_anybody_to_propose_the_run_stops_after_its_own_mixtures(tmp_path: Path) -> None:
+    path = small_campaign.write_campaign(tmp_path, PROPOSING)
+    result = CliRunner().invoke(app, ["run", str(path), "--in-process"], catch_exceptions=False)
+    assert result.exit_code != 0
+    assert "Which mixtures are poured next, into at most 2 cups (rack/B1, rack/C1)?" in result.output
+    (folder,) = (tmp_path / "runs").iterdir()
+    again = ["run", str(path), "--in-process", "--resume", "--run", folder.name, "--answer", "[]"]
+    result = CliRunner().invoke(app, again, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert len(decant.open_run(folder).mixtures) == 3
+
+
+def test_a_cup_for_proposals_is_named_once(tmp_path: Path) -> None:
+    path = small_campaign.write_campaign(tmp_path, PROPOSING.replace("[B1, C1]", "[B1, A1]"))
+    with pytest.raises(decant.ConfigError, match="'A1' is named before; such a cup is empty"):
+        decant.load_campaign(path)

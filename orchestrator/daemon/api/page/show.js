@@ -124,7 +124,7 @@ function bar(what, done, of) {
   return el("label", { class: "bar" }, `${what} ${done} of ${of}`, el("progress", { value: Math.min(done, of), max: of }));
 }
 
-const NAMES = { done: "Done", yes: "Yes", no: "No", lost: "Lost: outcome unknown", repeat: "Pour it again", accept: "Leave it as it is", correct: "Correct the other amounts" };
+const NAMES = { done: "Done", yes: "Yes", no: "No", lost: "Lost: outcome unknown", repeat: "Pour it again", accept: "Leave it as it is", correct: "Correct the other amounts", "[]": "No more mixtures" };
 
 /** A question with answers that a wet finger hits. `send` takes the answer and throws what is wrong with it. */
 export function questionCard(question, campaign, mode, send) {
@@ -138,7 +138,7 @@ export function questionCard(question, campaign, mode, send) {
     el("p", { class: "quiet" }, modeBadge(mode), ` ${campaign} at ${question.rig}, asked at ${clock(question.asked)}`),
     el("h2", { id: head, tabindex: "-1" }, question.text), problem,
     question.hands ? el("p", { class: "hands" }, "Hands go into the cell: the arm stands still until you answer.") : null,
-    details(question.details), el("div", { class: "answers" }, answers(question, answer)));
+    question.about === "vessels_laid_out" ? null : details(question.details), el("div", { class: "answers" }, answers(question, answer)));
   if (question.kind === "bench") card.append(el("details", {}, el("summary", {}, "This pour can't be made"),
     button(`give-up-${question.id}`, "Give it up", () => answer("give up"), "plain danger")));
   return card;

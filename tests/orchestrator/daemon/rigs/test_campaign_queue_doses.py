@@ -14,6 +14,7 @@ from actors.dosing_settings import DosingSettings
 from actors.interfaces import DoseProgress, PourProgress, ProgressCallback
 from sim_engine.outcome import PourMeasurement
 from sim_engine.scene import Scene
+from tests.orchestrator.reports.test_mixture_report import PROPOSING
 from tests.support.small_campaign import series, write_campaign
 from tests.support.toy_campaign import ToyOptimizer, ToySimulators
 from tests.support.toy_daemon import HeldBench, HeldLaboratory, run, serving
@@ -68,5 +69,34 @@ def test_a_queued_series_shows_its_doses_while_it_runs_and_reports_them(tmp_path
             cells = [float(text) for text in re.findall(r"<td>([0-9.]+)", page)]
             for amount in received:  # the list of pours shows one decimal, the table two
                 assert any(cell == pytest.approx(amount, abs=0.051) for cell in cells)
+
+    run(work())
+
+
+def test_a_program_proposes_mixtures_by_answering_a_question(tmp_path: Path) -> None:
+    write_campaign(tmp_path, PROPOSING)
+
+    async def work() -> None:
+        async with serving(tmp_path, held_dose) as served:
+            key = await served.submit()
+            (await served.pouring()).bench.go.set()
+            question = await served.question()
+            assert (question["kind"], question["options"]) == ("mixtures", ["[]"])
+            assert "at most 2 cups (rack/B1, rack/C1)" in question["text"]
+            poured = (await served.get(f"/campaigns/{key}"))["mixtures"]
+            assert {row["state"] for row in poured} == {"full"}
+            answer = f"/questions/{question['id']}/answer"
+            refused = await served.post(answer, {"answer": "water 20 g"}, status=422)
+            assert "should be a list in JSON" in refused["detail"]
+            await served.post(answer, {"answer": '[{"water": "70 g"}]'})
+            again = await served.question()
+            assert again["problem"] == "Refused: rack/B1: it is heavier than 50 g, the largest mixture of the table"
+            await served.post(f"/questions/{again['id']}/answer", {"answer": '[{"water": "20 g", "ethanol": "15 g"}]'})
+            while (last := await served.question())["id"] == again["id"]:
+                await asyncio.sleep(0.01)
+            await served.post(f"/questions/{last['id']}/answer", {"answer": "[]"})
+            found = await served.until(key, "finished", "failed")
+            assert found["state"] == "finished"
+            assert [row["cup"] for row in found["mixtures"]][-2:] == ["rack/B1", "rack/B1"]
 
     run(work())
