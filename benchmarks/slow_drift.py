@@ -1,7 +1,7 @@
 """Measure what a slow drift of the bench costs D3: mean loss of 40 pours, beside the same strategy on a still bench.
 
     python benchmarks/slow_drift.py [--levels 'cliff, small' small] [--drifts 0 0.5 2] [--programs drift still]
-                                    [--still-drifts 0] [--seeds 20] [--first 71000] [--pours 40] --out FILE
+                                    [--still-drifts 0] [--seeds 20] [--first 71000] [--pours 40] --out FILE | --ideal
 
 The receiver of a toy bench (`mismatch_worlds.py`) moves evenly, by some millimetres in ten pours, in a direction
 that the seed draws. Strategy and optimiser are the real ones; a seed has the same world and scatter of pours in
@@ -19,6 +19,9 @@ takes it to be. A drift of 1 halves the oil's viscosity evenly in 40 pours. D3 m
 pour and none between pours.
 
 3. `--levels viscosity --drifts 0 1 --seeds 3`: is the mean loss with that drift at most 1.3 times that without?
+
+`--ideal` prints what is attainable instead: the loss of an observer who knows the valley and the scatter exactly and
+infers position and pace along x_offset alone, by Bayes' rule. Before the first pour the position is known to 1.5 mm.
 """
 
 from __future__ import annotations
@@ -33,6 +36,7 @@ from unittest.mock import patch
 import numpy as np
 from mismatch_worlds import OFFSET, Floats, Valley
 from players import SCENE, Numbers, interval, play
+from scipy.special import ndtr
 
 from actors.optimizer import model_discrepancy
 from actors.optimizer.questions import PourQuery, Suggestion, SuggestionQuery
@@ -167,6 +171,50 @@ def campaign(
     }
 
 
+def ideal(level: str, seed: int, drift: float, pours: int, foresight: float) -> float:
+    """Return the mean loss of the observer of the module docstring, who makes the pour with the least expected loss.
+
+    Args:
+        drift: in ten pours [mm].
+        foresight: weight of the loss that the same place has eight pours later.
+    """
+    valley, rng, width = (
+        Valley(level, seed),
+        np.random.default_rng([seed, 20261127]),
+        1e3 * (OFFSET.upper - OFFSET.lower),
+    )
+    middle = np.array([valley._speed, valley._offset, valley._height])[: valley.space.dimension]
+    along = np.arange(-50.0, 50.0, 0.05)  # [mm]
+    lost = [valley._lost(middle + np.eye(len(middle))[1] * x / width, 1.0) for x in along]
+    # As D3: drifting with a probability of one half, by N(0, (r · 10 mm)²) per pour, r log-uniform.
+    low, high = model_discrepancy.DRIFTS
+    paces, sizes = np.arange(-0.6, 0.605, 0.01), 10.0 * low * (high / low) ** np.linspace(0.0, 1.0, 60)
+    likely = np.mean([np.exp(-0.5 * (paces / size) ** 2) / size for size in sizes], axis=0)
+    likely *= 0.5 / likely.sum()
+    likely[len(paces) // 2] += 0.5
+    starts = np.arange(-6.0, 6.05, 0.15)
+    pace, start = (grid.ravel() for grid in np.meshgrid(paces, starts, indexing="ij"))
+    logs = np.log(np.repeat(likely, len(starts))) - 0.5 * (start / 1.5) ** 2
+    places, positions = np.arange(-14.0, 14.1, 0.2), np.arange(-32.0, 32.0, 0.1)
+    costs = np.interp(places[:, None] + positions, along, lost)  # (place, position of the bench)
+    truth, poured = 1.5 * rng.standard_normal(), []
+    for number in range(pours):
+        weights = np.exp(logs - logs.max())
+        scores = 1e-6 * np.abs(places)
+        for later, weight in ((0, 1.0), (min(8, pours - 1 - number), foresight)):
+            cells = np.rint((start + pace * (number + later) - positions[0]) / 0.1).astype(int)
+            scores += weight * costs @ np.bincount(cells, weights / weights.sum(), len(positions))
+        place = places[int(np.argmin(scores))]
+        cost = float(np.interp(place + truth + 0.1 * drift * number, along, lost))
+        poured.append(cost)
+        seen = min(max(cost + (0.003 + 0.03 * cost) * rng.standard_normal(), 0.0), 1.0)
+        means = np.interp(place + start + pace * number, along, lost)
+        low, high = ((seen + half - means) / np.hypot(0.004, 0.05 * means) for half in (-0.005, 0.005))
+        chances = ndtr(high) - (ndtr(low) if seen > 0.005 else 0.0)
+        logs = logs + np.log(np.maximum(chances, 1e-12))
+    return float(np.mean(poured))
+
+
 def rows(runs: list[dict[str, Any]]) -> list[str]:
     """Return a line per level, drift and program: mean loss, and the ratio to the still bench and to the other program.
 
@@ -199,11 +247,26 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=71000)
     parser.add_argument("--pours", type=int, default=40)
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--ideal", action="store_true", help="print what is attainable on toy benches")
     chosen = parser.parse_args()
+    seeds = range(chosen.first, chosen.first + chosen.seeds)
+    if chosen.ideal:
+        for level in chosen.levels:
+            for foresight in (0.0, 1.0):
+                for drift in chosen.drifts:
+                    losses = [ideal(level, seed, drift, chosen.pours, foresight) for seed in seeds]
+                    mean, low, high = interval(losses)
+                    print(
+                        f"{level} | foresight {foresight:g} | {drift:g} mm | {mean:.4f} ({low:.4f} … {high:.4f})",
+                        flush=True,
+                    )
+        return
+    if chosen.out is None:
+        parser.error("--out FILE is needed")
     runs = [json.loads(line) for line in chosen.out.read_text().splitlines()] if chosen.out.exists() else []
     known = {(run["level"], run["seed"], run["drift"], run["program"]) for run in runs}
-    for seed in range(chosen.first, chosen.first + chosen.seeds):
+    for seed in seeds:
         for level in chosen.levels:
             answers: dict[Any, Suggestion] = {}
             for program in chosen.programs:
