@@ -387,10 +387,14 @@ def test_a_second_change_is_noticed_like_the_first():
     assert propose(on_a_changed_bench(costs)).discrepancy.since_change == 3
 
 
-def on_a_drifting_bench(count, pace, **changes):
-    """Pours all around a valley that moves away with every one."""
-    places = [(0.35 + 0.1 * np.cos(2.4 * i), 0.6 + 0.1 * np.sin(2.4 * i)) for i in range(count)]
-    costs = [float(cup(np.subtract(place, (pace * i, 0.0)))[0]) for i, place in enumerate(places)]
+def around(i):
+    return 0.35 + 0.1 * np.cos(2.4 * i), 0.6 + 0.1 * np.sin(2.4 * i)
+
+
+def on_a_drifting_bench(count, pace, growth=0.0, **changes):
+    """Pours all around a valley that moves away, and loses more, with every one."""
+    places = [around(i) for i in range(count)]
+    costs = [float(cup(np.subtract(place, (pace * i, 0.0)))[0]) + growth * i for i, place in enumerate(places)]
     near = (0.35, 0.6) + 0.15 * np.random.default_rng(3).standard_normal((40, 2))
     simulated = np.concatenate([np.random.default_rng(1).random((40, 2)), near])
     return asked(cup, [], data=data_of(places, costs), simulated=data_of(simulated, cup(simulated)), **changes)
@@ -405,6 +409,12 @@ def test_the_pace_of_a_bench_that_drifts_is_inferred():
 
 def test_a_bench_that_stands_still_is_not_said_to_drift():
     assert propose(on_a_drifting_bench(20, 0.0)).discrepancy.drifts is None
+
+
+def test_older_pours_are_forgotten_where_more_is_lost_with_every_pour():
+    following = [around(i) for i in range(20, 26)]
+    answer = propose(on_a_drifting_bench(20, 0.0, growth=0.015, predict_at=tuple(following)))
+    assert np.abs(answer.predictions - cup(following) - 0.3).mean() < 0.04
 
 
 def test_question_and_answer_survive_the_journal():
