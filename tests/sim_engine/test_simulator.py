@@ -18,6 +18,7 @@ from actors.runtime.child_process import child_environment
 from sim_engine.action import DEG, Action
 from sim_engine.errors import SimulationCancelled
 from sim_engine.liquids import Liquid, SimulationParameters
+from sim_engine.outcome import ParticleState
 from sim_engine.scene import MIRRORED_FROM, PoseError, PourTask, SampledMotion, Scene
 from sim_engine.simulator import PourSimulator, why_whole
 from sim_engine.vessel.mesh_shape import MeshShape
@@ -157,6 +158,29 @@ def test_recorded_frames_of_a_mirrored_pour_show_the_whole_liquid(
         assert positions[150:] == pytest.approx(positions[:150] * [1.0, -1.0, 1.0])
         assert list(states[150:]) == list(states[:150])
         assert np.abs(positions[:, 1]).max() > 0.02  # the cup's radius is 40 mm
+
+
+def test_a_mirrored_pour_is_dense_at_the_plane_and_its_stream_as_thick(
+    simulator: PourSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the addition to distances from own images hardly any particle comes so near to the plane."""
+    near: dict[bool, float] = {}
+    thickness: dict[bool, float] = {}
+    for mirrored in (False, True):
+        monkeypatch.setattr("sim_engine.simulator.MIRRORED_FROM", 0 if mirrored else 10**9)
+        pour = dataclasses.replace(task(2, speed=60.0, particles=1500, scene=SYMMETRIC), frame_rate=50.0)
+        simulated = simulator.simulate(pour)
+        assert simulated.frames is not None
+        flowing = [k for k, s in enumerate(simulated.frames.states) if (s == ParticleState.IN_FLIGHT).any()]
+        aside = (
+            np.abs(np.concatenate([simulated.frames.positions[k][:, 1] for k in flowing])) / simulated.outcome.spacing
+        )
+        states = np.concatenate([simulated.frames.states[k] for k in flowing])
+        cup = aside[states == ParticleState.IN_POURER]
+        near[mirrored] = float((cup < 0.25).mean() / 0.25 / ((cup < 4.0).mean() / 4.0))
+        thickness[mirrored] = float(aside[states == ParticleState.IN_FLIGHT].mean())
+    assert near[True] == pytest.approx(near[False], abs=0.3)
+    assert thickness[True] == pytest.approx(thickness[False], rel=0.04)
 
 
 def test_recorded_frames_show_the_liquid_from_the_start_of_a_slow_pour(simulator: PourSimulator) -> None:
