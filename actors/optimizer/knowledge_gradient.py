@@ -50,13 +50,7 @@ from scipy.special import ndtr
 
 from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
-from actors.optimizer.model_discrepancy import (
-    LEAST_CHANCE,
-    RESOLUTION,
-    ModelAveragedProcess,
-    clipped_mean,
-    shortfall,
-)
+from actors.optimizer.model_discrepancy import LEAST_CHANCE, RESOLUTION, ModelAveragedProcess, clipped_mean, shortfall
 from actors.optimizer.questions import (
     BenchOffset,
     DiscrepancyFound,
