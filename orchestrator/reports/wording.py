@@ -448,17 +448,20 @@ def _sentence(text: str) -> str:
 def what_was_asked(plan: CampaignPlan, record: RunState) -> dict[str, str]:
     """Names and values: the liquid, and the calibration of the simulator and the search for pours, or the doses."""
     rows: list[tuple[str, str]] = []
+    mixtures = None if plan.dispense is None else plan.dispense.mixtures
     scenes = (list(plan.calibration.poured) if plan.calibration is not None else []) + (
         list(plan.deployment.scenes) if plan.deployment is not None else []
     )
     scenes += [*([] if plan.dispense is None else plan.dispense.scenes), *filter(None, [plan.pour])]
     if scenes:
-        liquid = scenes[0].liquid
-        volume = liquid.millilitres(liquid.mass)
-        rows.append(("liquid", f"{1e3 * liquid.mass:g} g of {liquid.name} ({volume:.0f} mL)"))
+        liquids = [scene.liquid for scene in (scenes if mixtures is not None else scenes[:1])]
+        texts = (f"{1e3 * liq.mass:g} g of {liq.name} ({liq.millilitres(liq.mass):.0f} mL)" for liq in liquids)
+        rows.append(("liquid", _listed(texts)))
         rows.append(("poured from", _listed(scene.pourer.name for scene in scenes)))
     if doses := [pour.request.dose for pour in record.pours if pour.request.dose is not None]:
-        rows.append(("wanted", ", ".join(f"{1e3 * dose.amount:g} g" for dose in doses)))
+        amounts = ", ".join(f"{1e3 * dose.amount:g} g" for dose in doses)
+        cups = len({dose.position for dose in doses})
+        rows.append(("wanted", amounts if mixtures is None else f"{cups} mixtures, {len(doses)} doses"))
         return dict(rows)
     if plan.calibration is not None:
         calibration = plan.calibration

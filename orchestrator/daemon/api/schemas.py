@@ -24,7 +24,7 @@ class AnswerIn(RequestModel):
     """An answer to a question."""
 
     answer: str = Field(min_length=1, max_length=1000)
-    """'done', 'yes', 'no', a weight with its unit, one of the options, or 'give up'."""
+    """'done', 'yes', 'no', a weight with its unit, one of the options, 'give up', or a list of mixtures in JSON."""
 
 
 class MoveIn(RequestModel):

@@ -83,7 +83,8 @@ def test_json_workbook_and_library_have_the_same_table(run: decant.Run) -> None:
 def test_the_report_begins_with_the_rack_and_runs_show_lists_it(run: decant.Run) -> None:
     page = (run.directory / "report.html").read_text(encoding="utf-8")
     assert page.index('alt="rack: ') < page.index("<h2>Summary</h2>")
-    assert "2 mixtures" in page
+    assert "2 mixtures, 3 doses" in page
+    assert "100 g of water (100 mL), 90 g of ethanol (114 mL)" in page
     shown = CliRunner().invoke(app, ["runs", "show", str(run.directory)], catch_exceptions=False).output
     assert re.search(r"rack/B2  full: ethanol [\d.]+ of 20 g, water [\d.]+ of 30 g", shown)
 
