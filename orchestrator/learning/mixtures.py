@@ -288,10 +288,14 @@ class Mix(Dispense):
         densities = {scene.liquid.name: scene.liquid.density for scene in self._plan.scenes}
         full = {scene.liquid.name: scene.liquid.mass for scene in self._plan.scenes}
         volume = sum(1e-3 * (dose.received_g or 0.0) / densities[dose.liquid] for dose in poured)
+        # it was not checked that source and balance support less than this
+        smallest = min(dose.amount for row in self._planned.values() for dose in row.values())
         for dose in corrected:
             liquid = dose.liquid or ""
             if dose.amount <= dose.limit:
                 return f"{1e3 * dose.amount:.3g} g of {liquid} would be within its tolerance"
+            if dose.amount < smallest:
+                return f"{1e3 * dose.amount:.3g} g of {liquid} would be less than any amount of the table"
             if dose.amount + dose.limit + self._plan.refill_below >= full[liquid]:
                 return f"a full source holds too little {liquid}"
             volume += (dose.amount + dose.limit) / densities[liquid]

@@ -544,39 +544,45 @@ def main() -> int:
 
 
 def table(seeds: Sequence[int]) -> list[str]:
-    """Lines of the page's table, of what was written."""
-    rows = [json.loads(line) for seed in seeds for line in results(seed).read_text("utf-8").splitlines()]
-    tries, ends = [Try(**row) for row in rows if "cup" in row], [row for row in rows if "runs" in row]
+    """Lines of the page's table, of what was written: a column for each night."""
+    columns = [_column([json.loads(line) for line in results(seed).read_text("utf-8").splitlines()]) for seed in seeds]
+    return [
+        f"| seed | {' | '.join(map(str, seeds))} |",
+        f"|---|{'---|' * len(seeds)}",
+        *(f"| {name} | {' | '.join(column[name] for column in columns)} |" for name in columns[0]),
+    ]
+
+
+def _column(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
+    tries, end = [Try(**row) for row in rows if "cup" in row], next(row for row in rows if "runs" in row)
     faulty = [attempt for attempt in tries if attempt.fault]
     weighed = [attempt for attempt in tries if attempt.received is not None and attempt.true is not None]
 
-    def mean(low: float, high: float) -> str:
-        errors = [abs((t.true or 0.0) - t.wanted) for t in weighed if low <= t.wanted < high]
-        return f"{statistics.fmean(errors):.2f}, {max(errors):.2f}" if errors else "–"
+    def errors(low: float, high: float) -> str:
+        values = [abs((t.true or 0.0) - t.wanted) for t in weighed if low <= t.wanted < high]
+        return f"{statistics.fmean(values):.2f}, {max(values):.2f} ({len(values)})" if values else "–"
 
     def kinds(outcome: str) -> str:
         counts = Counter(attempt.fault for attempt in faulty if attempt.outcome == outcome)
         return ", ".join(f"{kind} ({count})" if count > 1 else kind for kind, count in counts.items()) or "–"
 
-    shares, within = sum(end["shares"] for end in ends), sum(end["within"] for end in ends)
-    return [
-        "| | |",
-        "|---|---|",
-        f"| nights, doses weighed, tries, consents | {len(ends)}, {len(weighed)}, {len(tries)}, "
-        f"{sum(end['runs'] for end in ends)} |",
-        f"| faults; of them with one message | {len(faulty)}; {sum(t.messages == 1 for t in faulty)} |",
-        f"| consents that ended without a fault | {sum(bool(t.unplanned) for t in tries)} |",
-        f"| a person mended it, and the same dose was made | {kinds('weighed')} |",
-        f"| nothing was poured; another run made the dose | {kinds('not poured')} |",
-        f"| the dose is UNKNOWN, and its cup gets nothing more | {kinds('unknown')} |",
-        f"| error of doses of 10 g and more [g]: mean, largest | {mean(10.0, 1e3)} |",
-        f"| error of doses below 10 g [g]: mean, largest | {mean(0.0, 10.0)} |",
-        "| largest difference of a dose's reported and true amount [g] | "
-        f"{max(abs((t.received or 0.0) - (t.true or 0.0)) for t in weighed):.2f} |",
-        f"| largest error of the account of a cup [g] | {max(t.wrong for t in tries):.2f} |",
-        f"| shares within their stated intervals | {within} of {shares} |",
-        f"| other than it should be | {len([text for end in ends for text in end['wrong']])} |",
-    ]
+    apart = max(abs((t.received or 0.0) - (t.true or 0.0)) for t in weighed)
+    return {
+        "doses weighed, tries, consents": f"{len(weighed)}, {len(tries)}, {end['runs']}",
+        "cups": ", ".join(f"{count} {state}" for state, count in end["cups"].items()),
+        "faults; of them with one message": f"{len(faulty)}; {sum(t.messages == 1 for t in faulty)}",
+        "consents that ended without a fault": str(sum(bool(t.unplanned) for t in tries)),
+        "a person mended it, or put the vessel back; the dose was weighed": kinds("weighed"),
+        "nothing was poured; another run made the dose": kinds("not poured"),
+        "the dose is UNKNOWN, and its cup gets nothing more": kinds("unknown"),
+        "error of doses of 10 g and more [g]: mean, largest (number); goal 0.4": errors(10.0, 1e3),
+        "error of doses below 10 g [g]: mean, largest (number); goal 0.25": errors(0.0, 10.0),
+        "largest difference of a dose's reported and true amount [g]": f"{apart:.2f}",
+        "largest error of the account of a cup [g]": f"{max(t.wrong for t in tries):.2f}",
+        "shares within their stated 90 % intervals": f"{end['within']} of {end['shares']}",
+        "minutes": f"{end['wall_s'] / 60.0:.0f}",
+        "other than it should be": str(len(end["wrong"])),
+    }
 
 
 if __name__ == "__main__":

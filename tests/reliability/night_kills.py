@@ -97,11 +97,12 @@ class KilledNight:
         self.place, self.state, self._log = place, place / "state", place / "log"
         (place / "tmp").mkdir()
         self._log.touch()
+        self._finished = False
         self._campaign = (write or _write_campaign)(place)
         self.plan = load_campaign(self._campaign)
 
-    def kill(self, motion: int, delay: float) -> Killed:
-        """One life: until it is killed so long [s] after a motion has begun."""
+    def kill(self, motion: int, delay: float) -> Killed | None:
+        """One life: until it is killed so long [s] after a motion has begun. None if the campaign ended before."""
         (self.state / "url").unlink(missing_ok=True)
         self._note("life", "")
         child = os.fork()
@@ -110,6 +111,10 @@ class KilledNight:
         wrong, end = [], time.monotonic() + PATIENCE
         while os.waitpid(child, os.WNOHANG)[0] == 0:
             time.sleep(0.05)
+            if self._finished:
+                strikes.kill([child])
+                os.waitpid(child, 0)
+                return None
             if time.monotonic() > end:
                 strikes.kill([child])
                 os.waitpid(child, 0)
@@ -120,11 +125,6 @@ class KilledNight:
                     self._attend(client)
         twice = [f"a pour was made twice: {seed}" for seed in self._twice()]
         return self._look(motion, [*wrong, *twice, *self._left()])
-
-    @property
-    def finished(self) -> bool:
-        """Whether the campaign ended in the last life."""
-        return any(line == ["finished", ""] for line in self._lines()[-3:])
 
     def _lines(self) -> list[list[Any]]:
         return [json.loads(line) for line in self._log.read_text("utf-8").splitlines()]
@@ -170,8 +170,7 @@ class KilledNight:
             client.post(f"/questions/{question['id']}/answer", {"answer": answer})
         if items[0]["state"] in ("failed", "paused", "unknown") and not items[0]["progress"]:
             client.post(f"/campaigns/{items[0]['id']}/resume")
-        if items[0]["state"] == "finished" and not self.finished:
-            self._note("finished", "")
+        self._finished = items[0]["state"] == "finished"
 
     def _weigh_unknown(self) -> None:
         """A person weighs the cups whose content is UNKNOWN, and enters what they hold."""
@@ -360,10 +359,10 @@ def main() -> int:
         warm_up(load_campaign(_small(place)))
         with options.results.open("w", encoding="utf-8") as out:
             for _ in range(options.kills):
-                if night.finished:
-                    break
                 motions = DOSES if options.mixtures else MOTIONS
-                found.append(night.kill(rng.randint(1, motions), rng.uniform(0.0, LATEST)))
+                if (life := night.kill(rng.randint(1, motions), rng.uniform(0.0, LATEST))) is None:
+                    break
+                found.append(life)
                 out.write(json.dumps(asdict(found[-1])) + "\n")
                 out.flush()
                 print(found[-1], flush=True)

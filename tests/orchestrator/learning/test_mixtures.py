@@ -76,6 +76,12 @@ def test_a_dose_within_its_tolerance_changes_nothing() -> None:
     assert steps(run(Mix(plan(*TWO), 5), {1: 0.9}))[1] == ("rack/A1", "source/water", 40.0)
 
 
+def test_amounts_are_not_corrected_below_the_smallest_one_that_was_checked() -> None:
+    strategy = Mix(plan({"water": 5.0, "oil": 6.0}), 5)
+    assert steps(run(strategy, {1: -2.5}))[1] == ("rack/A1", "source/oil", 6.0)
+    assert "stay as they are: 3 g of oil would be less than any amount of the table" in strategy.decisions[1].text
+
+
 def test_a_cup_without_room_is_not_corrected() -> None:
     strategy = Mix(plan({"water": 85.0, "oil": 20.0}), 5)
     assert steps(run(strategy, {1: 2.0}))[1] == ("rack/A1", "source/water", 85.0)
