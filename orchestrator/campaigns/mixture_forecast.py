@@ -28,9 +28,9 @@ LARGEST_ERROR = 0.5
 """Error of a dose, as a share of its amount, from which on it is refused."""
 
 
-CARRIED_DOSE, CARRIED_CUP = 35.0, 25.0
+CARRIED_DOSE, CARRIED_CUP = 23.0, 57.0
 """Time in which an arm takes and returns the source of a dose and weighs the cup, and carries a cup to the balance and
-back [s], as measured with `configs/laboratories/rack.yaml`."""
+back [s], as measured with `configs/laboratories/rack.yaml` without a person."""
 
 
 class MixtureForecast:

@@ -321,7 +321,7 @@ def table(results: Path) -> list[str]:
     moments = {
         "the arm carried a vessel": lambda text: "with a vessel" in text,
         "the arm moved to a vessel, or away from it": lambda text: text.startswith("carry") and "with" not in text,
-        "the arm poured, dosed, or poured back": lambda text: not text.startswith("carry"),
+        "the arm poured, or poured back": lambda text: not text.startswith("carry"),
     }
     lines = [
         "| killed while or after | kills | places right, UNKNOWN | contents right, UNKNOWN | wrong |",
@@ -349,7 +349,9 @@ def main() -> int:
     options = parser.parse_args()
     options.results = options.results or (MIXTURES if options.mixtures else RESULTS)
     if options.write:
-        write(PAGE, "mixture kills" if options.mixtures else "night kills", table(options.results))
+        about = ["Their daemon, killed (`python -m tests.reliability.night_kills --mixtures`):", ""]
+        lines = table(options.results)
+        write(PAGE, *(("mixture kills", [*about, *lines]) if options.mixtures else ("night kills", lines)))
         return 0
     options.results.parent.mkdir(exist_ok=True)
     place = Path(tempfile.mkdtemp(prefix="n", dir="/tmp"))
