@@ -547,9 +547,9 @@ def table(seeds: Sequence[int]) -> list[str]:
     """Lines of the page's table, of what was written: a column for each night."""
     columns = [_column([json.loads(line) for line in results(seed).read_text("utf-8").splitlines()]) for seed in seeds]
     return [
-        "Mixtures on `rack.yaml`: 24 cups of water, 70 % ethanol and rapeseed oil, 72 doses of 2.5 to 60 g. All but the first",
-        "have a fault in twelve doses. Doses of 2 g are refused: source and balance support 2.1 to 2.4 g,",
-        "by the eight simulated doses of a forecast. With seed 22 it refused up to 4.5 g of oil, too.",
+        "Mixtures on `rack.yaml`: cups of water, 70 % ethanol and rapeseed oil, doses of 2.5 to 60 g; all nights but",
+        "the first have a fault in twelve doses. Doses of 2 g are refused: source and balance support 2.1 to 2.4 g, by",
+        "the eight simulated doses of a forecast. With seed 22 it refused up to 4.5 g of oil, too.",
         "Load of the machine: 8 to 15 on two cores.",
         "",
         f"| seed | {' | '.join(map(str, seeds))} |",
