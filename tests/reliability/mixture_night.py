@@ -271,14 +271,13 @@ class MixtureNight:
         self.record = Watched(self.folder, self.plan.laboratory.name)
         self._held: dict[str, float] = {}
         self._dry: dict[str, float] = {}
-        self._rested = False
+        self._owed: Try | None = None
 
     async def run(self) -> Dispensed:
         """All of it. Returns the doses and cups."""
         resume = False
         while True:
             self.runs, before = self.runs + 1, len(self.tries)
-            self._rested = False
             state = await self._one_run(resume=resume)
             if state is State.FINISHED:
                 break
@@ -401,6 +400,11 @@ class MixtureNight:
         """After a fault the run ends, with one message; a run without one goes on."""
         where = f"{attempt.cup}, {attempt.liquid}, {attempt.fault or 'no fault'}"
         ended = "the consent has ended" in self.stage.said("warning")
+        if ended and attempt.outcome == "weighed" and not self.person.messages and self._owed is None:
+            self._owed = attempt  # nobody was asked yet: the next dose begins with a question
+            return
+        if self._owed is not None:
+            attempt, self._owed = self._owed, None
         if ended or attempt.outcome != "weighed":
             states = {"weighed": "paused", "not poured": "failed", "unknown": "unknown"}
             reason = "stopped on request" if attempt.outcome == "weighed" else attempt.outcome
@@ -552,6 +556,8 @@ def table(seeds: Sequence[int]) -> list[str]:
         "the eight simulated doses of a forecast. With seed 22 it refused up to 4.5 g of oil, too.",
         "Load of the machine: 8 to 15 on two cores. Of the consents of night 24 that ended without a fault, one missed",
         "a heartbeat, and two asked for a source to be filled: one was UNKNOWN, the other full (corrected since).",
+        "Night 28: the measurement paused after a silent balance, before the question of the next dose, which is the",
+        "message (corrected, and seen in two cups).",
         "",
         f"| seed | {' | '.join(map(str, seeds))} |",
         f"|---|{'---|' * len(seeds)}",
