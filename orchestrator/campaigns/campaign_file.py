@@ -561,8 +561,9 @@ class CampaignFile(Settings):
         if problems.valid(*sections) and not any(self.value(section) for section in sections):
             problems.add("there is nothing to do; add a 'calibration', 'deployment', 'dispense' or 'mixtures' section")
         if self.mixtures is not None and self.dispense is not None:
-            problems.add("stands beside 'dispense'; give each a campaign of its own", "mixtures", key=True)
-        alone = self.mixtures is not None and calibration is None and self.deployment is None and not self.pour
+            problems.add("can't be combined with 'dispense'; give each a campaign of its own", "mixtures", key=True)
+        others = self.dispense is not None or calibration is not None or self.deployment is not None or self.pour
+        alone = self.mixtures is not None and not others
         if self.liquid is None and not alone and problems.valid("liquid"):
             problems.add("key 'liquid' is missing; add for example 'liquid: {name: water, mass: 200 g}'", key=True)
         elif self.liquid is not None and alone:

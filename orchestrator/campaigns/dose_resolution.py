@@ -36,7 +36,7 @@ from sim_engine.vessel.vessel import build_vessel
 DOSE_MOTION = {"angular_velocity": math.radians(115.0), "max_angle": math.radians(110.0)}
 """Fastest tilt and range of a dose, where the motion does not limit them."""
 
-CUP_COLUMNS = ("cup", "position", "well", "vial")
+CUP_COLUMNS = ("cup", "position", "well", "vial", "destination well")
 """Names of the column with the cups."""
 
 WHOLE = 1e-3
@@ -236,7 +236,7 @@ def _read_table(source: str, builder: SceneBuilder, place: Place, liquids: list[
 
     cups: list[int] = []
     for i, cell in enumerate(table.header.cells):
-        if str(cell).strip().lower() in CUP_COLUMNS:
+        if " ".join(re.split(r"[\s_]+", str(cell).strip().lower())) in CUP_COLUMNS:
             cups.append(i)
             continue
         name, unit = _column(str(cell), liquids)
@@ -250,7 +250,8 @@ def _read_table(source: str, builder: SceneBuilder, place: Place, liquids: list[
             columns[i] = (name, unit)
     if len(cups) != 1:
         text = "has no column 'cup'" if not cups else "has two columns with cups; keep one"
-        problems.append(table.problem(table.header, None, "", f"{text}; it names the position of each mixture"))
+        names = f"it names the position of each mixture, in one line ({', '.join(CUP_COLUMNS)})"
+        problems.append(table.problem(table.header, None, "", f"{text}; {names}"))
         return amounts, complain
     problems.extend(misfits := table.misfits())
     for row in () if misfits else table.rows:
@@ -281,6 +282,7 @@ def _column(header: str, liquids: list[str]) -> tuple[str, str]:
     """Liquid and unit that the header of a column names; the unit is '' if it has none."""
     bracketed = re.fullmatch(r"(.*?)\s*[\[(]\s*(.*?)\s*[\])]", header)
     text, unit = (bracketed[1], bracketed[2]) if bracketed else (header, "")
+    text = re.sub(r"(?i)([\s_]+transfer)?[\s_]+(volume|mass|weight|amount)$", "", text) if bracketed else text
     by_word = {re.sub(r"[\s_-]+", "_", liquid.strip()).lower(): liquid for liquid in liquids}
     word = re.sub(r"[\s_-]+", "_", text.strip()).lower()
     if word in by_word:

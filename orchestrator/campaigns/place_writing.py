@@ -22,6 +22,9 @@ from actors.arm_geometry import Pose
 from actors.places import PlaceSettings, RackSettings, position_name
 from sim_engine.errors import DecantError
 
+FINGERS = 12.0
+"""Smallest pitch of a rack whose vessels a gripper could take [mm]."""
+
 RACKS = ("tubeRack", "aluminumBlock", "other")
 """Categories of labware out of which vessels may be taken."""
 
@@ -130,6 +133,11 @@ def labware_rack(path: Path) -> tuple[RackSettings, float]:
                 f"{path}: '{name}' is not one regular grid: with the pitch of A1, A2 and B1, {key} {where}. Make one "
                 "place for each regular part"
             )
+    if (narrowest := min(abs(row_pitch), abs(column_pitch))) < FINGERS:
+        raise DecantError(
+            f"{path}: the positions of '{name}' are {narrowest:.3g} mm apart, as those of a plate or of strips: no "
+            "fingers fit between them"
+        )
     rack = RackSettings(rows=rows, columns=columns, row_pitch=1e-3 * row_pitch, column_pitch=1e-3 * column_pitch)
     return rack, 1e-3 * depth + LIFT
 

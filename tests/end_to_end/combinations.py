@@ -70,6 +70,18 @@ def _doses(file: File) -> None:
     file["dispense"] = {"doses": [{"amount": "50 g"}], "motion": motion}
 
 
+def _mixtures(file: File) -> None:
+    liquids = [{"name": "water", "liquid": {"name": "water", "mass": "250 g"}}]
+    motion = {"x_offset": "90 mm", "max_angle": "110 deg", "hold_time": "until_flow_ends"}
+    file["mixtures"] = {
+        "liquids": liquids,
+        "wanted": {name: {"water": "40 g"} for name in ("A1", "A3")},
+        "motion": motion,
+    }
+    if not {"deployment", "calibration", "dispense"} & set(file):
+        del file["liquid"]  # each liquid is described by itself
+
+
 def _in(laboratory: str) -> Callable[[File], None]:
     text = (LABORATORIES / laboratory).read_text(encoding="utf-8")
     return lambda file: file.update(laboratory=yaml.safe_load(text) | {"simulators": 2})
@@ -82,8 +94,8 @@ def _records(file: File) -> None:
 
 
 def _places(file: File) -> None:
-    _in("night.yaml")(file)
-    if "dispense" in file:
+    _in("rack.yaml" if "mixtures" in file else "night.yaml")(file)
+    if "dispense" in file or "mixtures" in file:
         file["on_unknown"] = "ask"  # vessels of places keep what is in them, so that a dose is not repeated
 
 
@@ -125,6 +137,7 @@ FEATURES = {
     "D2": Feature("`deployment: {strategy: D2}`", _nothing, ("D2",)),
     "D3": Feature("`deployment: {strategy: D3}`", _nothing, ("D3",)),
     "doses": Feature("`dispense`, `decant dose`", _doses),
+    "mixtures": Feature("`mixtures`", _mixtures),
     "objectives": Feature(
         "`deployment: {objectives: […]}`",
         _under("deployment", objectives=[{"name": "spilled"}, {"name": "time"}]),
@@ -144,12 +157,12 @@ def campaign(names: Sequence[str]) -> File:
     """A small campaign with some features, in any order."""
     features = [feature for name, feature in FEATURES.items() if name in names]
     file = _base()
-    has_task = any(name in ("calibration", "doses", *DEPLOYMENTS) for name in names)
+    has_task = any(name in ("calibration", "doses", "mixtures", *DEPLOYMENTS) for name in names)
     needed = [feature for feature in features if feature.deployments]
     if needed and (not has_task or any("deployment" in each.keys or "prior" in each.keys for each in needed)):
         common = [name for name in needed[0].deployments if all(name in each.deployments for each in needed)]
         strategy = common[0] if common else min((each.deployments for each in needed), key=len)[0]
-        if not (set(names) <= {"calibration", "doses", "prior"} and has_task):
+        if not (set(names) <= {"calibration", "doses", "mixtures", "prior"} and has_task):
             file["deployment"] = {**DEPLOYMENTS[strategy], "actions": ACTIONS}
     for feature in features:
         feature.change(file)
@@ -203,13 +216,15 @@ class Run:
         file = campaign(self.features)
         planned: int = file.get("deployment", {}).get("pours", 0)
         planned += file["calibration"]["pours"]["count"] if "calibration" in file else 0
-        return planned + (len(file["dispense"]["doses"]) if "dispense" in file else 0)
+        planned += len(file["dispense"]["doses"]) if "dispense" in file else 0
+        return planned + sum(len(row) for row in file.get("mixtures", {"wanted": {}})["wanted"].values())
 
 
 TOGETHER = (
     ("calibration", "D3", "doses", "risk limit", "prior"),
     ("calibration", "D1", "doses", "prior"),
     ("D2", "objectives", "recordings", "places", "unattended"),
+    ("calibration", "D3", "mixtures", "objectives", "risk limit"),
 )
 """Campaigns that have every feature between them: each is run in every way."""
 
@@ -235,6 +250,9 @@ RUNS = [
         ("D1", "objectives", "doses"),
         ("D3", "objectives", "doses"),
         ("doses", "recordings", "places", "unattended"),
+        ("calibration", "D1", "mixtures"),
+        ("D2", "mixtures"),
+        ("mixtures", "recordings", "places", "unattended"),
     )
 ]
 RUNS += [Run(("D2", "cluster"), (way, "command line")) for way in sorted(JOINED)]

@@ -199,6 +199,25 @@ def test_all_problems_of_a_table_are_reported_at_once(tmp_path: Path) -> None:
         assert message in text, text
 
 
+def test_tables_of_other_programs_are_read_or_refused_with_what_is_missing(tmp_path: Path) -> None:
+    """Headers as of a public protocol that reads one line a well, of a list of transfers, and of a design of runs."""
+    wide = "Destination Well,Water Transfer Volume (ul),ethanol volume (mL)\nA1,40000,19.01\n"
+    assert amounts(from_table(tmp_path, wide)) == {"rack/A1": {"ethanol": 15.004593, "water": 39.92}}
+    for table, texts in (
+        (
+            "Source_Well,Destination_Well,Transfer_Volume\nA1,A2,15\n",
+            ("1:1: Source_Well: is no liquid of the mixtures", "1:30: Transfer_Volume: is no liquid of the mixtures"),
+        ),
+        (
+            ",water,ethanol,Yield\n0,0.3,0.7,\n",
+            ("has no column 'cup'; it names the position of each mixture, in one line (cup,", "Yield: is no liquid"),
+        ),
+    ):
+        with pytest.raises(ConfigError) as caught:
+            from_table(tmp_path, table)
+        assert all(text in problems(caught.value) for text in texts), problems(caught.value)
+
+
 def test_a_campaign_without_mixtures_still_needs_its_liquid(tmp_path: Path) -> None:
     section = CAMPAIGN[CAMPAIGN.index("mixtures:") :]
     assert "key 'liquid' is missing; add for example" in refused(

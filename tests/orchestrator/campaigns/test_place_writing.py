@@ -67,6 +67,38 @@ def _without(name: str) -> Labware:
     return definition
 
 
+def _block() -> Labware:
+    """As opentrons_96_aluminumblock_biorad_wellplate_200ul: its category is that of the block, not of the plate."""
+    wells = {
+        f"{'ABCDEFGH'[row]}{column + 1}": {"x": 14.38 + 9 * column, "y": 74.24 - 9 * row, "z": 4.0, "depth": 14.81}
+        for column in range(12)
+        for row in range(8)
+    }
+    return _of(displayCategory="aluminumBlock", displayName="a plate in a block") | {"wells": wells}
+
+
+# shared-data/labware/definitions/2: x and y of A1, pitch of columns and of rows, rows, columns, z, depth [mm]
+RACKS = {
+    "opentrons_15_tuberack_falcon_15ml_conical": (13.88, 67.74, 25.0, 25.0, 3, 5, 7.78, 117.98),
+    "opentrons_24_tuberack_eppendorf_2ml_safelock_snapcap": (18.21, 75.43, 19.89, 19.28, 4, 6, 41.27, 39.1),
+    "opentrons_24_tuberack_eppendorf_2ml_safelock_snapcap_acrylic": (15.28, 72.4, 19.5, 19.5, 4, 6, 13.42, 38.58),
+}
+
+
+@pytest.mark.parametrize("name", RACKS)
+def test_public_racks_are_read(name: str, tmp_path: Path) -> None:
+    x, y, across, down, rows, columns, z, depth = RACKS[name]
+    wells = {
+        f"{'ABCD'[row]}{column + 1}": {"x": x + across * column, "y": y - down * row, "z": z, "depth": depth}
+        for column in range(columns)
+        for row in range(rows)
+    }
+    rack, lift = labware_rack(labware(tmp_path, _of(displayName=name) | {"wells": wells}))
+    assert (rack.rows, rack.columns) == (rows, columns)
+    assert (rack.row_pitch, rack.column_pitch) == (pytest.approx(1e-3 * down), pytest.approx(1e-3 * across))
+    assert lift == pytest.approx(1e-3 * depth, abs=0.02)
+
+
 @pytest.mark.parametrize(
     ("value", "message"),
     [
@@ -77,6 +109,10 @@ def _without(name: str) -> Labware:
         (_well("A3", x=116.1), "not one regular grid: with the pitch of A1, A2 and B1, A3 is 10.6 mm beside it"),
         (_well("B2", z=20.0), "B2 is 11.8 mm beside it"),
         (_without("B3"), "B3 is missing"),
+        (
+            _block(),
+            "the positions of 'a plate in a block' are 9 mm apart, as those of a plate or of strips: no fingers",
+        ),
         (_without("A1"), "should have names such as A1; they are B1, A2"),
         ({**tubes(), "schemaVersion": 1}, "has schemaVersion 1; 2 and 3 can be read"),
         ({"ordering": []}, "should be a labware definition of Opentrons with 'schemaVersion'"),
