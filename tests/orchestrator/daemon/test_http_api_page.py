@@ -473,7 +473,7 @@ def test_a_daemon_that_was_started_again_shows_the_cup_that_is_unknown(page: Any
         page.locator("#racks img").wait_for()
         assert rack_of(page) == {"B2": "being filled", "A1": "empty"}
         for _ in range(2):
-            page.get_by_role("button", name="Stop the motion").click()
+            lab.do(lab.served.post(f"/campaigns/{key}/abort"))
         lab.do(lab.served.until(key, "unknown"))
         wait_until(page, lambda: rack_of(page) == {"B2": "UNKNOWN", "A1": "empty"})
     with on_port(tmp_path, held_dose, campaign=MIXTURES) as lab:
