@@ -321,9 +321,7 @@ class DoseHandling:
                 f"'{cup}' has {held} of {scene.liquid.name} already, and no liquid is dosed into a cup twice"
             )
         await self._liquids.room_for_spills(scene.liquid, MOST_SPILLED, consent)
-        source, content = source_of(scene, dose), self._record.held(source_name)
-        resumed = not self._vessels[source_name].filled  # a source that the run has filled, and not used, is still full
-        fresh = source_name in self._filled or (resumed and content is not None and content[0] >= source.mass)
+        source, fresh = source_of(scene, dose), source_name in self._filled
         self._filled.discard(source_name)
         if source.fill and not fresh:
             source = await self._refilled(source, source_name, scene.liquid, consent, seed)
@@ -373,7 +371,9 @@ class DoseHandling:
             self._empty(name)
         for name, mass in fill.items():
             self._liquids.enter(name, mass, 0.5e-3, self._vessels[name].liquid)
-        self._filled, self._laid_out = self._filled | fill.keys(), True
+        # a source that an interrupted series has filled, and not used, is still full
+        full = {v.name for v in vessels if v.liquid and not v.filled and (held[v.name] or (0.0,))[0] >= v.mass}
+        self._filled, self._laid_out = self._filled | fill.keys() | full, True
         masses = {name: (self._record.held(name) or (self._vessels[name].mass,))[0] for name in self._vessels}
         self._carrier.laid_out({vessel.name: vessel.place for vessel in vessels}, masses)
 
