@@ -40,6 +40,8 @@ except ImportError:
             """Return parameters by the index of the trial."""
             first, self._trials = self._trials, self._trials + max_trials
             shares = SMALLEST + (1.0 - 3.0 * SMALLEST) * self._rng.dirichlet(np.ones(3), max_trials)
+            if first == 0:  # the centre, as Ax does
+                shares[0] = 0.425, 0.425, SMALLEST
             return {first + i: {"water": float(row[0]), "ethanol": float(row[1])} for i, row in enumerate(shares)}
 
         def complete_trial(self, trial_index, raw_data):

@@ -411,7 +411,8 @@ class CupsSettings(Settings):
     """Empty cups into which mixtures are poured again, such as [D5, D6]; for `on_miss: repeat` or `ask`."""
 
     proposals: list[Text] | None = None
-    """Empty cups for further mixtures, such as [B1, B2], which an optimiser proposes when the others are poured."""
+    """Empty cups for further mixtures, such as [B1, B2], which an optimiser proposes when the others are poured: no
+    amount smaller than the smallest one of the table, and no mixture heavier than its heaviest one."""
 
 
 class MixturesSettings(DoseSeriesSettings):

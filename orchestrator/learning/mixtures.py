@@ -189,7 +189,7 @@ class Mix(Dispense):
         if unknown := [liquid for liquid in row if liquid not in known]:
             raise ValueError(f"{position}: the table has no {', '.join(unknown)}")
         doses = {
-            liquid: replace(known[liquid], amount=round(row[liquid], 5), position=position)
+            liquid: replace(known[liquid], amount=row[liquid], position=position)
             for liquid in pouring_order(row, self._mixtures.order)
         }
         reason = self._no_room([], list(doses.values()))
@@ -294,7 +294,7 @@ class Mix(Dispense):
             liquid = dose.liquid or ""
             if dose.amount <= dose.limit:
                 return f"{1e3 * dose.amount:.3g} g of {liquid} would be within its tolerance"
-            if dose.amount < smallest:
+            if dose.amount < smallest - 0.5 * STEP:
                 return f"{1e3 * dose.amount:.3g} g of {liquid} would be less than any amount of the table"
             if dose.amount + dose.limit + self._plan.refill_below >= full[liquid]:
                 return f"a full source holds too little {liquid}"

@@ -268,11 +268,11 @@ def test_proposed_mixtures_are_poured_into_the_empty_cups() -> None:
     assert "at most 3 cups (rack/B1, rack/B2, rack/B3)" in question.question
     assert not strategy.finished
     assert decode_request(encode_request(question)) == question
-    strategy.tell(question, Answered('[{"water": "20 g", "oil": "5 g"}, {"oil": "0.03 kg"}]'))
+    strategy.tell(question, Answered('[{"water": "20 g", "oil": "12 g"}, {"oil": "0.03 kg"}]'))
     again = poured_until_asked(strategy)
     result = strategy.result()
     assert [(c.cup, c.liquid, c.wanted_g, c.state) for c in result.components()][4:] == [
-        ("rack/B1", "oil", 5.0, "full"), ("rack/B1", "water", 20.0, "full"), ("rack/B2", "oil", 30.0, "full"),
+        ("rack/B1", "oil", 12.0, "full"), ("rack/B1", "water", 20.0, "full"), ("rack/B2", "oil", 30.0, "full"),
     ]  # fmt: skip
     assert "at most 1 cups (rack/B3)" in again.question
     strategy.tell(again, Answered("[]"))
@@ -288,8 +288,9 @@ def test_proposed_mixtures_are_poured_into_the_empty_cups() -> None:
         ('[{"milk": "20 g"}]', "rack/B1: the table has no milk"),
         ('[{"water": "0.5 g"}]', "rack/B1: 0.5 g of water would be within its tolerance"),
         ('[{"water": "40 g", "oil": "11 g"}]', "rack/B1: it is heavier than 50 g, the largest mixture of the table"),
-        ('[{"oil": "5 g"}, {"oil": "5 g"}, {"oil": "5 g"}]', "3 mixtures, and 2 cups are empty"),
-        ('[{"oil": "5 g"}, {"oil": "0.1 g"}]', "rack/B2: 0.1 g of oil would be within its tolerance"),
+        ('[{"oil": "15 g"}, {"oil": "15 g"}, {"oil": "15 g"}]', "3 mixtures, and 2 cups are empty"),
+        ('[{"oil": "5 g"}]', "rack/B1: 5 g of oil would be less than any amount of the table"),
+        ('[{"oil": "15 g"}, {"oil": "0.1 g"}]', "rack/B2: 0.1 g of oil would be within its tolerance"),
     ],
 )
 def test_impossible_proposals_are_refused_together_and_asked_for_again(answer: str, reason: str) -> None:
@@ -299,5 +300,5 @@ def test_impossible_proposals_are_refused_together_and_asked_for_again(answer: s
     (question,) = strategy.ask(Slots(0))
     assert isinstance(question, Ask)
     assert reason in question.question.partition("\nRefused: ")[2]
-    strategy.tell(question, Answered('[{"oil": "5 g"}]'))
+    strategy.tell(question, Answered('[{"oil": "10 g"}]'))
     assert "Refused" not in poured_until_asked(strategy).question

@@ -91,7 +91,7 @@ def test_a_program_proposes_mixtures_by_answering_a_question(tmp_path: Path) -> 
             await served.post(answer, {"answer": '[{"water": "70 g"}]'})
             again = await served.question()
             assert again["problem"] == "Refused: rack/B1: it is heavier than 50 g, the largest mixture of the table"
-            await served.post(f"/questions/{again['id']}/answer", {"answer": '[{"water": "20 g", "ethanol": "15 g"}]'})
+            await served.post(f"/questions/{again['id']}/answer", {"answer": '[{"water": "20 g", "ethanol": "20 g"}]'})
             while (last := await served.question())["id"] == again["id"]:
                 await asyncio.sleep(0.01)
             await served.post(f"/questions/{last['id']}/answer", {"answer": "[]"})
