@@ -53,8 +53,9 @@ class MixtureForecast:
         assert series.mixtures is not None
         self._series, self._cups, self._laboratory = series, series.mixtures.cups, plan.laboratory
         self._predicted: dict[str, list[tuple[float, DoseForecast]]] = {}
-        seeds = SeedStream(plan.seed, "predict mixtures")
         for liquid in dict.fromkeys(dose.liquid or "" for dose in series.doses):
+            # neither the campaign's seed nor other liquids decide what is supported
+            seeds = SeedStream(0, "predict mixtures")
             planned = {dose.amount: dose for dose in series.doses if dose.liquid == liquid}
             self._predicted[liquid] = [
                 (amount, self._prediction(planned[amount], seeds.next() % 2**32))

@@ -310,7 +310,8 @@ class MixtureNight:
             self.reason = f"{type(error).__name__}: {error}"
         finally:
             self.handle.close()
-        self._held, self._dry = dict(self.stage.contents.liquids), dict(self.stage.contents.dry)
+        self._held |= self.stage.contents.liquids
+        self._dry = dict(self.stage.contents.dry)
         self.wrong += [f"hands were invited while something moved: {about}" for about in self.stage.unsafe]
         return read_result(self.folder / "run").state
 
@@ -350,6 +351,7 @@ class MixtureNight:
             if question.about == "vessels_laid_out":
                 again = [name for name in self._held if f"{name} filled_g" not in question.details]
                 stage.contents.liquids |= {name: self._held[name] for name in again}
+                self._held = {}  # once they are laid out again in the same run, they are as they stand there
                 await stage.site.put(stage.contents.carried)
             if question.about == "cup_unknown":
                 for name in (name for name in stage.contents.stands if self.record.unknown(name)):

@@ -32,6 +32,9 @@ SLOWEST_WAKE = 0.002
 MOST_BEHIND = 0.1
 """Longest lag of the clock in wall time [s]; more is dropped, because a controller never runs faster to catch up."""
 
+BUSY = 0.75
+"""Share of a second's processor time above which the clock gives its priority up."""
+
 LONGEST_WAKE = 0.05
 """Wall time after which a wake-up with more pending cycles serves the ports first [s]."""
 
@@ -215,14 +218,15 @@ class Host:
         if behind > 2.0 * max(period, SLOWEST_WAKE):
             self.timing.late += 1
         self.timing.worst = max(self.timing.worst, behind)
-        worked = time.thread_time()
         if behind > MOST_BEHIND:
             self.timing.dropped += behind - MOST_BEHIND
             self._next = now - MOST_BEHIND
-            if self.timing.priority != "normal" and worked - self._worked > 0.5 * (now - self._woke):
-                # Its own work, for example a program's, causes the delay; other processes would get no processor time.
+        if self.timing.priority != "normal" and now > self._woke + 1.0:
+            worked = time.thread_time()
+            if worked - self._worked > BUSY * (now - self._woke):
+                # Its own work, for example a program's: other processes would get no processor time.
                 self.timing.priority = lower_priority()
-        self._worked, self._woke = worked, now
+            self._worked, self._woke = worked, now
         try:
             while self._next <= now and loop.time() < now + LONGEST_WAKE:
                 self._next += period

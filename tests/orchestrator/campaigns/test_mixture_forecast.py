@@ -70,6 +70,10 @@ def test_a_cup_that_would_be_open_for_too_long_is_refused(tmp_path: Path) -> Non
     assert re.search(r"mixtures.max_open: a cup is open for up to [12]\.\d min; pour fewer liquids", problems)
 
 
+def test_what_is_expected_does_not_depend_on_the_seed(tmp_path: Path) -> None:
+    assert checked(tmp_path, "name: mix", "name: mix\nseed: 1") == checked(tmp_path, "name: mix", "name: mix\nseed: 2")
+
+
 def test_later_doses_cost_no_further_predictions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "mix.yaml"
     rows = "".join(f"    B{i}: {{water: {20 + i} g, ethanol: {20 + i / 2} g}}\n" for i in range(1, 20))
