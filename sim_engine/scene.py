@@ -76,10 +76,9 @@ class Pivot:
     z: float = 0.0
 
 
-MIRRORED_FROM = 10_000
-"""Least number of particles of a pour of which one half is simulated. With 2,000 and 5,000 the mean spillage of some
-pours is up to 0.9 points more than that of whole ones; with 10,000 that of one in eight is 0.5 less
-(docs/notes/solver.md)."""
+MIRRORED_FROM = 2_000
+"""Least number of particles of a pour of which one half is simulated. From there on a mirrored pour is nearer to fine
+particles than a whole one that takes as long (docs/notes/solver.md)."""
 
 
 @dataclass(frozen=True)

@@ -191,7 +191,9 @@ class SceneBuilder:
                 )
         if pourer is None or receiver is None or self.liquid is None or not ok:
             return None
-        mirrored = True if self.file.simulator.mirrors and fixed.get("y_offset") == 0.0 else None
+        simulated = self.file.calibration is not None or self.file.deployment is not None
+        half = simulated and self.file.simulator.mirrors and fixed.get("y_offset") == 0.0
+        mirrored = True if half else None
         return Scene(name, pourer, receiver, self.liquid, pivot, fixed, max_hold_time, mirrored)
 
     def pourer(self, value: Any, place: Place) -> VesselSpec | None:

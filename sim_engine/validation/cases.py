@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from sim_engine.liquids import SimulationParameters
+from sim_engine.scene import MIRRORED_FROM
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation import (
     capillarity,
@@ -172,6 +173,11 @@ def _convergence(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Mea
     return convergence.convergence(simulator, convergence.QUICK, (1_000,), 1, PLAIN)
 
 
+def _halves(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
+    chosen, seeds = (convergence.POURS[:8], 30) if effort.full else (convergence.POURS[:1], 2)
+    return convergence.halves(simulator, chosen, MIRRORED_FROM, seeds, PLAIN)
+
+
 def _walls(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
     many = 40 if effort.full else 5
     return wall_tightness.walls(many, 10_000 if effort.full else 1_500), None
@@ -276,6 +282,13 @@ CASES: tuple[Case, ...] = (
         "(`benchmarks/convergence.py`). Three pours change by more than 0.02 from 10,000 to 40,000: they splash, and "
         "without surface tension the spray grows with the number of particles. They are not judged.",
         _convergence,
+    ),
+    Case(
+        "halves",
+        "Mirrored pours",
+        "Eight of these pours with one half of the liquid and its mirror image, compared with the whole liquid: mean "
+        "spillage of thirty seeds each. References are the whole pours.",
+        _halves,
     ),
     Case(
         "walls",

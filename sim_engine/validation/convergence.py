@@ -60,9 +60,9 @@ class ConvergencePour:
         stop = "" if self.angle == 120.0 else f" to {self.angle:g}°"
         return f"{self.receiver.name} {self.speed:g} °/s{stop}, {self.distance:g} mm"
 
-    def task(self, parameters: SimulationParameters, seed: int) -> PourTask:
-        """The task of its simulation."""
-        scene = Scene(self.name, POURER, self.receiver, Liquid(mass=0.1996))
+    def task(self, parameters: SimulationParameters, seed: int, mirrored: bool | None = None) -> PourTask:
+        """The task of its simulation; `mirrored` as in `Scene`."""
+        scene = Scene(self.name, POURER, self.receiver, Liquid(mass=0.1996), mirrored=mirrored)
         return PourTask(scene, self.action(HEIGHTS[self.receiver.name]), parameters, seed)
 
     def action(self, height: float) -> Action:
@@ -105,10 +105,14 @@ POURS = FOUND + CHOSEN
 
 
 def spillage(
-    simulator: PourSimulator, pour: ConvergencePour, parameters: SimulationParameters, seed: int
+    simulator: PourSimulator,
+    pour: ConvergencePour,
+    parameters: SimulationParameters,
+    seed: int,
+    mirrored: bool | None = None,
 ) -> tuple[float, float]:
-    """Spilled over poured of one pour, and its CPU time [s]."""
-    outcome = simulator.simulate(pour.task(parameters, seed)).outcome
+    """Spilled over poured of one pour, and its CPU time [s]; `mirrored` as in `Scene`."""
+    outcome = simulator.simulate(pour.task(parameters, seed, mirrored)).outcome
     if outcome.invalid is not None:
         raise ArithmeticError(f"{pour.name}, {parameters.particles} particles: {outcome.invalid}")
     return outcome.spilled / max(outcome.fractions.poured, 1e-9), outcome.cpu_s
@@ -220,3 +224,52 @@ def convergence(
         tuple(curves),
     )
     return measurements, figure
+
+
+AGREEMENT = 0.003
+"""Largest difference of the mean spillage between mirrored and whole pours that was allowed before it was measured."""
+
+
+def halves(
+    simulator: PourSimulator,
+    chosen: tuple[ConvergencePour, ...],
+    number: int,
+    seeds: int,
+    parameters: SimulationParameters,
+) -> tuple[list[Measurement], None]:
+    """Mean spillage of mirrored pours, compared with whole ones.
+
+    Args:
+        simulator: of this process.
+        chosen: some of `POURS`.
+        number: of particles, at least `MIRRORED_FROM`.
+        seeds: number of seeds for each, at least 2.
+        parameters: θ; its number of particles is replaced.
+    """
+    theta = parameters.model_copy(update={"particles": number})
+    spillages = np.array(
+        [
+            [[spillage(simulator, pour, theta, seed, half)[0] for half in (None, True)] for seed in range(1, seeds + 1)]
+            for pour in chosen
+        ]
+    )  # (pour, seed, whole or mirrored)
+    means = spillages.mean(axis=1)
+    differences = means[:, 1] - means[:, 0]
+    errors = np.sqrt((spillages.var(axis=1, ddof=1) / seeds).sum(axis=1))
+    scatter = np.sqrt(spillages.var(axis=1, ddof=1).mean(axis=0))
+    measurements = [
+        reported(f"spilled over poured, {pour.name}", float(mean[1]), reference=float(mean[0]), particles=number)
+        for pour, mean in zip(chosen, means, strict=True)
+    ]
+    largest = int(np.argmax(np.abs(differences)))
+    for name, difference in (
+        ("difference from the whole pours, mean", differences.mean()),
+        ("… and the largest", differences[largest]),
+    ):
+        size, criterion = float(abs(difference)), f"at most {AGREEMENT:g}"
+        measurements.append(at_most(name, size, AGREEMENT, criterion=criterion, particles=number))
+    measurements += [
+        reported("… its standard error", float(errors[largest]), particles=number),
+        reported("scatter between seeds, mirrored over whole", float(scatter[1] / scatter[0]), particles=number),
+    ]
+    return measurements, None
