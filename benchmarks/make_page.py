@@ -101,7 +101,7 @@ def stale(records: dict[str, Any]) -> list[str]:
 def draw(records: dict[str, Any], images: Path) -> None:
     """Draw the figures that have measurements."""
     pours = pour_records(records)
-    ours = {r["result"]["particles"]: r["result"]["cpu_s"] for r in pours}
+    ours = {r["result"]["particles"]: r["result"]["whole"]["cpu_s"] for r in pours}
     if "scaling" in records:
         ours = {row["particles"]: row["cpu_s"] for row in records["scaling"]["result"]["cost"]} | ours
     theirs = [(r["result"]["particles"], r["result"]["peer"]["cpu_s"]) for r in pours if "peer" in r["result"]]

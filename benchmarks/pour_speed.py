@@ -41,9 +41,11 @@ def of_ours(particles: int, runs: list[Measured]) -> dict[str, Any]:
     """Return the figures of our runs: medians over the seeds."""
     middle = sorted(runs, key=lambda run: run.cpu_s)[len(runs) // 2]
     cpu_s = statistics.median(run.cpu_s for run in runs)
-    rates = [particles * run.iterations / run.cpu_s for run in runs]
+    simulated = particles // (1 + middle.outcome.mirrored)
+    rates = [simulated * run.iterations / run.cpu_s for run in runs]
     left = [statistics.mean(values) for values in zip(*(run.left for run in runs), strict=True)]
     return {
+        "mirrored": middle.outcome.mirrored,
         "cpu_s": round(cpu_s, 3),
         "cpu_s_of_each": [round(run.cpu_s, 3) for run in runs],
         "wall_s": round(statistics.median(run.wall_s for run in runs), 3),
@@ -115,13 +117,15 @@ def main() -> None:
     simulator.simulate(short_task(particles))
     first = time.perf_counter() - begun
     ours: list[Measured] = []
+    whole: list[Measured] = []
     tense: list[Measured] = []
     theirs: list[PeerRun] = []
     for turn in turns(options.repeats, options.peer):
         if turn == "ours":
-            ours.append(measure(simulator, particles, seed=len(ours) + 1))
-            tense.append(measure(simulator, particles, len(ours), SimulationParameters().cohesion))
-            say(f"ours, seed {len(ours)}: {ours[-1].cpu_s:.2f} CPU s")
+            ours.append(measure(simulator, particles, seed=len(ours) + 1, mirrored=True))
+            whole.append(measure(simulator, particles, seed=len(ours)))
+            tense.append(measure(simulator, particles, len(ours), SimulationParameters().cohesion, mirrored=True))
+            say(f"ours, seed {len(ours)}: {ours[-1].cpu_s:.2f} CPU s, whole {whole[-1].cpu_s:.2f} CPU s")
         elif python is not None:
             say(f"{peer.NAME}, seed {len(theirs) + 1}: running")
             theirs.append(peer.pour(python, particles, seed=len(theirs) + 1))
@@ -132,11 +136,13 @@ def main() -> None:
         "cpu_s": round(statistics.median(run.cpu_s for run in tense), 3),
         "left": [round(statistics.mean(values), 3) for values in zip(*(run.left for run in tense), strict=True)],
     }
+    result["whole"] = of_ours(particles, whole)
     if theirs:
         result["peer"] = of_theirs(particles, theirs)
-        result["ratio"] = round(result["peer"]["cpu_s"] / result["cpu_s"], 2)
-        per_second = result["simulated_time_s"] / END
-        result["ratio_per_simulated_second"] = round(result["ratio"] * per_second, 2)
+        for figures in (result, result["whole"]):
+            figures["ratio"] = round(result["peer"]["cpu_s"] / figures["cpu_s"], 2)
+            per_second = figures["simulated_time_s"] / END
+            figures["ratio_per_simulated_second"] = round(figures["ratio"] * per_second, 2)
     result["core"] = core
     result["machine"] = describe()
     simulator.close()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -62,10 +62,12 @@ def standard_action(angular_velocity: float = 30 * DEG, hold_time: float = 2.0) 
     )
 
 
-def standard_task(particles: int, seed: int, *, frame_rate: float = 0.0, cohesion: float = 0.0) -> PourTask:
+def standard_task(
+    particles: int, seed: int, *, frame_rate: float = 0.0, cohesion: float = 0.0, mirrored: bool | None = None
+) -> PourTask:
     """Return the standard pour at the default θ except N, and without surface tension, which the peer lacks."""
     theta = SimulationParameters(particles=particles, cohesion=cohesion)
-    return PourTask(SCENE, standard_action(), theta, seed, frame_rate=frame_rate)
+    return PourTask(replace(SCENE, mirrored=mirrored), standard_action(), theta, seed, frame_rate=frame_rate)
 
 
 def short_task(particles: int) -> PourTask:
@@ -111,7 +113,9 @@ class Measured:
     outcome: PourOutcome
 
 
-def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float = 0.0) -> Measured:
+def measure(
+    simulator: PourSimulator, particles: int, seed: int, cohesion: float = 0.0, mirrored: bool | None = None
+) -> Measured:
     """Pour once.
 
     Args:
@@ -119,6 +123,7 @@ def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float
         particles: N.
         seed: seed of the initial positions.
         cohesion: surface tension [N/m].
+        mirrored: as in `Scene`.
 
     Raises:
         SystemExit: the outcome is invalid, so its time is meaningless.
@@ -126,7 +131,7 @@ def measure(simulator: PourSimulator, particles: int, seed: int, cohesion: float
     from sim_engine.fluid.engine import engine
 
     begun = time.perf_counter()
-    run = simulator.simulate(standard_task(particles, seed, frame_rate=10.0, cohesion=cohesion))
+    run = simulator.simulate(standard_task(particles, seed, frame_rate=10.0, cohesion=cohesion, mirrored=mirrored))
     wall = time.perf_counter() - begun
     outcome = run.outcome
     if outcome.invalid is not None:
