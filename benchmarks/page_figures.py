@@ -32,7 +32,10 @@ def cost_figure(
         targets: required and target CPU seconds by particles.
     """
     figure, axes = style.new_figure(size=(6.4, 4.2))
-    for points, colour, name in ((theirs, style.GREY, "SPlisHSPlasH, DFSPH"), (ours, style.MEASURED, "Decant, whole pour")):
+    for points, colour, name in (
+        (theirs, style.GREY, "SPlisHSPlasH, DFSPH"),
+        (ours, style.MEASURED, "Decant, whole pour"),
+    ):
         if points:
             numbers, seconds = zip(*sorted(points), strict=True)
             axes.plot(numbers, seconds, color=colour, marker="o", ms=4.5, lw=1.5, label=name)
