@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from machine import KeptRows, write_table
 
+from sim_engine.fluid import engine
 from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import MIRRORED_FROM
 from sim_engine.simulator import PourSimulator
@@ -122,7 +123,8 @@ def simulate(
     kept: KeptRows, pours: Sequence[ConvergencePour], particles: int, seed: int, mirrored: bool = False
 ) -> None:
     """Simulate the pours that the store lacks."""
-    theta = SimulationParameters(particles=particles, cohesion=0.0, xsph_rate=1.0)
+    plain = SimulationParameters(cohesion=0.0, xsph_rate=1.0)
+    theta = plain.model_copy(update={"particles": particles})  # beyond the largest number that is allowed, too
     for pour in pours:
         key = {"pour": pour.name, "particles": particles, "seed": seed} | ({"mirrored": True} if mirrored else {})
         if all(row | key != row or row.get("mirrored", False) != mirrored for row in kept.rows):
@@ -132,7 +134,8 @@ def simulate(
 
 @cache
 def simulator() -> PourSimulator:
-    """The simulator of this process."""
+    """The simulator of this process, with room for 80,000 particles and their images."""
+    engine.POOL = 80_000
     return PourSimulator()
 
 

@@ -14,10 +14,11 @@ share of the resolution is left out, and the scatter s of the simulations, which
 In other scenes the larger of the residual and the error of coarse particles is used. With n simulations of a pour:
 
     in a scene of the calibration:  width² = max(residual² − s², 0) + 2 s² / n
-    in another scene:               width² = max(resolution, residual)² + 2 s² / n
+    in another scene:               width² = max(resolution, residual, finer)² + 2 s² / n
 
-This is the width of the normal distribution about each simulation; their mixture is the distribution of the pour. A
-band is the interval of r that contains a single pour with probability `LEVEL`.
+`finer` is the shift of a simulation with five times the particles, if there is one; it moves the interval, too. The
+width is that of the normal distribution about each simulation; their mixture is the distribution of the pour. A band
+is the interval of r that contains a single pour with probability `LEVEL`.
 
 Source: derived here; measured in docs/evidence/validation.md (landing, convergence), and compared with unseen pours in
 docs/evidence/results.md.
@@ -173,6 +174,7 @@ def band(
     particles: int,
     residual: CalibrationResidual | None = None,
     level: float = LEVEL,
+    finer: float = 0.0,
 ) -> PredictionInterval:
     """The interval of a single pour, given its simulations.
 
@@ -183,6 +185,8 @@ def band(
         residual: of the calibration, for the scene of the pour with the vessels as they are known; None without
             calibration.
         level: probability with which a pour lies in it.
+        finer: shift of a simulation with several times the particles; it moves the interval, and is the least
+            standard deviation of what still finer ones would add. 0 without one.
 
     Raises:
         ValueError: no simulation, or a level that is not between 0 and 1.
@@ -190,11 +194,11 @@ def band(
     if not spillages or not 0.0 < level < 1.0:
         raise ValueError(f"a band needs simulations and a level between 0 and 1, not {len(spillages)} and {level}")
     count = len(spillages)
-    places = [shift_of(r, particles) for r in spillages]
+    places = [shift_of(r, particles) + finer for r in spillages]
     mean = math.fsum(places) / count
     spread = math.fsum((z - mean) ** 2 for z in places) / (count - 1) if count > 1 else 0.0
     here = residual is not None and residual.here
-    lacking = lacking_shift(particles, residual, math.sqrt(spread))
+    lacking = max(lacking_shift(particles, residual, math.sqrt(spread)), abs(finer))
     # The mixture of the simulations has a variance of s² (n − 1) / n; a further one differs from their mean by
     # s² (n + 1) / n.
     width = max(math.sqrt(lacking**2 + 2.0 * spread / count), _NARROWEST)
@@ -206,20 +210,22 @@ def band(
         level,
         steep * math.sqrt(spread),
         None if residual is None else steep * (lacking if here else residual.shift),
-        0.0 if here else steep * resolution_shift(particles),
+        0.0 if here else steep * max(resolution_shift(particles), abs(finer)),
     )
 
 
-def band_of(outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None = None) -> PredictionInterval | None:
+def band_of(
+    outcomes: Sequence[PourOutcome], residual: CalibrationResidual | None = None, finer: float = 0.0
+) -> PredictionInterval | None:
     """The band of one pour's simulations; None if none of them has a spillage.
 
     Args:
         outcomes: of the same action, with fresh seeds, perhaps of several θ and shapes.
-        residual: as in `band`.
+        residual, finer: as in `band`.
     """
     usable = [outcome for outcome in outcomes if outcome.invalid is None]
     spillages = [r for outcome in usable if (r := outcome.fractions.spillage) is not None]
-    return band(spillages, usable[0].particles, residual) if spillages else None
+    return band(spillages, usable[0].particles, residual, finer=finer) if spillages else None
 
 
 def _quantile(places: Sequence[float], width: float, share: float) -> float:

@@ -354,7 +354,7 @@ class PlannedOrder:
     async def _simulated(self, pool: SimulatorPool) -> dict[str, Any]:
         costing = Costing(Loss(), self.scene, self.plan.parameters)
         strategy = RepeatedSimulation(costing, self.action, SEEDS, self.order.seed)
-        requests = strategy.ask(Slots(SEEDS, 0))
+        requests = strategy.ask(Slots(SEEDS + 1, 0))
         tasks = [PourTask(self.scene, r.action, r.parameters, r.seed) for r in requests]  # type: ignore[union-attr]
         done = await asyncio.gather(*map(pool.simulate, tasks), return_exceptions=True)
         for request, outcome in zip(requests, done, strict=True):
