@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+from collections import Counter
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -175,7 +176,8 @@ def main() -> None:
                 simulate(kept, POURS, n, seed)
     settings = "200 mL of water, no surface tension, uncalibrated; "
     if options.halves:
-        settings += f"eight pours, {len(seeds)} seeds; root mean squares over the pours; CPU seconds of one core"
+        counts = Counter((row["pour"], row["particles"], row.get("mirrored", False)) for row in kept.rows).values()
+        settings += f"{min(counts)} to {max(counts)} seeds; root mean squares over eight pours; CPU seconds of one core"
         tables = {"halves": halves(kept.rows), "halves-pours": differences(kept.rows)}
     elif options.fine:
         tables = {"convergence-fine": finest(kept.rows)}
