@@ -40,7 +40,7 @@ from orchestrator.campaigns import file_references as vessel
 from orchestrator.campaigns.pour_table import MASS_COLUMNS, SPLITS, column_name
 from orchestrator.campaigns.scene_builder import DEFAULTS, NEEDED
 from orchestrator.campaigns.yaml.section_validation import sections_in
-from orchestrator.catalogue.control_charts import QUANTITIES
+from orchestrator.catalogue.control_charts import CHECKS, QUANTITIES
 from orchestrator.catalogue.run_reading import TABLES as CATALOGUE
 from orchestrator.daemon.state import daemon_settings as daemon
 from orchestrator.daemon.state.notifications import NotifySettings
@@ -321,7 +321,7 @@ def catalogued(table: str) -> str:
 
 def charted() -> str:
     """Quantities with a control chart, and what to check."""
-    rows = [(q.label, q.unit, ", ".join(q.groups), _one_line(q.check)) for q in QUANTITIES]
+    rows = [(q.label, q.unit, ", ".join(q.groups), _one_line(CHECKS[q.column])) for q in QUANTITIES]
     return _table(("quantity", "unit", "compared for the same", "if it leaves its limits"), rows)
 
 

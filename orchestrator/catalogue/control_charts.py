@@ -1,6 +1,6 @@
 """Control charts of a laboratory: what every run measures anyway, day by day, against limits from its own history.
 
-- `QUANTITIES` declares what is charted, and what to check if it leaves its limits.
+- `QUANTITIES` declares what is charted, `CHECKS` what to look at if it leaves its limits.
 - `control_chart` has the statistics: arrays in, points and violations out.
 - `charts_of` makes the charts of every laboratory from rows of the catalogue.
 
@@ -14,7 +14,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
@@ -91,39 +91,6 @@ class ChartViolation(BaseModel):
     """Mean distance since it began, in standard deviations."""
 
 
-@dataclass
-class _History:
-    """Days of one group that were in control: number, mean and variance of their means, and variance within days."""
-
-    days: int = 0
-    mean: float = 0.0
-    squares: float = 0.0
-    inverse: float = 0.0
-    within: float = 0.0
-    freedom: int = 0
-
-    def add(self, point: ChartPoint, squares: float) -> None:
-        self.days += 1
-        step = point.value - self.mean
-        self.mean += step / self.days
-        self.squares += step * (point.value - self.mean)
-        self.inverse += 1.0 / point.pours
-        self.within += squares
-        self.freedom += point.pours - 1
-
-    def deviation(self, values: int, resolution: float) -> float:
-        """Standard deviation of the next day's difference from the mean, if it has so many values.
-
-        Days with fewer values than the history scatter more, by the variance within days. Those with more get no
-        narrower limits: the estimate would be too uncertain.
-        """
-        variance = self.squares / (self.days - 1)
-        within = self.within / self.freedom if self.freedom else 0.0
-        expected = variance + within * (1.0 / values - self.inverse / self.days)
-        spread = max(expected, variance, resolution**2)
-        return math.sqrt(spread * (1.0 + 1.0 / self.days))
-
-
 def control_chart(
     times: Sequence[float], values: Sequence[float], about: Sequence[str] | None = None, *, resolution: float = 0.0
 ) -> tuple[list[ChartPoint], list[ChartViolation]]:
@@ -150,21 +117,21 @@ def control_chart(
     first day on is seen late, because the limits contain it.
     """
     points: list[ChartPoint] = []
-    histories: dict[str, _History] = {}
+    histories: dict[str, list[tuple[ChartPoint, float]]] = {}
     periods: list[tuple[ChartViolation, int, int | None]] = []
     sums, since = [0.0, 0.0], [0, 0]
     recent: deque[float] = deque(maxlen=3)
     for number, (point, squares) in enumerate(_days(times, values, about or [""] * len(values))):
         points.append(point)
-        history = histories.setdefault(point.about, _History())
-        if history.days < FEWEST:
-            history.add(point, squares)
+        history = histories.setdefault(point.about, [])
+        if len(history) < FEWEST:
+            history.append((point, squares))
             continue
-        deviation = history.deviation(point.pours, resolution)
+        mean, deviation = _expected(history, point.pours, resolution)
         # Beyond 37, Student's distribution is exactly 0 or 1 in floating-point numbers.
-        z = _normal((point.value - history.mean) / max(deviation, 1e-300), history.days - 1)
-        half = _student(LIMIT, history.days - 1) * deviation
-        point.deviations, point.low, point.high = z, history.mean - half, history.mean + half
+        z = _normal((point.value - mean) / max(deviation, 1e-300), len(history) - 1)
+        half = _student(LIMIT, len(history) - 1) * deviation
+        point.deviations, point.low, point.high = z, mean - half, mean + half
         recent.append(z)
         before = tuple(sums)
         for side, sign in enumerate((1, -1)):
@@ -180,12 +147,27 @@ def control_chart(
         elif rule is not None and ended is not None:
             begun = max(since[side], ended) if before[side] > CALM else number
             periods.append((ChartViolation(begun=points[begun].time, noticed=point.time, rule=rule), begun, None))
-        elif rule is None and ended is not None and history.days < HISTORY:
-            history.add(point, squares)
+        elif rule is None and ended is not None and len(history) < HISTORY:
+            history.append((point, squares))
     for violation, begun, ended in periods:
         distances = [point.deviations for point in points[begun:ended] if point.deviations is not None]
         violation.deviations = float(np.mean(distances))
     return points, [violation for violation, _, _ in periods]
+
+
+def _expected(history: Sequence[tuple[ChartPoint, float]], pours: int, resolution: float) -> tuple[float, float]:
+    """Mean of a history, and the standard deviation of a further day's difference from it, if that day has so many
+    pours.
+
+    Days with fewer pours than the history scatter more, by the variance within days. Those with more get no narrower
+    limits: the estimate would be too uncertain.
+    """
+    means, counts, squares = np.array([(point.value, point.pours, squares) for point, squares in history]).T
+    variance = means.var(ddof=1)
+    within = squares.sum() / max((counts - 1.0).sum(), 1.0)
+    expected = variance + within * (1.0 / pours - (1.0 / counts).mean())
+    spread = max(expected, variance, resolution**2)
+    return float(means.mean()), math.sqrt(spread * (1.0 + 1.0 / len(history)))
 
 
 def _rule(z: float, recent: Iterable[float], cusum: float) -> Rule | None:
@@ -228,6 +210,23 @@ def _student(z: float, freedom: int) -> float:
 # ---- the charts of a laboratory
 
 
+CHECKS = {
+    "prediction_error": "was the receiver, the tray or the arm moved, or is it another liquid? Measure the placement; "
+    "else calibrate again",
+    "dose_error_g": "the display and the cables of the balance, drops at the lip, and the temperature of the liquid",
+    "onset_deg": "does the vessel slip in the gripper? Clean its pads, check its force, and teach the grip again; is "
+    "it the right vessel?",
+    "film_g": "wash and dry the receiver; does it drain as long as before?",
+    "missing_g": "is liquid on the table, or does it evaporate? Is it always the same vessel that is weighed?",
+    "empty_pourer_g": "weigh a reference weight (`decant balance check`), adjust the balance; is the pourer dry, clean "
+    "and the right one?",
+    "zero_g": "does something touch the pan? Level the balance, and keep draughts and warmth away",
+    "reading_noise_g": "vibrations, draughts and static charge at the balance; its filter setting",
+    "seconds": "the speed slider of the arm, stable readings of the balance, and waiting questions",
+}
+"""What to look at if a quantity leaves its limits, by column of the table of pours."""
+
+
 @dataclass(frozen=True)
 class ChartedQuantity:
     """A quantity with a chart.
@@ -235,7 +234,6 @@ class ChartedQuantity:
     Attributes:
         column: of the table of pours.
         label, unit: for people.
-        check: what to look at if it leaves its limits.
         resolution: smallest standard deviation that means anything, in the unit (or of the logarithm).
         groups: columns whose values have levels of their own.
         logarithmic: whether ratios count, not differences.
@@ -245,7 +243,6 @@ class ChartedQuantity:
     column: str
     label: str
     unit: str
-    check: str
     resolution: float
     groups: tuple[str, ...] = ()
     logarithmic: bool = False
@@ -255,81 +252,15 @@ class ChartedQuantity:
 _VESSELS = ("pourer", "receiver", "liquid")
 
 QUANTITIES = (
-    ChartedQuantity(
-        "prediction_error",
-        "prediction error",
-        "SD",
-        "was the receiver, the tray or the arm moved, or is it another liquid? Measure the placement; else calibrate "
-        "again",
-        0.1,
-        _VESSELS,
-    ),
-    ChartedQuantity(
-        "dose_error_g",
-        "dose error",
-        "g",
-        "the display and the cables of the balance, drops at the lip, and the temperature of the liquid",
-        0.02,
-        ("pourer", "liquid"),
-    ),
-    ChartedQuantity(
-        "onset_deg",
-        "tilt at which doses begin to flow",
-        "deg",
-        "does the vessel slip in the gripper? Clean its pads, check its force, and teach the grip again; is it the "
-        "right vessel?",
-        0.1,
-        ("pourer", "liquid"),
-    ),
-    ChartedQuantity(
-        "film_g",
-        "film in the receiver",
-        "g",
-        "wash and dry the receiver; does it drain as long as before?",
-        0.01,
-        ("receiver", "liquid"),
-    ),
-    ChartedQuantity(
-        "missing_g",
-        "masses that do not close",
-        "g",
-        "is liquid on the table, or does it evaporate? Is it always the same vessel that is weighed?",
-        0.02,
-    ),
-    ChartedQuantity(
-        "empty_pourer_g",
-        "weight of the empty pourer",
-        "g",
-        "weigh a reference weight (`decant balance check`), adjust the balance; is the pourer dry, clean and the right "
-        "one?",
-        0.01,
-        ("pourer",),
-        once=True,
-    ),
-    ChartedQuantity(
-        "zero_g",
-        "zero of the balance",
-        "g",
-        "does something touch the pan? Level the balance, and keep draughts and warmth away",
-        0.005,
-    ),
-    ChartedQuantity(
-        "reading_noise_g",
-        "scatter of readings at rest",
-        "g",
-        "vibrations, draughts and static charge at the balance; its filter setting",
-        0.1,
-        logarithmic=True,
-    ),
-    ChartedQuantity(
-        "seconds",
-        "time of a pour",
-        "s",
-        "the speed slider of the arm, stable readings of the balance, and waiting questions",
-        0.05,
-        ("purpose", *_VESSELS),
-        logarithmic=True,
-    ),
+    ChartedQuantity("prediction_error", "prediction error", "SD", 0.1, _VESSELS),
+    ChartedQuantity("dose_error_g", "dose error", "g", 0.02, ("pourer", "liquid")),
+    ChartedQuantity("onset_deg", "tilt at which doses begin to flow", "deg", 0.1, ("pourer", "liquid")),
+    ChartedQuantity("film_g", "film in the receiver", "g", 0.01, ("receiver", "liquid")),
+    ChartedQuantity("missing_g", "masses that do not close", "g", 0.02),
+    ChartedQuantity("empty_pourer_g", "weight of the empty pourer", "g", 0.01, ("pourer",), once=True),
+    ChartedQuantity("zero_g", "zero of the balance", "g", 0.005),
+    ChartedQuantity("reading_noise_g", "scatter of readings at rest", "g", 0.1, logarithmic=True),
+    ChartedQuantity("seconds", "time of a pour", "s", 0.05, ("purpose", *_VESSELS), logarithmic=True),
 )
 """What is charted, in the order in which it is shown."""
 
@@ -387,47 +318,38 @@ class LaboratoryChart(BaseModel):
         return f"{self.label}: {off}; check: {self.check}"
 
 
-@dataclass
-class _Values:
-    """Values of one quantity in one laboratory with their times and groups, and the runs that they are from."""
-
-    times: list[float] = field(default_factory=list)
-    values: list[float] = field(default_factory=list)
-    about: list[str] = field(default_factory=list)
-    runs: set[tuple[str, str]] = field(default_factory=set)
-
-
 def charts_of(rows: Sequence[Mapping[str, Any]]) -> list[LaboratoryChart]:
     """The charts of all laboratories, by laboratory and quantity; quantities without values have none.
 
     Args:
         rows: weighed pours, the oldest first, with 'laboratory', 'mode', 'path', 'time' and `COLUMNS`.
     """
-    streams: dict[tuple[str, str], dict[str, _Values]] = {}
+    laboratories: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for row in rows:
-        laboratory = streams.setdefault((str(row["laboratory"] or ""), str(row["mode"])), {})
-        for quantity in QUANTITIES:
-            value = row[quantity.column]
-            if value is None or not math.isfinite(value) or (quantity.logarithmic and value <= 0.0):
-                continue
-            stream = laboratory.setdefault(quantity.column, _Values())
-            about = ", ".join(filter(None, (str(row[name] or "") for name in quantity.groups)))
-            if quantity.once and (row["path"], about) in stream.runs:
-                continue
-            stream.runs.add((row["path"], about))
-            stream.times.append(float(row["time"]))
-            stream.values.append(math.log(value) if quantity.logarithmic else value)
-            stream.about.append(about)
-    return [
-        _chart(name, mode, quantity, laboratory[quantity.column])
-        for (name, mode), laboratory in sorted(streams.items())
+        laboratories.setdefault((str(row["laboratory"] or ""), str(row["mode"])), []).append(row)
+    charts = [
+        _chart(name, mode, quantity, laboratories[name, mode])
+        for name, mode in sorted(laboratories)
         for quantity in QUANTITIES
-        if quantity.column in laboratory
     ]
+    return [chart for chart in charts if chart.points]
 
 
-def _chart(laboratory: str, mode: str, quantity: ChartedQuantity, stream: _Values) -> LaboratoryChart:
-    points, violations = control_chart(stream.times, stream.values, stream.about, resolution=quantity.resolution)
+def _chart(laboratory: str, mode: str, quantity: ChartedQuantity, rows: Sequence[Mapping[str, Any]]) -> LaboratoryChart:
+    times, values, groups = [], [], []
+    runs: set[tuple[str, str]] = set()
+    for row in rows:
+        value = row[quantity.column]
+        if value is None or not math.isfinite(value) or (quantity.logarithmic and value <= 0.0):
+            continue
+        about = ", ".join(filter(None, (str(row[name] or "") for name in quantity.groups)))
+        if quantity.once and (row["path"], about) in runs:
+            continue
+        runs.add((row["path"], about))
+        times.append(float(row["time"]))
+        values.append(math.log(value) if quantity.logarithmic else value)
+        groups.append(about)
+    points, violations = control_chart(times, values, groups, resolution=quantity.resolution)
     for point in points if quantity.logarithmic else ():
         point.value = math.exp(point.value)
         if point.low is not None and point.high is not None:
@@ -438,7 +360,7 @@ def _chart(laboratory: str, mode: str, quantity: ChartedQuantity, stream: _Value
         quantity=quantity.column,
         label=quantity.label,
         unit=quantity.unit,
-        check=quantity.check,
+        check=CHECKS[quantity.column],
         points=points,
         violations=violations,
     )
