@@ -125,12 +125,7 @@ class Covariance:
     """
 
     def __init__(
-        self,
-        points: Array,
-        prior: HyperPrior,
-        *,
-        known: PriorCovariance | None = None,
-        unit: float = 1.0,
+        self, points: Array, prior: HyperPrior, *, known: PriorCovariance | None = None, unit: float = 1.0
     ) -> None:
         """Select the terms of the model.
 

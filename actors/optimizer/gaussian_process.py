@@ -152,13 +152,7 @@ class GaussianProcess:
     """
 
     def __init__(
-        self,
-        costs: Array,
-        covariance: Covariance,
-        *,
-        mean: Mean,
-        scale: float,
-        estimated_mean: bool = False,
+        self, costs: Array, covariance: Covariance, *, mean: Mean, scale: float, estimated_mean: bool = False
     ) -> None:
         """Fit.
 
@@ -236,12 +230,7 @@ class GaussianProcess:
         return np.asarray(self.scale**2 * (self.covariance_terms.between(theta, first, second) - V.T @ W))
 
 
-def constant_mean_process(
-    points: Array,
-    costs: Array,
-    *,
-    prior: HyperPrior = CONSTANT_PRIOR,
-) -> GaussianProcess:
+def constant_mean_process(points: Array, costs: Array, *, prior: HyperPrior = CONSTANT_PRIOR) -> GaussianProcess:
     """GP whose prior mean is the mean of the data: (n, dimension), (n,)."""
     centre = float(costs.mean())
     mean, scale = _constant(centre), _scale(costs - centre, costs)
@@ -257,11 +246,7 @@ def zero_mean_process(points: Array, costs: Array) -> GaussianProcess:
     return GaussianProcess(costs, Covariance(points, CONSTANT_PRIOR), mean=_constant(0.0), scale=_scale(costs, costs))
 
 
-def simulated_mean_process(
-    simulated: GaussianProcess,
-    points: Array,
-    costs: Array,
-) -> GaussianProcess:
+def simulated_mean_process(simulated: GaussianProcess, points: Array, costs: Array) -> GaussianProcess:
     """GP of the real cost around a surrogate of the simulated one: f_r = f_s + δ, f_s ~ `simulated`'s posterior.
 
     The prior mean is the simulated surrogate's posterior mean. The prior covariance is its posterior covariance plus

@@ -51,13 +51,7 @@ from scipy.special import ndtr
 from actors.optimizer import acquisition
 from actors.optimizer.feasible_region import Feasibility, Region
 from actors.optimizer.model_discrepancy import LEAST_CHANCE, RESOLUTION, ModelAveragedProcess, clipped_mean, shortfall
-from actors.optimizer.questions import (
-    BenchOffset,
-    DiscrepancyFound,
-    ModelDiscrepancy,
-    PourQuery,
-    found_good,
-)
+from actors.optimizer.questions import BenchOffset, DiscrepancyFound, ModelDiscrepancy, PourQuery, found_good
 from actors.optimizer.surrogate_models import QueryArrays, tuples
 
 Array = NDArray[np.float64]

@@ -60,6 +60,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,13 +175,7 @@ class Hypotheses:
     origin: Array
 
     @classmethod
-    def of(
-        cls,
-        discrepancy: ModelDiscrepancy,
-        centre: Array,
-        latent: Array,
-        contrary: NDArray[np.bool_],
-    ) -> Hypotheses:
+    def of(cls, discrepancy: ModelDiscrepancy, centre: Array, latent: Array, contrary: NDArray[np.bool_]) -> Hypotheses:
         """Return the hypotheses of latent variables (J, `latent_size`), a priori standard normal; with `drift_size`
         further ones the bench may drift.
         """
@@ -398,10 +393,7 @@ class ModelAveragedProcess:
         sample = sample % J
         self._kept = self._all.only(sample)
         if len(points):
-
-            def make(moved: Array) -> Hypotheses:
-                return Hypotheses.of(discrepancy, centre, moved, contrary[sample])
-
+            make = partial(Hypotheses.of, discrepancy, centre, contrary=contrary[sample])
             self._kept = self._resampled(latent[sample], self._kept, counting, make)
         self.mixture = np.concatenate([np.full(KEPT, informed.sum() / KEPT), uninformative.sum(axis=0)])
         self._kernel = self._kept.kernel.with_uninformative()

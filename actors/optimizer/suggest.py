@@ -268,11 +268,7 @@ def _candidates(arrays: QueryArrays, model: Model, rng: np.random.Generator) -> 
 
 
 def _search(
-    query: ProposalQuery,
-    arrays: QueryArrays,
-    model: Model,
-    feasibility: Feasibility | None,
-    rng: np.random.Generator,
+    query: ProposalQuery, arrays: QueryArrays, model: Model, feasibility: Feasibility | None, rng: np.random.Generator
 ) -> Array:
     """`count` minimisers of the acquisition, each avoiding the pending points and the ones before it."""
     chosen: list[Array] = []

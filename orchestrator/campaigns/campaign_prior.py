@@ -111,25 +111,22 @@ class WeighedPairSettings(Settings):
     action: Annotated[dict[Text, float], Example("{angular_velocity: 1.2, x_offset: 0.1, height: 0.1}")]
     """The action [SI]; dimensions that are switched off are left out."""
 
-    poured: Annotated[float, Example("0.98")]
+    poured: Annotated[float, Field(ge=0.0, le=1.0), Example("0.98")]
     """Fraction of the load that left the pourer."""
 
-    measured: Annotated[float, Example("0.12")]
+    measured: Annotated[float, Field(ge=0.0, le=1.0), Example("0.12")]
     """Spilled / poured, weighed."""
 
-    simulated: Annotated[float, Example("0.14")]
+    simulated: Annotated[float, Field(ge=0.0, le=1.0), Example("0.14")]
     """Spilled / poured, simulated."""
 
     def check_values(self, problems: Problems) -> None:
-        """Check the action, and that the others are fractions."""
+        """Check the action."""
         if problems.valid("action"):
             try:
                 self.pair()
             except (TypeError, ValueError) as error:
                 problems.add(str(error), "action")
-        for name in ("poured", "measured", "simulated"):
-            if problems.valid(name) and not 0.0 <= getattr(self, name) <= 1.0:
-                problems.add(f"{getattr(self, name):g} is not between 0 and 1", name)
 
     @classmethod
     def of(cls, pair: WeighedPair) -> WeighedPairSettings:

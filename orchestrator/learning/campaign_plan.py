@@ -317,8 +317,8 @@ class CalibrationEvidence:
         lines: the used pours, and the reasons why others are not used, one text each.
     """
 
-    pours: tuple[CalibrationPours, ...]
-    lines: tuple[str, ...]
+    pours: tuple[CalibrationPours, ...] = ()
+    lines: tuple[str, ...] = ()
 
     def __add__(self, other: CalibrationEvidence) -> CalibrationEvidence:
         return CalibrationEvidence(self.pours + other.pours, self.lines + other.lines)

@@ -60,10 +60,8 @@ def _panel(axes: Axes, chart: LaboratoryChart) -> None:
         any(v.begun <= point.time and (v.ended is None or point.time < v.ended) for v in chart.violations)
         for point in points
     ]
-    for state, colour in ((False, style.MEASURED), (True, style.BEST)):
-        chosen = [(x, y) for x, y, is_out in zip(times, values, out, strict=True) if is_out is state]
-        if chosen:
-            axes.plot(*zip(*chosen, strict=True), "o", color=colour, markersize=3.5, zorder=3)
+    colours = [style.BEST if is_out else style.MEASURED for is_out in out]
+    axes.scatter(times, values, s=12, c=colours, linewidths=1.0, zorder=3)  # type: ignore[arg-type]
     unit = "standard deviations" if several or chart.unit == "SD" else chart.unit
     lasting = chart.lasting
     title = (

@@ -290,10 +290,7 @@ def deployment_stages(plan: CampaignPlan, deployment: DeploymentPlan) -> list[St
 
 
 def prediction_stages(
-    plan: CampaignPlan,
-    deployment: DeploymentPlan,
-    seeds: int,
-    thetas: Sequence[SimulationParameters] = (),
+    plan: CampaignPlan, deployment: DeploymentPlan, seeds: int, thetas: Sequence[SimulationParameters] = ()
 ) -> list[StageDefinition]:
     """One stage for each receiver, which simulates its recommended pour again with new seeds.
 
@@ -409,7 +406,7 @@ def with_evidence(
     not contradict, as evidence about the simulator."""
     if not deployment.settings.learns_offsets:
         return deployment
-    memory, evidence = deployment.memory, CalibrationEvidence((), ())
+    memory, evidence = deployment.memory, CalibrationEvidence()
     if calibration is not None and EVALUATION in results:
         weighed = [*measured_pours(calibration, results), *_recorded(calibration.transfer)]
         scores, searched = result_of(results, EVALUATION, Scores), len(calibrated_theta(results).searched)

@@ -39,14 +39,7 @@ __all__ = ["REPORT", "Pours", "summary_of"]
 
 
 def violated_charts(state: Path) -> list[LaboratoryChart]:
-    """The control charts of all laboratories that have left their limits.
-
-    Args:
-        state: the state directory.
-
-    Raises:
-        RunError, OSError: the catalogue can't be read.
-    """
+    """The control charts of all laboratories that have left their limits. Raises RunError and OSError."""
     with Catalogue(state) as catalogue:
         catalogue.refresh()
         return [chart for chart in catalogue.charts({}) if chart.lasting is not None]

@@ -101,10 +101,10 @@ def calibration_evidence(
     plain = scores.gain is not None and scores.gain.recommended == UNCALIBRATED and UNCALIBRATED in scores.thetas
     chosen = [pair for pair in scores.pairs if pair.theta == (UNCALIBRATED if plain else CALIBRATED)]
     train = sum(pair.split == "train" and pair.simulated is not None for pair in chosen)
-    evidence = CalibrationEvidence((), ())
+    evidence = CalibrationEvidence()
     if not plain and 0 < train <= searched:
         text = f"not used: {train} training pours of the calibration, to which {searched} parameters were fitted"
-        evidence = CalibrationEvidence((), (text,))
+        evidence = CalibrationEvidence(lines=(text,))
     pairs = weighed_pairs(weighed, chosen, 0 if plain else searched)
     scenes = {place.name: place for place in calibration.poured}
     scenes |= {records.scene.name: records.scene for records in (calibration.records, calibration.transfer) if records}
@@ -112,9 +112,9 @@ def calibration_evidence(
         at, rows = scenes[name], [pair for pair in pairs if pair.into == name]
         into = f"calibration pours into {at.receiver.name}"
         if at.liquid.model_copy(update={"name": scene.liquid.name}) != scene.liquid:
-            evidence += CalibrationEvidence((), (f"not used: {len(rows)} {into}: another liquid or amount",))
+            evidence += CalibrationEvidence(lines=(f"not used: {len(rows)} {into}: another liquid or amount",))
         elif at.pourer.shape != scene.pourer.shape:
-            evidence += CalibrationEvidence((), (f"not used: {len(rows)} {into}: poured from another vessel",))
+            evidence += CalibrationEvidence(lines=(f"not used: {len(rows)} {into}: poured from another vessel",))
         else:
             same = (digest := scene_digest(at)) is not None and digest == scene_digest(scene)
             costing = Costing.of(deployment, at, parameters)
@@ -130,7 +130,7 @@ def memory_evidence(
     Everything was set up again since then. So the errors of all are those of another receiver, and with the probability
     1 − `RELIANCE`, with which a calibration doubts a memory, too, they say nothing.
     """
-    evidence, pours = CalibrationEvidence((), ()), memory.pours or ()
+    evidence, pours = CalibrationEvidence(), memory.pours or ()
     costing = Costing.of(deployment, scene, parameters)
     for name in dict.fromkeys(pair.into for pair in pours):
         rows = [pair for pair in pours if pair.into == name]
@@ -151,7 +151,7 @@ def _evidence(
                 near.append((point, *(_cost(costing, pair, spillage) for spillage in (pair.measured, pair.simulated))))
     if len(near) < LEAST_POURS:
         text = f"only {len(near)} are close to the deployment's actions, and {LEAST_POURS} are needed"
-        return CalibrationEvidence((), (f"not used: {len(pairs)} {into}: {text}",))
+        return CalibrationEvidence(lines=(f"not used: {len(pairs)} {into}: {text}",))
     count = min(len(near), MOST_POURS)
     points, costs, simulated = zip(*(near[i * len(near) // count] for i in range(count)), strict=True)
     error = math.fsum(abs(a - b) for a, b in zip(costs, simulated, strict=True)) / count / costing.worst

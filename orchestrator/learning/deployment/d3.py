@@ -9,22 +9,12 @@ from __future__ import annotations
 from functools import partial
 from typing import Annotated, Literal
 
-from actors.optimizer.questions import (
-    FOUND,
-    Limit,
-    MinimumQuery,
-    Suggestion,
-    found_good,
-)
+from actors.optimizer.questions import FOUND, Limit, MinimumQuery, Suggestion, found_good
 from orchestrator.learning.campaign_plan import DeploymentPlan, Premises
 from orchestrator.learning.deployment.deployment_base import MAP_RESOLUTION, Deployment
 from orchestrator.learning.deployment.deployment_ledger import SearchSettings
 from orchestrator.learning.deployment.deployment_result import Deployed
-from orchestrator.learning.deployment.model_monitoring import (
-    RiskLimitSettings,
-    Rules,
-    StopSettings,
-)
+from orchestrator.learning.deployment.model_monitoring import RiskLimitSettings, Rules, StopSettings
 from orchestrator.learning.deployment.pour_choice import PourChoice
 from orchestrator.learning.requests import Decision
 from orchestrator.learning.strategy import Progress, Strategy

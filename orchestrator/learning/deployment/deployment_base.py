@@ -17,16 +17,7 @@ from orchestrator.learning.deployment.deployment_ledger import MAX_REFUSED, Depl
 from orchestrator.learning.deployment.deployment_result import Deployed, Recommended, SimulatedAction
 from orchestrator.learning.deployment.model_monitoring import Believed
 from orchestrator.learning.deployment.real_pours import PredictionCheck, expecting, scaled_interval, trust
-from orchestrator.learning.requests import (
-    Decision,
-    Outcome,
-    Pour,
-    Prediction,
-    Request,
-    Simulate,
-    Slots,
-    Suggest,
-)
+from orchestrator.learning.requests import Decision, Outcome, Pour, Prediction, Request, Simulate, Slots, Suggest
 from orchestrator.learning.stage_result import displayed_map
 from orchestrator.learning.strategy import Progress
 from orchestrator.learning.trials import OptimizerQueries, SeedStream, Trial

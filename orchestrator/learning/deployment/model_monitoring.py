@@ -137,16 +137,16 @@ class Rules:
 
 
 class SimulatorMonitor:
-    """Records the conclusions about the simulator, and decides whether a proposed pour is made."""
+    """Records the conclusions about the simulator in `decisions`, and decides whether a proposed pour is made."""
 
-    def __init__(self, rules: Rules, actions: Space, worst: float) -> None:
+    def __init__(self, rules: Rules, actions: Space, worst: float, decisions: list[Decision]) -> None:
         self._rules, self._actions, self._worst = rules, actions, worst
         self._after: list[Belief] = []
         self._latest: DiscrepancyFound | None = None
         self._changed: int | None = None
         self._announced = -SAME_CHANGE
         self._alarmed = self._accepted = self._drifted = False
-        self.decisions: list[Decision] = []
+        self.decisions = decisions
 
     # -- what is logged --------------------------------------------------------------------------------------------
 
@@ -163,9 +163,8 @@ class SimulatorMonitor:
         if latest.drifts is not None and not self._drifted:
             self._drifted = True
             text = "the bench drifts"
-            if paces := [
-                _pace(axis, drift) for axis, drift in zip(self._actions.axes, latest.drifts, strict=True) if drift
-            ]:
+            pairs = zip(self._actions.axes, latest.drifts, strict=True)
+            if paces := [_difference(axis, _in_si(axis, drift, 0.0)) for axis, drift in pairs if drift]:
                 text += f": with every pour, it is as if {' and '.join(paces)} than before"
             self.decisions.append(Decision(f"{text}; older pours count less", urgent=True))
         if self._after and self._after[-1].pour == number:
@@ -187,11 +186,8 @@ class SimulatorMonitor:
             text += f"; since pour {self._changed} the bench behaves differently"
         if share >= WORDS[-2][0]:
             return text
-        moved = [
-            _moved(axis, offset) for axis, offset in zip(self._actions.axes, self._shifts(), strict=True)
-            if abs(offset.mean) > offset.deviation
-        ]  # fmt: skip
-        if moved:
+        pairs = zip(self._actions.axes, self._shifts(), strict=True)
+        if moved := [_difference(axis, offset) for axis, offset in pairs if abs(offset.mean) > offset.deviation]:
             text += f"; the pours look as if {' and '.join(moved)} than commanded"
         if abs(math.log(self._latest.factor)) > 0.2:
             text += f"; {self._latest.factor:.2g} times the predicted loss"
@@ -292,24 +288,13 @@ def _in_si(axis: Axis, shift: float, deviation: float) -> Displaced:
     return Displaced(mean=shift * width, deviation=deviation * width)
 
 
-def _moved(axis: Axis, offset: Displaced) -> str:
-    """'x_offset were 6 ± 2 mm more'."""
-    factor, unit, sense = _shown(axis, offset.mean)
-    return f"{axis.name} were {abs(offset.mean) / factor:.2g} ± {offset.deviation / factor:.1g}{unit} {sense}"
-
-
-def _pace(axis: Axis, drift: float) -> str:
-    """'x_offset were about 0.2 mm more'."""
-    offset = _in_si(axis, drift, 0.0)
-    factor, unit, sense = _shown(axis, offset.mean)
-    return f"{axis.name} were about {abs(offset.mean) / factor:.1g}{unit} {sense}"
-
-
-def _shown(axis: Axis, shift: float) -> tuple[float, str, str]:
-    """Factor and text of the unit in which a shift is displayed, and its sense."""
+def _difference(axis: Axis, offset: Displaced) -> str:
+    """'x_offset were 6 ± 2 mm more'; without a deviation 'x_offset were about 6 mm more'."""
     dimension = ACTION_DIMENSIONS.get(axis.name)
     factor, unit = (1.0, "") if dimension is None else (dimension.factor, f" {dimension.display_unit}")
-    return factor, unit, "more" if shift > 0.0 else "less"
+    size, deviation = abs(offset.mean) / factor, offset.deviation / factor
+    shown = f"{size:.2g} ± {deviation:.1g}" if deviation else f"about {size:.1g}"
+    return f"{axis.name} were {shown}{unit} {'more' if offset.mean > 0.0 else 'less'}"
 
 
 def _percent(share: float) -> str:

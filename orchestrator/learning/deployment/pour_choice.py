@@ -27,19 +27,15 @@ class PourChoice:
         ended: reason why no further pour is made; None if they go on.
     """
 
-    def __init__(
-        self,
-        requests: DeploymentRequests,
-        simulated: Callable[[], Data],
-        rules: Rules | None,
-    ) -> None:
+    def __init__(self, requests: DeploymentRequests, simulated: Callable[[], Data], rules: Rules | None) -> None:
         self._requests, self._ledger, self._plan = requests, requests.ledger, requests.ledger.plan
         self._simulated, self._rules = simulated, rules
         worst = self._ledger.costing.worst
-        self._monitor = None if rules is None else SimulatorMonitor(rules, self._plan.actions, worst)
+        decisions = self._ledger.decisions
+        self._monitor = None if rules is None else SimulatorMonitor(rules, self._plan.actions, worst, decisions)
         evidence = None if rules is None else self._plan.evidence
         self._calibration = () if evidence is None else evidence.pours
-        self._ledger.decisions += [Decision(line) for line in (() if evidence is None else evidence.lines)]
+        decisions += () if evidence is None else map(Decision, evidence.lines)
         self.ended: str | None = None
         requests.warned = rules is not None
 
@@ -90,27 +86,17 @@ class PourChoice:
 
     def judge(self, suggestion: Suggestion, pour: Callable[[Suggestion], None]) -> None:
         """Record the conclusions about the simulator, and make the next pour if they allow it."""
-        monitor = self._monitor
-        if monitor is None or suggestion.discrepancy is None:
-            pour(suggestion)
-            return
         self.record(suggestion)
-        end = monitor.judge(suggestion, self._ledger.pours, self._plan.pours - self._ledger.counted)
-        self._take_decisions(monitor)
-        if end:
-            self.ended = end  # conclude with the data so far
-        else:
+        if self._monitor is not None:
+            left = self._plan.pours - self._ledger.counted
+            self.ended = self._monitor.judge(suggestion, self._ledger.pours, left) or None
+        if self.ended is None:
             pour(suggestion)
 
     def record(self, suggestion: Suggestion) -> None:
         """Record the conclusions about the simulator."""
         if self._monitor is not None and suggestion.discrepancy is not None:
             self._monitor.record(suggestion.discrepancy, self._ledger.pours)
-            self._take_decisions(self._monitor)
-
-    def _take_decisions(self, monitor: SimulatorMonitor) -> None:
-        self._ledger.decisions += monitor.decisions
-        monitor.decisions.clear()
 
     def result(self, report: DeploymentReport) -> Deployed:
         """The result so far, with the conclusions about simulator and bench."""

@@ -377,7 +377,7 @@ def test_of_very_many_earlier_runs_the_newest_pours_are_enough(state: Path, tmp_
 
 @pytest.mark.parametrize(
     ("change", "problem"),
-    [({"action": {"x_offset": 9.0}}, "x_offset"), ({"poured": 1.2}, "1.2 is not between 0 and 1")],
+    [({"action": {"x_offset": 9.0}}, "x_offset"), ({"poured": 1.2}, "1.2 is too large; at most 1")],
 )
 def test_impossible_pours_in_the_file_of_a_posterior_are_refused(
     tmp_path: Path, change: dict[str, Any], problem: str

@@ -155,7 +155,7 @@ def test_a_bench_that_drifts_is_followed() -> None:
 
 
 def test_a_drift_is_said_once_and_how_fast() -> None:
-    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0)
+    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0, [])
     still = DiscrepancyFound(0.01, (0.0, 0.0), (0.1, 0.1), 1.0)
     for latest in (still, replace(still, drifts=(0.0, 0.003)), replace(still, drifts=(0.0, 0.004))):
         monitor.record(latest, [])
@@ -166,7 +166,7 @@ def test_a_drift_is_said_once_and_how_fast() -> None:
 
 
 def test_on_a_drifting_bench_a_change_is_said_once_and_none_after_the_drift() -> None:
-    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0)
+    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0, [])
     still = DiscrepancyFound(0.01, (0.0, 0.0), (0.1, 0.1), 1.0)
     pours = [PourTrial(number, (0.5, 0.5), {}, None, 0.01, cost=0.1) for number in range(1, 41)]
     # Since pour 21, dated again after an answer without a change; a drift; and a change that the drift explains.
@@ -179,7 +179,7 @@ def test_on_a_drifting_bench_a_change_is_said_once_and_none_after_the_drift() ->
 
 
 def test_a_second_change_long_after_the_first_is_said() -> None:
-    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0)
+    monitor = SimulatorMonitor(Rules(None, "go on", None, None), ACTIONS, 1.0, [])
     still = DiscrepancyFound(0.01, (0.0, 0.0), (0.1, 0.1), 1.0)
     pours = [PourTrial(number, (0.5, 0.5), {}, None, 0.01, cost=0.1) for number in range(1, 41)]
     for made, since in {6: 2, 20: 2}.items():
