@@ -139,10 +139,6 @@ class Liquid(BaseModel):
         return 1e6 * mass / self.density
 
 
-MOST_PARTICLES = 50_000
-"""Largest number of particles of a simulation."""
-
-
 class SimulationParameters(BaseModel):
     """Parameters that calibration may change: θ_s and nuisances of the bench.
 
@@ -154,7 +150,7 @@ class SimulationParameters(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
-    particles: int = Field(default=2_000, ge=200, le=MOST_PARTICLES)
+    particles: int = Field(default=2_000, ge=200, le=50_000)
     """Number of particles at fixed liquid volume; sets the spacing d = (V/N)^(1/3)."""
 
     cohesion: float = Field(default=0.02, ge=0.0, le=0.2, json_schema_extra={"unit": "N/m"})

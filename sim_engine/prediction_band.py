@@ -16,7 +16,7 @@ In other scenes the larger of the residual and the error of coarse particles is 
     in a scene of the calibration:  width² = max(residual² − s², 0) + 2 s² / n
     in another scene:               width² = max(resolution, residual, finer)² + 2 s² / n
 
-`finer` is the shift of a simulation with five times the particles, if there is one; it moves the interval, too. The
+`finer` is the shift of a simulation with many more particles, if there is one; it moves the interval, too. The
 width is that of the normal distribution about each simulation; their mixture is the distribution of the pour. A band
 is the interval of r that contains a single pour with probability `LEVEL`.
 
@@ -185,7 +185,7 @@ def band(
         residual: of the calibration, for the scene of the pour with the vessels as they are known; None without
             calibration.
         level: probability with which a pour lies in it.
-        finer: shift of a simulation with several times the particles; it moves the interval, and is the least
+        finer: shift of a simulation with many more particles; it moves the interval, and is the least
             standard deviation of what still finer ones would add. 0 without one.
 
     Raises:

@@ -32,7 +32,7 @@ from orchestrator.learning.stage_result import StageResult, WeighedMasses, weigh
 from orchestrator.learning.strategy import Progress
 from orchestrator.learning.trials import SeedStream
 from sim_engine.action import Action
-from sim_engine.liquids import MOST_PARTICLES, SimulationParameters
+from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourMeasurement, PourOutcome
 from sim_engine.prediction_band import (
     CalibrationResidual,
@@ -44,8 +44,8 @@ from sim_engine.prediction_band import (
 )
 from sim_engine.scene import PoseError, Scene
 
-FINER = 5
-"""Factor of the number of particles of the simulation that shows how much the resolution matters."""
+FINE = 20_000
+"""Number of particles of the simulation that shows how much the resolution matters."""
 
 
 class WeighedPour(WeighedMasses):
@@ -167,8 +167,8 @@ class RepeatedSimulation:
     the selection give an unbiased prediction, and the scatter of a single pour around it.
 
     Some fast pours splash the more, the finer the particles. If pours are mirrored and the scene is not one of the
-    calibration, whose residual contains the resolution, the first simulation is repeated with `FINER` times the
-    particles, and the prediction interval contains the difference.
+    calibration, whose residual contains the resolution, the first simulation is repeated with `FINE` particles, and the
+    prediction interval contains the difference.
     """
 
     def __init__(
@@ -212,10 +212,10 @@ class RepeatedSimulation:
                 Simulate(scene.name, action, turns[i % len(turns)], s, "predict", missed[i % len(missed)], uncertain)
                 for i, s in enumerate(seeds_of_all)
             ]
-            if scene.mirrored and not (residual is not None and residual.here):
-                first = self._unissued[0]
-                finer = {"particles": min(FINER * first.parameters.particles, MOST_PARTICLES)}
-                self._fine = replace(first, parameters=first.parameters.model_copy(update=finer))
+            first = self._unissued[0]
+            here = residual is not None and residual.here
+            if scene.mirrored and first.parameters.particles < FINE and not here:
+                self._fine = replace(first, parameters=first.parameters.model_copy(update={"particles": FINE}))
                 self._unissued.insert(0, self._fine)
             among = f" and {len(set(thetas))} θ of the posterior" if thetas else ""
             among += f" under {len(errors)} draws of the pose error" if any(errors) else ""

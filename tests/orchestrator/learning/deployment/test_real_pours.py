@@ -174,10 +174,10 @@ def test_what_calibration_left_over_widens_the_band_of_a_planned_pour() -> None:
 
 
 def test_the_band_of_a_mirrored_pour_contains_what_finer_particles_spill() -> None:
-    """A fast pour into a shallow bowl spills 5 % with 2,000 particles, 14 % with 10,000 and 26 % with 40,000."""
+    """A fast pour into a shallow bowl spills 5 % with 2,000 particles, 21 % with 20,000 and 33 % with 80,000."""
 
     def splash(_: Action, parameters: SimulationParameters, rng: np.random.Generator) -> float:
-        return (0.14 if parameters.particles == 10_000 else 0.05) + 0.003 * rng.standard_normal()
+        return (0.21 if parameters.particles == 20_000 else 0.05) + 0.003 * rng.standard_normal()
 
     bands = {}
     here = CalibrationResidual(0.1, here=True)  # its pours were weighed in this scene: it contains the resolution
@@ -196,9 +196,9 @@ def test_the_band_of_a_mirrored_pour_contains_what_finer_particles_spill() -> No
     assert whole is not None
     assert mirrored is not None
     assert weighed is not None
-    assert mirrored.holds(0.26)
-    assert not whole.holds(0.26)
-    assert not weighed.holds(0.26)
+    assert mirrored.holds(0.33)
+    assert not whole.holds(0.33)
+    assert not weighed.holds(0.33)
     assert mirrored.resolution > whole.resolution > weighed.resolution == 0.0
 
 
