@@ -29,8 +29,10 @@ from typing import Any
 import numpy as np
 from machine import KeptRows, write_table
 
+from orchestrator.learning import single_action
 from sim_engine.fluid import engine
 from sim_engine.liquids import SimulationParameters
+from sim_engine.prediction_band import band, shift_of
 from sim_engine.scene import MIRRORED_FROM
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation.convergence import POURS, ConvergencePour, has_converged, spillage
@@ -38,6 +40,8 @@ from sim_engine.validation.convergence import POURS, ConvergencePour, has_conver
 CONVERGED = 0.02
 FINE = 10_000
 """Number of particles whose whole pours are the reference of `--halves`."""
+PLANNED, SEEDS, FINE_ONE = 2_000, 5, single_action.FINE
+"""Of a plan: particles and number of its simulations, and particles of the finer one."""
 
 
 def table(made: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
@@ -105,8 +109,11 @@ def differences(made: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]
 
 
 def finest(made: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Return head and rows: mean spillage of the pours that do not converge, by number of particles, mirrored."""
-    numbers = sorted({row["particles"] for row in made if row.get("mirrored")})
+    """Return head and rows: mean spillage of the pours that do not converge, by number of particles, mirrored.
+
+    The last column is the 90 % interval of a plan with `PLANNED` particles and one simulation of `FINE_ONE`.
+    """
+    numbers = sorted({row["particles"] for row in made if row.get("mirrored")} - {PLANNED})
     rows = []
     for pour in POURS:
         cells = []
@@ -116,8 +123,13 @@ def finest(made: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
             ]
             cells.append(f"{np.mean(values):.3f} ({min(values):.3f} … {max(values):.3f})" if values else "")
         if any(cells):
-            rows.append([pour.name, *cells])
-    return ["pour", *(f"{n:,}" for n in numbers)], rows
+            first, fine = (
+                {r["seed"]: r["spillage"] for r in made if (r["pour"], r["particles"]) == (pour.name, n)}
+                for n in (PLANNED, FINE_ONE)
+            )
+            finer = shift_of(fine[min(fine)], PLANNED) - shift_of(first[min(first)], PLANNED)
+            rows.append([pour.name, *cells, band(list(first.values()), PLANNED, finer=finer).percent()])
+    return ["pour", *(f"{n:,}" for n in numbers), f"interval of a plan with {PLANNED:,}"], rows
 
 
 def simulate(
@@ -169,7 +181,8 @@ def main() -> None:
                 if n >= MIRRORED_FROM or not half:
                     simulate(kept, POURS[:8], n, seed, half)
         elif options.fine:
-            for n, seed in itertools.product(fine, seeds):
+            planned = [(PLANNED, seed) for seed in range(seeds[0], seeds[0] + SEEDS)]
+            for n, seed in [*planned, *itertools.product(fine, seeds)]:
                 simulate(kept, [pour for pour in POURS if not has_converged(pour)], n, seed, True)
         else:
             for n, seed in [*itertools.product(numbers, seeds), *((n, seeds[0]) for n in fine)]:
