@@ -141,7 +141,7 @@ def simulate(
     for pour in pours:
         key = {"pour": pour.name, "particles": particles, "seed": seed} | ({"mirrored": True} if mirrored else {})
         if all(row | key != row or row.get("mirrored", False) != mirrored for row in kept.rows):
-            spilled, cpu_s = spillage(simulator(), pour, theta, seed, mirrored or None)
+            spilled, cpu_s = spillage(simulator(), pour, theta, seed, mirrored)
             kept.add({**key, "spillage": round(spilled, 5), "cpu_s": round(cpu_s, 5)})
 
 

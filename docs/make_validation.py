@@ -14,7 +14,7 @@ import json
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,12 @@ AGAIN = "decant validate-solver --json"
 REFERENCES = (("--", "o"), (":", "s"), ("-.", "^"), ((0, (6, 2)), "D"))
 """Line style, or marker for few points, of several references in a panel."""
 
+MIRRORED = ", mirrored"
+"""End of the names of what is measured with half of a liquid and its mirror image."""
+
+SHORT_DASHES = (0, (2, 1))
+"""Style of curves of mirrored liquids."""
+
 INTRODUCTION = """# Validation
 
 <!-- written by docs/make_validation.py; edit the cases, not this page -->
@@ -64,7 +70,8 @@ recordings](recordings.md). All values are in [validation.json](../data/validati
 has the values that fail; if all pass, the one with the largest difference from its reference.
 
 θ of all cases unless they say otherwise: {theta}.
-N is the number of particles.
+N is the number of particles. In *mirrored* rows one half of the liquid is simulated and the other is its mirror image,
+as pours of 2,000 particles and more are; the criteria are those of the whole liquid.
 """
 
 
@@ -111,11 +118,13 @@ class CaseFigureStyle:
 
 
 def _curve_styles(figure: Figure) -> dict[str, CaseFigureStyle]:
-    """Styles by name. Measured curves differ in colour; references have their subject's colour and another style."""
+    """Styles by name. Measured curves differ in colour; references have their subject's colour and another style, and
+    mirrored liquids the colour of the whole ones."""
     shades = figure_style.MEASURED, figure_style.PREDICTED, figure_style.GOOD
     colours = (*shades, figure_style.BEST, figure_style.FALLING, figure_style.ESCAPED)
-    measured = list(dict.fromkeys(s.name for s in figure.series if s.kind == "measured"))
+    measured = list(dict.fromkeys(s.name.removesuffix(MIRRORED) for s in figure.series if s.kind == "measured"))
     styles = {name: CaseFigureStyle(colour) for name, colour in zip(measured, colours * 4, strict=False)}
+    styles |= {name + MIRRORED: replace(style, line=SHORT_DASHES) for name, style in styles.items()}
     of_subject = {_subject(name): styles[name].colour for name in reversed(measured)}
     references = iter(REFERENCES * 4)
     for series in figure.series:
@@ -227,7 +236,9 @@ def _criteria(case: str, record: Mapping[str, Any]) -> list[str]:
         if m["judged"]:
             row = next((row for row in rows if _comparable(row[-1], m)), None)
             if row is None:
-                rows.append([m])
+                whole = {**m, "name": m["name"].removesuffix(MIRRORED)}
+                place = next((k for k, row in enumerate(rows, 1) if _comparable(row[-1], whole)), len(rows))
+                rows.insert(place, [m])
             else:
                 row.append(m)
     anchor = re.sub(r"[^\w -]", "", record["title"].lower()).replace(" ", "-")

@@ -19,7 +19,7 @@ from orchestrator.reports import figure_style as style
 from orchestrator.reports.figure_style import INK
 from sim_engine import solver_fingerprint as sources
 from sim_engine.validation import cases as suite
-from sim_engine.validation.case_result import Figure, Series, reported, within
+from sim_engine.validation.case_result import CaseEffort, Figure, Measurement, Series, reported, within
 from tests.orchestrator.extra_commands.test_physics_command import FIGURE, a_case, height, two_cases  # noqa: F401
 from tests.support.example_results import strays
 
@@ -87,6 +87,26 @@ def test_quantities_that_differ_in_one_word_share_a_row_with_the_values_that_fai
     assert make_validation.page_text({"kept": record}, "", "same").count("| 1 of 1 |") == 2
 
 
+def test_a_mirrored_liquid_has_its_row_below_that_of_the_whole_one_and_its_curve_the_same_colour(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def work(simulator: object, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+        return [height(0.05 if effort.mirrored else 0.0397), replace(height(0.04), name="depth", criterion="")], FIGURE
+
+    case = suite.Case("kept", "Kept", "Liquid.", work)
+    record = case_record(case, case.run(None, *case.efforts(full=True)))  # type: ignore[arg-type]
+    page = make_validation.page_text({"kept": {**record, "solver": "same", "image": None}}, "", "same")
+    rows = [line.split(" | ")[1:4] for line in page.splitlines() if line.startswith("| [kept]")]
+    assert [row[0] for row in rows] == ["height", "height, mirrored", "depth", "depth, mirrored"]
+    assert [row[2] for row in rows[:2]] == ["39.7 mm", "50 mm (**fails**)"]
+    assert "3 of 4 criteria are met" in page
+    drawn = saved(make_validation.figure_of(record), monkeypatch).axes[0].get_lines()
+    assert [line.get_label() for line in drawn] == ["2,000 particles", "theory", "2,000 particles, mirrored"]
+    whole, _, mirrored = drawn
+    assert (mirrored.get_color(), mirrored.get_linestyle()) == (whole.get_color(), "--")
+    assert whole.get_linestyle() == "-"
+
+
 @pytest.mark.slow
 def test_many_panels_go_into_rows(tmp_path: Path) -> None:
     from matplotlib.image import imread
@@ -140,7 +160,7 @@ def test_the_legend_lies_on_no_curve_and_no_number_is_tiny(panels: int, monkeypa
 
 def test_a_figure_is_drawn_again_from_what_is_kept_of_it() -> None:
     case = a_case("good", height(0.0397), figure=FIGURE)
-    record = case_record(case, case.run(None, suite.CaseEffort()))  # type: ignore[arg-type]
+    record = case_record(case, case.run(None, CaseEffort()))  # type: ignore[arg-type]
     assert make_validation.figure_of(json.loads(json.dumps(record))) == FIGURE
     assert make_validation.figure_of({**record, "figure": None}) is None
 

@@ -27,7 +27,12 @@ SHOWN_UNITS = {"1": (1.0, ""), "m": (1e3, "mm"), "m³": (1e6, "mL")}
 
 def validate_solver(
     cases: Annotated[list[str] | None, typer.Argument(help="Names of cases; default: all.")] = None,
-    full: Annotated[bool, typer.Option("--full", help="Use all resolutions and seeds; takes several minutes.")] = False,
+    full: Annotated[
+        bool,
+        typer.Option(
+            "--full", help="Use all resolutions and seeds, of whole and of mirrored liquids; takes half an hour."
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Validate the solver against theory, experiments and other solvers; each case has a criterion.
@@ -39,7 +44,6 @@ def validate_solver(
     from orchestrator.reports.console_view import PLAIN_WIDTH
     from sim_engine.simulator import PourSimulator
     from sim_engine.solver_fingerprint import solver_fingerprint
-    from sim_engine.validation.cases import CaseEffort
 
     chosen = _chosen(cases or [])
     records: dict[str, dict[str, Any]] = {}
@@ -48,7 +52,7 @@ def validate_solver(
         for case in chosen:
             print_message(f"{case.name}: {case.title} …")
             with stdout_for_results():
-                result = case.run(simulator, CaseEffort(full))
+                result = case.run(simulator, *case.efforts(full))
             records[case.name] = case_record(case, result)
     finally:
         simulator.close()

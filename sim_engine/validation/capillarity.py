@@ -20,8 +20,16 @@ from numpy.typing import NDArray
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import SimulationParameters
 from sim_engine.simulator import PourSimulator
-from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, reported, within
-from sim_engine.validation.container_runs import DENSITY, EMPTY_SPACE, block, box, run
+from sim_engine.validation.case_result import (
+    CaseEffort,
+    Figure,
+    Measurement,
+    Series,
+    at_most,
+    reported,
+    within,
+)
+from sim_engine.validation.container_runs import DENSITY, EMPTY_SPACE, block, box, run, symmetric
 from sim_engine.validation.sloshing import fit_oscillation
 
 Floats = NDArray[np.float64]
@@ -45,11 +53,14 @@ def capillary_step(d: float, tension: float) -> float:
     return CAPILLARY * math.sqrt(DENSITY * d**3 / (2.0 * math.pi * tension))
 
 
-def _lattice(d: float, count: int) -> Floats:
-    """A cube of count³ particles about the origin, slightly jittered."""
+def _lattice(d: float, count: int, mirrored: bool) -> Floats:
+    """A cube of count³ particles about the origin, slightly jittered, with an even number of layers along y if it is
+    symmetric."""
     axis = (np.arange(count) - 0.5 * (count - 1)) * d
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    return points + np.random.default_rng(1).uniform(-0.05, 0.05, points.shape) * d
+    along = axis + 0.5 * d * (count % 2) if mirrored else axis
+    points = np.stack(np.meshgrid(axis, along, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    points += np.random.default_rng(1).uniform(-0.05, 0.05, points.shape) * d
+    return symmetric(points, points[:, 1] > 0.0) if mirrored else points
 
 
 def surface_radii(points: Floats, directions: int = 300) -> Floats:
@@ -73,24 +84,23 @@ def surface_radii(points: Floats, directions: int = 300) -> Floats:
     return surface
 
 
-def cube_to_sphere(particles: int, parameters: SimulationParameters) -> list[Measurement]:
+def cube_to_sphere(particles: int, parameters: SimulationParameters, mirrored: bool = False) -> list[Measurement]:
     """Release a cube without gravity.
 
     Args:
         particles: N, approximately.
         parameters: θ; its tension is replaced by water's.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    from sim_engine.fluid.engine import engine
-
     volume = 4.0 / 3.0 * math.pi * RADIUS**3
     n = round(particles ** (1.0 / 3.0))
     d = volume ** (1.0 / 3.0) / n
-    cube = _lattice(d, n)
+    cube = _lattice(d, n, mirrored)
     theta = parameters.model_copy(update={"cohesion": TENSION})
     step = capillary_step(d, TENSION)
-    radii = surface_radii(cube)
-    for _ in run(cube, d, EMPTY_SPACE, theta, np.array([0.5]), gravity=0.0, longest_step=step):
-        radii = surface_radii(engine().particles()[0].astype(float))
+    times = np.array([0.5])
+    ((_, drop),) = run(cube, d, EMPTY_SPACE, theta, times, gravity=0.0, longest_step=step, mirrored=mirrored)
+    radii = surface_radii(drop.positions)
     return [
         at_most(
             "cube after 0.5 s: farthest from the mean radius, in spacings",
@@ -102,28 +112,29 @@ def cube_to_sphere(particles: int, parameters: SimulationParameters) -> list[Mea
     ]
 
 
-def oscillation(particles: int, parameters: SimulationParameters) -> tuple[list[Measurement], list[Series], float]:
+def oscillation(
+    particles: int, parameters: SimulationParameters, mirrored: bool = False
+) -> tuple[list[Measurement], list[Series], float]:
     """Release a stretched drop without gravity.
 
     Args:
         particles: N, approximately.
         parameters: θ; its tension is replaced by water's.
+        mirrored: whether only the half y ≥ 0 is simulated.
 
     Returns:
         Measurements, curves and the tension that corresponds to the frequency [N/m].
     """
-    from sim_engine.fluid.engine import engine
-
     d = (4.0 / 3.0 * math.pi * RADIUS**3 / particles) ** (1.0 / 3.0)
-    lattice = _lattice(d, round(2.8 * RADIUS / d))
+    lattice = _lattice(d, round(2.8 * RADIUS / d), mirrored)
     scale = np.array([STRETCH**-0.5, STRETCH**-0.5, STRETCH])
     drop = lattice[np.linalg.norm(lattice / scale, axis=1) < RADIUS]
     theta = parameters.model_copy(update={"cohesion": TENSION})
     times = np.arange(0.002, WATCHED, 0.002)
     stretch = np.empty(len(times))
     step = capillary_step(d, TENSION)
-    for k in run(drop, d, EMPTY_SPACE, theta, times, gravity=0.0, longest_step=step):
-        x = engine().particles()[0].astype(float)
+    for k, liquid in run(drop, d, EMPTY_SPACE, theta, times, gravity=0.0, longest_step=step, mirrored=mirrored):
+        x = liquid.positions
         spread = np.mean((x - x.mean(axis=0)) ** 2, axis=0)
         stretch[k] = (spread[2] - 0.5 * (spread[0] + spread[1])) / spread.sum()
     # A drop that never passes the sphere creeps back without oscillation, so it has no frequency.
@@ -186,37 +197,39 @@ def height(angle: float) -> float:
     return 2.0 * math.sqrt(WATER_TENSION / (DENSITY * GRAVITY)) * math.sin(0.5 * angle)
 
 
-def puddle(particles: int, angle: float) -> tuple[float, float, int]:
+def puddle(particles: int, angle: float, mirrored: bool = False) -> tuple[float, float, int]:
     """Height of a puddle after 2 s.
 
     Args:
         particles: N, approximately.
         angle: contact angle [rad].
+        mirrored: whether only the half y ≥ 0 is simulated.
 
     Returns:
         Twice the height of the mass centre [m], spacing [m] and N.
     """
-    from sim_engine.fluid.engine import engine
-
     side = math.sqrt(VOLUME / LAID)
-    start, d = block(np.array([0.04, -side / 2.0, 0.0]), np.array([0.04 + side, side / 2.0, LAID]), particles, 1)
+    low, high = np.array([0.04, -side / 2.0, 0.0]), np.array([0.04 + side, side / 2.0, LAID])
+    start, d = block(low, high, particles, 1, mirrored)
     plane = box(0.08 + side, 0.08 + side, 0.04, 0.5 * d)
     theta = SimulationParameters(cohesion=WATER_TENSION, xsph_rate=0.0)
-    for _ in run(start, d, plane, theta, np.array([2.0]), viscosity=VISCOSITY, no_slip=False, contact_angle=angle):
-        pass
-    return 2.0 * float(engine().particles()[0][:, 2].mean()), d, len(start)
+    ((_, liquid),) = run(
+        start, d, plane, theta, np.array([2.0]), viscosity=VISCOSITY, no_slip=False, contact_angle=angle,
+        mirrored=mirrored,
+    )  # fmt: skip
+    return 2.0 * float(liquid.positions[:, 2].mean()), d, len(start)
 
 
-def wetting(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+def wetting(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     """Puddles of several contact angles."""
-    angles = (60.0, 90.0, 120.0, 150.0) if full else (60.0, 120.0)
+    angles = (60.0, 90.0, 120.0, 150.0) if effort.full else (60.0, 120.0)
     measurements: list[Measurement] = []
     curves: list[Series] = []
-    for particles in (250, 2_000):
+    for particles in effort.numbers((250, 2_000), (250, 2_000), coarse=1):
         values = []
         for degrees in angles:
             right = height(math.radians(degrees))
-            value, d, n = puddle(particles, math.radians(degrees))
+            value, d, n = puddle(particles, math.radians(degrees), effort.mirrored)
             values.append(1e3 * value)
             name = f"height at {degrees:g}°, d = {1e3 * d:.1f} mm"
             if d < 0.8 * right:

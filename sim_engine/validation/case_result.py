@@ -1,4 +1,4 @@
-"""Results of a case: measured quantities with their references, and the curves of its figure."""
+"""Effort and results of a case: measured quantities with their references, and the curves of its figure."""
 
 from __future__ import annotations
 
@@ -6,6 +6,28 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
+
+
+@dataclass(frozen=True)
+class CaseEffort:
+    """The amount of computation.
+
+    Attributes:
+        full: all resolutions and seeds; else the quick subset.
+        mirrored: all of them that pours are mirrored with, and only half of the liquid is simulated.
+    """
+
+    full: bool = False
+    mirrored: bool = False
+
+    def numbers(self, quick: tuple[int, ...], full: tuple[int, ...], coarse: int = 0) -> tuple[int, ...]:
+        """Resolutions of the case.
+
+        Args:
+            quick, full: those of the quick and the full run, increasing.
+            coarse: number of those that have fewer particles than pours are mirrored with.
+        """
+        return full[coarse:] if self.mirrored else full if self.full else quick
 
 
 @dataclass(frozen=True)
@@ -127,11 +149,11 @@ def collected(
 ) -> tuple[list[Measurement], list[Series]]:
     """Measurements and curves of several runs; a curve that several of them have is drawn only once."""
     measurements: list[Measurement] = []
-    curves: dict[tuple[str, str], Series] = {}
+    curves: dict[tuple[str, str, int], Series] = {}
     for of_run, series in runs:
         measurements += of_run
         for curve in series:
-            curves.setdefault((curve.name, curve.kind), curve)
+            curves.setdefault((curve.name, curve.kind, curve.panel), curve)
     return measurements, list(curves.values())
 
 

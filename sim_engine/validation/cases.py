@@ -22,7 +22,7 @@ from sim_engine.validation import (
     wall_tightness,
     whole_pours,
 )
-from sim_engine.validation.case_result import CaseResult, Figure, Measurement, at_least, collected
+from sim_engine.validation.case_result import CaseEffort, CaseResult, Figure, Measurement, at_least, collected
 
 PLAIN = SimulationParameters(cohesion=0.0, xsph_rate=1.0, friction=0.0)
 """θ of the cases, as their references assume. Water's own viscosity has no effect in a cup, a liquid has no dry
@@ -37,17 +37,6 @@ SEEDS = 5
 
 
 @dataclass(frozen=True)
-class CaseEffort:
-    """The amount of computation.
-
-    Attributes:
-        full: all resolutions and seeds; else the quick subset.
-    """
-
-    full: bool = False
-
-
-@dataclass(frozen=True)
 class Case:
     """One case.
 
@@ -56,22 +45,38 @@ class Case:
         title: in tables and pages.
         about: setup, reference and source, in a sentence or two.
         work: runs it.
+        repeated: whether its full run is repeated with the mirrored liquid, by the same criteria.
     """
 
     name: str
     title: str
     about: str
     work: Callable[[PourSimulator, CaseEffort], tuple[list[Measurement], Figure | None]]
+    repeated: bool = True
 
-    def run(self, simulator: PourSimulator, effort: CaseEffort) -> CaseResult:
-        """Run the case and measure its CPU time. A solver that stops with a fault counts as a failed criterion."""
-        begun = time.process_time()
-        try:
-            measurements, figure = self.work(simulator, effort)
-        except ArithmeticError as fault:
-            name = f"the solver ran to the end (1: yes); it stopped {fault}"
-            measurements, figure = [at_least(name, 0.0, 1.0, criterion="yes", particles=0)], None
-        return CaseResult(tuple(measurements), figure, time.process_time() - begun)
+    def efforts(self, full: bool) -> list[CaseEffort]:
+        """Efforts of the quick or the full run."""
+        return [CaseEffort(full), CaseEffort(full, mirrored=True)] if full and self.repeated else [CaseEffort(full)]
+
+    def run(self, simulator: PourSimulator, *efforts: CaseEffort) -> CaseResult:
+        """Run the case with some efforts and measure its CPU time. A solver that stops with a fault counts as a failed
+        criterion. Measurements and curves of a mirrored effort have this word at the end of their names."""
+        begun, figures = time.process_time(), []
+        measurements: list[Measurement] = []
+        for effort in efforts:
+            suffix = ", mirrored" if effort.mirrored else ""
+            try:
+                of_effort, figure = self.work(simulator, effort)
+            except ArithmeticError as fault:
+                name = f"the solver ran to the end (1: yes); it stopped {fault}"
+                of_effort, figure = [at_least(name, 0.0, 1.0, criterion="yes", particles=0)], None
+            measurements += [replace(m, name=m.name + suffix) for m in of_effort]
+            if figure is not None:
+                named = [replace(s, name=s.name + suffix) if s.kind == "measured" else s for s in figure.series]
+                figures.append(replace(figure, series=tuple(named)))
+        _, curves = collected(([], figure.series) for figure in figures)
+        whole = replace(figures[0], series=tuple(curves)) if figures else None
+        return CaseResult(tuple(measurements), whole, time.process_time() - begun)
 
 
 def describe(parameters: SimulationParameters) -> str:
@@ -86,59 +91,54 @@ def describe(parameters: SimulationParameters) -> str:
 
 
 def _at_rest(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    runs = [hydrostatic_cases.at_rest(n, PLAIN) for n in ((2_000, 5_000) if effort.full else (2_000,))]
+    numbers = effort.numbers((2_000,), (2_000, 5_000))
+    runs = [hydrostatic_cases.at_rest(n, PLAIN, mirrored=effort.mirrored) for n in numbers]
     outcome, curves = collected((measurements, figure.series) for measurements, figure in runs)
     return outcome, replace(runs[-1][1], series=tuple(curves))
 
 
 def _retention(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
+    numbers = effort.numbers((500,), (500, 1_000, 2_000, 5_000), coarse=2)
+    runs = [(hydrostatic_cases.straight_cup(), n) for n in numbers]
     if effort.full:
-        runs = [
-            (hydrostatic_cases.straight_cup(), 500, hydrostatic_cases.ANGLES),
-            (hydrostatic_cases.straight_cup(), 1_000, hydrostatic_cases.ANGLES),
-            (hydrostatic_cases.straight_cup(), 2_000, hydrostatic_cases.ANGLES),
-            (hydrostatic_cases.straight_cup(), 5_000, hydrostatic_cases.ANGLES),
-            (hydrostatic_cases.conical_cup(), 2_000, hydrostatic_cases.ANGLES),
-            (hydrostatic_cases.mesh_jug(), 2_000, hydrostatic_cases.ANGLES),
-        ]
-    else:
-        runs = [(hydrostatic_cases.straight_cup(), 500, hydrostatic_cases.ANGLES[:1])]
-    seeds = SEEDS if effort.full else 1
+        runs += [(hydrostatic_cases.conical_cup(), 2_000), (hydrostatic_cases.mesh_jug(), 2_000)]
+    angles, seeds = (hydrostatic_cases.ANGLES, SEEDS) if effort.full else (hydrostatic_cases.ANGLES[:1], 1)
     measurements, curves = collected(
-        hydrostatic_cases.slow_tilt(vessel, LOAD, n, PLAIN, angles, seeds) for vessel, n, angles in runs
+        hydrostatic_cases.slow_tilt(vessel, LOAD, n, PLAIN, angles, seeds, effort.mirrored) for vessel, n in runs
     )
     return measurements, hydrostatic_cases.retention_figure(curves)
 
 
 def _outflow(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    numbers = (500, 1_000, 2_000, 5_000) if effort.full else (500, 1_000)
+    numbers = effort.numbers((500, 1_000), (500, 1_000, 2_000, 5_000), coarse=2)
     measurements, curves = collected(
-        whole_pours.outflow(simulator, n, PLAIN, seeds=3 if n <= 2_000 else 1) for n in numbers
+        whole_pours.outflow(simulator, n, PLAIN, 3 if n <= 2_000 else 1, effort.mirrored) for n in numbers
     )
     return measurements, whole_pours.outflow_figure(curves)
 
 
 def _delivered(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
-    return whole_pours.delivered(simulator, 2_000, PLAIN, seeds=10 if effort.full else 3), None
+    return whole_pours.delivered(simulator, 2_000, PLAIN, 10 if effort.full else 3, effort.mirrored), None
 
 
 def _jet(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    return whole_pours.free_jet(simulator, 5_000 if effort.full else 1_000, PLAIN)
+    return whole_pours.free_jet(simulator, 5_000 if effort.full else 1_000, PLAIN, effort.mirrored)
 
 
 def _column(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
-    numbers = (2_000, 5_000, 10_000) if effort.full else (2_000,)
-    return [m for n in numbers for m in hydrostatic_cases.tall_column(n, PLAIN)], None
+    numbers = effort.numbers((2_000,), (2_000, 5_000, 10_000))
+    return [m for n in numbers for m in hydrostatic_cases.tall_column(n, PLAIN, effort.mirrored)], None
 
 
 def _sloshing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    numbers = (2_000, 5_000, 10_000) if effort.full else (2_000,)
-    measurements, curves = collected(sloshing.sloshing(n, PLAIN) for n in numbers)
+    numbers = effort.numbers((2_000,), (2_000, 5_000, 10_000))
+    measurements, curves = collected(sloshing.sloshing(n, PLAIN, effort.mirrored) for n in numbers)
     return measurements, sloshing.sloshing_figure(curves)
 
 
 def _torricelli(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    runs = {n: torricelli.torricelli(n, PLAIN) for n in ((6_000, 12_000) if effort.full else (6_000,))}
+    numbers = effort.numbers((6_000,), (6_000, 12_000))
+    runs = {n: torricelli.torricelli(n, PLAIN, effort.mirrored) for n in numbers}
     measurements, curves = collected(run[:2] for run in runs.values())
     if len(runs) > 1:
         measurements.append(torricelli.steadiness({n: discharge for n, (_, _, discharge) in runs.items()}))
@@ -147,14 +147,17 @@ def _torricelli(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Meas
 
 def _dam_break(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     across = 16 if effort.full else 12
-    measurements, curves = collected(dam_break.dam_break(width, across, PLAIN) for width in dam_break.MEASURED)
+    measurements, curves = collected(
+        dam_break.dam_break(width, across, PLAIN, effort.mirrored) for width in dam_break.MEASURED
+    )
     return measurements, dam_break.dam_figure(curves)
 
 
 def _cohesion(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     free = PLAIN.model_copy(update={"xsph_rate": 0.0})
-    sphere = capillarity.cube_to_sphere(2_000, free)
-    runs = {n: capillarity.oscillation(n, free) for n in ((2_000, 10_000) if effort.full else (2_000,))}
+    sphere = capillarity.cube_to_sphere(2_000, free, effort.mirrored)
+    numbers = effort.numbers((2_000,), (2_000, 10_000))
+    runs = {n: capillarity.oscillation(n, free, effort.mirrored) for n in numbers}
     measurements, curves = collected([(sphere, []), *(run[:2] for run in runs.values())])
     if len(runs) > 1:
         measurements.append(capillarity.same_tension({n: tension for n, (_, _, tension) in runs.items()}))
@@ -162,15 +165,15 @@ def _cohesion(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measur
 
 
 def _landing(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    if effort.full:
-        return jet_landing.compared(simulator, (500, 1_000, 2_000), 10_000, PLAIN, SEEDS)
-    return jet_landing.compared(simulator, (500,), 1_000, PLAIN)
+    numbers = effort.numbers((500,), (500, 1_000, 2_000), coarse=2)
+    finest, seeds = (10_000, SEEDS) if effort.full else (1_000, 1)
+    return jet_landing.compared(simulator, numbers, finest, PLAIN, seeds, effort.mirrored)
 
 
 def _convergence(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
-    if effort.full:
-        return convergence.convergence(simulator, convergence.POURS, (500, 1_000), 3, PLAIN)
-    return convergence.convergence(simulator, convergence.QUICK, (1_000,), 1, PLAIN)
+    numbers = effort.numbers((1_000,), (500, 1_000, 2_000), coarse=2)
+    pours, seeds = (convergence.POURS, 3) if effort.full else (convergence.QUICK, 1)
+    return convergence.convergence(simulator, pours, numbers, seeds, PLAIN, effort.mirrored)
 
 
 def _halves(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
@@ -180,22 +183,17 @@ def _halves(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurem
 
 def _walls(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
     many = 40 if effort.full else 5
-    return wall_tightness.walls(many, 10_000 if effort.full else 1_500), None
+    return wall_tightness.walls(many, 10_000 if effort.full else 1_500, mirrored=effort.mirrored), None
 
 
 def _dribbling(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure | None]:
-    counts, speeds = ((500, 1_000, 2_000), dribbling_onset.SPEEDS) if effort.full else ((500,), (20.0,))
-    return dribbling_onset.onset(simulator, counts, PLAIN, speeds)
+    numbers = effort.numbers((500,), (500, 1_000, 2_000), coarse=2)
+    speeds = dribbling_onset.SPEEDS if effort.full else (20.0,)
+    return dribbling_onset.onset(simulator, numbers, PLAIN, speeds, effort.mirrored)
 
 
 def _repeatability(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], None]:
-    return whole_pours.repeatability(simulator, 2_000 if effort.full else 500, PLAIN), None
-
-
-def _of_thick_liquids(
-    work: viscous_flows.Work,
-) -> Callable[[PourSimulator, CaseEffort], tuple[list[Measurement], Figure | None]]:
-    return lambda simulator, effort: work(simulator, effort.full)
+    return whole_pours.repeatability(simulator, 2_000 if effort.full else 500, PLAIN, effort.mirrored), None
 
 
 CASES: tuple[Case, ...] = (
@@ -289,6 +287,7 @@ CASES: tuple[Case, ...] = (
         "Eight of these pours with one half of the liquid and its mirror image, compared with the whole liquid: mean "
         "spillage of thirty seeds each. References are the whole pours.",
         _halves,
+        repeated=False,
     ),
     Case(
         "walls",
@@ -312,7 +311,7 @@ CASES: tuple[Case, ...] = (
         "and resolution; the critical number and the film of a flow are the model's own.",
         _dribbling,
     ),
-    *(Case(name, title, about, _of_thick_liquids(work)) for name, title, about, work in viscous_flows.CASES),
+    *(Case(*entry) for entry in viscous_flows.CASES),
 )
 
 

@@ -1,7 +1,7 @@
 """Runs of the solver without a pour: one vessel, at rest or on a given path, and nothing else.
 
-`run` advances the solver; `box` and `holed_cup` make containers that are not vessels, as analytic distance grids: a box
-that is open at the top, a cup with a hole.
+`run` advances the solver, with a whole liquid or with the half y > 0 of a symmetric one; `box` and `holed_cup` make
+containers that are not vessels, as analytic distance grids: a box that is open at the top, a cup with a hole.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import NEUTRAL, SimulationParameters
+from sim_engine.simulator import fill
 from sim_engine.vessel import profile
 from sim_engine.vessel.distance_grid import SignedDistanceGrid
 from sim_engine.vessel.vessel import Vessel
@@ -69,6 +70,46 @@ class Container:
 EMPTY_SPACE = Container(NOTHING, NOTHING.cavity, 1e-3)
 
 
+@dataclass(frozen=True)
+class LiquidState:
+    """The whole liquid at one time, also if only its half is simulated.
+
+    Attributes:
+        positions: (N, 3) in the world [m].
+        velocities: (N, 3) [m/s].
+        states: see `ParticleState`, (N,).
+    """
+
+    positions: Floats
+    velocities: Floats
+    states: NDArray[np.uint8]
+
+
+def symmetric(vectors: Floats, half: NDArray[np.bool_] | None = None) -> Floats:
+    """Vectors with their images by the plane y = 0.
+
+    Args:
+        vectors: (N, 3).
+        half: selected ones, (N,); None: all.
+    """
+    selected = vectors if half is None else vectors[half]
+    return np.concatenate([selected, selected * (1.0, -1.0, 1.0)])
+
+
+def filled(
+    vessel: Vessel, volume: float, particles: int, seed: int, parameters: SimulationParameters, mirrored: bool
+) -> Floats:
+    """Positions of a load, as pours begin with them (`fill`), shape (N, 3) [m].
+
+    Args:
+        vessel, volume, particles, seed: see `fill`.
+        parameters: θ.
+        mirrored: whether the load is symmetric about y = 0.
+    """
+    places = fill(vessel, volume, particles, seed, parameters.wall_distance, mirrored=mirrored).astype(float)
+    return symmetric(places) if mirrored else places
+
+
 def still_pose(duration: float) -> Floats:
     """Poses of a vessel that stands at the world's origin, for `run`'s pose table."""
     from sim_engine.fluid.scene_setup import POSE_STEP
@@ -93,7 +134,8 @@ def run(
     viscosity: float = 0.0,
     no_slip: bool = True,
     contact_angle: float = NEUTRAL,
-) -> Iterator[int]:
+    mirrored: bool = False,
+) -> Iterator[tuple[int, LiquidState]]:
     """Load a scene and run it to each of the given times.
 
     Args:
@@ -110,9 +152,10 @@ def run(
         viscosity: kinematic [m²/s]; 0: θ's rate alone.
         no_slip: whether a liquid of such a viscosity sticks to the vessel.
         contact_angle: on the vessel [rad].
+        mirrored: whether only the positions y > 0 are simulated; the others are their images.
 
     Yields:
-        The index of each time when it has been reached; the engine's state may then be read.
+        The index of each time when it has been reached, and the liquid then.
 
     Raises:
         ArithmeticError: the solver stopped with a fault.
@@ -126,7 +169,7 @@ def run(
         container.grid, container.plane(SUPPORT * spacing), container.inside, container.wall, container.rim
     )
     setup = SceneSetup(
-        positions=np.ascontiguousarray(positions, dtype=np.float32),
+        positions=np.ascontiguousarray(positions[positions[:, 1] > 0.0] if mirrored else positions, dtype=np.float32),
         spacing=spacing,
         density=DENSITY,
         parameters=parameters,
@@ -141,13 +184,19 @@ def run(
         viscosity=viscosity,
         no_slip=no_slip,
         contact_angle=contact_angle,
+        mirrored=mirrored,
     )
     fluid.load([setup])
     for k, time in enumerate(times):
         fluid.advance(float(time))
         if fluid.fault() is not None:
             raise ArithmeticError(f"at {fluid.time():.3f} s: {fluid.fault()}")
-        yield k
+        x, states = fluid.particles()
+        state = LiquidState(x.astype(float), fluid.velocities().astype(float), states)
+        if mirrored:
+            both = np.concatenate([states, states])
+            state = LiquidState(symmetric(state.positions), symmetric(state.velocities), both)
+        yield k, state
 
 
 def stir(add: Callable[[Floats], Floats]) -> None:
@@ -228,13 +277,14 @@ def holed_cup(radius: float, height: float, hole: float, floor: float, spacing: 
     return Container(grid, np.ascontiguousarray(inside), min(wall, floor), open=free)
 
 
-def block(low: Floats, high: Floats, count: int, seed: int) -> tuple[Floats, float]:
+def block(low: Floats, high: Floats, count: int, seed: int, mirrored: bool = False) -> tuple[Floats, float]:
     """A jittered lattice of about `count` particles that fills a block.
 
     Args:
         low, high: corners of the volume that the liquid fills, shape (3,) each [m].
         count: desired number of particles.
         seed: of the jitter.
+        mirrored: whether it is symmetric about y = 0, with the same number of layers on both sides.
 
     Returns:
         Positions (N, 3) [m], half a spacing inside the block, and the spacing d [m].
@@ -242,7 +292,10 @@ def block(low: Floats, high: Floats, count: int, seed: int) -> tuple[Floats, flo
     size = np.asarray(high) - np.asarray(low)
     d = float(np.cbrt(np.prod(size) / count))
     numbers = np.maximum(np.round(size / d).astype(int), 1)
+    if mirrored:
+        numbers[1] += numbers[1] % 2
     d = float(np.cbrt(np.prod(size) / np.prod(numbers)))
     axes = [low[i] + (np.arange(n) + 0.5) * size[i] / n for i, n in enumerate(numbers)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    return points + np.random.default_rng(seed).uniform(-0.05, 0.05, points.shape) * d, d
+    points += np.random.default_rng(seed).uniform(-0.05, 0.05, points.shape) * d
+    return symmetric(points, points[:, 1] > 0.0) if mirrored else points, d

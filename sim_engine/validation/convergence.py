@@ -18,6 +18,7 @@ from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, reported
+from sim_engine.validation.whole_pours import simulated
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
 
 LIP_RADIUS = 0.04
@@ -60,9 +61,9 @@ class ConvergencePour:
         stop = "" if self.angle == 120.0 else f" to {self.angle:g}°"
         return f"{self.receiver.name} {self.speed:g} °/s{stop}, {self.distance:g} mm"
 
-    def task(self, parameters: SimulationParameters, seed: int, mirrored: bool | None = None) -> PourTask:
-        """The task of its simulation; `mirrored` as in `Scene`."""
-        scene = Scene(self.name, POURER, self.receiver, Liquid(mass=0.1996), mirrored=mirrored)
+    def task(self, parameters: SimulationParameters, seed: int) -> PourTask:
+        """The task of its simulation."""
+        scene = Scene(self.name, POURER, self.receiver, Liquid(mass=0.1996))
         return PourTask(scene, self.action(HEIGHTS[self.receiver.name]), parameters, seed)
 
     def action(self, height: float) -> Action:
@@ -109,10 +110,10 @@ def spillage(
     pour: ConvergencePour,
     parameters: SimulationParameters,
     seed: int,
-    mirrored: bool | None = None,
+    mirrored: bool = False,
 ) -> tuple[float, float]:
-    """Spilled over poured of one pour, and its CPU time [s]; `mirrored` as in `Scene`."""
-    outcome = simulator.simulate(pour.task(parameters, seed, mirrored)).outcome
+    """Spilled over poured of one pour, whole or by half, and its CPU time [s]."""
+    outcome = simulated(simulator, pour.task(parameters, seed), mirrored).outcome
     if outcome.invalid is not None:
         raise ArithmeticError(f"{pour.name}, {parameters.particles} particles: {outcome.invalid}")
     return outcome.spilled / max(outcome.fractions.poured, 1e-9), outcome.cpu_s
@@ -165,6 +166,7 @@ def convergence(
     numbers: tuple[int, ...],
     seeds: int,
     parameters: SimulationParameters,
+    mirrored: bool = False,
 ) -> tuple[list[Measurement], Figure]:
     """Spillage at some resolutions, compared with 10,000 particles. Pours that have not converged are only reported.
 
@@ -174,6 +176,7 @@ def convergence(
         numbers: of particles, increasing.
         seeds: number of seeds for each.
         parameters: θ; its number of particles is replaced.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
     measurements: list[Measurement] = []
     curves: list[Series] = []
@@ -182,7 +185,7 @@ def convergence(
             [
                 np.mean(
                     [
-                        spillage(simulator, pour, parameters.model_copy(update={"particles": n}), seed)[0]
+                        spillage(simulator, pour, parameters.model_copy(update={"particles": n}), seed, mirrored)[0]
                         for seed in range(1, seeds + 1)
                     ]
                 )
@@ -249,7 +252,10 @@ def halves(
     theta = parameters.model_copy(update={"particles": number})
     spillages = np.array(
         [
-            [[spillage(simulator, pour, theta, seed, half)[0] for half in (None, True)] for seed in range(1, seeds + 1)]
+            [
+                [spillage(simulator, pour, theta, seed, half)[0] for half in (False, True)]
+                for seed in range(1, seeds + 1)
+            ]
             for pour in chosen
         ]
     )  # (pour, seed, whole or mirrored)

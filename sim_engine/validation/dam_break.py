@@ -53,23 +53,27 @@ def slope(T: Floats, Z: Floats) -> float:
     return float(np.polyfit(T[late], Z[late], 1)[0])
 
 
-def dam_break(width: float, layers: int, parameters: SimulationParameters) -> tuple[list[Measurement], list[Series]]:
+def dam_break(
+    width: float, layers: int, parameters: SimulationParameters, mirrored: bool = False
+) -> tuple[list[Measurement], list[Series]]:
     """Release one column.
 
     Args:
         width: a, one of `MEASURED` [m].
         layers: spacings in a.
         parameters: θ; its number of particles is ignored.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
     reference = np.array(MEASURED[width])
-    T, Z, particles = front(width, layers, parameters.model_copy(update={"friction": FLOOR}), float(reference[-1, 0]))
+    rough, last = parameters.model_copy(update={"friction": FLOOR}), float(reference[-1, 0])
+    T, Z, particles = front(width, layers, rough, last, mirrored)
     late = reference[reference[:, 0] > FROM]
     delays = np.linspace(0.0, 0.6, 121)
     errors = [float(np.max(np.abs(np.interp(late[:, 0] - s, T, Z) / late[:, 1] - 1.0))) for s in delays]
     best = int(np.argmin(errors))
     name = f"a = {1e3 * width:.1f} mm"
     wanted = slope(reference[:, 0], reference[:, 1])
-    T_free, Z_free, _ = front(width, layers, parameters, float(reference[-1, 0]))
+    T_free, Z_free, _ = front(width, layers, parameters, last, mirrored)
     measurements = [
         at_most(
             f"largest error of the front after the gate's delay, {name}",
@@ -102,7 +106,9 @@ def dam_break(width: float, layers: int, parameters: SimulationParameters) -> tu
     return measurements, curves
 
 
-def front(width: float, layers: int, parameters: SimulationParameters, last: float) -> tuple[Floats, Floats, int]:
+def front(
+    width: float, layers: int, parameters: SimulationParameters, last: float, mirrored: bool
+) -> tuple[Floats, Floats, int]:
     """Position of the front over time.
 
     Args:
@@ -110,12 +116,11 @@ def front(width: float, layers: int, parameters: SimulationParameters, last: flo
         layers: spacings in a.
         parameters: θ; its number of particles is ignored.
         last: largest T of the simulation.
+        mirrored: whether only the half y ≥ 0 is simulated.
 
     Returns:
         T and Z, shape (80,) each, and N.
     """
-    from sim_engine.fluid.engine import engine
-
     d = width / layers
     across = WIDTH * d
     start, d = block(
@@ -123,13 +128,14 @@ def front(width: float, layers: int, parameters: SimulationParameters, last: flo
         np.array([width, across / 2.0, ASPECT * width]),
         round(layers * layers * ASPECT * WIDTH),
         1,
+        mirrored,
     )
     unit = math.sqrt(width / (2.0 * GRAVITY))
     channel = box(width * (2.0 * last + 3.0), across, 1.2 * ASPECT * width, 0.5 * d)
     times = np.linspace(0.1, last + 0.1, 80) * unit
     places = np.empty(len(times))
-    for k in run(start, d, channel, parameters, times):
-        x = engine().particles()[0].astype(float)
+    for k, liquid in run(start, d, channel, parameters, times, mirrored=mirrored):
+        x = liquid.positions
         strip = np.clip(((x[:, 1] / across + 0.5) * STRIPS).astype(int), 0, STRIPS - 1)
         places[k] = np.mean([x[strip == s, 0].max() for s in range(STRIPS)]) + 0.5 * d
     return times / unit, places / width, len(start)

@@ -9,6 +9,8 @@ Weber number, nor the relation of a flow to its film: both are those of the mode
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +21,7 @@ from sim_engine.liquids import SimulationParameters
 from sim_engine.scene import PourTask
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
-from sim_engine.validation.whole_pours import SCENE
+from sim_engine.validation.whole_pours import SCENE, simulated
 
 Floats = NDArray[np.float64]
 
@@ -52,6 +54,7 @@ def _pour(theta: SimulationParameters, speed: float) -> PourTask:
     return PourTask(SCENE, action, theta, 1)
 
 
+@cache
 def slow_share(simulator: PourSimulator, theta: SimulationParameters, speed: float) -> float:
     """Fraction of the poured liquid that leaves below the critical Weber number, by the simulated outflow.
 
@@ -77,7 +80,11 @@ def slow_share(simulator: PourSimulator, theta: SimulationParameters, speed: flo
 
 
 def onset(
-    simulator: PourSimulator, counts: tuple[int, ...], parameters: SimulationParameters, speeds: tuple[float, ...]
+    simulator: PourSimulator,
+    counts: tuple[int, ...],
+    parameters: SimulationParameters,
+    speeds: tuple[float, ...],
+    mirrored: bool = False,
 ) -> tuple[list[Measurement], Figure]:
     """Dribbled fraction of the poured liquid against the speed of the tilt.
 
@@ -86,6 +93,7 @@ def onset(
         counts: numbers of particles.
         parameters: θ; number of particles and adhesion are replaced.
         speeds: angular velocities [deg/s].
+        mirrored: whether only the half y ≥ 0 is simulated, except of the reference.
     """
     fine = parameters.model_copy(update={"particles": FINE})
     references = [slow_share(simulator, fine, speed) for speed in speeds]
@@ -93,7 +101,7 @@ def onset(
     curves: list[Series] = []
     for count in counts:
         theta = parameters.model_copy(update={"particles": count, "lip_adhesion": ADHESION})
-        outcomes = [simulator.simulate(_pour(theta, speed)).outcome for speed in speeds]
+        outcomes = [simulated(simulator, _pour(theta, speed), mirrored).outcome for speed in speeds]
         shares = [outcome.dribbled / outcome.fractions.poured for outcome in outcomes]
         curves.append(Series(f"{count:,} particles", speeds, tuple(shares)))
         measurements += [

@@ -28,9 +28,10 @@ from scipy.spatial import ConvexHull, Voronoi
 from sim_engine.hydrostatics import GRAVITY, level, retained_volume, tilting_cup_outflow
 from sim_engine.liquids import SimulationParameters
 from sim_engine.motion import Phase, PourMotion, Segment, turn
-from sim_engine.simulator import SETTLING, fill, spacing
+from sim_engine.outcome import ParticleState
+from sim_engine.simulator import SETTLING, spacing
 from sim_engine.validation.case_result import Figure, Measurement, Series, at_most, within
-from sim_engine.validation.container_runs import Container, run
+from sim_engine.validation.container_runs import Container, filled, run
 from sim_engine.vessel import profile
 from sim_engine.vessel.mesh_shape import MeshShape
 from sim_engine.vessel.shapes import ProfileShape, VesselSpec, cylinder
@@ -67,29 +68,29 @@ def mean_density(points: Floats, inner: NDArray[np.bool_], d: float) -> float:
     return d**3 / float(np.mean(volumes)) if volumes else math.nan
 
 
-def at_rest(particles: int, parameters: SimulationParameters, seed: int = 1) -> tuple[list[Measurement], Figure]:
+def at_rest(
+    particles: int, parameters: SimulationParameters, seed: int = 1, mirrored: bool = False
+) -> tuple[list[Measurement], Figure]:
     """Fill the cup, let it stand for a second, and measure for a fifth of a second.
 
     Args:
         particles: N.
         parameters: θ; its number of particles is replaced.
         seed: of the initial positions.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    from sim_engine.fluid.engine import engine
-
     vessel = build_vessel(CUP)
     floor = vessel.inner_floor
     d = spacing(VOLUME, particles)
-    start = fill(vessel, VOLUME, particles, seed, parameters.wall_distance).astype(float)
+    start = filled(vessel, VOLUME, particles, seed, parameters, mirrored)
     early = np.arange(0.02, 1.0, 0.02)
     times = np.concatenate([early, WINDOW])
     energy, heights, densities = [], [], []
-    for k in run(start, d, Container.of(vessel), parameters, times):
-        fluid = engine()
-        energy.append(0.5 * float(np.mean(np.sum(fluid.velocities().astype(float) ** 2, axis=1))) / (GRAVITY * HEIGHT))
+    for k, liquid in run(start, d, Container.of(vessel), parameters, times, mirrored=mirrored):
+        energy.append(0.5 * float(np.mean(np.sum(liquid.velocities**2, axis=1))) / (GRAVITY * HEIGHT))
         if k < len(early):
             continue
-        x = fluid.particles()[0].astype(float)
+        x = liquid.positions
         heights.append(2.0 * float(np.mean(x[:, 2] - floor)))
         if (k - len(early)) % 5 == 0:
             depth = x[:, 2] - floor
@@ -139,29 +140,26 @@ SLIM_HEIGHT = SLIM_VOLUME / (math.pi * SLIM_RADIUS**2)
 SLIM_CUP = cylinder("slim cup", inner_radius=SLIM_RADIUS, inner_height=0.115)
 
 
-def tall_column(particles: int, parameters: SimulationParameters) -> list[Measurement]:
+def tall_column(particles: int, parameters: SimulationParameters, mirrored: bool = False) -> list[Measurement]:
     """A slim, nearly full cup stands still for a second: it has many layers of particles, whose pressures add up.
 
     Args:
         particles: N.
         parameters: θ; its number of particles is replaced.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    from sim_engine.fluid.engine import engine
-    from sim_engine.outcome import ParticleState
-
     vessel = build_vessel(SLIM_CUP)
     d = spacing(SLIM_VOLUME, particles)
-    start = fill(vessel, SLIM_VOLUME, particles, 1, parameters.wall_distance).astype(float)
-    heights = []
-    for _ in run(start, d, Container.of(vessel), parameters, WINDOW, settling=SETTLING):
-        x, homes = engine().particles()
-        inside = homes == ParticleState.IN_POURER
-        heights.append(2.0 * float(np.mean(x[inside, 2].astype(float)) - vessel.inner_floor))
+    start = filled(vessel, SLIM_VOLUME, particles, 1, parameters, mirrored)
+    heights, inside = [], np.ones(particles, bool)
+    for _, liquid in run(start, d, Container.of(vessel), parameters, WINDOW, settling=SETTLING, mirrored=mirrored):
+        inside = liquid.states == ParticleState.IN_POURER
+        heights.append(2.0 * float(np.mean(liquid.positions[inside, 2]) - vessel.inner_floor))
     layers = f"{SLIM_HEIGHT / d:.0f} layers"
     return [
         within(
             f"still in the cup after a second, {layers}",
-            float(engine().census()[ParticleState.IN_POURER] / particles),
+            float(inside.mean()),
             1.0,
             0.0,
             criterion="all of it",
@@ -269,6 +267,7 @@ def slow_tilt(
     parameters: SimulationParameters,
     angles: tuple[float, ...] = ANGLES,
     seeds: int = 1,
+    mirrored: bool = False,
 ) -> tuple[list[Measurement], list[Series]]:
     """Tilt a cup slowly and read its retained volume.
 
@@ -279,10 +278,9 @@ def slow_tilt(
         parameters: θ; its number of particles is replaced.
         angles: of the readings, increasing [rad].
         seeds: number of loads, with different initial positions, over which the result is averaged.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    from sim_engine.fluid.engine import engine
     from sim_engine.fluid.scene_setup import POSE_STEP
-    from sim_engine.outcome import ParticleState
 
     d = spacing(volume, particles)
     motion, readings = slow_turn(vessel, volume, angles)
@@ -292,10 +290,11 @@ def slow_tilt(
     bottom = LIP_HEIGHT - 2.0 * vessel.bounding_sphere[1]
     cup = Container.of(vessel)
     for seed in range(1, seeds + 1):
-        local = fill(vessel, volume, particles, seed, parameters.wall_distance).astype(float)
-        start = local + poses[0, :3]  # upright at first
-        for k in run(start, d, cup, parameters, times, poses=poses, settling=0.15, spill_level=bottom):
-            retained[k] += engine().census()[ParticleState.IN_POURER] * d**3 / seeds
+        start = filled(vessel, volume, particles, seed, parameters, mirrored) + poses[0, :3]  # upright at first
+        for k, liquid in run(
+            start, d, cup, parameters, times, poses=poses, settling=0.15, spill_level=bottom, mirrored=mirrored
+        ):
+            retained[k] += np.count_nonzero(liquid.states == ParticleState.IN_POURER) * d**3 / seeds
     measurements = []
     for angle, reading in zip(angles, readings, strict=True):
         now = (times >= reading) & (times <= reading + READING)

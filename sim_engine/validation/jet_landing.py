@@ -8,6 +8,7 @@ height 60 mm below the lip. The reference is the finest resolution.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from sim_engine.scene import PoseError, PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
 from sim_engine.validation.convergence import CONE, POURER, ConvergencePour
+from sim_engine.validation.whole_pours import simulated
 
 Floats = NDArray[np.float64]
 
@@ -68,7 +70,10 @@ class Landing:
         return np.array([np.median(section) for section in np.array_split(self.away, PARTS)])
 
 
-def landing(simulator: PourSimulator, speed: float, parameters: SimulationParameters, seeds: int = 1) -> Landing:
+@cache
+def landing(
+    simulator: PourSimulator, speed: float, parameters: SimulationParameters, seeds: int = 1, mirrored: bool = False
+) -> Landing:
     """Record a jet that passes a receiver moved aside.
 
     Args:
@@ -76,8 +81,9 @@ def landing(simulator: PourSimulator, speed: float, parameters: SimulationParame
         speed: of the turn [deg/s].
         parameters: θ.
         seeds: number of pours, with different initial positions, that are combined.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    pours = [_of_one(simulator, speed, parameters, seed) for seed in range(1, seeds + 1)]
+    pours = [_of_one(simulator, speed, parameters, seed, mirrored) for seed in range(1, seeds + 1)]
     times = np.concatenate([pour.times for pour in pours])
     order = np.argsort(times, kind="stable")
     away, aside, fast = (
@@ -86,12 +92,14 @@ def landing(simulator: PourSimulator, speed: float, parameters: SimulationParame
     return Landing(times[order], away, aside, fast)
 
 
-def _of_one(simulator: PourSimulator, speed: float, parameters: SimulationParameters, seed: int) -> Landing:
+def _of_one(
+    simulator: PourSimulator, speed: float, parameters: SimulationParameters, seed: int, mirrored: bool
+) -> Landing:
     """Landing of one pour; by frame, not in the order of time."""
     pour = ConvergencePour(CONE, speed, DISTANCE)
     scene = Scene("landing", POURER, CONE, Liquid(mass=0.1996))
-    task = PourTask(scene, pour.action(FALL), parameters, seed, frame_rate=50.0, pose_error=PoseError(y=ASIDE))
-    frames = simulator.simulate(task).frames
+    task = PourTask(scene, pour.action(FALL), parameters, seed, frame_rate=50.0, pose_error=PoseError(x=ASIDE))
+    frames = simulated(simulator, task, mirrored).frames
     assert frames is not None
     x = np.stack(frames.positions).astype(float)
     level = simulator.vessel(CONE).rim_height
@@ -108,7 +116,12 @@ def _of_one(simulator: PourSimulator, speed: float, parameters: SimulationParame
 
 
 def compared(
-    simulator: PourSimulator, numbers: tuple[int, ...], finest: int, parameters: SimulationParameters, seeds: int = 1
+    simulator: PourSimulator,
+    numbers: tuple[int, ...],
+    finest: int,
+    parameters: SimulationParameters,
+    seeds: int = 1,
+    mirrored: bool = False,
 ) -> tuple[list[Measurement], Figure]:
     """Landing at some resolutions, compared with the finest.
 
@@ -118,12 +131,13 @@ def compared(
         finest: number of particles of the reference.
         parameters: θ; its number of particles is replaced.
         seeds: number of pours that are combined for each.
+        mirrored: whether only the half y ≥ 0 is simulated, except of the finest.
     """
     measurements: list[Measurement] = []
     curves: list[Series] = []
     for panel, speed in enumerate(SPEEDS):
         landings = {
-            n: landing(simulator, speed, parameters.model_copy(update={"particles": n}), seeds)
+            n: landing(simulator, speed, parameters.model_copy(update={"particles": n}), seeds, mirrored and n < finest)
             for n in (*numbers, finest)
         }
         reference = landings[finest]

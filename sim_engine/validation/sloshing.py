@@ -19,9 +19,9 @@ from scipy.special import jv, jvp
 
 from sim_engine.hydrostatics import GRAVITY
 from sim_engine.liquids import SimulationParameters
-from sim_engine.simulator import fill, spacing
+from sim_engine.simulator import spacing
 from sim_engine.validation.case_result import Figure, Measurement, Series, reported, within
-from sim_engine.validation.container_runs import Container, run, still_pose
+from sim_engine.validation.container_runs import Container, filled, run, still_pose
 from sim_engine.validation.hydrostatic_cases import CUP, HEIGHT, RADIUS, VOLUME
 from sim_engine.vessel.vessel import build_vessel
 
@@ -86,26 +86,29 @@ def first_mode(x: Floats, y: Floats, z: Floats) -> Floats:
     return flow
 
 
-def sloshing(particles: int, parameters: SimulationParameters) -> tuple[list[Measurement], list[Series]]:
+def sloshing(
+    particles: int, parameters: SimulationParameters, mirrored: bool = False
+) -> tuple[list[Measurement], list[Series]]:
     """Push the cup and measure the liquid's oscillation.
 
     Args:
         particles: N.
         parameters: θ; its number of particles is replaced.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    from sim_engine.fluid.engine import engine
     from sim_engine.fluid.scene_setup import POSE_STEP
 
     vessel = build_vessel(CUP)
-    start = fill(vessel, VOLUME, particles, 1, parameters.wall_distance).astype(float)
+    start = filled(vessel, VOLUME, particles, 1, parameters, mirrored)
     end = REST + PUSH_TIME + WATCHED
     poses = still_pose(end)
     phase = np.clip((np.arange(len(poses)) * POSE_STEP - REST) / PUSH_TIME, 0.0, 1.0)
     poses[:, 0] = PUSH * 0.5 * (1.0 - np.cos(math.pi * phase))
     times = np.arange(REST + PUSH_TIME, end, 0.01)
     speeds = np.empty(len(times))
-    for k in run(start, spacing(VOLUME, particles), Container.of(vessel), parameters, times, poses=poses):
-        place, speed = engine().particles()[0].astype(float), engine().velocities().astype(float)
+    d, cup = spacing(VOLUME, particles), Container.of(vessel)
+    for k, liquid in run(start, d, cup, parameters, times, poses=poses, mirrored=mirrored):
+        place, speed = liquid.positions, liquid.velocities
         flow = first_mode(place[:, 0] - PUSH, place[:, 1], place[:, 2] - vessel.inner_floor)
         speeds[k] = np.sum(speed * flow) / math.sqrt(particles * float(np.sum(flow**2)))
     frequency, decay = fit_oscillation(times - times[0], speeds, FREQUENCY)

@@ -29,43 +29,40 @@ FASTEST = RATIO * math.sqrt(2.0 * HEIGHT / GRAVITY)
 
 
 def settled(
-    particles: int, parameters: SimulationParameters
+    particles: int, parameters: SimulationParameters, mirrored: bool = False
 ) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]], float]:
     """Positions of a load that has come to rest in the closed cup, (N, 3) [m], and the spacing [m]."""
-    from sim_engine.fluid.engine import engine
-
     d = float(np.cbrt(VOLUME / particles))
     half = np.array([RADIUS, RADIUS, 0.0])
     tall = 1.4 * HEIGHT
     count = round((2 * RADIUS) ** 2 * tall / d**3)
-    lattice, _ = block(-half, half + np.array([0.0, 0.0, tall]), count, 1)
+    lattice, _ = block(-half, half + np.array([0.0, 0.0, tall]), count, 1, mirrored)
     places = lattice[np.hypot(lattice[:, 0], lattice[:, 1]) < RADIUS - 0.45 * d]
     places = places[np.argsort(places[:, 2], kind="stable")][:particles]
     closed = holed_cup(RADIUS, 0.10, 0.0, FLOOR, GRID)
-    for _ in run(places, d, closed, parameters, np.array([0.8])):
-        pass
-    return engine().particles()[0].astype(float), d
+    ((_, liquid),) = run(places, d, closed, parameters, np.array([0.8]), mirrored=mirrored)
+    return liquid.positions, d
 
 
-def torricelli(particles: int, parameters: SimulationParameters) -> tuple[list[Measurement], list[Series], float]:
+def torricelli(
+    particles: int, parameters: SimulationParameters, mirrored: bool = False
+) -> tuple[list[Measurement], list[Series], float]:
     """Drain the cup.
 
     Args:
         particles: N.
         parameters: θ; its number of particles is replaced.
+        mirrored: whether only the half y ≥ 0 is simulated.
 
     Returns:
         Measurements, curves and C_d.
     """
-    from sim_engine.fluid.engine import engine
-
-    start, d = settled(particles, parameters)
-    count = len(start)
+    start, d = settled(particles, parameters, mirrored)
     times = np.arange(0.02, 2.0 * FASTEST, 0.02)
     left = np.empty(len(times))
     cup = holed_cup(RADIUS, 0.10, HOLE, FLOOR, GRID)
-    for k in run(start, d, cup, parameters, times, spill_level=-0.02):
-        left[k] = np.count_nonzero(engine().particles()[0][:, 2] > 0.0) / count
+    for k, liquid in run(start, d, cup, parameters, times, spill_level=-0.02, mirrored=mirrored):
+        left[k] = np.mean(liquid.positions[:, 2] > 0.0)
     fitted = (left <= FIT[0]) & (left >= FIT[1])
     slope = float(np.polyfit(times[fitted], np.sqrt(left[fitted]), 1)[0]) if fitted.sum() > 2 else math.nan
     duration = -1.0 / slope

@@ -22,8 +22,19 @@ from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation import capillarity as wetting
-from sim_engine.validation.case_result import Figure, Measurement, Series, collected, reported, within
-from sim_engine.validation.container_runs import MARGIN, Container, block, box, run, still_pose, stir
+from sim_engine.validation.case_result import CaseEffort, Figure, Measurement, Series, collected, reported, within
+from sim_engine.validation.container_runs import (
+    MARGIN,
+    Container,
+    LiquidState,
+    block,
+    box,
+    run,
+    still_pose,
+    stir,
+    symmetric,
+)
+from sim_engine.validation.whole_pours import simulated
 from sim_engine.vessel.distance_grid import SignedDistanceGrid
 from sim_engine.vessel.shapes import cylinder
 
@@ -84,13 +95,16 @@ def _open_channel(
     return Container(grid, np.ascontiguousarray(cavity), WALL, open=everywhere)
 
 
-def ring(inner: float, outer: float, low: float, high: float, d: float, seed: int = 1) -> Floats:
+def ring(
+    inner: float, outer: float, low: float, high: float, d: float, mirrored: bool = False, seed: int = 1
+) -> Floats:
     """A jittered lattice in the space between two cylinders.
 
     Args:
         inner, outer: radii of the space that the liquid fills [m].
         low, high: heights [m].
         d: spacing [m].
+        mirrored: whether it is symmetric about y = 0.
         seed: of the jitter.
 
     Returns:
@@ -107,11 +121,12 @@ def ring(inner: float, outer: float, low: float, high: float, d: float, seed: in
             height = np.full(many, low + (level + 0.5) * (high - low) / levels)
             points.append(np.column_stack([r * np.cos(angle), r * np.sin(angle), height]))
     positions = np.concatenate(points)
-    return np.asarray(positions + np.random.default_rng(seed).uniform(-0.05, 0.05, positions.shape) * d)
+    positions += np.random.default_rng(seed).uniform(-0.05, 0.05, positions.shape) * d
+    return symmetric(positions, positions[:, 1] > 0.0) if mirrored else positions
 
 
 def down_a_tube(
-    layers: int, viscosity: float, parameters: SimulationParameters, radius: float = 0.015
+    layers: int, viscosity: float, parameters: SimulationParameters, mirrored: bool = False, radius: float = 0.015
 ) -> tuple[list[Measurement], list[Series]]:
     """A plug of liquid falls in a vertical tube that is open at both ends.
 
@@ -119,17 +134,18 @@ def down_a_tube(
         layers: spacings in the radius.
         viscosity: kinematic [m²/s].
         parameters: θ; its number of particles is ignored.
+        mirrored: whether only the half y ≥ 0 is simulated.
         radius: of the tube [m].
     """
     length, mean = 8.0 * radius, GRAVITY * radius**2 / (8.0 * viscosity)
     d, times, bottom = radius / layers, *_when_steady(0.6, radius, viscosity, mean)
     return _fall(
         f"{layers} spacings in the radius, ν = {_mm2(viscosity)}",
-        ring(0.0, radius, 0.0, length, d),
+        ring(0.0, radius, 0.0, length, d, mirrored),
         radius,
         d,
         run_in=lambda start: run(start, d, tube(radius, length + 0.05, bottom, 0.4 * d), parameters, times,
-                                 viscosity=viscosity, settling=SETTLING),
+                                 viscosity=viscosity, settling=SETTLING, mirrored=mirrored),
         from_middle=lambda x: np.hypot(x[:, 0], x[:, 1]),
         chosen=lambda x: np.abs(x[:, 2] - np.median(x[:, 2])) < radius,
         mean=mean,
@@ -138,7 +154,7 @@ def down_a_tube(
 
 
 def down_a_slot(
-    layers: int, viscosity: float, parameters: SimulationParameters, half_gap: float = 0.010
+    layers: int, viscosity: float, parameters: SimulationParameters, mirrored: bool = False, half_gap: float = 0.010
 ) -> tuple[list[Measurement], list[Series]]:
     """A slab of liquid falls between two vertical plates, open at both ends and at the sides.
 
@@ -146,19 +162,20 @@ def down_a_slot(
         layers: spacings in half the gap.
         viscosity: kinematic [m²/s].
         parameters: θ; its number of particles is ignored.
+        mirrored: whether only the half y ≥ 0 is simulated.
         half_gap: half the distance of the plates [m].
     """
     length, width, mean = 10.0 * half_gap, 8.0 * half_gap, GRAVITY * half_gap**2 / (3.0 * viscosity)
     times, bottom = _when_steady(1.5, half_gap, viscosity, mean)
     low, high = np.array([-half_gap, -width / 2.0, 0.0]), np.array([half_gap, width / 2.0, length])
-    start, d = block(low, high, 160 * layers**3, 1)
+    start, d = block(low, high, 160 * layers**3, 1, mirrored)
     return _fall(
         f"{layers} spacings in half the gap, ν = {_mm2(viscosity)}",
         start,
         half_gap,
         d,
         run_in=lambda start: run(start, d, slot(half_gap, 1.5 * width, length + 0.05, bottom, 0.4 * d), parameters,
-                                 times, viscosity=viscosity, settling=SETTLING),
+                                 times, viscosity=viscosity, settling=SETTLING, mirrored=mirrored),
         from_middle=lambda x: np.abs(x[:, 0]),
         chosen=lambda x: (np.abs(x[:, 2] - np.median(x[:, 2])) < length / 6.0) & (np.abs(x[:, 1]) < width / 4.0),
         mean=mean,
@@ -178,7 +195,7 @@ def _fall(
     half: float,
     d: float,
     *,
-    run_in: Callable[[Floats], Iterable[object]],
+    run_in: Callable[[Floats], Iterable[tuple[int, LiquidState]]],
     from_middle: Callable[[Floats], Floats],
     chosen: Callable[[Floats], NDArray[np.bool_]],
     mean: float,
@@ -197,14 +214,11 @@ def _fall(
         mean: the mean velocity by theory [m/s].
         fastest: velocity in the middle over the mean.
     """
-    from sim_engine.fluid.engine import engine
-
     places, speeds = [], []
-    for _ in run_in(start):
-        x, v = engine().particles()[0].astype(float), engine().velocities().astype(float)
-        measured = chosen(x)
-        places.append(from_middle(x[measured]))
-        speeds.append(-v[measured, 2])
+    for _, liquid in run_in(start):
+        measured = chosen(liquid.positions)
+        places.append(from_middle(liquid.positions[measured]))
+        speeds.append(-liquid.velocities[measured, 2])
     r, u = np.concatenate(places), np.concatenate(speeds)
     velocity = within(f"mean velocity, {name}", float(u.mean()), mean, 0.10 * mean, unit="m/s", criterion="within 10 %",
                    particles=len(start))  # fmt: skip
@@ -221,7 +235,7 @@ INCLINE = math.radians(20.0)
 
 
 def down_an_incline(
-    layers: int, viscosity: float, parameters: SimulationParameters, thickness: float = 0.01
+    layers: int, viscosity: float, parameters: SimulationParameters, mirrored: bool = False, thickness: float = 0.01
 ) -> tuple[list[Measurement], list[Series]]:
     """A film on a plane of 20°, measured in its middle, away from its edges and from the channel's sides.
 
@@ -229,10 +243,9 @@ def down_an_incline(
         layers: spacings in the film.
         viscosity: kinematic [m²/s].
         parameters: θ; its number of particles is ignored.
+        mirrored: whether only the half y ≥ 0 is simulated.
         thickness: of the film [m].
     """
-    from sim_engine.fluid.engine import engine
-
     d = thickness / layers
     pull = GRAVITY * math.sin(INCLINE)
     mean = pull * thickness**2 / (3.0 * viscosity)
@@ -241,7 +254,7 @@ def down_an_incline(
     length, width = 12.0 * thickness, 8.0 * thickness
     local, _ = block(
         np.array([0.03, -width / 2.0, 0.0]), np.array([0.03 + length, width / 2.0, thickness]),
-        round(length * width * thickness / d**3), 1,
+        round(length * width * thickness / d**3), 1, mirrored,
     )  # fmt: skip
     channel = box(length + 0.06 + 3.0 * mean * float(times[-1]), width, 3.0 * thickness, 0.5 * d)
     cosine, sine = math.cos(INCLINE), math.sin(INCLINE)
@@ -249,9 +262,11 @@ def down_an_incline(
     poses = still_pose(float(times[-1]))
     poses[:, 3], poses[:, 5] = math.cos(INCLINE / 2.0), math.sin(INCLINE / 2.0)
     heights, speeds, deep = [], [], []
-    for _ in run(local @ turn.T, d, channel, parameters, times, poses=poses, viscosity=viscosity, settling=SETTLING):
-        x = engine().particles()[0].astype(float) @ turn
-        v = engine().velocities().astype(float) @ turn
+    for _, liquid in run(
+        local @ turn.T, d, channel, parameters, times, poses=poses, viscosity=viscosity, settling=SETTLING,
+        mirrored=mirrored,
+    ):  # fmt: skip
+        x, v = liquid.positions @ turn, liquid.velocities @ turn
         middle = (np.abs(x[:, 0] - np.median(x[:, 0])) < 2.0 * thickness) & (np.abs(x[:, 1]) < width / 4.0)
         heights.append(x[middle, 2])
         speeds.append(v[middle, 0])
@@ -279,7 +294,13 @@ def down_an_incline(
 
 
 def left_on_a_wall(
-    layers: int, viscosity: float, parameters: SimulationParameters, *, height: float = 0.1, radius: float = 0.03
+    layers: int,
+    viscosity: float,
+    parameters: SimulationParameters,
+    mirrored: bool = False,
+    *,
+    height: float = 0.1,
+    radius: float = 0.03,
 ) -> tuple[list[Measurement], list[Series]]:
     """A film inside a vertical tube drains.
 
@@ -287,19 +308,19 @@ def left_on_a_wall(
         layers: initial spacings in the film.
         viscosity: kinematic [m²/s].
         parameters: θ; its number of particles is ignored.
+        mirrored: whether only the half y ≥ 0 is simulated.
         height, radius: of the tube [m].
     """
-    from sim_engine.fluid.engine import engine
-
     first = 0.008
     d = first / layers
     times = np.linspace(0.05, 3.0, 30) * viscosity * height / (GRAVITY * first**2) * 9.0
-    start = ring(radius - first, radius, 0.0, height, d)
+    start = ring(radius - first, radius, 0.0, height, d, mirrored)
     pipe = tube(radius, height + 0.01, 0.0, 0.4 * d)
     left = []
-    for _ in run(start, d, pipe, parameters, times, viscosity=viscosity, spill_level=-0.02, settling=SETTLING):
-        x = engine().particles()[0].astype(float)
-        left.append(float(np.mean(x[:, 2] > 0.0)))
+    for _, liquid in run(
+        start, d, pipe, parameters, times, viscosity=viscosity, spill_level=-0.02, settling=SETTLING, mirrored=mirrored
+    ):
+        left.append(float(np.mean(liquid.positions[:, 2] > 0.0)))
     wanted = [jeffreys(float(t), first, height, radius, viscosity) for t in times]
     far = [abs(a - b) for a, b in zip(left, wanted, strict=True)]
     thin = math.sqrt(viscosity * height / (GRAVITY * float(times[-1])))
@@ -328,7 +349,7 @@ def jeffreys(time: float, first: float, height: float, radius: float, viscosity:
 
 
 def spreading(
-    particles: int, viscosity: float, parameters: SimulationParameters, volume: float = 250e-6
+    particles: int, viscosity: float, parameters: SimulationParameters, mirrored: bool = False, volume: float = 250e-6
 ) -> tuple[list[Measurement], list[Series]]:
     """Release a cylinder of liquid on a plane: a viscous dam break.
 
@@ -336,20 +357,19 @@ def spreading(
         particles: N.
         viscosity: kinematic [m²/s].
         parameters: θ; its number of particles is replaced.
+        mirrored: whether only the half y ≥ 0 is simulated.
         volume: of the liquid [m³].
     """
-    from sim_engine.fluid.engine import engine
-
     d = (volume / particles) ** (1.0 / 3.0)
     radius = (volume / math.pi) ** (1.0 / 3.0)
-    start = ring(0.0, radius, 0.0, radius, d)
+    start = ring(0.0, radius, 0.0, radius, d, mirrored)
     volume = len(start) * d**3
     plain = box(0.5, 0.5, 2.0 * radius, 0.002)
     times = np.linspace(0.05, 2.0, 40)
     at = np.array([0.25, 0.0, 0.0])
     radii = []
-    for _ in run(start + at, d, plain, parameters, times, viscosity=viscosity):
-        x = engine().particles()[0].astype(float) - at
+    for _, liquid in run(start + at, d, plain, parameters, times, viscosity=viscosity, mirrored=mirrored):
+        x = liquid.positions - at
         r = np.sort(np.hypot(x[:, 0], x[:, 1]))
         # a puddle's profile (1 − r²/R²)^⅓ has the mean square of r at R²·3/7
         radii.append(math.sqrt(float(np.mean(r**2)) * 7.0 / 3.0))
@@ -403,7 +423,7 @@ SIDE, VOLUME = 0.07, 200e-6
 """Side [m] and volume [m³] of the tank in which the solver's own viscosity is measured."""
 
 
-def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float, float, int]:
+def own_viscosity(particles: int, viscosity: float, speed: float, mirrored: bool = False) -> tuple[float, float, int]:
     """Viscosity from the decay of four vortices side by side in a tank with slip walls.
 
     Taylor and Green's vortices: u = (sin kx cos ky, −cos kx sin ky) U, k = 2π/side, decay as exp(−2νk²t), for any U.
@@ -412,15 +432,14 @@ def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float
         particles: N.
         viscosity: kinematic, of the liquid; 0: none [m²/s].
         speed: U [m/s].
+        mirrored: whether only the half y ≥ 0 is simulated.
 
     Returns:
         Viscosity by the decay [m²/s], spacing [m] and N.
     """
-    from sim_engine.fluid.engine import engine
-
     k = 2.0 * math.pi / SIDE
     depth = VOLUME / SIDE**2
-    start, d = block(np.array([0.0, -SIDE / 2.0, 0.0]), np.array([SIDE, SIDE / 2.0, depth]), particles, 1)
+    start, d = block(np.array([0.0, -SIDE / 2.0, 0.0]), np.array([SIDE, SIDE / 2.0, depth]), particles, 1, mirrored)
     tank = box(SIDE, SIDE, 2.0 * depth, 0.5 * d)
     lasts = min(0.8, 0.75 / ((max(viscosity, 3e-5) + 3e-5) * k**2))
 
@@ -430,11 +449,11 @@ def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float
 
     times = 0.3 + np.linspace(0.0, lasts, 21)
     measurements = []
-    for step in run(start, d, tank, THETA, times, viscosity=viscosity, no_slip=False):
+    for step, liquid in run(start, d, tank, THETA, times, viscosity=viscosity, no_slip=False, mirrored=mirrored):
+        w, v = vortices(liquid.positions), liquid.velocities
         if step == 0:
             stir(lambda x: speed * vortices(x))
-        x, v = engine().particles()[0].astype(float), engine().velocities().astype(float)
-        w = vortices(x)
+            v = v + speed * w
         measurements.append(float((v * w).sum() / (w * w).sum()))
     left = np.array(measurements) / measurements[0]
     clear = left > 0.1
@@ -442,16 +461,16 @@ def own_viscosity(particles: int, viscosity: float, speed: float) -> tuple[float
     return rate / (2.0 * k**2), d, len(start)
 
 
-def floor(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+def floor(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     """Viscosity that the solver adds to that of a liquid, by spacing and speed."""
     speed = 0.2
     measurements: list[Measurement] = []
     curves: list[Series] = []
-    given = (1e-5, 1e-4, 5e-4, 2e-3) if full else (1e-4, 2e-3)
-    for wanted in (2_000, 8_000) if full else (2_000,):
+    given = (1e-5, 1e-4, 5e-4, 2e-3) if effort.full else (1e-4, 2e-3)
+    for wanted in effort.numbers((2_000,), (2_000, 8_000)):
         values = []
         for nu in given:
-            value, d, n = own_viscosity(wanted, nu, speed)
+            value, d, n = own_viscosity(wanted, nu, speed, effort.mirrored)
             values.append(value)
             measurements.append(
                 reported(f"viscosity by decay at U = {speed:g} m/s, d = {1e3 * d:.1f} mm, given {1e6 * nu:.0f} mm²/s",
@@ -459,8 +478,8 @@ def floor(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figu
             )  # fmt: skip
         curves.append(Series(f"{n:,} particles", tuple(1e6 * nu for nu in given), tuple(1e6 * v for v in values)))
     curves.append(Series("given", tuple(1e6 * nu for nu in given), tuple(1e6 * nu for nu in given), "reference"))
-    if full:
-        value, d, n = own_viscosity(2_000, 1e-4, 0.05)
+    if effort.full:
+        value, d, n = own_viscosity(2_000, 1e-4, 0.05, effort.mirrored)
         measurements.append(reported("the same at U = 0.05 m/s, given 100 mm²/s", value, unit="m²/s", reference=1e-4,
                               particles=n))  # fmt: skip
     thick = next(m for m in measurements if "given 2000" in m.name)
@@ -471,42 +490,42 @@ def floor(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figu
     )
 
 
-def film(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+def film(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     """Down an incline."""
     return _figure(
-        [down_an_incline(layers, 1e-3, THETA) for layers in ((2, 3, 4, 6) if full else (4,))],
+        [down_an_incline(n, 1e-3, THETA, effort.mirrored) for n in effort.numbers((4,), (2, 3, 4, 6), coarse=1)],
         ("Film on an incline", "height over the film's", "velocity over the mean's"),
     )
 
 
-def tube_flow(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+def tube_flow(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     """Down a tube."""
     return _figure(
-        [down_a_tube(layers, 2e-3, THETA) for layers in ((3, 5, 8) if full else (3,))],
+        [down_a_tube(n, 2e-3, THETA, effort.mirrored) for n in effort.numbers((3,), (3, 5, 8), coarse=1)],
         ("Plug in a tube", "radius over the tube's", "velocity over the mean's"),
     )
 
 
-def slot_flow(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+def slot_flow(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     """Between two plates."""
     return _figure(
-        [down_a_slot(layers, 2e-3, THETA) for layers in ((2, 3, 5) if full else (3,))],
+        [down_a_slot(n, 2e-3, THETA, effort.mirrored) for n in effort.numbers((3,), (2, 3, 5), coarse=1)],
         ("Slab between plates", "distance from the middle over half the gap", "velocity over the mean's"),
     )
 
 
-def drainage(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+def drainage(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     """A film on a wall."""
     return _figure(
-        [left_on_a_wall(layers, 1e-3, THETA) for layers in ((2, 4) if full else (2,))],
+        [left_on_a_wall(n, 1e-3, THETA, effort.mirrored) for n in effort.numbers((2,), (2, 4))],
         ("What is left on a wall", "time [s]", "over the film at first"),
     )
 
 
-def puddle(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+def puddle(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     """Spreading on a plane."""
-    cases = ((2_000, 2e-3), (8_000, 2e-3), (2_000, 2e-4)) if full else ((1_000, 2e-3),)
-    return _figure([spreading(n, nu, THETA) for n, nu in cases], ("Puddle", "time [s]", "radius [m]"))
+    cases = ((2_000, 2e-3), (8_000, 2e-3), (2_000, 2e-4)) if effort.full else ((1_000, 2e-3),)
+    return _figure([spreading(n, nu, THETA, effort.mirrored) for n, nu in cases], ("Puddle", "time [s]", "radius [m]"))
 
 
 def _figure(
@@ -534,7 +553,7 @@ TIMES = (2.1, 2.3, 2.5, 2.7, 2.9, 3.1, 3.3, 3.5)
 FAR = 0.05
 
 
-def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure]:
+def cup(simulator: PourSimulator, effort: CaseEffort) -> tuple[list[Measurement], Figure]:
     """The standard pour with increasingly viscous liquids."""
     measurements: list[Measurement] = []
     curves: list[Series] = []
@@ -548,11 +567,12 @@ def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure
         angular_velocity=30 * DEG, x_offset=0.080, height=0.110, max_angle=120 * DEG, angular_acceleration=None,
         hold_time=2.0, return_velocity=None,
     )  # fmt: skip
-    for particles in (2_000, 5_000) if full else (1_000,):
+    for particles in effort.numbers((1_000,), (2_000, 5_000)):
         theta = SimulationParameters(particles=particles)
         for nu in (1e-4, 1e-3):
             liquid = scene.liquid.model_copy(update={"dynamic_viscosity": 1e3 * nu})
-            outcome = simulator.simulate(PourTask(replace(scene, liquid=liquid), action, theta, 1)).outcome
+            task = PourTask(replace(scene, liquid=liquid), action, theta, 1)
+            outcome = simulated(simulator, task, effort.mirrored).outcome
             left = 1.0 - np.interp(TIMES, outcome.curve_times, outcome.curve_poured)
             name = f"{nu * 1e3:g} Pa s"
             curves.append(Series(f"{name}, {particles:,} particles", TIMES, tuple(left.tolist())))
@@ -568,7 +588,7 @@ def cup(simulator: PourSimulator, full: bool) -> tuple[list[Measurement], Figure
     return measurements, Figure(("Thick liquids leave a cup",), ("time [s]",), ("left in the pourer",), tuple(curves))
 
 
-Work = Callable[[PourSimulator, bool], tuple[list[Measurement], Figure | None]]
+Work = Callable[[PourSimulator, CaseEffort], tuple[list[Measurement], Figure | None]]
 
 CASES: tuple[tuple[str, str, str, Work], ...] = (
     ("floor", "The solver's own viscosity", FLOOR, floor),
@@ -580,4 +600,4 @@ CASES: tuple[tuple[str, str, str, Work], ...] = (
     ("wetting", "Contact angle", wetting.ABOUT, wetting.wetting),
     ("thick-outflow", "Outflow of thick liquids", CUP, cup),
 )
-"""Name, title, description, and the function that runs it, in the quick or the full run."""
+"""Name, title, description, and the function that runs it."""

@@ -16,9 +16,10 @@ from sim_engine.action import DEG, Action
 from sim_engine.errors import InvalidSceneError
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.outcome import PourOutcome
-from sim_engine.scene import PourTask, Scene
+from sim_engine.scene import MIRRORED_FROM, PourTask, Scene
 from sim_engine.simulator import PourSimulator
 from sim_engine.validation.case_result import Measurement, at_most, reported
+from sim_engine.validation.whole_pours import simulated
 from sim_engine.vessel.shapes import ProfileShape, VesselError, VesselSpec
 from sim_engine.vessel.vessel import build_vessel
 
@@ -51,7 +52,7 @@ def random_vessel(rng: np.random.Generator, name: str, radius: tuple[float, floa
     return VesselSpec(name=name, shape=shape)
 
 
-def random_task(rng: np.random.Generator, most_particles: int) -> PourTask:
+def random_task(rng: np.random.Generator, least_particles: int, most_particles: int) -> PourTask:
     """A pour, in which the vessels may touch."""
     pourer = random_vessel(rng, "thin cup", (0.025, 0.04))
     receiver = random_vessel(rng, "thin glass", (0.03, 0.045))
@@ -66,7 +67,7 @@ def random_task(rng: np.random.Generator, most_particles: int) -> PourTask:
         height=float(rng.uniform(0.01, 0.15)),
     )
     parameters = SimulationParameters(
-        particles=round(math.exp(rng.uniform(math.log(500), math.log(most_particles)))),
+        particles=round(math.exp(rng.uniform(math.log(least_particles), math.log(most_particles)))),
         cohesion=float(rng.uniform(0.0, 0.1)),
         xsph_rate=float(rng.uniform(0.0, 5.0)),
         friction=float(rng.uniform(0.0, 0.2)),
@@ -75,26 +76,27 @@ def random_task(rng: np.random.Generator, most_particles: int) -> PourTask:
     return PourTask(scene, action, parameters, int(rng.integers(1 << 30)))
 
 
-def _one(rng: np.random.Generator, most_particles: int) -> PourOutcome:
+def _one(rng: np.random.Generator, most_particles: int, mirrored: bool) -> PourOutcome:
     for _ in range(ATTEMPTS):
         try:
-            task = random_task(rng, most_particles)
+            task = random_task(rng, MIRRORED_FROM if mirrored else 500, most_particles)
             # One simulator each: hundreds of vessels must not stay in memory.
-            return PourSimulator().simulate(task).outcome
+            return simulated(PourSimulator(), task, mirrored).outcome
         except (VesselError, InvalidSceneError):
             continue
     raise RuntimeError(f"{ATTEMPTS} draws, and in none could the vessels be kept apart")
 
 
-def random_pours(pours: int, most_particles: int, seed: int = 1) -> Escapes:
+def random_pours(pours: int, most_particles: int, seed: int = 1, mirrored: bool = False) -> Escapes:
     """Simulate random pours.
 
     Args:
         pours: number of pours.
-        most_particles: N is drawn between 500 and this, uniformly in its logarithm.
+        most_particles: N is drawn between 500, or `MIRRORED_FROM`, and this, uniformly in its logarithm.
         seed: of the draws.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    outcomes = [_one(np.random.default_rng([seed, k]), most_particles) for k in range(pours)]
+    outcomes = [_one(np.random.default_rng([seed, k]), most_particles, mirrored) for k in range(pours)]
     sums = [o.received + o.spilled + o.retained + o.in_flight + o.escaped for o in outcomes]
     return Escapes(
         pours,
@@ -105,9 +107,9 @@ def random_pours(pours: int, most_particles: int, seed: int = 1) -> Escapes:
     )
 
 
-def walls(pours: int, most_particles: int, seed: int = 1) -> list[Measurement]:
+def walls(pours: int, most_particles: int, seed: int = 1, mirrored: bool = False) -> list[Measurement]:
     """Random pours with their criteria."""
-    pours_made = random_pours(pours, most_particles, seed)
+    pours_made = random_pours(pours, most_particles, seed, mirrored)
     return [
         reported(f"particles in {pours} random pours", pours_made.particles, particles=most_particles),
         at_most("escaped particles", pours_made.escaped, 0.0, criterion="none", particles=most_particles),

@@ -47,10 +47,24 @@ FALL = 0.35
 """Height of the lip above the receiver's rim for the free jet [m]."""
 
 
-def pour(simulator: PourSimulator, particles: int, parameters: SimulationParameters, seed: int = 1) -> SimulatedPour:
+def simulated(simulator: PourSimulator, task: PourTask, mirrored: bool) -> SimulatedPour:
+    """Simulate a pour, whole or by half.
+
+    Raises:
+        ValueError: it is to be mirrored, but it is not symmetric, or has too few particles.
+    """
+    run = simulator.simulate(replace(task, scene=replace(task.scene, mirrored=mirrored)))
+    if run.outcome.mirrored != mirrored:
+        raise ValueError(f"{task.scene.name}, {task.parameters.particles} particles: it can't be simulated by half")
+    return run
+
+
+def pour(
+    simulator: PourSimulator, particles: int, parameters: SimulationParameters, seed: int = 1, mirrored: bool = False
+) -> SimulatedPour:
     """The standard pour."""
     theta = parameters.model_copy(update={"particles": particles})
-    return simulator.simulate(PourTask(SCENE, ACTION, theta, seed))
+    return simulated(simulator, PourTask(SCENE, ACTION, theta, seed), mirrored)
 
 
 def left_at(run: SimulatedPour, times: tuple[float, ...]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
@@ -59,7 +73,7 @@ def left_at(run: SimulatedPour, times: tuple[float, ...]) -> np.ndarray[tuple[in
 
 
 def outflow(
-    simulator: PourSimulator, particles: int, parameters: SimulationParameters, seeds: int
+    simulator: PourSimulator, particles: int, parameters: SimulationParameters, seeds: int, mirrored: bool = False
 ) -> tuple[list[Measurement], list[Series]]:
     """The standard pour's outflow curve.
 
@@ -68,8 +82,9 @@ def outflow(
         particles: N.
         parameters: θ; its number of particles is replaced.
         seeds: number of seeds; one of 2,000 particles differs from their mean by 0.0015.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    runs = [pour(simulator, particles, parameters, seed) for seed in range(1, seeds + 1)]
+    runs = [pour(simulator, particles, parameters, seed, mirrored) for seed in range(1, seeds + 1)]
     lefts = np.mean([left_at(run, TIMES) for run in runs], axis=0)
     measurements = [
         within(
@@ -98,7 +113,7 @@ def outflow_figure(curves: list[Series]) -> Figure:
 
 
 def delivered(
-    simulator: PourSimulator, particles: int, parameters: SimulationParameters, seeds: int
+    simulator: PourSimulator, particles: int, parameters: SimulationParameters, seeds: int, mirrored: bool = False
 ) -> list[Measurement]:
     """Fraction of the standard pour that arrives, and its variation over seeds.
 
@@ -106,8 +121,9 @@ def delivered(
         particles: N.
         parameters: θ; its number of particles is replaced.
         seeds: number of seeds.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    outcomes = [pour(simulator, particles, parameters, seed).outcome for seed in range(1, seeds + 1)]
+    outcomes = [pour(simulator, particles, parameters, seed, mirrored).outcome for seed in range(1, seeds + 1)]
     arrived = np.array([o.received for o in outcomes])
     return [
         at_least(
@@ -128,14 +144,17 @@ def delivered(
     ]
 
 
-def repeatability(simulator: PourSimulator, particles: int, parameters: SimulationParameters) -> list[Measurement]:
+def repeatability(
+    simulator: PourSimulator, particles: int, parameters: SimulationParameters, mirrored: bool = False
+) -> list[Measurement]:
     """The same pour twice, and with another seed.
 
     Args:
         particles: N.
         parameters: θ; its number of particles is replaced.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
-    first, again, other = (pour(simulator, particles, parameters, seed).outcome for seed in (1, 1, 2))
+    first, again, other = (pour(simulator, particles, parameters, seed, mirrored).outcome for seed in (1, 1, 2))
     same = replace(first, cpu_s=0.0) == replace(again, cpu_s=0.0)
     differs = replace(first, cpu_s=0.0, seed=2) != replace(other, cpu_s=0.0)
     return [
@@ -145,7 +164,7 @@ def repeatability(simulator: PourSimulator, particles: int, parameters: Simulati
 
 
 def free_jet(
-    simulator: PourSimulator, particles: int, parameters: SimulationParameters
+    simulator: PourSimulator, particles: int, parameters: SimulationParameters, mirrored: bool = False
 ) -> tuple[list[Measurement], Figure]:
     """The fall of the mass centre of parcels of the jet.
 
@@ -155,13 +174,14 @@ def free_jet(
     Args:
         particles: N.
         parameters: θ; its number of particles is replaced.
+        mirrored: whether only the half y ≥ 0 is simulated.
     """
     from sim_engine.outcome import ParticleState
 
     rate, span = 50.0, 5  # frames are taken every 0.02 s at most
     theta = parameters.model_copy(update={"particles": particles})
     action = ACTION.with_values(height=FALL, x_offset=0.12)
-    frames = simulator.simulate(PourTask(SCENE, action, theta, 1, frame_rate=rate)).frames
+    frames = simulated(simulator, PourTask(SCENE, action, theta, 1, frame_rate=rate), mirrored).frames
     assert frames is not None
     rim = 0.004 + 0.09
     z = np.stack(frames.positions)[:, :, 2].astype(float)

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from orchestrator.cli.app import app
 from sim_engine.validation import cases as suite
-from sim_engine.validation.case_result import CaseResult, Figure, Measurement, Series, reported, within
+from sim_engine.validation.case_result import CaseEffort, CaseResult, Figure, Measurement, Series, reported, within
 from tests.support.output_schema import validated
 
 ROOT = Path(__file__).parents[3]
@@ -62,6 +62,18 @@ def test_a_case_alone_passes_and_its_json_is_valid() -> None:
     assert spread["value"] is None
 
 
+@pytest.mark.parametrize("repeated", [False, True])
+def test_a_full_run_repeats_the_case_with_the_mirrored_liquid(monkeypatch: pytest.MonkeyPatch, repeated: bool) -> None:
+    def work(simulator: object, effort: CaseEffort) -> tuple[list[Measurement], None]:
+        return [height(0.05 if effort.mirrored else 0.0397)], None
+
+    monkeypatch.setattr(suite, "CASES", (suite.Case("rest", "Rest", "Liquid stands.", work, repeated),))
+    assert runner.invoke(app, ["validate-solver"]).exit_code == 0
+    result = runner.invoke(app, ["validate-solver", "--full"])
+    assert ("height, mirrored" in result.stdout, result.exit_code) == (repeated, int(repeated))
+    assert f"{1 + repeated} criteria" in result.stderr
+
+
 def test_a_wrong_name_is_refused_before_anything_runs() -> None:
     wrong = runner.invoke(app, ["validate-solver", "slosh"])
     assert wrong.exit_code == 2
@@ -69,7 +81,7 @@ def test_a_wrong_name_is_refused_before_anything_runs() -> None:
 
 
 def test_a_case_without_criteria_is_judged_by_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    def work(simulator: object, effort: suite.CaseEffort) -> tuple[list[Measurement], None]:
+    def work(simulator: object, effort: CaseEffort) -> tuple[list[Measurement], None]:
         return [reported("slope", 0.1, particles=500)], None
 
     monkeypatch.setattr(suite, "CASES", (suite.Case("long", "Long", "It takes its time.", work),))
@@ -78,8 +90,8 @@ def test_a_case_without_criteria_is_judged_by_nothing(monkeypatch: pytest.Monkey
 
 
 def test_a_fault_of_the_solver_does_not_pass() -> None:
-    def work(simulator: object, effort: suite.CaseEffort) -> tuple[list[Measurement], None]:
+    def work(simulator: object, effort: CaseEffort) -> tuple[list[Measurement], None]:
         raise ArithmeticError("at 0.1 s: diverged")
 
-    result: CaseResult = suite.Case("x", "X", "", work).run(None, suite.CaseEffort())  # type: ignore[arg-type]
+    result: CaseResult = suite.Case("x", "X", "", work).run(None, CaseEffort())  # type: ignore[arg-type]
     assert not result.passed

@@ -12,6 +12,7 @@ from sim_engine.fluid.engine import engine
 from sim_engine.liquids import Liquid, SimulationParameters
 from sim_engine.scene import PourTask, Scene
 from sim_engine.simulator import PourSimulator
+from sim_engine.validation.container_runs import EMPTY_SPACE, block, run, stir
 from sim_engine.vessel.shapes import cylinder
 
 MIRROR = np.array([1.0, -1.0, 1.0], np.float32)
@@ -51,3 +52,22 @@ def test_half_of_a_symmetric_liquid_moves_as_it_does_beside_the_other_half(
     assert fluid.steps(0) == fluid.steps(1) >= 3
     assert np.abs(fluid.particles(0)[0] - fluid.particles(1)[0][:n]).max() < agreement * half.spacing
     assert np.abs(fluid.velocities(0) - fluid.velocities(1)[:n]).max() < agreement  # of 0.5 m/s
+
+
+@pytest.mark.parametrize(("cohesion", "viscosity"), [(0.0, 0.0), (0.07, 0.0), (0.0, 1e-3)])
+def test_momentum_passes_the_plane_as_it_does_within_a_whole_liquid(
+    simulator: PourSimulator, cohesion: float, viscosity: float
+) -> None:
+    """Halves of a cube meet at 0.3 m/s and slide along the plane at 0.2 m/s: pressure stops them, and nothing else."""
+    side, theta = np.full(3, 0.02), SimulationParameters(cohesion=cohesion)
+    start, d = block(-side, side, 1000, 1, mirrored=True)
+    means: dict[bool, np.ndarray] = {}
+    for mirrored in (False, True):
+        for k, liquid in run(
+            start, d, EMPTY_SPACE, theta, np.array([1e-6, 0.03]), gravity=0.0, viscosity=viscosity, mirrored=mirrored
+        ):
+            if k == 0:
+                stir(lambda x: np.column_stack([0.2 + 0.0 * x[:, 0], -0.3 * np.sign(x[:, 1]), 0.0 * x[:, 2]]))
+            means[mirrored] = liquid.velocities[liquid.positions[:, 1] > 0.0].mean(axis=0)
+    assert means[True][0] == pytest.approx(0.2, abs=2e-3)
+    assert means[True] == pytest.approx(means[False], abs=0.01)
