@@ -12,7 +12,7 @@ None of these depends on strategies.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
@@ -60,12 +60,12 @@ class InvalidActionError(LaboratoryError):
 
     Args:
         text: the reason.
-        problems: all reasons, if there are several.
+        problems: all reasons, each with the name of the vessel that it is about, or ''; by default the text.
     """
 
-    def __init__(self, text: str = "", problems: Sequence[str] = ()) -> None:
+    def __init__(self, text: str = "", problems: Mapping[str, str] = {}) -> None:
         super().__init__(text)
-        self.problems = tuple(problems) or (text,)
+        self.problems = dict(problems) or {text: ""}
 
 
 class UnreachablePlaceError(InvalidActionError):

@@ -128,16 +128,18 @@ def check_vessels(
     pan = [place for place in places if place.use == "balance" and "receiver" in place.holds]
     if len(pan) != 1:
         raise InvalidActionError("doses need one place with 'use: balance' that holds a receiver")
-    known, homes, problems = {place.name: place for place in places}, dict[str, str](), list[str]()
+    known, homes, problems = {place.name: place for place in places}, dict[str, str](), dict[str, str]()
     for vessel in vessels:
         role: Role = "pourer" if vessel.liquid else "receiver"
-        place = known.get(vessel.place)
+        place, text = known.get(vessel.place), ""
         if place is None:
-            problems.append(f"there is no place '{vessel.place}' for a vessel; there are {', '.join(sorted(known))}")
+            text = f"there is no place '{vessel.place}' for a vessel; there are {', '.join(sorted(known))}"
         elif role not in place.holds or place.use == "balance":
-            problems.append(f"place '{place.name}' is not for a {role}: see its 'use' and 'holds'")
+            text = f"place '{place.name}' is not for a {role}: see its 'use' and 'holds'"
         elif vessel.place in homes:
-            problems.append(f"two vessels belong to place '{vessel.place}': {homes[vessel.place]} and {vessel.name}")
+            text = f"two vessels belong to place '{vessel.place}': {homes[vessel.place]} and {vessel.name}"
+        if text:
+            problems.setdefault(text, vessel.name)
         homes.setdefault(vessel.place, vessel.name)
     if problems:
         raise InvalidActionError("; ".join(problems), problems)
@@ -178,7 +180,8 @@ def plan_waste(
     try:
         return plan_emptying(emptying, others, arm_kind(spec).pouring_at(waste), vessels)
     except InvalidActionError as error:
-        raise InvalidActionError(f"'{cup.name}' cannot be emptied at '{waste.name}': {error}") from error
+        text = f"'{cup.name}' cannot be emptied at '{waste.name}': {error}"
+        raise InvalidActionError(text, {text: cup.name}) from error
 
 
 def shapes_of(places: Sequence[PlaceSettings], loads: Mapping[str, Load]) -> dict[str, Vessel]:

@@ -110,35 +110,38 @@ def check_carrying(
         InvalidActionError: it cannot; the text states why, for all places.
     """
     kind = arm_kind(spec)
-    widths, unfit = dict[Load, float](), list[str]()
-    for load in dict.fromkeys(loads.values()):
+    widths, unfit = dict[Load, float](), dict[str, str]()
+    for name, load in loads.items():
+        if load in widths:
+            continue
         try:
             widths[load] = _check_load(load, spec, gripper)
         except InvalidActionError as error:
-            unfit.append(str(error))
+            unfit.setdefault(str(error), name)
     if unfit:
         raise _refused(unfit)
     vessels = {name: load.vessel for name, load in loads.items()} | dict(others)
     opened = {name: widths[load] for name, load in loads.items()}
-    if problems := [text for _, text in kind.place_problems(places, vessels, opened)]:
+    first = {place.name: next((name for name in place.holds if name in loads), "") for place in places}
+    if problems := {text: first[places[i].name] for i, text in kind.place_problems(places, vessels, opened)}:
         raise _refused(problems)
-    ways, impossible = Ways(), list[str]()
+    ways, impossible = Ways(), dict[str, str]()
     for place in stops:
         largest = max((loads[name].volume for name in place.holds if name in loads), default=0.0)
         for full, volume in ((False, None), (True, largest)):
             try:
                 ways[place.name, full] = kind.way(place, places, vessels, volume)
             except InvalidActionError as error:
-                impossible.append(str(error))
+                impossible.setdefault(str(error), first[place.name])
     if impossible:
-        raise _refused([*dict.fromkeys(impossible)])
+        raise _refused(impossible)
     return ways
 
 
-def _refused(problems: Sequence[str]) -> InvalidActionError:
-    """The error with all problems; of a rack with many, its text has the first ones."""
+def _refused(problems: Mapping[str, str]) -> InvalidActionError:
+    """The error with all problems and their vessels; of a rack with many, its text has the first ones."""
     more = f"; and {len(problems) - SHOWN} more" if len(problems) > SHOWN else ""
-    return InvalidActionError("; ".join(problems[:SHOWN]) + more, problems)
+    return InvalidActionError("; ".join(list(problems)[:SHOWN]) + more, problems)
 
 
 def _check_load(load: Load, spec: ArmSettings, gripper: GripperSettings) -> float:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -400,8 +399,8 @@ class _Checker:
                     cup = next(vessel for vessel in each if not vessel.liquid)
                     plan_waste(at_places, self.arm, plan.scenes[0], cup, shapes_of(self.places, loads))
             except InvalidActionError as error:
-                for text in error.problems[:SHOWN]:
-                    self.add((*_named(plan, text), section), text)
+                for text, vessel in itertools.islice(error.problems.items(), SHOWN):
+                    self.add((*_dosed(plan, vessel), section), text)
                 if len(error.problems) > SHOWN:
                     self.add((section,), f"and {len(error.problems) - SHOWN} more problems of the same kind")
                 return
@@ -673,17 +672,14 @@ def check_campaign(
     return list(dict.fromkeys(checker.problems))
 
 
-def _named(plan: DispensePlan, text: str) -> tuple[Loc, ...]:
-    """Keys of the mixtures' file that describe the vessel which a problem names first."""
-    cups = () if plan.mixtures is None else (*plan.mixtures.cups, *plan.mixtures.spares)
-    liquids = list(dict.fromkeys(map(plan.liquid, plan.sources)))
-    for name in re.findall(r"'([^']+)'", text):
-        if name in plan.sources and plan.mixtures is not None:
-            i = liquids.index(plan.liquid(name))
-            return ("mixtures", "liquids", i, "source"), ("mixtures", "liquids", i, "stands"), ("pourer",)
-        if name in cups or name == plan.scenes[0].receiver.name:
-            return ("mixtures", "cups", "vessel"), ("receiver",)
-    return ()
+def _dosed(plan: DispensePlan, vessel: str) -> tuple[Loc, ...]:
+    """Keys that may describe a vessel of doses, the most specific first; none without a vessel."""
+    if vessel in plan.sources and plan.mixtures is not None:
+        i = list(dict.fromkeys(map(plan.liquid, plan.sources))).index(plan.liquid(vessel))
+        return ("mixtures", "liquids", i, "source"), ("mixtures", "liquids", i, "stands"), ("pourer",)
+    if vessel in plan.sources:
+        return ("dispense", "sources"), ("pourer",)
+    return (("mixtures", "cups", "vessel"), ("receiver",)) if vessel else ()
 
 
 def dose_section(plan: DispensePlan) -> Loc:

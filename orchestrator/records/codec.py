@@ -16,7 +16,7 @@ import types
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ValidationError
 
@@ -64,26 +64,42 @@ def digest(data: Any) -> str:
     return hashlib.sha256(canonical(data).encode()).hexdigest()
 
 
-def first_difference(expected: Any, actual: Any, path: str = "") -> str | None:
-    """The first place where two JSON-ready values differ, as text for a message; None if they are equal."""
+NOTHING: Final = object()
+"""Takes the place of a value that is missing."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A place where two JSON-ready values differ.
+
+    Attributes:
+        path: keys and indices that lead to it.
+        expected, actual: values there; `NOTHING` where the key is missing.
+    """
+
+    path: tuple[str | int, ...]
+    expected: Any
+    actual: Any
+
+    def __str__(self) -> str:
+        """'action.x_offset: 0.1 became 0.2'."""
+        steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in self.path)
+        place = "".join(steps).removeprefix(".") or "value"
+        return f"{place}: {_short(self.expected)} became {_short(self.actual)}"
+
+
+def first_difference(expected: Any, actual: Any, path: tuple[str | int, ...] = ()) -> Difference | None:
+    """The first place where two JSON-ready values differ; None if they are equal."""
     if isinstance(expected, dict) and isinstance(actual, dict):
-        for key in sorted(set(expected) | set(actual)):
-            place = f"{path}.{key}" if path else str(key)
-            if key not in actual:
-                return f"{place}: {_short(expected[key])} became nothing"
-            if key not in expected:
-                return f"{place}: nothing became {_short(actual[key])}"
-            if difference := first_difference(expected[key], actual[key], place):
-                return difference
+        inner = [(key, expected.get(key, NOTHING), actual.get(key, NOTHING)) for key in sorted(expected | actual)]
+    elif isinstance(expected, list) and isinstance(actual, list) and len(expected) == len(actual):
+        inner = [(index, *pair) for index, pair in enumerate(zip(expected, actual, strict=True))]
+    elif NOTHING not in (expected, actual) and canonical(expected) == canonical(actual):
         return None
-    if isinstance(expected, list) and isinstance(actual, list) and len(expected) == len(actual):
-        for index, (left, right) in enumerate(zip(expected, actual, strict=True)):
-            if difference := first_difference(left, right, f"{path}[{index}]"):
-                return difference
-        return None
-    if canonical(expected) == canonical(actual):
-        return None
-    return f"{path or 'value'}: {_short(expected)} became {_short(actual)}"
+    else:
+        return Difference(path, expected, actual)
+    differences = (first_difference(before, after, (*path, step)) for step, before, after in inner)
+    return next(filter(None, differences), None)
 
 
 def to_json(value: Any, hint: Any = Any) -> Any:
@@ -304,6 +320,8 @@ def _name(hint: Any) -> str:
 
 
 def _short(value: Any, limit: int = 80) -> str:
+    if value is NOTHING:
+        return "nothing"
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False, default=repr)
     return text if len(text) <= limit else text[: limit - 1] + "…"
 

@@ -440,8 +440,8 @@ class Journal(JournalReader):
     def _check_same_campaign(self, header: Header) -> None:
         if digest(self.header.fingerprint) == digest(header.fingerprint):
             return
-        difference = first_difference(self.header.fingerprint, header.fingerprint) or ""
-        if difference.endswith("mirrored: nothing became true"):
+        difference = first_difference(self.header.fingerprint, header.fingerprint)
+        if difference is not None and difference.path[-1:] == ("mirrored",) and difference.actual is True:
             raise JournalError(
                 f"{self.path}: this run simulated whole pours, and now one half would be simulated. Write 'symmetry: "
                 "off' under 'simulator' in the campaign's file to resume it, or begin a new run"

@@ -372,8 +372,10 @@ GRIPPER = GRIPPERS.get("robotiq")(model="2F-140")
 def test_vessels_that_cannot_be_carried_are_refused(change: Callable[[Any], Any], message: str) -> None:
     lab = spec()
     assert lab.arm is not None
-    with pytest.raises(InvalidActionError, match=message):
-        check_vessels(all_places(lab.places), tuple(change(lab.vessels)), lab.arm, GRIPPER)
+    vessels = tuple(change(lab.vessels))
+    with pytest.raises(InvalidActionError, match=message) as caught:
+        check_vessels(all_places(lab.places), vessels, lab.arm, GRIPPER)
+    assert set(caught.value.problems.values()) <= {vessel.name for vessel in vessels}  # whose problems these are
 
 
 def test_positions_that_overlap_are_all_refused_also_where_only_open_fingers_do() -> None:

@@ -110,6 +110,19 @@ def test_vessels_places_and_amounts_that_are_impossible_are_refused_at_once(tmp_
     assert re.match(r"12: mixtures.wanted.A1.ethanol: ethanol into rack/A1: .* support ([\d.]+) g", problems[3])
 
 
+def test_vessels_of_plain_doses_that_can_not_be_carried_are_refused_at_their_own_lines(tmp_path: Path) -> None:
+    text = CAMPAIGN.partition("mixtures:")[0].replace("floor: 4 mm}}", "floor: 4 mm}, grip: {mass: 1400 g}}")
+    text = re.sub("laboratory: .*", f"laboratory: {RACK.with_name('night.yaml')}", text)
+    text += "liquid: {name: water, mass: 350 g}\ndispense: {doses: [{amount: 50 g}], tolerance: 1 g}\non_unknown: ask\n"
+    path = tmp_path / "doses.yaml"
+    path.write_text(f"{text}outputs: {{directory: runs}}\n", encoding="utf-8")
+    problems = [f"{p.line}: {p.where}: {p.message}" for p in check_campaign(load_campaign(path))]
+    assert [problem[:40] for problem in problems] == [
+        "3: pourer: 'beaker' is too heavy when fu",
+        "4: receiver: 'cup' is carried between pl",
+    ]
+
+
 def test_a_source_whose_stream_misses_the_cups_is_refused_with_distances_that_hit(tmp_path: Path) -> None:
     _, problems = checked(tmp_path, "x_offset: 90 mm", "x_offset: 160 mm")
     assert (

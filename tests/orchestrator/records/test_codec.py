@@ -206,9 +206,16 @@ def test_entries_of_a_newer_version_are_refused_by_name() -> None:
 def test_the_first_difference_is_named() -> None:
     old = {"action": {"x_offset": 0.1}, "seed": 4, "points": [1.0, 2.0]}
     assert first_difference(old, old) is None
-    assert first_difference(old, {**old, "points": [1.0, 2.5]}) == "points[1]: 2.0 became 2.5"
-    assert first_difference(old, {**old, "action": {"x_offset": 0.2}}) == "action.x_offset: 0.1 became 0.2"
-    assert first_difference(old, {**old, "new": 1}) == "new: nothing became 1"
+    for change, path, text in (
+        ({"points": [1.0, 2.5]}, ("points", 1), "points[1]: 2.0 became 2.5"),
+        ({"action": {"x_offset": 0.2}}, ("action", "x_offset"), "action.x_offset: 0.1 became 0.2"),
+        ({"action": {}}, ("action", "x_offset"), "action.x_offset: 0.1 became nothing"),
+        ({"new": None}, ("new",), "new: nothing became null"),
+    ):
+        difference = first_difference(old, {**old, **change})
+        assert difference is not None
+        assert (difference.path, str(difference)) == (path, text)
+    assert str(first_difference([1], [1, 2])) == "value: [1] became [1, 2]"
 
 
 def test_a_request_of_a_version_without_drawn_shapes_is_read() -> None:

@@ -214,6 +214,8 @@ def test_a_run_of_whole_pours_says_how_it_is_resumed(path: Path) -> None:
     Journal.create(path, Header("toy", {"scene": {"name": "cup"}})).close()
     with pytest.raises(JournalError, match=r"simulated whole pours.* Write 'symmetry: off' under 'simulator'"):
         Journal.resume(path, Header("toy", {"scene": {"name": "cup", "mirrored": True}}))
+    with pytest.raises(JournalError, match=r"begun with other settings.* scene\.not_mirrored: nothing became true"):
+        Journal.resume(path, Header("toy", {"scene": {"name": "cup", "not_mirrored": True}}))
 
 
 @pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
