@@ -17,7 +17,7 @@ from sim_engine.resources import cache_directory
 
 with imports(NAME):
     from sim_engine.fluid.state import CELLS, LEAST_CELLS, LIST_RESERVE, NEIGHBOURS, FluidState, of_parameters
-    from sim_engine.fluid.step import FACTS, LONGEST_STEP, Stepper
+    from sim_engine.fluid.step import FACTS, LONGEST_STEP, STATES, Stepper
 
 POOL, MOST_SCENES = 50_000, 64
 """Capacity of a process: particles, and scenes. The largest scene has 50,000 particles, or half of them and their
@@ -48,7 +48,7 @@ class FluidEngine:
         self._poses = np.zeros((1, 7), np.float32)
         self._thick: list[bool] = []
         self._ranges: list[tuple[int, int]] = []
-        self._facts = np.zeros((0, len(FACTS)))
+        self._facts = np.zeros((0, STATES + len(FACTS)))
 
     def load(self, setups: Sequence[SceneSetup]) -> None:
         """Set up scenes, which replace the loaded ones.
@@ -119,7 +119,7 @@ class FluidEngine:
         for (first, count), setup in zip(self._ranges, setups, strict=True):
             positions[first : first + count] = setup.positions
         self._load(self.state.table.rows(scenes), positions)
-        self._facts = np.full((self.scenes, len(FACTS)), np.nan)
+        self._facts = np.full((self.scenes, STATES + len(FACTS)), np.nan)
 
     @ti.kernel
     def _load(
@@ -170,17 +170,14 @@ class FluidEngine:
         times, due = np.full(scene + 1, until), np.ones(scene + 1, np.int32)
         tables = self._grids, self._planes, self._cavities, self._poses
         while due[scene]:
-            self.stepper.advance(scene, scene + 1, times, *tables, due, self._thick[scene])
+            self.stepper.advance(scene, scene + 1, times, *tables, due, self._facts, self._thick[scene])
             if due[scene]:
                 self.stepper.cohere(scene, scene + 1, due)
-        self._facts[scene] = np.nan
 
     def census(self, scene: int = 0) -> NDArray[np.int32]:
         """Particles in each `ParticleState`, shape (5,)."""
-        counts = np.zeros((scene + 1, len(ParticleState)), np.int32)
-        self.stepper.look(scene, scene + 1, counts, self._facts)
-        counted: NDArray[np.int32] = counts[scene]
-        return counted
+        counts: NDArray[np.int32] = self._row(scene)[:STATES].astype(np.int32)
+        return counts
 
     def _copies(self, scene: int) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
         begin, n = self._ranges[scene]
@@ -197,10 +194,14 @@ class FluidEngine:
         """Velocities (N, 3) [m/s], in the order in which they were loaded."""
         return self._copies(scene)[1]
 
-    def _fact(self, name: str, scene: int) -> float:
+    def _row(self, scene: int) -> NDArray[np.float64]:
         if np.isnan(self._facts[scene, 0]):
-            self.census(scene)
-        return float(self._facts[scene, FACTS.index(name)])
+            self.advance(-np.inf, scene)
+        row: NDArray[np.float64] = self._facts[scene]
+        return row
+
+    def _fact(self, name: str, scene: int) -> float:
+        return float(self._row(scene)[STATES + FACTS.index(name)])
 
     def time(self, scene: int = 0) -> float:
         """Time of a scene [s]."""

@@ -62,7 +62,8 @@ TREACLE = 0.7
 of thick liquids become zero: an expanding lattice would throw films off walls."""
 
 FACTS = ("time", "fault", "steps", "iterations", "compression")
-"""Names of the fields that `Stepper.look` returns for a scene in addition to its particles."""
+"""Names of the fields that `Stepper.advance` returns for a scene, after its number of particles in each state."""
+STATES = len(ParticleState)
 
 IN_POURER, IN_FLIGHT, RECEIVED, SPILLED, ESCAPED = (int(s) for s in ParticleState)
 
@@ -478,10 +479,11 @@ class Stepper:
         cavities: ti.types.ndarray(dtype=ti.u8, ndim=1),
         poses: ti.types.ndarray(dtype=ti.f32, ndim=2),
         due: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        facts: ti.types.ndarray(dtype=ti.f64, ndim=2),
         thick: ti.template(),
     ):
         """Advance each of the scenes s0 … s1 − 1 until its time reaches `until[s]` [s], a fault stops it, or cohesion
-        is due.
+        is due. Store the number of particles in each state and `FACTS`, a row for each scene.
 
         Cohesion is due in the middle of a step: if `due[s]` is 1, call `cohere`, and then this kernel again. Two
         kernels compile in less time than one with both parts, and simulations without cohesion never compile the
@@ -501,6 +503,14 @@ class Stepper:
                     # Cohesion that acts too late is unstable, so it acts before the interval ends.
                     if f.cohesion[s] > 0.0 and f.pull_waited[s] + f.dt[s] > f.pull_wait[s]:
                         due[s] = 1
+            counts = ti.Vector([0] * STATES)
+            for i in range(f.begin[s], f.begin[s] + f.particles[s]):
+                for state in ti.static(range(STATES)):
+                    counts[state] += ti.cast(f.home[i] == state, ti.i32)
+            for state in ti.static(range(STATES)):
+                facts[s, state] = counts[state]
+            for k in ti.static(range(len(FACTS))):
+                facts[s, STATES + k] = self.facts[k][s]
 
     @ti.kernel
     def cohere(self, s0: ti.i32, s1: ti.i32, due: ti.types.ndarray(dtype=ti.i32, ndim=1)):
@@ -510,21 +520,3 @@ class Stepper:
             if due[s] == 1:
                 pull(f, s, f.pull_waited[s])
                 f.pull_waited[s] = 0.0
-
-    @ti.kernel
-    def look(
-        self,
-        s0: ti.i32,
-        s1: ti.i32,
-        counts: ti.types.ndarray(dtype=ti.i32, ndim=2),
-        facts: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    ):
-        """Number of particles in each state, and `FACTS`, for each of the scenes s0 … s1 − 1."""
-        f = self.state
-        for s in range(s0, s1):
-            for k in ti.static(range(len(FACTS))):
-                facts[s, k] = self.facts[k][s]
-            for k in range(5):
-                counts[s, k] = 0
-            for i in range(f.begin[s], f.begin[s] + f.particles[s]):
-                counts[s, f.home[i]] += 1
