@@ -28,9 +28,6 @@ LAYERS = 3.0
 search then reads little more of it than it needs."""
 
 
-NEAR_PLANE = SUPPORT + 2.0
-"""Distance from the plane of symmetry within which particles have images, in spacings: the support and a step."""
-
 GOLDEN = 0.61803399
 """Fractional parts of its multiples are evenly spread over [0, 1) (Weyl 1916)."""
 
@@ -46,13 +43,12 @@ def reflect(f: ti.template(), s, values: ti.template(), signs: ti.template()):
         values: of all particles; a fourth component is a number.
         signs: `POLAR`, `AXIAL` or `SCALAR`.
     """
-    if f.mirrored[s] == 1:
-        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            if f.x[i][1] < NEAR_PLANE * f.spacing[s]:
-                value = values[i]
-                for c in ti.static(range(len(signs))):
-                    value[c] *= signs[c]
-                values[i + f.particles[s]] = value
+    for m in range(f.begin[s], f.begin[s] + f.images[s]):
+        i = f.near[m]
+        value = values[i]
+        for c in ti.static(range(len(signs))):
+            value[c] *= signs[c]
+        values[i + f.particles[s]] = value
 
 
 @ti.func
@@ -70,12 +66,12 @@ def change_places(f: ti.template(), s, i):
 def part_from_own(f: ti.template(), s):
     """Lengthen the distance of each particle from its own image, squared in `pair`."""
     # r² = 4 y² + (a d)², a between 0 and `apart` for each particle: how near it may come to the plane differs.
-    if f.mirrored[s] == 1:
-        for i in range(f.begin[s], f.begin[s] + f.moving[s]):
-            k = ti.max(f.first[i] + f.count[i] - 1, 0)  # its own image is listed last
-            if f.count[i] > 0 and f.neighbour[k] == i + f.particles[s]:
-                share = GOLDEN * f.name[i]
-                f.pair[k] = f.pair[k] + (f.apart[s] * f.spacing[s] * (share - ti.floor(share))) ** 2
+    for m in range(f.begin[s], f.begin[s] + f.images[s]):
+        i = f.near[m]
+        k = ti.max(f.first[i] + f.count[i] - 1, 0)  # its own image is listed last
+        if f.count[i] > 0 and f.neighbour[k] == i + f.particles[s]:
+            share = GOLDEN * f.name[i]
+            f.pair[k] = f.pair[k] + (f.apart[s] * f.spacing[s] * (share - ti.floor(share))) ** 2
 
 
 @ti.func
@@ -83,11 +79,12 @@ def list_images(f: ti.template(), s, i, entries, reach, low, edge, size):
     """List the images within `reach` of a particle, its own last, and return the end of its list."""
     table = f.cells_begin[s]
     x = f.x[i]
-    a0 = ti.max(ti.cast((x[0] - low[0] - reach) / edge[0], ti.i32), 0)
-    a1 = ti.min(ti.cast((x[0] - low[0] + reach) / edge[0], ti.i32), size[0] - 1)
+    along = ti.sqrt(reach * reach - x[1] * x[1])  # an image is at least y away
+    a0 = ti.max(ti.cast((x[0] - low[0] - along) / edge[0], ti.i32), 0)
+    a1 = ti.min(ti.cast((x[0] - low[0] + along) / edge[0], ti.i32), size[0] - 1)
     b1 = ti.min(ti.cast((reach - x[1] - low[1]) / edge[1], ti.i32), size[1] - 1)
-    c0 = ti.max(ti.cast((x[2] - low[2] - reach) / edge[2], ti.i32), 0)
-    c1 = ti.min(ti.cast((x[2] - low[2] + reach) / edge[2], ti.i32), size[2] - 1)
+    c0 = ti.max(ti.cast((x[2] - low[2] - along) / edge[2], ti.i32), 0)
+    c1 = ti.min(ti.cast((x[2] - low[2] + along) / edge[2], ti.i32), size[2] - 1)
     for a in range(a0, a1 + 1):
         for b in range(0, b1 + 1):
             column = table + (a * size[1] + b) * size[2]
@@ -95,9 +92,9 @@ def list_images(f: ti.template(), s, i, entries, reach, low, edge, size):
             if column + c0 > table:
                 j0 = f.cell_start[column + c0 - 1]
             for j in range(j0, f.cell_start[column + c1]):
-                image = j + f.particles[s]
-                f.neighbour[entries] = image
-                entries += ti.cast(square(x - f.x[image]) < reach * reach and i != j, ti.i32)
+                f.neighbour[entries] = j + f.particles[s]
+                r = x - f.x[j] * POLAR
+                entries += ti.cast(square(r) < reach * reach and i != j, ti.i32)
     if 2.0 * x[1] < reach:
         f.neighbour[entries] = i + f.particles[s]
         entries += 1
@@ -156,7 +153,6 @@ def rebuild(f: ti.template(), s, skin):
     Pairs with images are listed at both particles: they add to the particle alone."""
     reach = (SUPPORT + skin) * f.spacing[s]
     low, edge, size = sort(f, s, reach)
-    reflect(f, s, f.x, POLAR)
     list_pairs(f, s, reach, low, edge, size)
 
 
@@ -204,6 +200,7 @@ def list_pairs(f: ti.template(), s, reach, low, edge, size):
     entries = f.list_begin[s]
     last = f.list_begin[s] + f.particles[s] * NEIGHBOURS
     reach2 = reach * reach
+    f.images[s] = 0
     for i in range(f.begin[s], f.begin[s] + f.moving[s]):
         xi = f.x[i]
         q = ti.cast((xi - low) / edge, ti.i32)
@@ -229,6 +226,8 @@ def list_pairs(f: ti.template(), s, reach, low, edge, size):
                     f.neighbour[entries] = j
                     entries += ti.cast(square(r) < reach2, ti.i32)
         if f.mirrored[s] == 1 and xi[1] < reach:
+            f.near[begin + f.images[s]] = i
+            f.images[s] = f.images[s] + 1
             entries = list_images(f, s, i, entries, reach, low, edge, size)
         f.count[i] = entries - f.first[i]
         if entries > last:
@@ -268,7 +267,6 @@ def take_seats(f: ti.template(), s, reach):
     table = f.cells_begin[s]
     for i in range(begin, end):
         change_places(f, s, i)
-    reflect(f, s, f.x, POLAR)
     low, edge, size = cover(f, s, reach, reach * f.mirrored[s])
     cells = size[0] * size[1] * size[2]
     for c in range(table, table + cells + 1):
@@ -279,6 +277,7 @@ def take_seats(f: ti.template(), s, reach):
         f.cell[i] = c
         f.cell_start[c] = f.cell_start[c] + 1
         if f.mirrored[s] == 1 and f.x[i][1] < reach:
+            f.x[i + n] = f.x[i] * POLAR
             c = cell_at(table, f.x[i + n], low, edge, size)
             f.cell_start[c] = f.cell_start[c] + 1
             behind += 1

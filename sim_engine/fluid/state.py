@@ -158,7 +158,7 @@ class FluidState:
         self.push = ti.Vector.field(VESSELS, ti.f32, shape=pool)
         self.normal = ti.Matrix.field(VESSELS, 3, ti.f32, shape=pool)
         self.home, self.home_copy, self.name, self.name_copy = (scalars(ti.i32) for _ in range(4))
-        self.cell = scalars(ti.i32)
+        self.cell, self.near = scalars(ti.i32), scalars(ti.i32)
         self.gradient, self.squares = vectors(), scalars()
         self.sums, self.place, self.move = (ti.Vector.field(4, ti.f32, shape=pool) for _ in range(3))
         self.first, self.count = scalars(ti.i32), scalars(ti.i32)
@@ -229,6 +229,7 @@ class FluidState:
         self.passes = ti.field(ti.i32, shape=scenes)  # of conjugate gradients
         self.rebuilds = ti.field(ti.i32, shape=scenes)
         self.moving = ti.field(ti.i32, shape=scenes)
+        self.images = ti.field(ti.i32, shape=scenes)
         self.stale = ti.field(ti.i32, shape=scenes)  # 1: neighbour lists must be rebuilt
         self.fault = ti.field(ti.i32, shape=scenes)  # 1: lists overflowed, 2: a position is not finite
         self.compression = ti.field(ti.f64, shape=scenes)  # sum over steps of the mean interior max(ρ/ρ₀ − 1, 0)
