@@ -12,7 +12,6 @@ from sim_engine.collision import rotations
 from sim_engine.fluid.compiler import KERNELS, NAME, ti
 from sim_engine.fluid.engine_startup import imports, look_up_quickly, uncollected
 from sim_engine.fluid.scene_setup import POSE_STEP, SceneSetup, pose_at
-from sim_engine.outcome import ParticleState
 from sim_engine.resources import cache_directory
 
 with imports(NAME):
@@ -43,9 +42,7 @@ class FluidEngine:
         self.state = FluidState(self.most_scenes, self.pool)
         self.stepper = Stepper(self.state)
         self.scenes = 0
-        self._grids = self._planes = np.zeros(1, np.float32)
-        self._cavities = np.zeros(1, np.uint8)
-        self._poses = np.zeros((1, 7), np.float32)
+        self._tables, self._cavities = np.zeros(1, np.float32), np.zeros(1, np.uint8)
         self._thick: list[bool] = []
         self._ranges: list[tuple[int, int]] = []
         self._facts = np.zeros((0, STATES + len(FACTS)))
@@ -59,15 +56,12 @@ class FluidEngine:
         blocks = [len(setup.positions) * (1 + setup.mirrored) for setup in setups]
         if sum(blocks) > self.pool:
             raise ValueError(f"{sum(blocks)} particles; at most {self.pool}")
-        values, planes = _Pool[np.float32](), _Pool[np.float32]()
-        insides = _Pool[np.uint8]()
-        begin, row = 0, 0
+        tables, insides = _Pool[np.float32](), _Pool[np.uint8]()
+        begin = 0
         scenes: list[dict[str, ArrayLike]] = []
         for s, setup in enumerate(setups):
             count = len(setup.positions)
             both = (setup.pourer, setup.receiver)
-            for walls in both:
-                insides.add(walls.inside, walls.grid.values)
             pose = pose_at(setup.poses, setup.start)
             origins, turns = [pose[:3], setup.receiver_at], [*rotations(pose[None]), np.eye(3)]
             scenes.append(
@@ -81,8 +75,9 @@ class FluidEngine:
                     "cells": count * CELLS + LEAST_CELLS,
                     "gravity": setup.gravity,
                     "longest_step": LONGEST_STEP if setup.longest_step is None else setup.longest_step,
-                    "grid_offset": [values.add(walls.grid.values) for walls in both],
-                    "plane_offset": [planes.add(walls.plane) for walls in both],
+                    "grid_offset": [tables.add(walls.grid.values) for walls in both],
+                    "plane_offset": [tables.add(walls.plane) for walls in both],
+                    "cavity_offset": [insides.add(walls.inside) for walls in both],
                     "grid_size": [walls.grid.values.shape for walls in both],
                     "grid_origin": [walls.grid.origin for walls in both],
                     "grid_spacing": [walls.grid.spacing for walls in both],
@@ -94,7 +89,7 @@ class FluidEngine:
                     "turn": turns,
                     "turn0": turns,
                     "spill_level": setup.spill_level,
-                    "poses_begin": row,
+                    "poses_begin": tables.add(setup.poses.astype(np.float32)),
                     "table_step": POSE_STEP,
                     "table_length": len(setup.poses),
                     "time": setup.start - setup.settling,
@@ -108,9 +103,7 @@ class FluidEngine:
                 }
             )
             begin += blocks[s]
-            row += len(setup.poses)
-        self._grids, self._planes, self._cavities = values.array(), planes.array(), insides.array()
-        self._poses = np.concatenate([s.poses for s in setups]).astype(np.float32)
+        self._tables, self._cavities = tables.array(), insides.array()
         self.scenes = len(setups)
         begins = np.cumsum([0, *blocks])
         self._ranges = [(int(first), len(setup.positions)) for first, setup in zip(begins, setups, strict=False)]
@@ -167,12 +160,10 @@ class FluidEngine:
 
     def advance(self, until: float, scene: int = 0) -> None:
         """Advance one scene until its time reaches `until` [s] or a fault stops it."""
-        times, due = np.full(scene + 1, until), np.ones(scene + 1, np.int32)
-        tables = self._grids, self._planes, self._cavities, self._poses
-        while due[scene]:
-            self.stepper.advance(scene, scene + 1, times, *tables, due, self._facts, self._thick[scene])
-            if due[scene]:
-                self.stepper.cohere(scene, scene + 1, due)
+        self.stepper.advance(scene, until, self._tables, self._cavities, self._facts, self._thick[scene])
+        while self._fact("open", scene):
+            self.stepper.cohere(scene, scene + 1)
+            self.stepper.advance(scene, until, self._tables, self._cavities, self._facts, self._thick[scene])
 
     def census(self, scene: int = 0) -> NDArray[np.int32]:
         """Particles in each `ParticleState`, shape (5,)."""
@@ -235,17 +226,13 @@ class _Pool(Generic[T]):
         self._offsets: dict[int, int] = {}
         self._size = 0
 
-    def add(self, array: NDArray[T], known_as: object = None) -> int:
-        """Add an array and return its offset in the pool.
-
-        Arrays that are `known_as` the same object are stored once.
-        """
-        key = id(array if known_as is None else known_as)
-        if key not in self._offsets:
-            self._offsets[key] = self._size
+    def add(self, array: NDArray[T]) -> int:
+        """Add an array and return its offset in the pool."""
+        if id(array) not in self._offsets:
+            self._offsets[id(array)] = self._size
             self._parts.append(array.ravel())
             self._size += array.size
-        return self._offsets[key]
+        return self._offsets[id(array)]
 
     def array(self) -> NDArray[T]:
         """The whole pool."""

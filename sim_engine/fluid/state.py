@@ -127,6 +127,7 @@ class FluidState:
         sag: how much lower each vessel's rim is for this particle [m], see `walls.py`.
         home: see `sim_engine.outcome.ParticleState`; `name`: index in the scene before any sorting.
         cell: index of the particle's cell.
+        near: particles that have images, `images` of a scene: those near the plane when lists were last built.
         seated, seat, stretch: of passes without lists (`neighbours.py`): the particle in a seat, its position in units
             of the reach, and the stretches with its possible partners: from one seat up to the one before a second,
             `STRETCHES` times a seat.
@@ -208,7 +209,7 @@ class FluidState:
         self.wall_shift = ti.field(ti.f32, shape=scenes)  # walls act as if nearer by this distance, in supports h
         self.wait = ti.field(ti.f32, shape=scenes)  # interval at which viscosity acts [s]
         self.pull_wait = ti.field(ti.f32, shape=scenes)  # longest interval at which cohesion acts [s]
-        self.poses_begin = ti.field(ti.i32, shape=scenes)  # first row in the table of poses
+        self.poses_begin = ti.field(ti.i32, shape=scenes)  # where poses of seven numbers start in the table
         self.table_step = ti.field(ti.f32, shape=scenes)  # of the pose table [s]
         self.table_length = ti.field(ti.i32, shape=scenes)
         self.start = ti.field(ti.f64, shape=scenes)  # time at which the pourer begins to move [s]
@@ -233,12 +234,13 @@ class FluidState:
         self.stale = ti.field(ti.i32, shape=scenes)  # 1: neighbour lists must be rebuilt
         self.fault = ti.field(ti.i32, shape=scenes)  # 1: lists overflowed, 2: a position is not finite
         self.compression = ti.field(ti.f64, shape=scenes)  # sum over steps of the mean interior max(ρ/ρ₀ − 1, 0)
-        # Signed distance grids: where they start in the shared pool of values, size, origin, spacing.
+        # Signed distance grids: where they start in the table of values, size, origin, spacing.
         self.grid_offset = ti.field(ti.i32, shape=(scenes, VESSELS))
         self.grid_size = ti.Vector.field(3, ti.i32, shape=(scenes, VESSELS))
         self.grid_origin = ti.Vector.field(3, ti.f32, shape=(scenes, VESSELS))
         self.grid_spacing = ti.field(ti.f32, shape=(scenes, VESSELS))
         self.plane_offset = ti.field(ti.i32, shape=(scenes, VESSELS))  # … of equivalent distances, same size
+        self.cavity_offset = ti.field(ti.i32, shape=(scenes, VESSELS))  # … of cavities, same size
         self.arm = ti.field(ti.f32, shape=scenes)  # largest distance of the pourer's grid from its origin [m]
         # largest displacement of a point by the vessels in this step [m]
         self.swing = ti.field(ti.f32, shape=(scenes, VESSELS))

@@ -61,7 +61,7 @@ TREACLE = 0.7
 """Factor by which velocities shrink in every step before the start, so that a lattice settles without splashing. Those
 of thick liquids become zero: an expanding lattice would throw films off walls."""
 
-FACTS = ("time", "fault", "steps", "iterations", "compression")
+FACTS = ("time", "fault", "steps", "iterations", "compression", "open")
 """Names of the fields that `Stepper.advance` returns for a scene, after its number of particles in each state."""
 STATES = len(ParticleState)
 
@@ -100,17 +100,17 @@ class Stepper:
         self.facts = [getattr(state, name) for name in FACTS]
 
     @ti.func
-    def place_pourer(self, s, time, poses: ti.template()):
-        """Pose of the pourer from the table, whose rows are `table_step` apart."""
+    def place_pourer(self, s, time, tables: ti.template()):
+        """Pose of the pourer from its table, whose rows are `table_step` apart."""
         f = self.state
         # Linear between rows k and k + 1 at the weight w: p = p_k + w (p_{k+1} − p_k); a quaternion is then normalised.
         u = ti.cast(ti.max(time, f.start[s]) / f.table_step[s], ti.f32)
         k = ti.min(ti.cast(u, ti.i32), f.table_length[s] - 2)
         w = ti.min(u - k, 1.0)
-        k += f.poses_begin[s]
+        k = f.poses_begin[s] + 7 * k
         row = ti.Vector([0.0] * 7)
         for c in ti.static(range(7)):
-            row[c] = poses[k, c] + w * (poses[k + 1, c] - poses[k, c])
+            row[c] = tables[k + c] + w * (tables[k + 7 + c] - tables[k + c])
         q = ti.Vector([row[3], row[4], row[5], row[6]]).normalized()
         f.origin[s, 0] = ti.Vector([row[0], row[1], row[2]])
         f.turn[s, 0] = rotation(q)
@@ -401,10 +401,8 @@ class Stepper:
     def step(
         self,
         s,
-        grids: ti.template(),
-        planes: ti.template(),
+        tables: ti.template(),
         cavities: ti.template(),
-        poses: ti.template(),
         thick: ti.template(),
     ):
         """One time step of one scene, up to cohesion, which has a separate kernel; `conclude` completes the step."""
@@ -420,23 +418,23 @@ class Stepper:
         f.origin0[s, 0] = f.origin[s, 0]
         f.turn0[s, 0] = f.turn[s, 0]
         f.time[s] += dt
-        self.place_pourer(s, f.time[s], poses)
+        self.place_pourer(s, f.time[s], tables)
         # Upper bound of the displacement of any point of the pourer's grid in the step: a difference of two rotations
         # stretches nothing by more than 1/√2 of its Frobenius norm.
         turned = f.turn[s, 0] - f.turn0[s, 0]
         f.swing[s, 0] = length(f.origin[s, 0] - f.origin0[s, 0]) + turned.norm() * (f.arm[s] / ti.sqrt(2.0))
         if ti.static(thick):
             flow(f, s, dt)
-        self.predict(s, dt, grids, thick)
+        self.predict(s, dt, tables, thick)
         if f.stale[s] == 1:
             rebuild(f, s, SKIN)
-        self.look_at_walls(s, planes)
+        self.look_at_walls(s, tables)
         if ti.static(thick):
             measure_before(f, s)
         self.solve_density(s, ratio, thick)
         if ti.static(thick):
             self.decompress(s)
-        self.finish(s, dt, grids, thick)
+        self.finish(s, dt, tables, thick)
         if ti.static(thick):
             yield_to_shear(f, s, dt)
         else:
@@ -471,38 +469,34 @@ class Stepper:
     @ti.kernel
     def advance(
         self,
-        s0: ti.i32,
-        s1: ti.i32,
-        until: ti.types.ndarray(dtype=ti.f64, ndim=1),
-        grids: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        planes: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        scene: ti.i32,
+        until: ti.f64,
+        tables: ti.types.ndarray(dtype=ti.f32, ndim=1),
         cavities: ti.types.ndarray(dtype=ti.u8, ndim=1),
-        poses: ti.types.ndarray(dtype=ti.f32, ndim=2),
-        due: ti.types.ndarray(dtype=ti.i32, ndim=1),
         facts: ti.types.ndarray(dtype=ti.f64, ndim=2),
         thick: ti.template(),
     ):
-        """Advance each of the scenes s0 … s1 − 1 until its time reaches `until[s]` [s], a fault stops it, or cohesion
-        is due. Store the number of particles in each state and `FACTS`, a row for each scene.
+        """Advance a scene until its time reaches `until` [s], a fault stops it, or cohesion is due. Store the number of
+        its particles in each state and `FACTS`, in its row.
 
-        Cohesion is due in the middle of a step: if `due[s]` is 1, call `cohere`, and then this kernel again. Two
+        Cohesion is due in the middle of a step, which is then `open`: call `cohere`, and then this kernel again. Two
         kernels compile in less time than one with both parts, and simulations without cohesion never compile the
-        second.
+        second. A call costs 7 µs for each array.
 
-        Scenes are independent and run one after another. Either all of them are `thick`, liquids with a viscosity in
-        SI, or none is. These are two kernels, so that neither contains code of the other.
+        The scene is `thick`, a liquid with a viscosity in SI, or it is not. These are two kernels, so that neither
+        contains code of the other.
         """
         f = self.state
-        for s in range(s0, s1):
-            due[s] = 0
-            while due[s] == 0 and (f.open[s] == 1 or (f.time[s] < until[s] and f.fault[s] == 0)):
+        for s in range(scene, scene + 1):
+            due = 0
+            while due == 0 and (f.open[s] == 1 or (f.time[s] < until and f.fault[s] == 0)):
                 if f.open[s] == 1:
                     self.conclude(s, cavities, thick)
                 else:
-                    self.step(s, grids, planes, cavities, poses, thick)
+                    self.step(s, tables, cavities, thick)
                     # Cohesion that acts too late is unstable, so it acts before the interval ends.
                     if f.cohesion[s] > 0.0 and f.pull_waited[s] + f.dt[s] > f.pull_wait[s]:
-                        due[s] = 1
+                        due = 1
             counts = ti.Vector([0] * STATES)
             for i in range(f.begin[s], f.begin[s] + f.particles[s]):
                 for state in ti.static(range(STATES)):
@@ -513,10 +507,9 @@ class Stepper:
                 facts[s, STATES + k] = self.facts[k][s]
 
     @ti.kernel
-    def cohere(self, s0: ti.i32, s1: ti.i32, due: ti.types.ndarray(dtype=ti.i32, ndim=1)):
-        """Let cohesion act in those of the scenes s0 … s1 − 1 in which it is due."""
+    def cohere(self, s0: ti.i32, s1: ti.i32):
+        """Let cohesion act in the scenes s0 … s1 − 1."""
         f = self.state
         for s in range(s0, s1):
-            if due[s] == 1:
-                pull(f, s, f.pull_waited[s])
-                f.pull_waited[s] = 0.0
+            pull(f, s, f.pull_waited[s])
+            f.pull_waited[s] = 0.0

@@ -151,7 +151,7 @@ def in_cavity(f: ti.template(), cavities: ti.template(), s, b, y):
     i = ti.cast(ti.floor((y - f.grid_origin[s, b]) / f.grid_spacing[s, b] + 0.5), ti.i32)
     inside = 0
     if i[0] >= 0 and i[1] >= 0 and i[2] >= 0 and i[0] < size[0] and i[1] < size[1] and i[2] < size[2]:
-        inside = ti.cast(cavities[f.grid_offset[s, b] + (i[0] * size[1] + i[1]) * size[2] + i[2]], ti.i32)
+        inside = ti.cast(cavities[f.cavity_offset[s, b] + (i[0] * size[1] + i[1]) * size[2] + i[2]], ti.i32)
     return inside
 
 

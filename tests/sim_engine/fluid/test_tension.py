@@ -87,7 +87,7 @@ def test_forces_are_the_gradient_of_the_energy_in_every_scene_of_a_load(seed: in
         left_behind.fill(np.nan)
     for s in range(len(blobs)):
         f.pull_waited[s] = DT
-    fluid.stepper.cohere(0, len(blobs), np.ones(len(blobs), np.int32))
+    fluid.stepper.cohere(0, len(blobs))
     unit = cohesion_acceleration(TENSION, DENSITY, D) * DT
     for s, points in enumerate(blobs):
         forces = fluid.velocities(s).astype(float) / unit
