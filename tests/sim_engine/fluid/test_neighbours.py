@@ -71,3 +71,31 @@ def test_momentum_passes_the_plane_as_it_does_within_a_whole_liquid(
             means[mirrored] = liquid.velocities[liquid.positions[:, 1] > 0.0].mean(axis=0)
     assert means[True][0] == pytest.approx(0.2, abs=2e-3)
     assert means[True] == pytest.approx(means[False], abs=0.01)
+
+
+def test_spray_that_crosses_the_plane_goes_on_as_its_image(simulator: PourSimulator) -> None:
+    d, theta = 5e-3, SimulationParameters(cohesion=0.0, xsph_rate=0.0, smagorinsky_constant=0.0)
+    start = np.array([[6.0 * d * k, 0.6 * d, 0.0] for k in range(5)])
+    for k, _ in run(start, d, EMPTY_SPACE, theta, np.array([1e-6, 0.1]), gravity=0.0, mirrored=True):
+        if k == 0:
+            stir(lambda x: np.array([0.0, -0.3, 0.0]) + 0.0 * x)
+    positions, _ = engine().particles()  # of the half that is simulated
+    assert positions == pytest.approx(start * [1.0, -1.0, 1.0] + [0.0, 0.03, 0.0], abs=2e-3)  # it stirs after a step
+    assert engine().velocities()[:, 1] == pytest.approx(0.3, abs=1e-3)
+
+
+def test_a_thick_liquid_that_turns_within_the_plane_is_held_back_as_little_as_a_whole_one(
+    simulator: PourSimulator,
+) -> None:
+    side, theta, left = np.full(3, 0.02), SimulationParameters(cohesion=0.0), []
+    start, d = block(-side, side, 1000, 1, mirrored=True)
+    for mirrored in (False, True):
+        for k, liquid in run(
+            start, d, EMPTY_SPACE, theta, np.array([1e-6, 0.03]), gravity=0.0, viscosity=1e-2, mirrored=mirrored
+        ):
+            x, v = liquid.positions, liquid.velocities
+            if k == 0:
+                stir(lambda x: SPIN * np.column_stack([x[:, 2], 0.0 * x[:, 1], -x[:, 0]]))
+                begun = SPIN * np.sum(x[:, 0] ** 2 + x[:, 2] ** 2)
+        left.append(np.sum(v[:, 0] * x[:, 2] - v[:, 2] * x[:, 0]) / begun)
+    assert left[1] == pytest.approx(left[0], abs=0.01)
