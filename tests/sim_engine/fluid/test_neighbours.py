@@ -99,3 +99,20 @@ def test_a_thick_liquid_that_turns_within_the_plane_is_held_back_as_little_as_a_
                 begun = SPIN * np.sum(x[:, 0] ** 2 + x[:, 2] ** 2)
         left.append(np.sum(v[:, 0] * x[:, 2] - v[:, 2] * x[:, 0]) / begun)
     assert left[1] == pytest.approx(left[0], abs=0.01)
+
+
+def test_a_scene_gives_beside_another_one_what_it_gives_alone(simulator: PourSimulator) -> None:
+    """Their vessels, poses and cavities differ, and lie one after another in the same tables."""
+    other = replace(SCENE, pourer=cylinder("flask", inner_radius=0.04, inner_height=0.12))
+    tasks = [PourTask(scene, FAST, SimulationParameters(particles=200), 1) for scene in (SCENE, other)]
+    setups = [simulator._setup(task, simulator.prepare(task), 0.0, False) for task in tasks]
+    fluid, alone = engine(), []
+    for setup in setups:
+        fluid.load([setup])
+        fluid.advance(0.3)
+        alone.append((fluid.particles()[0], fluid.census()))
+    fluid.load(setups)
+    for scene in (0, 1):
+        fluid.advance(0.3, scene)
+        assert np.array_equal(fluid.particles(scene)[0], alone[scene][0])
+        assert np.array_equal(fluid.census(scene), alone[scene][1])
