@@ -396,21 +396,21 @@ class RayLaboratory(_OpenLaboratory):
             # The ground truth's simulator, on the arm's machine. It reserves no core: the pool's size is the
             # campaign's choice, and a pour must never wait for it.
             placement = None if node is None else node.options
-            self._liquid = self._open_pool(ray_pool(1, self._make, cpus=0.0, placement=placement))
+            self._liquid = self._open_pool(ray_pool(1, self._make, cpus=0.0, placement=placement, tell=self._tell_loss))
         await self._open_bench(partial(RayDevice, node=node), self._liquid)
 
-    def _ray_pool(self) -> WorkerPool:
-        def tell(text: str) -> None:
-            self._report(Notice("warning", text))
+    def _tell_loss(self, text: str) -> None:
+        self._report(Notice("warning", text))
 
+    def _ray_pool(self) -> WorkerPool:
         if self._cluster is None:
-            return ray_pool(self._spec.simulator_count, self._make, tell=tell)
+            return ray_pool(self._spec.simulator_count, self._make, tell=self._tell_loss)
         pool = ray_pool(
             self._spec.simulators or self._cluster.cpus,
             self._make,
             placement={"scheduling_strategy": "SPREAD"},
             expected=versions(),
-            tell=tell,
+            tell=self._tell_loss,
         )
         if not self._spec.simulators:
             self._cluster.grown = pool.grow

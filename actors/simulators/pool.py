@@ -74,10 +74,12 @@ class Greeting:
     Attributes:
         pid: its process id.
         host: the name and address of another machine, for messages; '' on this one.
+        died: done once the process has died, also without a job; None if that is noticed by the next job.
     """
 
     pid: int
     host: str = ""
+    died: asyncio.Future[None] | None = None
 
 
 @dataclass(frozen=True)
@@ -408,6 +410,8 @@ class WorkerPool:
         error = started.exception()
         if error is None:
             member.greeting = started.result()
+            if member.greeting.died is not None:
+                member.greeting.died.add_done_callback(partial(self._died, member))
         if member not in self._members:
             return
         if isinstance(error, WorkerLostError):
@@ -418,6 +422,11 @@ class WorkerPool:
             unusable = isinstance(error, WorkerUnusableError)
             self._refuse(member, str(error) if unusable else f"a simulator can't be started: {error}")
         self._dispatch()
+
+    def _died(self, member: _Member, died: asyncio.Future[None]) -> None:
+        """A process has died. If it had jobs, their replies say why."""
+        if member in self._members and not member.sent and not died.cancelled() and self._abandoned is None:
+            self._lose(member)
 
     def _refuse(self, member: _Member, problem: str) -> None:
         """Reject a worker that would fail again or return different results; start another one later."""
@@ -433,6 +442,8 @@ class WorkerPool:
         asyncio.get_running_loop().call_later(RESTART_PAUSE, self._add)
 
     def _end(self, member: _Member, timeout: float) -> None:
+        if member.greeting is not None and member.greeting.died is not None:
+            member.greeting.died.cancel()
         task = asyncio.ensure_future(member.worker.close(timeout))
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
@@ -466,9 +477,10 @@ class WorkerPool:
         if self._closed:
             return
         hosts = ", ".join(sorted({host for host, _ in losses if host}))
+        count = sum(count for _, count in losses)
+        jobs = f"{count} simulation(s) are repeated by others" if count else "no simulation has to be repeated"
         self._report(
-            f"{len(losses)} simulator(s) lost{f' on {hosts}' if hosts else ''}: "
-            f"{sum(count for _, count in losses)} simulation(s) are repeated by others; "
+            f"{len(losses)} simulator(s) lost{f' on {hosts}' if hosts else ''}: {jobs}; "
             f"{len(self._up)} of {self._size} are up"
         )
 

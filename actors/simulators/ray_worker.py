@@ -15,6 +15,7 @@ import os
 import re
 import socket
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -48,8 +49,8 @@ from sim_engine.vessel.shapes import VesselSpec
 NICENESS = 15
 """Priority of simulators, below the arm's driver, the optimiser and other programs [nice]."""
 
-CONTROL = "control"
-"""Concurrency group of calls that do not queue behind a job."""
+CONTROL, LIFE = "control", "life"
+"""Concurrency groups of calls that do not queue behind a job: short ones, and one that lasts as long as the process."""
 
 FOLDER = "meshes"
 """Folder in the cache directory for meshes received from other machines."""
@@ -95,6 +96,10 @@ class SimulatorProcess:
         """
         self._recalled.add(number)
 
+    def live(self) -> None:
+        """Never return: the call fails once the process has died."""
+        threading.Event().wait()
+
     def close(self) -> None:
         """Write the compiled kernels. If a process is killed, its kernels are lost and the next one compiles them
         again.
@@ -116,7 +121,7 @@ class RayWorker:
         self, make: Callable[[], Simulator], packer: Packer, options: Mapping[str, Any], expected: Versions | None
     ) -> None:
         self._packer, self._expected = packer, expected
-        self._actor = actor_class(SimulatorProcess, ((CONTROL, 1),)).options(**options).remote(make)
+        self._actor = actor_class(SimulatorProcess, ((CONTROL, 1), (LIFE, 1))).options(**options).remote(make)
 
     async def start(self) -> Greeting:
         """See `Worker.start`."""
@@ -131,7 +136,9 @@ class RayWorker:
             raise _lost(error) from error
         if self._expected is not None and (difference := self._expected.difference(versions)):
             raise WorkerUnusableError(f"the simulator on {greeting.host} is not like this machine's: {difference}")
-        return greeting
+        died = asyncio.wrap_future(self._actor.live.options(concurrency_group=LIFE).remote().future())
+        died.add_done_callback(mark_retrieved)
+        return dataclasses.replace(greeting, died=died)
 
     async def run(self, number: int, task: PourTask) -> WorkerReply:
         """See `Worker.run`."""

@@ -94,14 +94,14 @@ def test_whoever_asks_simulators_or_optimiser_is_told_what_ray_has_lost(whose: s
             children = psutil.Process(program.pid).children(recursive=True)
             if lost == "raylet":
                 names = ("raylet", "ray::SimulatorProcess", "ray::Proposer")
-                struck = [p for p in children if p.name() in names]
+                struck = [p for p in children if p.name().startswith(names)]
                 assert len(struck) == 3
                 for process in struck:
                     process.kill()
             else:
                 assert strikes.cut(p.pid for p in children if p.name() in ("raylet", "gcs_server")) > 2
                 # Ray ends its workers as soon as it notices; until then a quick simulation still has a result.
-                workers = [p for p in children if p.name() in ("ray::SimulatorProcess", "ray::Proposer")]
+                workers = [p for p in children if p.name().startswith(("ray::SimulatorProcess", "ray::Proposer"))]
                 wait_for(lambda: not any(alive(p.pid) for p in workers), "end of Ray's workers")
             program.stdin.write("\n")
             program.stdin.flush()

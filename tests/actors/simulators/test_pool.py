@@ -448,6 +448,28 @@ def test_a_loss_is_told_with_what_is_repeated(ray_running, fake, task, tmp_path)
 
 @pytest.mark.realtime
 @pytest.mark.ray
+def test_a_simulator_that_dies_without_a_job_is_told_and_replaced(ray_running, fake, task):
+    told = []
+
+    async def play():
+        pool = ray_pool(1, make=fake(), tell=told.append)
+        (victim,) = await pool.pids()
+        os.kill(victim, signal.SIGKILL)
+        await until(lambda: told)
+        replaced = await pool.pids() != [victim]
+        answer = await pool.simulate(task())
+        statistics = pool.statistics()
+        await pool.close()
+        return replaced, answer.outcome.seed, statistics.deaths
+
+    assert asyncio.run(play()) == (True, 1, 1)
+    (text,) = told
+    assert text.startswith("1 simulator(s) lost")
+    assert "no simulation has to be repeated" in text
+
+
+@pytest.mark.realtime
+@pytest.mark.ray
 def test_both_pools_give_the_same_results_bit_for_bit(ray_running, fake, task):
     tasks = [task(seed=s, frame_rate=5.0) for s in range(3)]
 
