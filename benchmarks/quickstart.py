@@ -12,8 +12,8 @@ interrupted comparison continues.
 - `--calibration-only` skips the deployment, and scores only the test pours.
 - `--strategies "all pours"` makes 15 pours per seed and does not stop before, for the coverage of the prediction
   intervals.
-- `--calibration-only --strategies whole mirrored` calibrates with whole pours of 2,000 particles and with mirrored ones
-  of 3,100, which take as long, on a bench of 10,000 particles.
+- `--calibration-only --strategies shipped mirrored` calibrates with whole pours of 600 particles and with mirrored ones
+  of 1,100, which take as long. Decant itself mirrors pours of 2,000 particles and more only.
 - `--fits` compares calibrations only, for this number of seeds from `--first` on, on two benches: that of the
   laboratory file, and one whose receiver stands 14 mm farther away. θ* of `simulations: auto` is compared with θ* of 30
   simulations, with the uncalibrated θ, and with the best θ of a 10 × 10 grid, which has the same seeds as the first.
@@ -26,7 +26,7 @@ Questions, fixed before the first run on seeds from 401 on; seeds below 400 are 
 2. Is no pour above 10 % after the first below 1 %? Is the median number of pours until it stops four or fewer?
 3. (`all pours`.) Are 85 to 95 % of at least 300 pours in their 90 % intervals? Is the mean interval score better than
    that of intervals that are not scaled by a campaign's earlier pours?
-4. (`whole`, `mirrored`.) Is the mean error on the test pours with mirrored pours at least a quarter lower?
+4. (`mirrored`.) Is the mean error on the test pours with mirrored pours at least a quarter lower?
 5. (`--fits`.) Is θ* on the training pours in the mean at most 0.3 points above the best of the grid, and never above
    the uncalibrated θ? Is its mean error on 12 further pours at most 2 points? Do 85 to 95 % of these lie in their 90 %
    intervals?
@@ -58,6 +58,7 @@ from actors.interfaces import InvalidActionError
 from actors.simulators.job_runner import Simulator, pour_simulator
 from actors.simulators.local_worker import ThreadWorker
 from actors.simulators.pool import WorkerPool
+from orchestrator.campaigns import campaign_file
 from orchestrator.learning.calibration.action_prior import Contexts
 from orchestrator.learning.calibration.calibration_base import Calibrated
 from orchestrator.learning.calibration.calibration_scores import CalibrationEvaluation, calibration_residual
@@ -76,11 +77,12 @@ from orchestrator.runs.stages import (
     measured_pours,
     posterior_draws,
 )
+from sim_engine import simulator
 from sim_engine.action import Action
 from sim_engine.liquids import SimulationParameters
 from sim_engine.outcome import PourOutcome, SimulatedPour
 from sim_engine.prediction_band import LEVEL, CalibrationResidual, band
-from sim_engine.scene import PoseError, PourTask, Scene
+from sim_engine.scene import MIRRORED_FROM, PoseError, PourTask, Scene
 
 GOOD, BAD = 0.01, 0.10
 TRUTH = ("liquid", "pose_error", "pose_noise")
@@ -99,17 +101,14 @@ ALL_POURS = 15
 """Number of pours per seed of the arm `all pours`."""
 
 
-def _simulated(particles: int, symmetry: str, content: dict[str, Any]) -> None:
-    content["simulator"] = content["simulator"] | {"symmetry": symmetry}
-    content["simulator"]["parameters"] = content["simulator"]["parameters"] | {"particles": particles}
-    content["laboratory"]["bench"]["liquid"] = content["laboratory"]["bench"]["liquid"] | {"particles": 10_000}
+def _mirrored(content: dict[str, Any]) -> None:
+    content["simulator"]["parameters"] = content["simulator"]["parameters"] | {"particles": 1_100}
 
 
 ARMS: dict[str, Callable[[dict[str, Any]], None]] = {
     "shipped": lambda content: None,
     "all pours": _with_all_pours,
-    "whole": partial(_simulated, 2_000, "off"),
-    "mirrored": partial(_simulated, 3_100, "auto"),
+    "mirrored": _mirrored,
 }
 """What each arm changes in the content of the campaign."""
 
@@ -150,6 +149,8 @@ def one(seed: int, arm: str, laboratory: Path, into: Path, *, calibration_only: 
     with (
         tempfile.TemporaryDirectory(prefix="decant-quickstart-") as folder,
         patch.object(deployment_base, "scaled_interval", scale),
+        patch.multiple(campaign_file, MIRRORED_FROM=0 if arm == "mirrored" else MIRRORED_FROM),
+        patch.multiple(simulator, MIRRORED_FROM=0 if arm == "mirrored" else MIRRORED_FROM),
     ):
         content = on_numbers(seed, laboratory, folder)
         ARMS[arm](content)
