@@ -261,8 +261,8 @@ def engines(record: Record) -> str:
         """The packages that can compile the solver, in alternating processes: CPU seconds of the standard pour, the
         fractions that it leaves in the pourer with the most particles, CPU seconds of a process up to its first pour
         with a warm and an empty cache, peak memory, installed size. Compare rows only: all processes share one busy
-        core. Taichi is the default, because all other figures are from it and pours cost the same. Quadrants starts
-        faster, is smaller, and is maintained."""
+        core. Taichi is the default, because all other figures are from it, and it starts faster once kernels are
+        cached. Quadrants starts faster without a cache, is smaller, and is maintained."""
     )
     head = (
         "",
