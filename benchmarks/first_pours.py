@@ -32,8 +32,7 @@ Questions, fixed before the first run on seeds from 62000 on; seeds from 52000 t
    probability: 5 %}`?
 
 The remainder of D3 was changed after 24 first pours of seeds 62000 to 62009, by pours of the seeds below 52020, and
-again after all forty (docs/notes/deployment-tried.md). With the program after this, the calibrations of 62000 and 62001
-served for `arm moved`; seeds from 63000 on are for its first pours, of which one has run.
+again after all forty (docs/notes/deployment-tried.md). Seeds 63000 to 63009 ran with the program after this.
 """
 
 from __future__ import annotations

@@ -479,7 +479,7 @@ class SimulatorSettings(Settings):
 
     symmetry: Literal["auto", "off"] = "auto"
     """auto: one half is simulated of a pour that is its own mirror image, from 2000 particles on; its mean spillage
-    differed by up to 0.5 points from that of whole pours. off: always all."""
+    differed by up to 0.8 points from that of whole pours. off: always all."""
 
     @property
     def mirrors(self) -> bool:
