@@ -202,6 +202,7 @@ class RepeatedSimulation:
         self._outcomes: list[PourOutcome] = []
         self._losses: list[float] = []
         self._lost = 0
+        self._coarse: Simulate | None = None
         self._fine: Simulate | None = None
         self._spilled: dict[Simulate, float | None] = {}
         self.decisions: list[Decision] = []
@@ -215,6 +216,7 @@ class RepeatedSimulation:
             first = self._unissued[0]
             here = residual is not None and residual.here
             if scene.mirrored and first.parameters.particles < FINE and not here:
+                self._coarse = first
                 self._fine = replace(first, parameters=first.parameters.model_copy(update={"particles": FINE}))
                 self._unissued.insert(0, self._fine)
             among = f" and {len(set(thetas))} θ of the posterior" if thetas else ""
@@ -284,22 +286,14 @@ class RepeatedSimulation:
 
     def _shift_of_finer(self) -> float:
         """Shift of the simulation with more particles from the same with the usual number; 0 without one."""
-        if self._fine is None:
-            return 0.0
-        same = next(
-            (
-                r
-                for r in self._spilled
-                if r != self._fine and replace(r, parameters=self._fine.parameters) == self._fine
-            ),
-            None,
+        coarse, fine = (
+            None if request is None else self._spilled.get(request) for request in (self._coarse, self._fine)
         )
-        spilled = None if same is None else self._spilled[same]
-        finer = self._spilled.get(self._fine)
-        if same is None or spilled is None or finer is None:
+        if self._coarse is None or coarse is None or fine is None:
             return 0.0
         # Of both, half a particle of the coarser one is the least that can be seen.
-        return shift_of(finer, same.parameters.particles) - shift_of(spilled, same.parameters.particles)
+        particles = self._coarse.parameters.particles
+        return shift_of(fine, particles) - shift_of(coarse, particles)
 
 
 CONFIRM = "confirm"
