@@ -231,6 +231,9 @@ def logs(
             help="Only events of this campaign; default: all events.",
         ),
     ] = None,
+    kinds: Annotated[
+        list[str] | None, typer.Option("--kind", help="Only events of this type, such as QuestionAsked; repeatable.")
+    ] = None,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Wait for new events; Ctrl-C ends it.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print every event as one line of JSON.")] = False,
     url: Url = None,
@@ -238,9 +241,8 @@ def logs(
 ) -> None:
     """Print past events, and with -f also new events as they happen."""
     with connected_client(url, state) as client:
-        only = None if key is None else client.get(f"/campaigns/{key}")["id"]
         try:
-            for told in client.events(0, only, follow=follow):
+            for told in client.events(0, key, kinds or (), follow=follow):
                 line = json.dumps({"id": told.id, **told.data}, ensure_ascii=False) if as_json else _line(told.data)
                 if line:
                     print(line, flush=True)

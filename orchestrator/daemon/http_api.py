@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException as AnyHTTPException
 
 from orchestrator.daemon.api import archive_routes, command_routes, query_routes, station_routes
-from orchestrator.daemon.api.access_control import Daemon, RequestGuard, Stops, refused
+from orchestrator.daemon.api.access_control import Daemon, RequestGuard, Stops, invalid, refused
 from orchestrator.daemon.api.page import page_router
 from orchestrator.daemon.api.schemas import HealthOut, ProblemOut
 from orchestrator.daemon.rigs.ordering import Ordering
@@ -74,6 +75,7 @@ def create_app() -> FastAPI:
     for kind in (StoreError, OSError):
         app.add_exception_handler(kind, _not_stored)
     app.add_exception_handler(AnyHTTPException, refused)
+    app.add_exception_handler(RequestValidationError, invalid)
     app.state.shutdown = _nothing
     return app
 

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import re
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Annotated, Any
 
 from fastapi import Depends, HTTPException, Request, Response
 from fastapi.exception_handlers import http_exception_handler
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.exceptions import HTTPException as AnyHTTPException
@@ -164,6 +166,18 @@ async def refused(request: Request, error: Exception) -> Response:
     if is_stop(request.scope):
         text = not_stopped("a stop is sent with POST" if error.status_code == 405 else text)
     return await http_exception_handler(request, HTTPException(error.status_code, text, dict(error.headers or {})))
+
+
+async def invalid(request: Request, error: Exception) -> Response:
+    """Answer with the problems of a request and their places, and with nothing that was sent."""
+    assert isinstance(error, RequestValidationError)
+    problems = [{"type": e["type"], "loc": e["loc"], "msg": e["msg"]} for e in error.errors()]
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if any(e["loc"] == ("body",) for e in problems) and not re.fullmatch(r"application/(.+\+)?json", media_type):
+        text = "the body is not read as JSON; send application/json: 'Content-Type: application/json'"
+        return JSONResponse({"detail": text}, 422)
+    body = json.dumps({"detail": problems}, ensure_ascii=True).encode()
+    return Response(body, 422, media_type="application/json")
 
 
 def stopping_person(scope: MutableMapping[str, Any], tokens: Tokens) -> Person | None:

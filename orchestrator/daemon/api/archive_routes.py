@@ -13,13 +13,14 @@ from typing import Annotated, Any, TypeVar
 
 from fastapi import APIRouter, HTTPException, Query
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from orchestrator.catalogue.annotations import Note
 from orchestrator.catalogue.catalogue import Catalogue, NoSuchRunError
 from orchestrator.catalogue.control_charts import LaboratoryChart
 from orchestrator.catalogue.run_reading import PreviousRun
 from orchestrator.daemon.api.access_control import Daemon, Operator, Viewer
+from orchestrator.daemon.rigs.pour_request import RequestModel
 from orchestrator.daemon.rigs.rig_worker import SharedServices
 from orchestrator.daemon.state.run_readout import REPORT
 from orchestrator.learning.run_errors import RunError
@@ -29,10 +30,8 @@ T = TypeVar("T")
 router = APIRouter(tags=["previous runs"])
 
 
-class NoteIn(BaseModel):
+class NoteIn(RequestModel):
     """A note about a run."""
-
-    model_config = ConfigDict(extra="forbid")
 
     text: str = Field(min_length=1, max_length=4000)
 

@@ -10,7 +10,7 @@ import os
 import re
 import ssl
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -151,18 +151,24 @@ class Client:
         )
 
     def events(
-        self, after: int | None = None, campaign: str | None = None, *, follow: bool = True
+        self,
+        after: int | None = None,
+        campaign: str | None = None,
+        kinds: Sequence[str] = (),
+        *,
+        follow: bool = True,
     ) -> Iterator[ServerReply]:
         """Yield events as they arrive. A broken connection is restored without loss of events.
 
         Args:
             after: id of the last event seen; None: only new events; 0: all stored events.
             campaign: only events of this campaign.
+            kinds: only events of these types; all by default.
             follow: wait for further events.
         """
         failures = 0
         while True:
-            query = {"campaign": campaign, "after": after, "until": None if follow else "true"}
+            query = {"campaign": campaign, "kind": kinds or None, "after": after, "until": None if follow else "true"}
             try:
                 with self._http.stream(
                     "GET", f"{V1}/events", params=_given(query),

@@ -19,6 +19,7 @@ from fastapi import APIRouter, Header, HTTPException, Query, Response
 from fastapi.responses import FileResponse, StreamingResponse
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
+from pydantic import Field
 
 from orchestrator.campaigns.yaml.yaml_errors import ConfigError
 from orchestrator.daemon.api.access_control import Daemon, Queue, Stops, Viewer
@@ -166,6 +167,10 @@ async def events(
     queue: Queue,
     person: Viewer,
     campaign: Annotated[str | None, Query(max_length=80, description="Only events of this campaign.")] = None,
+    kind: Annotated[
+        list[Annotated[str, Field(max_length=60)]] | None,
+        Query(max_length=20, description="Only events of these types, such as QuestionAsked."),
+    ] = None,
     after: Annotated[int | None, Query(ge=0, description="Id of the last event seen; 0 for all stored events.")] = None,
     last_event_id: Annotated[str | None, Header(description="The same, as browsers send it.")] = None,
     until: Annotated[bool, Query(description="End with the newest event at the time of the request.")] = False,
@@ -180,19 +185,10 @@ async def events(
 
     async def stream() -> AsyncIterator[str]:
         yield ": from here on\n\n"
-        if until and (after is None or after >= newest):
+        if until and after is None:
             return
-        async for sent in daemon.feed.read(after, only, beat=0.5 if until else BEAT):
-            if sent is None:
-                if until:
-                    return
-                yield ": still here\n\n"
-                continue
-            if until and sent.id > newest:
-                return
-            yield f"id: {sent.id}\nevent: {sent.type}\ndata: {sent.data}\n\n"
-            if until and sent.id >= newest:
-                return
+        async for sent in daemon.feed.read(after, only, kind or (), until=newest if until else None, beat=BEAT):
+            yield ": still here\n\n" if sent is None else f"id: {sent.id}\nevent: {sent.type}\ndata: {sent.data}\n\n"
 
     return StreamingResponse(stream(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 

@@ -26,14 +26,15 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ValidationError, WithJsonSchema
+from pydantic import ValidationError, WithJsonSchema
 from starlette.exceptions import HTTPException as AnyHTTPException
 
-from orchestrator.daemon.api.access_control import refused
+from orchestrator.daemon.api.access_control import invalid, refused
 from orchestrator.daemon.rigs.emergency_stop import StopForms
 from orchestrator.daemon.rigs.ordering import Ordering
-from orchestrator.daemon.rigs.pour_request import PourIn, SubmissionIn, described, problems_text
+from orchestrator.daemon.rigs.pour_request import JsonModel, PourIn, SubmissionIn, described, problems_text
 from orchestrator.daemon.rigs.supervisor import Supervisor
 from orchestrator.daemon.state.daemon_settings import MadsciSettings, networks
 from orchestrator.daemon.state.daemon_store import ENDED, QueueItem
@@ -85,7 +86,7 @@ ACTIONS: dict[str, tuple[str, dict[str, tuple[str, bool]]]] = {
 """Actions with their descriptions, and arguments with description and whether they are required."""
 
 
-class ActionIn(BaseModel):
+class ActionIn(JsonModel):
     """Arguments of an action."""
 
     args: dict[str, Any] | None = None
@@ -342,6 +343,7 @@ def create_node(daemon: Supervisor, ordering: Ordering, settings: MadsciSettings
 
     app.add_middleware(StopForms)
     app.add_exception_handler(AnyHTTPException, refused)
+    app.add_exception_handler(RequestValidationError, invalid)
 
     @app.exception_handler(KeyError)
     async def unknown(request: Request, error: KeyError) -> JSONResponse:

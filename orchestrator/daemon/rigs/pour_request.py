@@ -6,12 +6,22 @@ help texts and arguments have its descriptions. The module imports pydantic alon
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Mapping
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 CallerId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,79}$")]
 Key = Annotated[str, Field(min_length=1, max_length=80)]
@@ -72,7 +82,33 @@ Moment = Annotated[
 ]
 
 
-class RequestModel(BaseModel):
+class JsonModel(BaseModel):
+    """Base of models that are read from JSON: NaN, infinite numbers and half characters are errors of their fields."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refuse_what_json_has_not(cls, data: Any) -> Any:
+        errors: list[InitErrorDetails] = []
+        waiting: list[tuple[tuple[int | str, ...], Any]] = [((), data)]
+        while waiting:
+            place, value = waiting.pop()
+            if isinstance(value, Mapping):
+                waiting += [((*place, str(key)), entry) for key, entry in value.items()]
+                waiting += [((*place, "key"), key) for key in value]
+            elif isinstance(value, list):
+                waiting += [((*place, index), entry) for index, entry in enumerate(value)]
+            elif isinstance(value, float) and not math.isfinite(value):
+                problem = PydanticCustomError("finite", "should be a finite number")
+                errors.append({"type": problem, "loc": place, "input": None})
+            elif isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
+                text = "should be text; it has half of a surrogate pair, which is no character"
+                errors.append({"type": PydanticCustomError("text", text), "loc": place, "input": None})
+        if errors:
+            raise ValidationError.from_exception_data(cls.__name__, errors)
+        return data
+
+
+class RequestModel(JsonModel):
     """Base of the models of requests: an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", use_attribute_docstrings=True)

@@ -14,7 +14,7 @@ import math
 import sqlite3
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -99,6 +99,8 @@ _SCHEMA = """
 create table if not exists event (
     id integer primary key, t real not null, campaign text not null, type text not null, data text not null
 ) strict;
+create index if not exists event_by_campaign on event (campaign, id);
+create index if not exists event_by_type on event (type, id);
 """
 
 
@@ -208,26 +210,33 @@ class Feed:
         self._news.set()
 
     async def read(
-        self, after: int | None = None, campaign: str | None = None, *, beat: float = 3600.0
+        self,
+        after: int | None = None,
+        campaign: str | None = None,
+        kinds: Collection[str] = (),
+        *,
+        until: int | None = None,
+        beat: float = 3600.0,
     ) -> AsyncIterator[SentEvent | None]:
         """Yield events after a number, and then new ones.
 
         Args:
             after: number of the last event seen; None: only new events.
             campaign: only events of this campaign.
+            kinds: only events of these types; all by default.
+            until: end with the event of this number, whether it is one of those or not.
             beat: yield None after so long without an event [s].
         """
         seen = self.last if after is None else min(after, self.last)
         self.readers += 1
         try:
-            while self._db is not None:
+            while self._db is not None and (until is None or seen < until):
                 news = self._news
-                batch = self._after(seen)
+                batch, seen = self._after(seen, campaign, kinds)
                 for sent in batch:
-                    seen = sent.id
-                    if campaign is None or sent.campaign == campaign:
+                    if until is None or sent.id <= until:
                         yield sent
-                if not batch:
+                if not batch and seen >= self.last and seen != until:
                     try:
                         async with asyncio.timeout(beat):
                             await news.wait()
@@ -236,17 +245,29 @@ class Feed:
         finally:
             self.readers -= 1
 
-    def _after(self, seen: int) -> list[SentEvent]:
-        """Return the next events after a number, at most one batch."""
+    def _after(self, seen: int, campaign: str | None, kinds: Collection[str]) -> tuple[list[SentEvent], int]:
+        """Return the next matching events after a number, at most one batch, and the number that they reach to."""
         if self._ring and seen + 1 >= self._ring[0].id:
             # Numbers in the ring have no gaps.
             begin = seen + 1 - self._ring[0].id
-            return [self._ring[i] for i in range(begin, min(begin + _BATCH, len(self._ring)))]
+            batch = [self._ring[i] for i in range(begin, min(begin + _BATCH, len(self._ring)))]
+            matching = [e for e in batch if campaign in (None, e.campaign) and (not kinds or e.type in kinds)]
+            return matching, batch[-1].id if batch else seen
         self.flush()
         if self._db is None:
-            return []
+            return [], seen
+        end = self._ring[0].id if self._ring else self._next
+        conditions = ["id > ?", "id < ?"]
+        arguments: list[int | str] = [seen, end]
+        if campaign is not None:
+            conditions.append("campaign = ?")
+            arguments.append(campaign)
+        if kinds:
+            conditions.append(f"type in ({', '.join('?' * len(kinds))})")
+            arguments += kinds
         rows = self._db.execute(
-            "select id, t, campaign, type, data from event where id > ? order by id limit ?", [seen, _BATCH]
+            f"select id, t, campaign, type, data from event where {' and '.join(conditions)} order by id limit ?",
+            [*arguments, _BATCH],
         )
         events = [SentEvent(*row) for row in rows]
-        return events or ([self._ring[0]] if self._ring else [])
+        return events, events[-1].id if len(events) == _BATCH else end - 1
