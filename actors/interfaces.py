@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 from pydantic import AfterValidator, Strict
@@ -237,6 +238,27 @@ class DoseTarget:
     stays: bool = field(default=False, metadata={"written": "if set"})
     emptied: bool = field(default=False, metadata={"written": "if set"})
     held: float | None = field(default=None, metadata={"written": "if set"})
+
+    def is_met_by(self, amount: float) -> bool:
+        """Whether a weighed amount [kg] lies within the tolerance."""
+        return abs(amount - self.amount) <= self.limit + 1e-9
+
+
+class DoseEnd(StrEnum):
+    """How a dose ended; written into its measurement's notes."""
+
+    REACHED = "reached"
+    """Weighed within its tolerance; only then."""
+    MISSED = "missed"
+    """Weighed beyond its tolerance, although nothing else stopped it."""
+    SHORT = "short"
+    """More than the smallest dependable amount is missing, and no further top-up is allowed."""
+    SOURCE_EMPTY = "source empty"
+    STREAM_MISSED = "stream misses the receiver"
+    UNSTABLE = "balance unstable"
+    RECEIVER_MISSING = "receiver missing or different"
+    CONNECTION_LOST = "connection to the balance lost"
+    TIME_LIMIT = "time limit"
 
 
 class Bench(Protocol):

@@ -29,6 +29,7 @@ from actors.dosing.dose_estimator import DoseReading
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.virtual_dosing_bench import DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
+from actors.interfaces import DoseEnd
 from sim_engine.liquids import Liquid
 from sim_engine.vessel import profile
 from sim_engine.vessel.mesh_shape import MeshShape
@@ -230,7 +231,7 @@ def with_rival(rival: type[Rival]) -> Callable[[Series], list[Dose]]:
             controller = rival(series.cup, amount, memory[0], fine)
             record = series.bench.dose(controller)
             controller.learn()
-            return record, "reached" if controller.weighed is not None else "unknown"
+            return record, DoseEnd.REACHED if controller.weighed is not None else "unknown"
 
         return list(series.doses(pour))
 
@@ -268,7 +269,7 @@ def figures(doses: Sequence[Dose]) -> dict[str, Any]:
         "time_50_p95": float(np.quantile(fifty, 0.95)) if fifty else None,
         "time_200_p95": float(np.quantile(largest, 0.95)) if largest else None,
         "time_median": float(np.median([d.weighed_at for d in doses])),
-        "aborted": sum(d.end != "reached" for d in doses),
+        "aborted": sum(d.end not in (DoseEnd.REACHED, DoseEnd.MISSED) for d in doses),
     }
 
 

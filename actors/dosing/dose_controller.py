@@ -9,7 +9,8 @@ tilt. The phases are:
    The wanted flow falls with the remaining amount.
 4. RETURN: ordered when the median of the predicted final amount reaches the target, or when more than target + limit
    is likelier than 1 %.
-5. SETTLE: weigh. If more is missing than the smallest dependable amount, continue with 2.
+5. SETTLE: weigh. If more is missing than the smallest dependable amount, continue with 2. A weight beyond the tolerance
+   is never `REACHED`.
 
 In doubt the cup is turned back: a tilted cup pours on while it stands still. `DoseResult` has the end of the dose and
 the amount in the receiver, if it is known.
@@ -31,7 +32,7 @@ from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats
 from actors.dosing.display_belief import REPEATS, DisplayBelief
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
 from actors.dosing_settings import DosingSettings
-from actors.interfaces import DoseProgress, DoseTarget, InvalidActionError
+from actors.interfaces import DoseEnd, DoseProgress, DoseTarget, InvalidActionError
 
 
 @dataclass(frozen=True)
@@ -43,20 +44,6 @@ class DoseOrder(DoseTarget):
     """
 
     receiver_mass: float | None = None
-
-
-class DoseEnd(StrEnum):
-    """How a dose ended."""
-
-    REACHED = "reached"
-    SHORT = "short"
-    """Less than the smallest dependable amount is missing, or no further top-up is allowed."""
-    SOURCE_EMPTY = "source empty"
-    STREAM_MISSED = "stream misses the receiver"
-    UNSTABLE = "balance unstable"
-    RECEIVER_MISSING = "receiver missing or different"
-    CONNECTION_LOST = "connection to the balance lost"
-    TIME_LIMIT = "time limit"
 
 
 @dataclass(frozen=True)
@@ -542,7 +529,8 @@ class DoseController:
                 self._enter(DosePhase.APPROACH)
                 return
             self._end = DoseEnd.SHORT
-        self._finish(self._end or DoseEnd.REACHED, known=True, amount=amount)
+        end = DoseEnd.REACHED if self._order.is_met_by(amount) else DoseEnd.MISSED
+        self._finish(self._end or end, known=True, amount=amount)
 
     @property
     def deviation(self) -> float:
@@ -587,7 +575,7 @@ class DoseController:
     def _finish(self, end: DoseEnd, *, known: bool, amount: float = 0.0) -> None:
         self.phase = DosePhase.DONE
         aim = self._aim()
-        if self._expected is not None and known and end is DoseEnd.REACHED:
+        if self._expected is not None and known and end in (DoseEnd.REACHED, DoseEnd.MISSED):
             # aim += max(1/4, 1/(n + 2)) (late − aim): mean of the doses so far, later an exponential average
             late = min(max(amount - self._expected, -1e-3), 1e-3)
             aim += max(0.25, 1.0 / (self._belief.doses + 2)) * (late - aim)

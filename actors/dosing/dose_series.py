@@ -22,7 +22,6 @@ from actors.dosing.cup_flow import CupFlow
 from actors.dosing.display_belief import IDEAL_DISPLAY, DisplayBelief
 from actors.dosing.dose_controller import (
     DoseController,
-    DoseEnd,
     DoseOrder,
     DoseResult,
     check_display,
@@ -30,7 +29,7 @@ from actors.dosing.dose_controller import (
 )
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading, draw_lags
 from actors.dosing_settings import DosingSettings
-from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget, InvalidActionError
+from actors.interfaces import DoseEnd, DoseKnowledge, DoseSource, DoseTarget, InvalidActionError
 from sim_engine.scene import Scene
 from sim_engine.vessel.shapes import VesselError
 from sim_engine.vessel.vessel import build_vessel, check_holds

@@ -166,6 +166,8 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
         source: of the dose.
         predicted: its forecast.
     """
+    from actors.interfaces import DoseEnd
+
     low, high = (1e3 * value for value in predicted.interval)
     fine, clean = 1e3 * predicted.fine_flow, 1e3 * predicted.clean_flow
     risk = f"the last stream has {fine:.1f} g/s and leaves the lip cleanly"
@@ -186,7 +188,7 @@ def forecast_text(planned: PlannedDose, source: DoseSource, predicted: DoseForec
             f"the tolerance of {1e3 * planned.limit:.2g} g is smaller"
         )
     for end, count in predicted.ends.items():
-        if end != "reached":
+        if end != DoseEnd.REACHED:
             lines.append(f"  {count} of {sum(predicted.ends.values())} predicted doses end otherwise: {end}")
     return "\n".join(lines)
 
@@ -234,10 +236,12 @@ def dose_text(dose: Dose) -> str:
     Args:
         dose: completed.
     """
+    from actors.interfaces import DoseEnd
+
     if dose.received_g is None:
         return f"dose {dose.number}, {dose.wanted_g:g} g: {dose.end}"
     time = "" if dose.duration_s is None else f" after {dose.duration_s:.1f} s"
     error = dose.received_g - dose.wanted_g
-    end = "" if dose.end == "reached" else f"; {dose.end}"
+    end = "" if dose.end == DoseEnd.REACHED else f"; {dose.end}"
     sure = "" if dose.half_interval_g is None else f" ± {dose.half_interval_g:.1f} g"
     return f"dose {dose.number}, {dose.wanted_g:g} g: {dose.received_g:.1f} g{sure} weighed ({error:+.1f} g){time}{end}"

@@ -95,7 +95,7 @@ async def dosed(stage: Stage, grams: float, **changes: Any) -> PourMeasurement:
 def check_amount(stage: Stage, measured: PourMeasurement, grams: float, held: float = 0.35) -> None:
     about = measured.notes["dose"]
     received = 1e3 * about["received"]
-    assert about["end"] in ("reached", "short")
+    assert about["end"] in ("reached", "missed", "short")
     # a busy machine pauses the commands: the dose is then less exact, but never unnoticed
     assert received == pytest.approx(grams, abs=4.0)
     assert received == pytest.approx(1e3 * about["true"], abs=0.5)
@@ -179,7 +179,7 @@ def test_a_dose_over_a_balance_that_is_read_each_second(open_stage: OpenStage) -
     async def scenario() -> None:
         async with open_stage(dosing_spec(interval=1.0)) as stage:
             about = (await dosed(stage, 50)).notes["dose"]
-            assert about["end"] in ("reached", "short")
+            assert about["end"] in ("reached", "missed", "short")
             assert 1e3 * about["received"] == pytest.approx(50, abs=4.0)
             assert about["received"] == pytest.approx(about["true"], abs=0.5e-3)
             assert 0.9 < float(np.median(np.diff(about["read_at"]))) < 1.2

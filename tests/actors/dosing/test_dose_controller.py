@@ -17,8 +17,8 @@ from actors.dosing.cup_flow import CupFlow
 from actors.dosing.display_belief import REPEATS, DisplayBelief, Repeats
 from actors.dosing.dose_controller import (
     DoseController,
-    DoseEnd,
     DoseOrder,
+    DosePhase,
     DoseResult,
     TiltCommand,
     check_display,
@@ -28,7 +28,7 @@ from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading,
 from actors.dosing.dose_series import DoseSeries, SourceContent
 from actors.dosing.virtual_dosing_bench import DoseRecord, DosingFault, TrueCup, TrueScale, VirtualDosingBench
 from actors.dosing_settings import DosingSettings
-from actors.interfaces import InvalidActionError
+from actors.interfaces import DoseEnd, InvalidActionError
 from sim_engine.hydrostatics import level, tilting_cup_outflow
 from sim_engine.liquids import Liquid
 from sim_engine.vessel.shapes import cylinder
@@ -38,6 +38,7 @@ WATER = Liquid(mass=0.3)
 BEAKER = build_vessel(cylinder("beaker", inner_radius=0.04, inner_height=0.10))
 CUP = CupFlow(BEAKER, WATER)
 SPOUTED = TrueCup(0.040, 0.100, 0.007, 0.014)
+POURED = (DoseEnd.REACHED, DoseEnd.MISSED)  # nothing stopped the dose; a slow balance misses 1 g at times
 
 
 def no_lag_known(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -222,7 +223,7 @@ def test_a_balance_that_sends_seldom_is_not_lost(interval: float, lost: float) -
     bench, controller = known_display(interval, lost)
     record, result = bench.dose(controller), controller.result
     assert result is not None
-    assert result.end is DoseEnd.REACHED
+    assert result.end in POURED
     assert record.received == pytest.approx(0.1, abs=2.5e-3)
     assert result.amount == pytest.approx(record.received, abs=0.3e-3)
 
@@ -232,7 +233,7 @@ def test_a_slow_display_that_repeats_readings_is_no_reason_to_stop() -> None:
     scale = TrueScale(lag=0.3, interval=1.0, behaviour=DisplayBehaviour(repeat_probability=0.42))
     record, controller = one_dose(0.1, scale=scale, seed=2)
     assert controller.result is not None
-    assert controller.result.end is DoseEnd.REACHED
+    assert controller.result.end in POURED
     assert record.received == pytest.approx(0.1, abs=2.5e-3)
     assert record.duration < 0.9 * DosingSettings().time_limit
 
@@ -393,9 +394,31 @@ def test_a_shortage_above_the_smallest_dependable_amount_is_poured_again() -> No
 def test_a_shortage_below_the_smallest_dependable_amount_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(DosingSettings, "smallest_top_up", 0.04)
     record, result = interrupted_dose(DosingSettings())
-    assert (result.end, result.top_ups) == (DoseEnd.REACHED, 0)
+    assert (result.end, result.top_ups) == (DoseEnd.MISSED, 0)
     assert 0.02 < record.received < 0.045
     assert result.amount == pytest.approx(record.received, abs=0.3e-3)
+
+
+class Late:
+    """A controller whose return the arm begins 0.6 s late."""
+
+    def __init__(self, controller: DoseController) -> None:
+        self._controller, self._since = controller, math.inf
+
+    def step(self, time: float, tilt: float, readings: Sequence[DoseReading]) -> TiltCommand:
+        command = self._controller.step(time, tilt, readings)
+        if self._controller.phase is not DosePhase.RETURN:
+            return command
+        self._since = min(self._since, time)
+        return command if time > self._since + 0.6 else TiltCommand(0.0)
+
+
+def test_a_dose_beyond_its_tolerance_is_not_reached() -> None:
+    bench, controller = known_display(0.1)
+    record, result = bench.dose(Late(controller)), controller.result
+    assert result is not None
+    assert record.received > 0.1015
+    assert (result.end, result.amount) == (DoseEnd.MISSED, pytest.approx(record.received, abs=0.3e-3))
 
 
 def swinging(readings: Sequence[DoseReading]) -> list[DoseReading]:
