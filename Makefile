@@ -17,15 +17,12 @@ READY := $(VENV)/.ready
 .PHONY: install demo test lint unit slow physics docs coverage oldest lock clean
 .DEFAULT_GOAL := demo
 
+# install.py says what each need installs, and continues what was interrupted.
 $(READY): requirements.lock pyproject.toml
-	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 15) else "Decant needs Python 3.11 to 3.14; this is %d.%d. Name another: make PYTHON=python3.12" % v)'
-	@echo "setting up $(VENV) (about 2.1 GB, once; a few minutes)"
-	$(PYTHON) -m venv $(VENV)
-# The lock names every package, so pip resolves nothing: older ones would take a newer release for a package with extras.
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps -r requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
-	@$(BIN)/python -m pip check --disable-pip-version-check
-	@touch $@
+	@$(PYTHON) install.py program
+
+$(READY)-%: requirements-%.lock $(READY)
+	@$(PYTHON) install.py $*
 
 install: $(READY)
 
@@ -34,30 +31,30 @@ demo: $(READY)
 
 test: lint unit
 
-lint: $(READY)
+lint: $(READY)-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	MYPYPATH=benchmarks $(BIN)/mypy benchmarks/*.py
 	$(BIN)/lint-imports
 
-unit: $(READY)
+unit: $(READY)-test
 	$(BIN)/pytest -m "not slow and not physics" -n 4 --timeout 300 $(BY_FILE)
 
 # What takes long, and every property on four times as many examples. DECANT_TESTS_PART=2/4 runs every fourth file.
-slow: $(READY)
+slow: $(READY)-test
 	DECANT_THOROUGH=1 $(BIN)/pytest -m "(slow or hypothesis) and not physics" -n 2 $(BY_FILE)
 
 # Every criterion of the solver's full cases, about half an hour. Near a limit the processor's rounding decides.
-physics: $(READY)
+physics: $(READY)-test
 	$(BIN)/pytest -m physics -n 2 --dist load
 
-docs: $(READY)
+docs: $(READY)-docs
 	$(BIN)/sphinx-build -W --keep-going -q -b html -c docs . build/site
 	@echo "open build/site/index.html"
 
 # Which lines the quick tests run, in this process and in those that they start.
-coverage: $(READY)
+coverage: $(READY)-test
 	COVERAGE_FILE=build/.coverage $(BIN)/pytest -m "not slow and not physics" -n 4 $(BY_FILE) --cov --cov-report=term:skip-covered --cov-report=html:build/coverage
 
 # The tests that start nothing, with the oldest dependencies that pyproject.toml allows (needs uv).
@@ -68,9 +65,12 @@ oldest:
 	$(OLDEST)/bin/python -m pytest -q -m "not slow and not physics and not realtime and not ray" tests/orchestrator tests/sim_engine
 
 # After a change of the dependencies in pyproject.toml (needs uv).
+COMPILE := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes \
+	--no-emit-index-url --no-emit-find-links --no-header --no-annotate -q
 lock:
-	uv pip compile pyproject.toml --all-extras --group dev --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-emit-find-links --no-header --no-annotate -q -o requirements.lock
+	$(COMPILE) --all-extras --group build --group test -o requirements-test.lock
+	$(COMPILE) -c requirements-test.lock --extra all --group build -o requirements.lock
+	$(COMPILE) -c requirements-test.lock --extra all --group build --group docs -o requirements-docs.lock
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build *.egg-info
