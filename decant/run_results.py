@@ -22,6 +22,7 @@ from orchestrator.learning.stage_result import UNIT_SUFFIXES, displayed_action
 from orchestrator.records.codec import Results
 from orchestrator.records.journal import JOURNAL_NAME
 from orchestrator.records.run_record import CampaignResult, Row, answers, read_record, read_result
+from orchestrator.records.verdict import Verdict, verdict_of
 from orchestrator.reports.loss_units import loss_of_pour
 from orchestrator.reports.mixture_report import mixture_rows, mixtures_of, with_unfinished
 from orchestrator.reports.publishing import Published, report_on, summary_of
@@ -70,6 +71,15 @@ class Run:
             RunError: the journal cannot be read.
         """
         return summary_of(self.campaign, self.result) if self.published is None else self.published.summary
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the run reached of what was wanted: 'complete', 'incomplete' or 'nothing', with counts and reasons.
+
+        Raises:
+            RunError: the journal cannot be read.
+        """
+        return verdict_of(read_record(self.directory))
 
     @property
     def calibrated(self) -> CalibratedTheta | None:
@@ -174,7 +184,7 @@ class Run:
 
     def _repr_html_(self) -> str:
         """Campaign, folder and recommended actions, in notebooks."""
-        rows = [("campaign", self.campaign.name), ("state", str(self.result.state)), ("folder", str(self.directory))]
+        rows = [("campaign", self.campaign.name), ("verdict", self.verdict.text), ("folder", str(self.directory))]
         rows.append(("done", f"{self.result.pours} pours, {self.result.simulations} simulations"))
         for name, action in self.recommended.items():
             rows.append((f"recommended for {name}", described(action.action_si)))

@@ -144,7 +144,14 @@ def test_exit_codes_are_the_commands() -> None:
         .partition("\n## ")[0]
     )
     codes = {int(code) for code in re.findall(r"^\| (\d+) \|", chapter, re.MULTILINE)}
-    assert codes == {0, common.FAILED, common.BAD_INPUT, OperatorNeededError.exit_code, common.INTERRUPTED}
+    assert codes == {
+        0,
+        common.FAILED,
+        common.BAD_INPUT,
+        OperatorNeededError.exit_code,
+        common.NOT_COMPLETE,
+        common.INTERRUPTED,
+    }
 
 
 def test_vessel_shown_in_the_guide_is_one(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ class Conditions(TypedDict, total=False):
     strategy: Annotated[_Text, "C1 to C4, D1 to D3, or one of a package."]
     mode: Annotated[_Text, "'virtual' or 'real'."]
     state: Annotated[_Text, "finished, paused, failed, unknown, interrupted …"]
+    verdict: Annotated[_Text, "complete, incomplete or nothing: what the run reached."]
 
 
 class PourConditions(Conditions, total=False):
@@ -52,7 +53,7 @@ _DATES = (("%Y-%m-%dT%H:%M:%S", 0), ("%Y-%m-%dT%H:%M", 60), ("%Y-%m-%d", 86_400)
 MODES = {"virtual": "virtual", "real": "hardware", "hardware": "hardware", "external": "external"}
 
 _LISTS = ("liquid", "pourer", "receiver", "strategy")
-_SEARCHED = ("run", "path", "campaign", "mode", "state", "reason", "laboratory", *_LISTS, "notes")
+_SEARCHED = ("run", "path", "campaign", "mode", "state", "verdict", "reason", "laboratory", *_LISTS, "notes")
 _ALL_TEXT = " || ' ' || ".join(f"coalesce({name}, '')" for name in _SEARCHED)
 _LIKE = "lower({}) glob lower(?)"
 _ANY_LIKE = "exists (select 1 from json_each({}) where lower(value) glob lower(?))"
@@ -92,7 +93,7 @@ def condition_sql(table: str, conditions: Mapping[str, Any]) -> tuple[str, list[
             case "run":
                 of_pour.append("(lower(run) glob lower(?) or path = ?)")
                 values += [str(text), str(Path(text).absolute())]
-            case "state":
+            case "state" | "verdict":
                 of_run.append(_LIKE.format(name))
                 run_values.append(text)
             case _:

@@ -25,6 +25,7 @@ from orchestrator.learning.stage_result import DOSE, displayed_action
 from orchestrator.records.codec import CodecError, from_json
 from orchestrator.records.events import StageClosed
 from orchestrator.records.run_record import Row, RunPour, RunState, read_record
+from orchestrator.records.verdict import verdict_of
 from sim_engine.action import ACTION_DIMENSIONS
 from sim_engine.outcome import Loss
 
@@ -67,6 +68,8 @@ RUNS = (
         "of the campaign, as in its journal; 'interrupted' where its process died without a word; "
         "'unreadable' if its journal is missing or damaged",
     ),
+    Column("verdict", "text", "what it reached: 'complete', 'incomplete' or 'nothing'"),
+    Column("reached", "values", "the verdict with its counts and reasons, as in `summary.json`"),
     Column("reason", "text", "why it is in that state, where there is something to report"),
     Column("laboratory", "text", "name of the laboratory"),
     Column("seed", "integer", "of every random choice"),
@@ -209,10 +212,13 @@ def _rows(directory: Path) -> tuple[Row, list[Row], str]:
     }
     pours = [about | _pour(pour, plan, scenes) for pour in record.pours if pour.state != "asked"]
     outcomes = [row["outcome"] for row in pours]
+    verdict = verdict_of(record)
     run = about | {
         "begun": record.header.created,
         "ended": record.ended,
         "state": str(record.state),
+        "verdict": verdict.word,
+        "reached": verdict.model_dump(mode="json"),
         "reason": record.reason,
         "laboratory": laboratory.get("name"),
         "seed": plan.get("seed"),

@@ -47,7 +47,8 @@ and how pours are optimised: D1 in simulation, D2 on the bench, D3 with both. St
 
     decant run configs/campaigns/quickstart.yaml
 
-Exit codes: 0 success, 1 failed, 2 bad input (nothing was started), 3 an operator must answer, 130 interrupted.
+Exit codes: 0 success, 1 failed, 2 bad input (nothing was started), 3 an operator must answer,
+4 the run did not reach all that was wanted, 130 interrupted.
 """,
 )
 

@@ -27,7 +27,7 @@ from orchestrator.cli.command_options import (
     Seed,
     Thetas,
 )
-from orchestrator.cli.console import FAILED, RefusalError, print_json, print_note
+from orchestrator.cli.console import RefusalError, print_json, print_note
 
 if TYPE_CHECKING:
     from orchestrator.cli.command_results import CalibrateOutput
@@ -55,6 +55,7 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
     ) -> None:
         from orchestrator.cli.foreground_run import (
             check_campaign_can_run,
+            conclude,
             read_campaign,
             resources_with_operator,
             resumed_run,
@@ -93,6 +94,7 @@ def _task_command(task: Literal["run", "calibrate"], text: str) -> Callable[...,
             from orchestrator.cli.json_output import RunOutput
 
             print_json(RunOutput.model_validate({"report": published.report, **summary_json(published.summary)}))
+        conclude(published.summary.verdict)
 
     work.__name__, work.__doc__ = task, text
     return work
@@ -174,7 +176,13 @@ def plan(
 
     Actions are shown in deg, deg/s, mm and s.
     """
-    from orchestrator.cli.foreground_run import check_campaign_can_run, read_campaign, read_draws, run_at_terminal
+    from orchestrator.cli.foreground_run import (
+        check_campaign_can_run,
+        conclude,
+        read_campaign,
+        read_draws,
+        run_at_terminal,
+    )
     from orchestrator.learning.deployment.deployment_result import Deployed
     from orchestrator.learning.single_action import PredictedPour
     from orchestrator.records.codec import result_of
@@ -203,9 +211,8 @@ def plan(
         result = result_of(run_result.results, stage.name, Deployed)
         recommended = result.recommended
         if recommended is None:
-            raise RefusalError(
-                f"{stage.name}: no action could be planned; every simulation failed. See {run_result.directory}", FAILED
-            )
+            conclude(published.summary.verdict)
+        assert recommended is not None
         receiver_name = stage.name.removeprefix(DEPLOYMENT)
         repeated = result_of(run_result.results, PREDICTION + receiver_name, PredictedPour).over_seeds
         spillage = repeated.get("spillage")
@@ -229,6 +236,7 @@ def plan(
         totals = {"simulations": run_result.simulations, "cpu_s": run_result.cpu_s, "run": str(run_result.directory)}
         several = answers if len(answers) > 1 else []
         print_json(PlanOutput.model_validate({**answers[0], "theta": chosen.parameters, **totals, "plans": several}))
+    conclude(published.summary.verdict)
 
 
 def planning_request(

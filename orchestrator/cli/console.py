@@ -26,8 +26,10 @@ from sim_engine.errors import DecantError
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
-"""Exit codes in addition to 0 (success) and 3 (an operator must answer; `RunError.exit_code`)."""
+FAILED, BAD_INPUT, NOT_COMPLETE, INTERRUPTED = 1, 2, 4, 130
+"""Exit codes in addition to 0 (success) and 3 (an operator must answer; `RunError.exit_code`).
+
+4: a run came to its end, and did not reach all that was wanted."""
 
 
 class RefusalError(DecantError):

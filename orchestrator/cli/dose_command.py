@@ -205,16 +205,17 @@ def pour_doses(request: RunRequest, *, in_process: bool, again: str) -> Path:
         The folder of the run.
 
     Raises:
-        RefusalError: refused (exit code 2), or not every dose was poured (1).
+        RefusalError: refused (exit code 2).
+        SystemExit: not every dose reached its amount (exit code 4).
     """
-    from orchestrator.cli.foreground_run import resources_with_operator, run_at_terminal
+    from orchestrator.cli.foreground_run import conclude, resources_with_operator, run_at_terminal
     from orchestrator.learning.dispense import Dispensed
     from orchestrator.records.codec import result_of
     from orchestrator.runs.stages import DOSES
 
     assert request.campaign.dispense is not None
     motion = f"doses          {len(request.campaign.dispense.doses)}", None
-    finished, _ = run_at_terminal(
+    finished, published = run_at_terminal(
         request,
         resources_with_operator(request, in_process=in_process, motion=motion),
         again=lambda folder: again,
@@ -225,8 +226,7 @@ def pour_doses(request: RunRequest, *, in_process: bool, again: str) -> Path:
     for dose in result.doses:
         print(dose_text(dose))
     print_note(f"run: {directory}")
-    if any(dose.received_g is None for dose in result.doses):
-        raise RefusalError("not every dose was poured", FAILED)
+    conclude(published.summary.verdict)
     return directory
 
 
@@ -242,6 +242,7 @@ def dose_text(dose: Dose) -> str:
         return f"dose {dose.number}, {dose.wanted_g:g} g: {dose.end}"
     time = "" if dose.duration_s is None else f" after {dose.duration_s:.1f} s"
     error = dose.received_g - dose.wanted_g
-    end = "" if dose.end == DoseEnd.REACHED else f"; {dose.end}"
+    end = f"; {dose.outcome_text}" if dose.outcome == "missed" or dose.by_hand else ""
+    end += "" if dose.end in (DoseEnd.MISSED, DoseEnd.REACHED) else f"; {dose.end}"
     sure = "" if dose.half_interval_g is None else f" ± {dose.half_interval_g:.1f} g"
     return f"dose {dose.number}, {dose.wanted_g:g} g: {dose.received_g:.1f} g{sure} weighed ({error:+.1f} g){time}{end}"

@@ -24,6 +24,7 @@ from orchestrator.catalogue.catalogue import posterior_source
 from orchestrator.cli.console import (
     FAILED,
     INTERRUPTED,
+    NOT_COMPLETE,
     RefusalError,
     Refused,
     WaitingIndicator,
@@ -48,6 +49,7 @@ from orchestrator.runs.run_folder import RESOLVED, create_run, find_run
 from orchestrator.runs.run_service import RunHandle, RunRequest, RunResources, RunService
 
 if TYPE_CHECKING:
+    from orchestrator.records.verdict import Verdict
     from orchestrator.reports.publishing import Published
     from sim_engine.liquids import SimulationParameters
 
@@ -269,6 +271,17 @@ def run_at_terminal(
     if published.report is not None:
         print_note(f"report  {published.report}")
     return result, published
+
+
+def conclude(verdict: Verdict) -> None:
+    """Print what a run reached as the last line of a command. Exits with code 4 unless that is all that was wanted."""
+    if verdict.word == "complete":
+        print_note(verdict.text)
+        return
+    for goal in verdict.unmet:
+        print_message(goal.line)
+    print_message(verdict.text)
+    raise SystemExit(NOT_COMPLETE)
 
 
 def _close(handle: RunHandle | None, live: LiveView | None) -> None:

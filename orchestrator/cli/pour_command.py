@@ -22,7 +22,6 @@ from orchestrator.cli.command_options import (
     SceneName,
 )
 from orchestrator.cli.console import (
-    FAILED,
     RefusalError,
     Refused,
     check_output,
@@ -228,9 +227,10 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str) -> Path:
         The folder of the run.
 
     Raises:
-        RefusalError: refused (exit code 2), or nothing was poured (1).
+        RefusalError: refused (exit code 2).
+        SystemExit: nothing was weighed (exit code 4).
     """
-    from orchestrator.cli.foreground_run import resources_with_operator, run_at_terminal
+    from orchestrator.cli.foreground_run import conclude, resources_with_operator, run_at_terminal
     from orchestrator.learning.single_action import OnePoured
     from orchestrator.records.codec import result_of
     from orchestrator.runs.run_tasks import pour_task
@@ -238,16 +238,16 @@ def pour_weighed(chosen: Chosen, *, in_process: bool, again: str) -> Path:
 
     request = pour_task(chosen.plan, chosen.scene, chosen.action)
     motion = "pours          1", None if chosen.path is None else chosen.path.report
-    finished, _ = run_at_terminal(
+    finished, published = run_at_terminal(
         request,
         resources_with_operator(request, in_process=in_process, motion=motion),
         again=lambda folder: again,
         not_resumed="this pour is not resumed; what was weighed of it",
     )
     result = result_of(finished.results, POUR, OnePoured)
-    if result.weighed is None:
-        raise RefusalError(result.failed or "nothing was poured", FAILED)
-    print(told(result.weighed))
+    if result.weighed is not None:
+        print(told(result.weighed))
+    conclude(published.summary.verdict)
     return finished.directory
 
 

@@ -18,7 +18,14 @@ from actors.dosing.dose_series import NINETY_PERCENT
 from actors.interfaces import DoseKnowledge, DoseSource, DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.requests import Decision, Failed, Outcome, Pour, Poured, Request, Slots
-from orchestrator.learning.stage_result import DOSE, ResultPart, StageResult, WeighedMasses, weighed_masses
+from orchestrator.learning.stage_result import (
+    DOSE,
+    ResultPart,
+    StageResult,
+    WeighedMasses,
+    entered_by_hand,
+    weighed_masses,
+)
 from orchestrator.learning.strategy import Progress
 from orchestrator.learning.trials import SeedStream
 
@@ -103,6 +110,30 @@ class DoseSignals(ResultPart):
     """Readings of the balance, without the receiver [g]."""
 
 
+DoseOutcome = Literal["reached", "missed", "refused", "failed", "unknown"]
+
+
+def dose_outcome(dose: DoseTarget, outcome: Outcome | None) -> DoseOutcome:
+    """Whether a dose reached its amount.
+
+    Args:
+        dose: that was requested.
+        outcome: of its pour; None: it had begun and has none.
+
+    Returns:
+        'missed' if the weighed amount differs from the wanted one by more than the tolerance, however the dose ended.
+    """
+    match outcome:
+        case Poured(measured):
+            received = 1e-3 * (weighed_masses(measured).delivered_g or 0.0)
+            return "reached" if dose.is_met_by(received) else "missed"
+        case Failed(kind="invalid_action"):
+            return "refused"
+        case Failed(kind="pour_failed"):
+            return "failed"
+    return "unknown"
+
+
 class Dose(ResultPart):
     """One dose."""
 
@@ -126,6 +157,16 @@ class Dose(ResultPart):
 
     end: str
     """How the dose ended, or why it failed."""
+
+    outcome: DoseOutcome | None = None
+    """'missed': its amount differs by more than the tolerance; 'refused': nothing was poured; 'unknown': it had begun,
+    and its amount is not known. None in runs of earlier versions."""
+
+    tolerance_g: float | None = None
+    """Tolerance of the amount [g]; None in runs of earlier versions."""
+
+    by_hand: bool = False
+    """Whether a person weighed it and entered the amount."""
 
     position: str = ""
     """Name of the receiver's place."""
@@ -152,12 +193,28 @@ class Dose(ResultPart):
     """Signals over time."""
 
     @property
+    def missed_by_g(self) -> float | None:
+        """Difference from the wanted amount beyond the tolerance [g], negative below it; None unless it missed."""
+        if self.outcome != "missed" or self.received_g is None or self.tolerance_g is None:
+            return None
+        difference = self.received_g - self.wanted_g
+        return math.copysign(abs(difference) - self.tolerance_g, difference)
+
+    @property
+    def outcome_text(self) -> str:
+        """'reached', or 'missed by +17.46 g beyond its tolerance of 1 g, entered by hand'; '' if it is not recorded."""
+        text = "UNKNOWN" if self.outcome == "unknown" else str(self.outcome or "")
+        if self.missed_by_g is not None:
+            text += f" by {self.missed_by_g:+.2f} g beyond its tolerance of {self.tolerance_g:g} g"
+        return f"{text}, entered by hand" if self.by_hand else text
+
+    @property
     def half_interval_g(self) -> float | None:
         """Half of the interval that contains the true amount with a probability of 90 % [g]."""
         return None if self.deviation_g is None else NINETY_PERCENT * self.deviation_g
 
 
-CupState = Literal["waiting", "filling", "full", "rejected", "refused", "unknown"]
+CupState = Literal["waiting", "filling", "full", "missed", "rejected", "refused", "unknown"]
 
 
 class MixedCup(ResultPart):
@@ -170,8 +227,9 @@ class MixedCup(ResultPart):
     """Amounts of the table by liquid [g]."""
 
     state: CupState = "waiting"
-    """'rejected': a dose missed its tolerance, and the mixture was poured again; 'refused': a dose was impossible;
-    'unknown': the amount of a dose is not known."""
+    """'full': all doses reached their amounts; 'missed': all were poured, and one missed its tolerance; 'rejected': a
+    dose missed, and the mixture was poured again; 'refused': a dose was impossible; 'unknown': the amount of a dose is
+    not known."""
 
     replaces: str = ""
     """Position of the rejected cup whose mixture it has."""
@@ -220,6 +278,22 @@ class MixedComponent(ResultPart):
     batch: str
     """Batch of the liquid, if the campaign states it."""
 
+    outcome: DoseOutcome | None
+    """Outcome of the dose; None if it was not tried."""
+
+    tolerance_g: float | None
+    """Tolerance of the dose [g]; None if it was not tried."""
+
+    missed_by_g: float | None
+    """Difference from the amount that was wanted of the dose beyond its tolerance [g], negative if too little was
+    poured; None unless it missed. After a missed dose this may be a corrected amount instead of the table's."""
+
+    by_hand: bool
+    """Whether a person weighed the dose and entered its amount."""
+
+    outcome_text: str
+    """The outcome in words; '' if the dose was not tried."""
+
     state: CupState
     """State of the cup."""
 
@@ -246,7 +320,7 @@ class Dispensed(StageResult):
         doses = {dose.liquid: dose for dose in self.doses if cup.contains(dose)}
         order = {liquid: dose.number for liquid, dose in doses.items()}
         masses = {liquid: dose.received_g for liquid, dose in doses.items()}
-        known = cup.state == "full" and all(mass is not None for mass in masses.values())
+        known = cup.state in ("full", "missed") and all(mass is not None for mass in masses.values())
         total = sum(mass or 0.0 for mass in masses.values())
         errors = {liquid: dose.deviation_g or 0.0 for liquid, dose in doses.items()}
         components = []
@@ -270,6 +344,11 @@ class Dispensed(StageResult):
                     dose=None if dose is None else dose.number,
                     source="" if dose is None else dose.source,
                     batch="" if dose is None else dose.batch,
+                    outcome=None if dose is None else dose.outcome,
+                    tolerance_g=None if dose is None else dose.tolerance_g,
+                    missed_by_g=None if dose is None else dose.missed_by_g,
+                    by_hand=dose is not None and dose.by_hand,
+                    outcome_text="" if dose is None else dose.outcome_text,
                     state=cup.state,
                 )
             )
@@ -425,6 +504,9 @@ class Dispense:
             spilled_g=masses.spilled_g,
             duration_s=about.get("duration"),
             end=end,
+            outcome=dose_outcome(pour.dose, outcome),
+            tolerance_g=1e3 * pour.dose.limit,
+            by_hand=isinstance(outcome, Poured) and entered_by_hand(outcome.measurement),
             position=pour.dose.position,
             source=pour.dose.source.name,
             liquid=liquid,
@@ -435,9 +517,9 @@ class Dispense:
             signals=DoseSignals(**{name: about.get(name, ()) for name in DoseSignals.model_fields}),
         )
         self._doses.append(dose)
-        self._settle(dose, outcome)
+        self._settle(dose)
 
-    def _settle(self, dose: Dose, outcome: Outcome) -> None:
+    def _settle(self, dose: Dose) -> None:
         """Decide what follows from a completed dose."""
 
     def progress(self) -> Progress:

@@ -25,7 +25,7 @@ from dataclasses import replace
 from actors.interfaces import DoseKnowledge, DoseTarget
 from orchestrator.learning.campaign_plan import DispensePlan, PlannedDose
 from orchestrator.learning.dispense import Dispense, Dispensed, Dose, KnownSource, MixedCup
-from orchestrator.learning.requests import Answered, Ask, Decision, Failed, Outcome, Pour, Poured, Request, Slots
+from orchestrator.learning.requests import Answered, Ask, Decision, Outcome, Pour, Request, Slots
 from sim_engine.settings.quantity import parse_quantity
 from sim_engine.vessel.vessel import build_vessel
 
@@ -215,23 +215,24 @@ class Mix(Dispense):
     def _count(self) -> int:
         return len(self._doses) + sum(len(self._remaining[cup.position]) for cup in self._cups if self._open(cup))
 
-    def _settle(self, dose: Dose, outcome: Outcome) -> None:
+    def _settle(self, dose: Dose) -> None:
         index = next(i for i, cup in enumerate(self._cups) if cup.position == dose.position)
         cup, remaining = self._cups[index], self._remaining[dose.position]
-        planned = remaining.pop(0)
-        state, missed = cup.state, False
-        match outcome:
-            case Poured() if dose.received_g is not None:
-                state = "filling" if remaining else "full"
-                missed = abs(1e-3 * dose.received_g - planned.amount) > planned.limit
-            case Failed(kind="invalid_action"):
+        del remaining[0]
+        state = cup.state
+        match dose.outcome:
+            case "reached" | "missed" if remaining:
+                state = "filling"
+            case "reached" | "missed":
+                state = "missed" if any(poured.outcome == "missed" for poured in self._poured(cup)) else "full"
+            case "refused":
                 state = "refused"
                 self._say(f"{cup.position}: a dose is impossible, the cup stays as it is: {dose.end}", urgent=True)
             case _:
                 state = "unknown"
                 self._say(f"{cup.position}: its content is UNKNOWN, nothing more is poured into it", urgent=True)
         self._cups[index] = cup.model_copy(update={"state": state})
-        if missed:
+        if dose.outcome == "missed":
             policy = self._mixtures.on_miss
             self._decide(index, dose, "correct" if policy == "accept" else policy)
 

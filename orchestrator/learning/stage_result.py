@@ -23,6 +23,10 @@ DOSE = "dose"
 """Purpose of the pours of wanted amounts, and the key of their notes."""
 
 
+ENTERED = "source"
+"""Key of a measurement's note that says how a person entered the masses; a bench writes none."""
+
+
 class ResultPart(BaseModel):
     """Part of a result. It is immutable, and its JSON form has exactly the declared fields."""
 
@@ -108,6 +112,11 @@ def weighed_masses(measured: PourMeasurement | None) -> WeighedMasses:
         delivered_g=1e3 * float(about.get("received", measured.delivered)),
         spillage=None if spilled is None else measured.fractions.spillage,
     )
+
+
+def entered_by_hand(measured: PourMeasurement) -> bool:
+    """Whether a person weighed a pour and entered its masses, instead of the bench."""
+    return ENTERED in measured.notes
 
 
 UNIT_SUFFIXES = {"deg/s": "deg_s", "deg/s^2": "deg_s2", "deg": "deg", "mm": "mm", "s": "s"}

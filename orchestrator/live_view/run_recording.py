@@ -43,7 +43,7 @@ from orchestrator.records.events import (
 )
 from orchestrator.records.run_clock import run_time
 from orchestrator.reports.loss_units import DISCREPANCY, deployment_unit, is_calibration, unit_of_pour
-from orchestrator.reports.mixture_report import draw_rack, mixtures_so_far, tolerances
+from orchestrator.reports.mixture_report import draw_rack, mixed_liquids, mixtures_so_far
 from orchestrator.reports.progress_state import ProgressState
 from orchestrator.runs.stages import scenes_of
 
@@ -160,7 +160,7 @@ class CampaignRecording:
         mixtures = mixtures_so_far(self._plan, self._progress.run, live=live)
         if mixtures is not None and mixtures != self._mixtures:
             self._mixtures = mixtures
-            shapes.rack(self._sink, draw_rack(mixtures, tolerances(self._plan)))
+            shapes.rack(self._sink, draw_rack(mixtures, mixed_liquids(self._plan)))
 
     def _say(self, text: str, level: str = "info", source: str = "") -> None:
         self._machine.line(text, level, source or "campaign")

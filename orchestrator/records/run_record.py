@@ -4,7 +4,8 @@
   those of a journal, and goes on where it stopped for pages that ask again at every event.
 - `RunPour.row` is the one row of a pour, for report, catalogue, API and library.
 - `answers` yields finished requests with their outcomes.
-- `read_result` returns the `CampaignResult`: state, counts, costs, and the results of the stages.
+- `read_result` returns the `CampaignResult`: state, counts, costs, and the results of the stages. The verdict of a run
+  is in `orchestrator.records.verdict`.
 
 Nothing here checks the journal (`orchestrator.records.journal_check`).
 """

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from actors.laboratory_settings import MODE_LABELS
-from orchestrator.records.states import State
 from orchestrator.reports import wording
 from orchestrator.reports.mixture_report import mixture_table, mixtures_of
 from orchestrator.reports.run_summary import RunSummary
@@ -115,7 +114,7 @@ def run_page(summary: RunSummary, resolved: Mapping[str, Any] | None = None) -> 
         heading=summary.campaign,
         mode=MODE_LABELS.get(summary.mode, "SIMULATION ONLY"),
         mode_look=summary.mode,
-        finished=summary.state == State.FINISHED,
+        unmet=[goal.line for goal in summary.verdict.unmet],
         lead=f"Begun {_date(summary.began_at)}, last entry {_date(summary.ended_at)}.{seed}",
         run=summary,
         stages=wording.stage_table(summary.outcome),

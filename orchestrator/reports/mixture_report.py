@@ -40,7 +40,7 @@ COLOURS = (style.POURER, style.PREDICTED, style.GOOD, style.POSTERIOR, style.FAL
 """Of the liquids, in the order of the campaign's table."""
 
 STATES: dict[CupState, str] = {
-    **{"waiting": "empty", "filling": "being filled", "full": "done"},
+    **{"waiting": "empty", "filling": "being filled", "full": "done", "missed": "missed"},
     **{"rejected": "rejected", "refused": "not poured", "unknown": "UNKNOWN"},
 }
 
@@ -52,13 +52,13 @@ def mixtures_of(results: Results) -> Dispensed | None:
     return next((dispensed for dispensed in all_of(results, Dispensed) if dispensed.cups), None)
 
 
-def tolerances(plan: CampaignPlan) -> dict[str, float]:
-    """Tolerances of the doses of mixtures by liquid, in the order of the campaign's liquids [g]."""
+def mixed_liquids(plan: CampaignPlan) -> tuple[str, ...]:
+    """Names of the liquids of mixtures, in the order of the campaign."""
     if plan.dispense is None:
-        return {}
-    limits = {dose.liquid or "": 1e3 * dose.limit for dose in plan.dispense.doses}
+        return ()
+    poured = {dose.liquid for dose in plan.dispense.doses}
     liquids = dict.fromkeys(scene.liquid.name for scene in plan.dispense.scenes)
-    return {liquid: limits[liquid] for liquid in liquids if liquid in limits}
+    return tuple(liquid for liquid in liquids if liquid in poured)
 
 
 def mixtures_so_far(plan: CampaignPlan, record: RunState, *, live: bool = False) -> Dispensed | None:
@@ -160,10 +160,12 @@ def mixture_table(dispensed: Dispensed) -> ResultTable:
         cells = [component.cup, component.liquid, *("—" if grams is None else f"{grams:.2f}" for grams in masses)]
         cells += ["—" if share is None else f"{100.0 * share:.2f}" for share in shares]
         source = component.source + (f", batch {component.batch}" if component.batch else "")
-        cells += ["—" if component.dose is None else str(component.dose), source or "—", component.state]
-        rows.append(ResultRow(cells, "" if component.state in ("full", "waiting", "filling") else "bad"))
+        cells += ["—" if component.dose is None else str(component.dose), component.outcome_text or "—"]
+        cells += [source or "—", component.state]
+        right = component.state in ("full", "waiting", "filling") and component.outcome in (None, "reached")
+        rows.append(ResultRow(cells, "" if right else "bad"))
     header = ["cup", "liquid", "wanted [g]", "received [g]", "difference [g]", "± (90 %) [g]"]
-    header += ["wanted share [%]", "share [%]", "± (90 %) [%]", "dose", "source", "cup is"]
+    header += ["wanted share [%]", "share [%]", "± (90 %) [%]", "dose", "dose is", "source", "cup is"]
     return ResultTable(f"{len(dispensed.cups)} mixtures", header, rows, frozenset(range(2, 10))).filled()
 
 
@@ -259,15 +261,17 @@ class RackDrawing:
         return figure
 
 
-def draw_rack(dispensed: Dispensed, limits: Mapping[str, float]) -> RackDrawing:
+def draw_rack(dispensed: Dispensed, liquids: Sequence[str]) -> RackDrawing:
     """Each cup with its liquids, its state, and the amounts with their differences from the table.
+
+    The difference of a dose that missed what was wanted of it is bold; after such a dose, this may be a corrected
+    amount instead of the table's.
 
     Args:
         dispensed: with cups.
-        limits: tolerances by liquid [g]. The difference of a dose that missed what was wanted of it is bold; after such
-            a dose, this may be a corrected amount instead of the table's.
+        liquids: names, in the order of their colours.
     """
-    colours = {liquid: COLOURS[i % len(COLOURS)] for i, liquid in enumerate(limits)}
+    colours = {liquid: COLOURS[i % len(COLOURS)] for i, liquid in enumerate(liquids)}
     places = _grid([cup.position for cup in dispensed.cups])
     requested = {dose.number: dose.wanted_g for dose in dispensed.doses}
     columns, rows = (1 + max(place[k] for place in places.values()) for k in (0, 1))
@@ -279,7 +283,7 @@ def draw_rack(dispensed: Dispensed, limits: Mapping[str, float]) -> RackDrawing:
         column, row = places[cup.position]
         own = [component for component in dispensed.components() if component.cup == cup.position]
         centre = (0.85 + 1.6 * column, 1.55 + 2.0 * row)
-        labels += _draw_cup(lines, texts, centre, own, requested, colours, limits)
+        labels += _draw_cup(lines, texts, centre, own, requested, colours)
     x, y = 0.15, bottom + 0.25
     for liquid, colour in colours.items():
         if x > 0.2 and x + 0.5 + 0.09 * len(liquid) > width:
@@ -307,12 +311,11 @@ def _draw_cup(
     components: Sequence[MixedComponent],
     requested: Mapping[int, float],
     colours: Mapping[str, str],
-    limits: Mapping[str, float],
 ) -> list[RackText]:
     """One cup: a ring of its liquids by mass, its name and state, and its amounts within. Returns its labels."""
     (x, y), amounts = centre, list[str]()
     name, start, total = components[0].cup.partition("/")[2], 0.0, sum(part.wanted_g for part in components)
-    step, missed, corrected = min(0.2, 0.9 / len(components)), False, False
+    step, corrected = min(0.2, 0.9 / len(components)), False
     for i, component in enumerate(components):
         end = start + component.wanted_g / total
         colour = style.PALE if component.received_g is None else colours[component.liquid]
@@ -325,14 +328,13 @@ def _draw_cup(
             continue
         wanted = requested[component.dose]
         error = component.received_g - component.wanted_g
-        beyond = abs(component.received_g - wanted) > limits[component.liquid]
-        missed, corrected = missed or beyond, corrected or wanted != component.wanted_g
+        corrected = corrected or wanted != component.wanted_g
         amount, difference = f"{component.received_g:.1f}", f"{round(error, 2) + 0.0:+.2f}"
         amounts.append(f"{amount} {difference}")
         texts.append(RackText((x - 0.02, level), amount, side="right"))
-        texts.append(RackText((x + 0.47, level), difference, bold=beyond, side="right"))
+        texts.append(RackText((x + 0.47, level), difference, bold=component.outcome == "missed", side="right"))
     state = components[0].state
-    word = ("missed, corrected" if corrected else "missed") if missed and state == "full" else STATES[state]
+    word = "missed, corrected" if corrected and state == "missed" else STATES[state]
     colour = style.BEST if word in PROBLEMS else style.INK
     edge = style.GREY if state == "waiting" else colour
     lines.append(RackLine(_arc(centre, 0.74, 0.0, 1.0), edge, 0.01 if word in ("empty", "done") else 0.03))

@@ -26,7 +26,7 @@ from orchestrator.records.codec import Results
 from orchestrator.reports import figure_style as style
 from orchestrator.reports.figure_style import safe_name
 from orchestrator.reports.loss_units import DISCREPANCY, LossUnit, at_least_nothing, deployment_unit, largest_loss
-from orchestrator.reports.mixture_report import draw_rack, mixtures_of, tolerances
+from orchestrator.reports.mixture_report import draw_rack, mixed_liquids, mixtures_of
 from orchestrator.reports.pour_figures import film_strip
 from orchestrator.reports.stage_views import (
     SPLITS,
@@ -108,11 +108,10 @@ def _drawings(plan: CampaignPlan, results: Results, directory: Path | None = Non
         title = f"How far the simulator is from the balance: {plan.name}"
         drawings["test discrepancy"] = partial(draw_discrepancy, groups, title=title)
     mixtures = mixtures_of(results)
-    limits = tolerances(plan)
     if mixtures is not None:
-        drawings["rack"] = draw_rack(mixtures, limits).figure
+        drawings["rack"] = draw_rack(mixtures, mixed_liquids(plan)).figure
     for dose in (dose for dispensed in all_of(results, Dispensed) for dose in dispensed.doses if dose.signals.times):
-        if mixtures is not None and abs((dose.received_g or 0.0) - dose.wanted_g) <= limits.get(dose.liquid, 0.0):
+        if mixtures is not None and dose.outcome in (None, "reached"):
             continue  # of many doses, those that missed
         drawings[f"dose {dose.number}"] = partial(draw_dose, dose)
     if plan.deployment is None:

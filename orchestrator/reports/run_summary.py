@@ -23,6 +23,7 @@ from orchestrator.learning.single_action import Confirmed
 from orchestrator.learning.stage_result import ResultPart, StageResult, WeighedMasses
 from orchestrator.learning.strategy_registry import result_kinds
 from orchestrator.records.run_record import PourState
+from orchestrator.records.verdict import Verdict
 from sim_engine.liquids import SimulationParameters
 from sim_engine.model_validity import NotCovered
 from sim_engine.prediction_band import PredictionInterval, SampleStatistics
@@ -354,6 +355,9 @@ class RunSummary(Totals):
 
     state: str = "queued"
     """State of the run when the summary was made."""
+
+    verdict: Verdict
+    """What was reached of what was wanted."""
 
     began_at: float | None = None
     """Seconds since 1970."""

@@ -18,6 +18,7 @@ from orchestrator.records.codec import Results
 from orchestrator.records.journal_check import JournalCheck
 from orchestrator.records.journal_file import Header
 from orchestrator.records.run_record import Occupancy, RunPour, RunState
+from orchestrator.records.verdict import verdict_of
 from orchestrator.reports import figure_style as style
 from orchestrator.reports import wording
 from orchestrator.reports.loss_units import (
@@ -183,6 +184,7 @@ def _of_record(record: RunState, run: str, check: JournalCheck | None) -> dict[s
     return {
         "run": run,
         "state": str(record.state),
+        "verdict": verdict_of(record),
         "began_at": record.header.created or None,
         "ended_at": record.ended or None,
         "standing": (*(() if check is None else _damage(check)), *standing),

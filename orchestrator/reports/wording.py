@@ -647,10 +647,10 @@ def _dose_table(stage: str, dispensed: Dispensed) -> ResultTable:
         cells += ["—" if dose.spilled_g is None else f"{dose.spilled_g:.2f}"]
         cells += ["—" if dose.duration_s is None else f"{dose.duration_s:.1f}", dose.source or "—"]
         cells += ["—" if dose.left_g is None else f"{dose.left_g:.0f} ± {2.0 * (dose.left_deviation_g or 0.0):.1f}"]
-        cells += [f"{dose.end}{', source filled before' if dose.filled else ''}"]
-        rows.append(ResultRow(cells, "bad" if dose.received_g is None else ""))
+        cells += [dose.outcome_text or "—", f"{dose.end}{', source filled before' if dose.filled else ''}"]
+        rows.append(ResultRow(cells, "bad" if dose.received_g is None or dose.outcome == "missed" else ""))
     header = ["dose", "position", "wanted [g]", "received [g]", "difference [g]", "± (90 %) [g]", "spilled [g]"]
-    header += ["time [s]", "source", "left [g]", "end"]
+    header += ["time [s]", "source", "left [g]", "outcome", "end"]
     return ResultTable(f"{stage}: {len(rows)} wanted amounts", header, rows, frozenset({0, *range(2, 8), 9})).filled()
 
 

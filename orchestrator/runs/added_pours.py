@@ -18,6 +18,7 @@ from orchestrator.campaigns.file_loading import load_campaign
 from orchestrator.campaigns.prior_data import fitting
 from orchestrator.learning.campaign_plan import CampaignPlan, RecordedPour
 from orchestrator.learning.requests import ADDED, Outcome, Pour, Poured
+from orchestrator.learning.stage_result import ENTERED
 from orchestrator.learning.strategy import Strategy
 from orchestrator.records.codec import Results, decode_outcome, encode_outcome
 from orchestrator.records.events import PourCorrected, Requested, RequestFinished, Told
@@ -86,7 +87,7 @@ def add_pour(
         received_g=received_g,
         retained_g=retained_g,
         loaded_g=loaded_g,
-        notes={**(notes or {}), "source": SOURCE},
+        notes={**(notes or {}), ENTERED: SOURCE},
     )
     _check_covered(campaign, scene, pour.action, measured)
     stage = DEPLOYMENT + name
@@ -161,7 +162,7 @@ def correct_pour(
         raise InvalidArgumentError(f"{folder}: {text}")
     pour = same[-1]
     load_g = 1e3 * scenes_of(campaign)[pour.request.scene].liquid.mass
-    notes = {"source": "corrected by hand"}
+    notes = {ENTERED: "corrected by hand"}
     if answer is None:
         masses = {"received_g": received_g, "retained_g": retained_g, "loaded_g": loaded_g}
         outcome: Outcome = Poured(weighed_by_hand(load_g, spilled_g=spilled_g, **masses, notes=notes)[0])

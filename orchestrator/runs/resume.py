@@ -19,7 +19,7 @@ from actors.balance.readings import KILOGRAMS
 from orchestrator.learning.campaign_plan import CampaignPlan
 from orchestrator.learning.requests import Failed, Outcome, Pour, Poured, Request, Slots
 from orchestrator.learning.run_errors import RunError
-from orchestrator.learning.stage_result import StageResult
+from orchestrator.learning.stage_result import ENTERED, StageResult
 from orchestrator.learning.strategy import Strategy
 from orchestrator.records.codec import canonical, encode_request, first_difference
 from orchestrator.records.events import (
@@ -264,7 +264,7 @@ def parse_answer(answer: str, options: Sequence[str], loaded: float) -> Outcome 
     return replace(weighed, measurement=replace(weighed.measurement, notes=dict(_BY_OPERATOR)))
 
 
-_BY_OPERATOR = {"source": "weighed by the operator after a restart"}
+_BY_OPERATOR = {ENTERED: "weighed by the operator after a restart"}
 _MASS = re.compile(r"([-+−–]?[.,]?[0-9]+(?:[.,'’][0-9]+)*\.?(?:e-?[0-9]+)?)\s*([a-zµ]+)?\s*(?:;|,?(?=\s|$))\s*")
 
 

@@ -31,7 +31,7 @@ from orchestrator.records.codec import CodecError
 from orchestrator.records.journal_file import JournalError
 from orchestrator.records.run_record import RunState, read_record
 from orchestrator.reports.html_report import REPORT_NAME as REPORT
-from orchestrator.reports.mixture_report import draw_rack, mixtures_so_far, tolerances
+from orchestrator.reports.mixture_report import draw_rack, mixed_liquids, mixtures_so_far
 from orchestrator.reports.run_summary import PourSummary
 from orchestrator.reports.summarise import pour_summaries
 
@@ -80,7 +80,7 @@ class Pours:
             pours = pour_summaries(planned, record, live=live)
             seen: dict[str, Any] = {"pours_made": pours, "night": night(record, pours)}
             if (mixtures := mixtures_so_far(planned, record, live=live)) is not None:
-                drawing = draw_rack(mixtures, tolerances(planned))
+                drawing = draw_rack(mixtures, mixed_liquids(planned))
                 seen |= {"mixtures": mixtures.components(), "rack": drawing.svg()}
             return seen
 

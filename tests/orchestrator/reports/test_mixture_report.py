@@ -72,8 +72,8 @@ def test_json_workbook_and_library_have_the_same_table(run: decant.Run) -> None:
     header, *lines = openpyxl.load_workbook(run.directory / "mixtures.xlsx").active.iter_rows(values_only=True)
     assert list(header) == list(written[0])
     for line, row in zip(lines, written, strict=True):
-        assert ["" if cell is None else cell for cell in line] == [
-            pytest.approx(v) if isinstance(v, float) else v for v in row.values()
+        assert list(line) == [
+            pytest.approx(v) if isinstance(v, float) else None if v == "" else v for v in row.values()
         ]
     frame = run.mixtures
     assert list(frame["received_g"]) == [row["received_g"] for row in written]
@@ -90,10 +90,10 @@ def test_the_report_begins_with_the_rack_and_runs_show_lists_it(run: decant.Run)
 
 
 DOSES = (
-    Dose(number=1, wanted_g=10.0, received_g=13.0, deviation_g=0.1, spilled_g=0.0, duration_s=9.0, end="reached",
-         position="rack/A1", source="source/oil", liquid="oil"),
+    Dose(number=1, wanted_g=10.0, received_g=13.0, deviation_g=0.1, spilled_g=0.0, duration_s=9.0, end="late",
+         outcome="missed", tolerance_g=1.0, position="rack/A1", source="source/oil", liquid="oil"),
     Dose(number=2, wanted_g=10.0, received_g=9.9, deviation_g=0.1, spilled_g=0.0, duration_s=9.0, end="reached",
-         position="rack/C4", source="source/oil", liquid="oil"),
+         outcome="reached", tolerance_g=1.0, position="rack/C4", source="source/oil", liquid="oil"),
 )  # fmt: skip
 PARTLY = Dispensed(
     scene="mixtures-source/oil-cup",
@@ -107,7 +107,7 @@ PARTLY = Dispensed(
 
 
 def test_the_picture_shows_the_cups_where_they_stand_and_their_differences() -> None:
-    drawing = draw_rack(PARTLY, {"oil": 1.0})
+    drawing = draw_rack(PARTLY, ["oil"])
     shown = {text.text: text.at for text in drawing.texts}
     assert {"A1", "C4", "A2", "13.0", "+3.00", "-0.10", "rejected", "done", "empty"} <= set(shown)
     assert shown["C4"][0] > shown["A2"][0] > shown["A1"][0]
@@ -116,7 +116,7 @@ def test_the_picture_shows_the_cups_where_they_stand_and_their_differences() -> 
 
 
 def test_figure_and_svg_have_the_same_texts_in_the_same_places() -> None:
-    drawing = draw_rack(PARTLY, {"oil": 1.0})
+    drawing = draw_rack(PARTLY, ["oil"])
     of_figure = {text.get_text(): text.get_position() for text in drawing.figure().axes[0].texts}
     of_svg = {
         text.text: (float(text.get("x")) / 100, float(text.get("y")) / 100)
@@ -128,13 +128,21 @@ def test_figure_and_svg_have_the_same_texts_in_the_same_places() -> None:
 
 
 def test_a_cup_that_misses_a_tolerance_and_one_of_unknown_content_stand_out() -> None:
-    missed = PARTLY.cups[0].model_copy(update={"state": "full"})
-    lost = DOSES[1].model_copy(update={"received_g": None})
+    missed = PARTLY.cups[0].model_copy(update={"state": "missed"})
+    lost = DOSES[1].model_copy(update={"received_g": None, "outcome": "unknown"})
     unknown = PARTLY.cups[1].model_copy(update={"state": "unknown"})
     several = PARTLY.model_copy(update={"doses": (DOSES[0], lost), "cups": (missed, unknown)})
-    drawing = draw_rack(several, {"oil": 1.0})
+    drawing = draw_rack(several, ["oil"])
     assert {text.text for text in drawing.texts if text.bold} == {"+3.00", "missed", "UNKNOWN"}
     assert "?" in {text.text for text in drawing.texts}
+    rows = mixture_rows(several, RunState(Header("mix", {})))
+    assert [(row["state"], row["outcome"], row["missed_by_g"], row["tolerance_g"]) for row in rows] == [
+        ("missed", "missed", pytest.approx(2.0), 1.0),
+        ("unknown", "unknown", None, 1.0),
+    ]
+    texts = [" ".join(row.cells) for row in mixture_table(several).rows]
+    assert "missed by +2.00 g beyond its tolerance of 1 g" in texts[0]
+    assert "UNKNOWN" in texts[1]
 
 
 def test_a_dose_of_a_corrected_amount_has_not_missed() -> None:
@@ -142,9 +150,9 @@ def test_a_dose_of_a_corrected_amount_has_not_missed() -> None:
     corrected = DOSES[1].model_copy(
         update={"wanted_g": 26.0, "received_g": 25.8, "liquid": "water", "position": "rack/A1"}
     )
-    cup = MixedCup(position="rack/A1", wanted_g=wanted, state="full")
+    cup = MixedCup(position="rack/A1", wanted_g=wanted, state="missed")
     dispensed = PARTLY.model_copy(update={"doses": (DOSES[0], corrected), "cups": (cup,)})
-    texts = {text.text: text.bold for text in draw_rack(dispensed, {"oil": 1.0, "water": 1.0}).texts}
+    texts = {text.text: text.bold for text in draw_rack(dispensed, ["oil", "water"]).texts}
     assert texts["+3.00"]
     assert not texts["+5.80"]
     assert texts["missed, corrected"]
