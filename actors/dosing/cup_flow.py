@@ -55,6 +55,8 @@ class CupFlow:
         self._levels = level_table(vessel, self._tilts, volumes)
         self._head_grid = LARGEST_HEAD * np.linspace(0.0, 1.0, 81) ** 2
         self._s, self._width = _opening(vessel)
+        self._area_up_to = np.append(0.0, np.cumsum(self._width * np.gradient(self._s)))
+        self._width_up_to = np.append(0.0, np.maximum.accumulate(self._width))
         self._flows = np.stack([self._flow_of_heads(float(tilt)) for tilt in self._tilts])
         # Volumes (rows) × heads (columns): the tilt at which a volume stands this high above the lip.
         self._aim_step = 1e-3
@@ -129,10 +131,9 @@ class CupFlow:
             inf if no tabulated flow reaches it.
         """
         # We = ρ U² e / σ with the film e = C_d A / w of the wetted area A = ∫ w ds and U = q / (w e), at every head
-        depth = np.maximum(self._head_grid[:, None] - self._s * math.sin(tilt), 0.0)
-        step = np.gradient(self._s)
-        area = ((depth > 0.0) * self._width) @ step
-        wide = np.maximum(((depth > 0.0) * self._width).max(axis=1), 1e-6)
+        # the distances whose lip is below the surface come first, so that sums over them are sums up to the last one
+        wet = np.searchsorted(self._s * math.sin(tilt), self._head_grid)
+        area, wide = self._area_up_to[wet], np.maximum(self._width_up_to[wet], 1e-6)
         flow = self._row(tilt)
         film = np.maximum(DISCHARGE * area / wide, 1e-9)
         number = self.density * (flow / (wide * film)) ** 2 * film / self._tension
@@ -179,17 +180,26 @@ def _opening(vessel: Vessel) -> tuple[Floats, Floats]:
     return s, width
 
 
+def median(values: Floats) -> float:
+    """The median of a few hundred values; numpy's takes ten times as long."""
+    ordered, half = np.sort(values), len(values) // 2
+    return 0.5 * float(ordered[half] + ordered[-1 - half])
+
+
 def _bilinear(table: Floats, row: Floats, column: Floats) -> Floats:
     """Values of a table at fractional places, clamped to it, elementwise."""
-    # (1 − u) ((1 − v) t_ij + v t_i,j+1) + u (…)_i+1
+    # (1 − u) ((1 − v) t_ij + v t_i,j+1) + u (…)_i+1, in place where it can be: this is half of a simulated dose
     rows, columns = table.shape
-    row = np.minimum(np.maximum(row, 0.0), rows - 1.000001)
-    column = np.minimum(np.maximum(column, 0.0), columns - 1.000001)
-    i, j = row.astype(np.int64), column.astype(np.int64)
-    u, v = row - i, column - j
-    place = i * columns + j
+    row, column = row.clip(0.0, rows - 1.000001), column.clip(0.0, columns - 1.000001)
+    place, j = row.astype(np.int64), column.astype(np.int64)
+    u, v = row - place, column - j
+    place *= columns
+    place += j
     flat = table.ravel()
-    low = flat[place] + v * (flat[place + 1] - flat[place])
-    high = flat[place + columns] + v * (flat[place + columns + 1] - flat[place + columns])
-    result: Floats = low + u * (high - low)
-    return result
+    low, high = flat.take(place), flat.take(place + columns)
+    low += v * (flat.take(place + 1) - low)
+    high += v * (flat.take(place + (columns + 1)) - high)
+    high -= low
+    high *= u
+    high += low
+    return high

@@ -28,7 +28,7 @@ from enum import StrEnum
 import numpy as np
 
 from actors.balance.display_quality import FLOW_ERROR, dose_tolerance
-from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats
+from actors.dosing.cup_flow import LARGEST_TILT, CupFlow, Floats, median
 from actors.dosing.display_belief import REPEATS, DisplayBelief
 from actors.dosing.dose_estimator import DoseBelief, DoseEstimator, DoseReading
 from actors.dosing_settings import DosingSettings
@@ -303,7 +303,7 @@ class DoseController:
         self._before_silence: float | None = None
         self._unchanged_since = 0.0
         self._tared, self._tracked, self._late_drops = False, 0.0, _late_drops(RUN_OFF)
-        self._factor_before = float(np.median(belief.flow_factor))
+        self._factor_before = median(belief.flow_factor)
         self._idle_since: float | None = None
         self._late_volume = float(belief.volume.mean() - 2.0 * belief.volume.std())
         self._late_onset = float(belief.onset_bias.mean() + max(2.0 * belief.onset_bias.std(), LATEST_ONSET))
@@ -321,7 +321,7 @@ class DoseController:
     @property
     def flow(self) -> float:
         """Estimated flow [kg/s]."""
-        return self._cup.density * float(np.median(self._estimator.flow))
+        return self._cup.density * median(self._estimator.flow)
 
     def progress(self, reading: float | None) -> DoseProgress:
         """What is shown of the dose now.
@@ -406,7 +406,7 @@ class DoseController:
             return self._towards(early + 0.01, self._settings.approach_speed, ahead)
         # Growth dm/dθ = ρ (−dV/dθ) [kg/rad] of the flow's rate with the speed of the tilt
         aim = float(np.quantile(self._tilts_for(self.fine_flow), 0.35))
-        growth = self._cup.volume_per_tilt(float(np.median(e.volume)), 2e-3) * self._cup.density
+        growth = self._cup.volume_per_tilt(median(e.volume), 2e-3) * self._cup.density
         # the flow at the moment when the stream is seen is about growth × speed × delay / lag of the cup
         calm = 2.0 * self.fine_flow / growth * SEEN_AFTER / (SEEN_AFTER + self._blind())
         search = min(self._settings.search_speed, max(calm, math.radians(0.8)))
@@ -417,9 +417,9 @@ class DoseController:
             return self._return()
         e = self._estimator
         wanted = self._wanted_flow()
-        aim = float(np.median(self._tilts_for(wanted)))
+        aim = median(self._tilts_for(wanted))
         volume, head = (
-            float(np.median(e.volume)),
+            median(e.volume),
             float(self._cup.head_for(np.array([wanted / self._cup.density]), aim)[0]),
         )
         # Feedforward θ' = q / (−dV/dθ), which keeps the head, plus feedback 4/s · (aim − θ), θ predicted by the latency
@@ -443,12 +443,12 @@ class DoseController:
     def _return_acceleration(self) -> float:
         """Acceleration of a return that raises little of a wave [rad/s²]."""
         # Ramp to the return speed v over RETURN_RAMP wave periods: a = v / (RETURN_RAMP · T)
-        s, period = self._settings, self._cup.wave_period(float(np.median(self._estimator.volume)))
+        s, period = self._settings, self._cup.wave_period(median(self._estimator.volume))
         return min(s.acceleration, s.return_speed / (RETURN_RAMP * period))
 
     def _settle(self) -> float:
         waited = self._now - self._since
-        lag = float(np.median(self._estimator.lag))
+        lag = median(self._estimator.lag)
         longest = math.ceil(LONGEST_EQUAL / self._interval) + 1
         old = min(self._estimator.repeats.in_a_row(STALE) + 1, MOST_EQUAL, longest)
         needed = max(old, math.ceil(AT_REST / self._interval) + 1, 4)
@@ -502,7 +502,7 @@ class DoseController:
             return False
         rise = e.mass - e.predicted(time)
         largest, deviation = LARGEST_REMAINDER
-        return abs(float(np.median(rise))) < largest and float(rise.std()) < deviation
+        return abs(median(rise)) < largest and float(rise.std()) < deviation
 
     def _weighed(self, mass: float) -> None:
         assert self._zero is not None
@@ -597,8 +597,8 @@ class DoseController:
         e, order, s = self._estimator, self._order, self._settings
         # flow = fine + max(left − 0.7 s · fine, 0) / horizon: it decays over 0.9 s, the lag and the display's repeats
         after = 0.1 * self.flow
-        left = order.amount - float(np.median(e.mass)) - after
-        horizon = 0.9 + 1.0 * float(np.median(e.lag)) + self._blind()
+        left = order.amount - median(e.mass) - after
+        horizon = 0.9 + 1.0 * median(e.lag) + self._blind()
         bulk = min(max(order.amount / 3.0, self.fine_flow), s.largest_flow)
         return min(self.fine_flow + max(left - 0.7 * self.fine_flow, 0.0) / horizon, bulk)
 
@@ -616,13 +616,13 @@ class DoseController:
             self._tilt, self._speed, latency=s.latency, back=s.return_speed, acceleration=self._return_acceleration()
         )
         # Return if median ≥ target, or P(final > target + limit) > 1 %: median + 2.33 σ ≥ target + limit
-        middle, deviation = float(np.median(final)) + self._aim(), math.hypot(float(final.std()), 0.1e-3)
+        middle, deviation = median(final) + self._aim(), math.hypot(float(final.std()), 0.1e-3)
         left, wait = order.amount - middle, 0.0
         if middle + 2.33 * deviation < order.amount + order.limit:
             wait = max(left, 0.0) / max(self.flow, 1e-6)
             if wait >= self._tick:
                 return False
-        self._expected = float(np.median(final)) + self.flow * wait
+        self._expected = median(final) + self.flow * wait
         self._turn_back(wait=wait, gently=True)
         return True
 
@@ -719,13 +719,13 @@ class DoseController:
             self._turn_back(DoseEnd.SOURCE_EMPTY)
         elif self._rate() < 0.5 * max(self._late_flow, 1e-3) and (
             self._late_mass - net - self._late_flow > max(2.5e-3, 0.3 * self._late_mass)
-            or (self.phase is DosePhase.POUR and float(np.median(e.flow_factor)) < 0.3 * self._factor_before)
+            or (self.phase is DosePhase.POUR and median(e.flow_factor) < 0.3 * self._factor_before)
         ):
             self._pause(self._lost_stream())
 
     def _lost_stream(self) -> DoseEnd:
         """Why less arrives than should have left the cup."""
-        left = float(np.median(self._estimator.volume))
+        left = median(self._estimator.volume)
         return DoseEnd.SOURCE_EMPTY if left < 0.12 * self._cup.capacity else DoseEnd.STREAM_MISSED
 
     def _holds_too_long(self) -> bool:

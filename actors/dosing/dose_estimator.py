@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.balance.step_response import FILTERS, LAGS, step_response
-from actors.dosing.cup_flow import CupFlow
+from actors.dosing.cup_flow import CupFlow, median
 from actors.dosing.display_belief import REPEATS, DisplayBelief, Repeats
 from actors.interfaces import DoseKnowledge
 from sim_engine.liquids import SimulationParameters
@@ -346,10 +346,13 @@ class DoseEstimator:
             self.onset_bias += math.radians(0.1) * wetting * noise[2]
             self.flow = flow
             self._ended = np.where(flows, 0.0, self._ended + TIME_STEP)
+        elif not self.mass.any():  # nothing has flowed yet, and everything below stays zero
+            self._steps += 1
+            return
         else:
             self.flow = np.zeros_like(self.mass)
             self._ended += TIME_STEP
-        self._middle_flow = cup.density * float(np.median(self.flow))
+        self._middle_flow = cup.density * median(self.flow)
         # Peak of the flow with exponential decay over the time that the display still shows it: 0.3 s and its lag
         memory = 0.3 + float(self.lag[0])
         self._recent_flow = max(self._middle_flow, self._recent_flow * (1.0 - TIME_STEP / memory))
