@@ -48,12 +48,6 @@ Their files alternate: many tests of the first wait for devices, and those of th
 REALTIME = (Path(__file__).parent / "end_to_end", Path(__file__).parent / "reliability")
 """Folders whose tests watch other processes: each is `realtime`."""
 
-WITH_PROCESSES = tuple(
-    Path(__file__).parent / name
-    for name in ("actors", "plugins", "orchestrator/cli", "orchestrator/daemon", "orchestrator/extra_commands")
-)
-"""Folders where many tests start processes or threads: a stalled machine may fail one, which is tried once more."""
-
 
 @pytest.fixture(autouse=True)
 def not_quiet() -> None:
@@ -87,23 +81,9 @@ def pytest_collection() -> Iterator[None]:
         gc.enable()
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """A test that is tried again gets new fixtures of its module: what failed may be what these have seen or broken."""
-    if getattr(item, "execution_count", 1) < 2 or not isinstance(item, pytest.Function):
-        return
-    for definitions in item._fixtureinfo.name2fixturedefs.values():
-        for definition in definitions:
-            if definition.scope != "session":
-                definition.finish(item._request)
-
-
 @pytest.hookimpl(trylast=True)  # after those that were not chosen have gone
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """A starved machine misses deadlines, and no arm should move on then: what is `realtime` is tried up to thrice.
-
-    Reruns are counted in the last line. A test that needs one on an idle machine has a fault.
-    """
+    """Sort and mark the tests, and leave out those of other parts. No test is tried again."""
     rank: dict[Path, float] = {}
     for folder in MANY:
         files = list(dict.fromkeys(item.path for item in items if item.path.is_relative_to(folder)))
@@ -114,10 +94,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(reason="ur-rtde, of which Python 3.13 has no wheel, is not installed"))
         if any(item.path.is_relative_to(folder) for folder in REALTIME):
             item.add_marker("realtime")
-        if item.get_closest_marker("realtime") is not None:
-            item.add_marker(pytest.mark.flaky(reruns=2))
-        elif any(item.path.is_relative_to(folder) for folder in WITH_PROCESSES):
-            item.add_marker(pytest.mark.flaky(reruns=1))
     if part := os.environ.get(PART):
         number, parts = (int(word) for word in part.split("/"))
         files = sorted({item.path for item in items})[number - 1 :: parts]

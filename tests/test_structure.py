@@ -17,6 +17,8 @@ def modules() -> dict[str, Path]:
     return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
 
 
+SLEEPS = ("time.sleep", "asyncio.sleep")
+
 PROCESSES = ("python_module", "ConnectedProcess")
 """Functions that start the module which their first argument names, in a process of its own."""
 
@@ -105,3 +107,19 @@ def test_journals_are_read_by_one_module_outside_the_engine() -> None:
     readers = [name for name, path in modules().items() if "JournalReader" in path.read_text(encoding="utf-8")]
     engine = ("orchestrator.records.journal", "orchestrator.runs.")
     assert [name for name in readers if not name.startswith(engine)] == ["orchestrator.records.run_record"]
+
+
+def test_a_test_that_sleeps_says_why() -> None:
+    """A loop that polls waits for its condition. A sleep elsewhere has a comment in its line or in the one above."""
+    silent = []
+    for path in (ROOT / "tests").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        tree = ast.parse(text)
+        polls = {id(node) for loop in ast.walk(tree) if isinstance(loop, ast.While) for node in ast.walk(loop)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and id(node) not in polls and ast.unparse(node.func) in SLEEPS:
+                yields = isinstance(node.args[0], ast.Constant) and node.args[0].value == 0
+                lines = text.splitlines()[max(node.lineno - 2, 0) : node.lineno]
+                if not yields and not any("  # " in line or line.strip().startswith("#") for line in lines):
+                    silent.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert silent == []

@@ -80,7 +80,7 @@ def test_optimiser_and_its_twin_propose_the_same_also_after_a_death(ray_running,
         async with laboratory(False, fake) as opened:
             victim = await opened.optimizer.device.pid()
             first = asyncio.create_task(opened.optimizer.suggest(PROBLEM))
-            await asyncio.sleep(0.02)
+            await asyncio.sleep(0.02)  # the query is under way, and takes longer than this
             os.kill(victim, signal.SIGKILL)
             with pytest.raises(DeviceLostError):
                 await first

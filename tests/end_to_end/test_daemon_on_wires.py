@@ -107,17 +107,17 @@ def test_hardware_is_armed_over_the_api_and_after_a_crash_shows_where_it_stands_
         assert any("deg" in line for line in moves["lines"])
         with pytest.raises(DaemonError, match="motion is not enabled: 'yes' was typed"):
             people.post(f"/campaigns/{key}/enable", {"laboratory": "yes"})
-        time.sleep(0.5)
+        time.sleep(0.5)  # an arm that moves would be seen to
         assert joints() == home
         people.post(f"/campaigns/{key}/enable", {"laboratory": "rig"})
         answer_until(laboratory, people, balance, lambda: people.get("/rigs")[0]["checkpoint"] == "tilt")
-        time.sleep(0.7)
+        time.sleep(0.7)  # into the tilt
         laboratory.kill()
     balance.put(SPILLED)
 
     def stands() -> bool:
         before = joints()
-        time.sleep(0.3)
+        time.sleep(0.3)  # an arm that moves would be seen to
         return bool(joints() == before)
 
     end = time.monotonic() + 20.0

@@ -38,7 +38,7 @@ class Formula:
             with Path(os.environ[LOG]).open("a", encoding="utf-8") as file:
                 file.write(f"{task.seed}\n")
         else:
-            time.sleep(float(os.environ.get(WORK, "0")))
+            time.sleep(float(os.environ.get(WORK, "0")))  # how long a simulation takes
         spilled = share * spillage(task)
         retained = 1.0 - share * 0.99
         outcome = PourOutcome(

@@ -109,7 +109,7 @@ def run(targets: Sequence[str], jobs: int, results: Path, limit: int | None = No
                     [sys.executable, "-m", "tests.reliability.page", *arguments], cwd=ROOT, env=child_environment()
                 )
             )
-        time.sleep(0.2)
+        time.sleep(0.2)  # polls the parts that run
         good &= all(process.returncode in (None, 0) for process in running)
         running = [process for process in running if process.poll() is None]
     if good:

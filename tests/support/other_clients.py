@@ -29,7 +29,7 @@ def ur_rtde(address: str) -> Cycle:
         inputs.setStandardDigitalOut(1, number % 20 < 10)
         inputs.setInputIntRegister(19, number)
         inputs.setInputDoubleRegister(20, 0.5 * number)
-        time.sleep(0.008)
+        time.sleep(0.008)  # the client's cycle, 125 Hz
         return bool(state.isConnected()) and len(state.getActualQ()) == 6
 
     return cycle

@@ -102,7 +102,7 @@ class ToyBench:
         if progress is not None:
             progress(PourProgress("tilt", 0.5))
         try:
-            await asyncio.sleep(self.pauses())
+            await asyncio.sleep(self.pauses())  # how long this takes
             while not self.until():
                 await asyncio.sleep(0.001)
         except asyncio.CancelledError:
@@ -131,7 +131,7 @@ class ToySimulators:
         self.running += 1
         self.most_running = max(self.running, self.most_running)
         try:
-            await asyncio.sleep(self.pauses())
+            await asyncio.sleep(self.pauses())  # how long this takes
         except asyncio.CancelledError:
             self.cancelled += 1
             raise
@@ -169,7 +169,7 @@ class ToyOptimizer:
 
     async def suggest(self, query: SuggestionQuery) -> Suggestion:
         self.asked += 1
-        await asyncio.sleep(self.pauses())
+        await asyncio.sleep(self.pauses())  # how long this takes
         if (error := self.fails()) is not None:
             raise error
         rng = np.random.default_rng(query.seed)

@@ -43,7 +43,7 @@ class _Simulators:
     separate = False
 
     async def simulate(self, task: PourTask) -> SimulatedPour:
-        await asyncio.sleep(float(os.environ.get(PAUSE, "0")))
+        await asyncio.sleep(float(os.environ.get(PAUSE, "0")))  # how long this takes
         share = spilled(task.action, task.parameters, task.seed)
         return SimulatedPour(PourOutcome(1 - share, share, 0, 0, 0, 500, 0.007, 0.01, 2.0, 400, 0.0, task.seed))
 
@@ -57,7 +57,7 @@ class _Bench:
     async def pour(
         self, scene: Scene, action: Action, *, seed: int, progress: Any = None, dose: Any = None
     ) -> PourMeasurement:
-        await asyncio.sleep(float(os.environ.get(PAUSE, "0")))
+        await asyncio.sleep(float(os.environ.get(PAUSE, "0")))  # how long this takes
         share = spilled(action, self._hidden, seed)
         return PourMeasurement(scene.liquid.mass, share * scene.liquid.mass, 0.0)
 

@@ -129,7 +129,7 @@ class Stage:
             if math.isinf(late := self.late.pop(question.about, 0.0)):
                 self.operator.heard.append(question)
                 await asyncio.Event().wait()
-            await asyncio.sleep(late)
+            await asyncio.sleep(late)  # how long this operator takes
             if self.answers.get(question.about):
                 self.operator.heard.append(question)
                 answer = self.answers[question.about].pop(0)

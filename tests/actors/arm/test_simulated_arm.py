@@ -106,8 +106,8 @@ def test_stop_ends_a_motion_under_way_and_holds_until_released(make_arm, path, m
             await arm.execute(path, lambda state: None)
         await arm.release()
         going = asyncio.create_task(arm.move_to_start(path))
-        await asyncio.sleep(0.1)
-        moving = await arm.state()
+        while not (moving := await arm.state()).moving:
+            await asyncio.sleep(0.02)
         await arm.stop()
         with pytest.raises(ArmStoppedError, match="during approach"):
             await going

@@ -45,7 +45,7 @@ class TypedWire:
     def line_until(self, moment: float) -> bytes | None:
         if self._lines:
             return self._lines.pop(0)
-        time.sleep(max(moment - time.monotonic(), 0.0))
+        time.sleep(max(moment - time.monotonic(), 0.0))  # a line on which nothing comes
         return None
 
     def close(self) -> None:

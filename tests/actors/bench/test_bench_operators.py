@@ -91,7 +91,7 @@ class Person:
         self.after = after
 
     async def ask(self, question: OperatorQuestion) -> str:
-        await asyncio.sleep(self.after)
+        await asyncio.sleep(self.after)  # how long this operator takes
         return "done"
 
     async def announce(self, text: str, seconds: float) -> None:

@@ -235,7 +235,7 @@ def test_a_pour_given_up_while_it_tilts_stops_the_arm_where_it_is(open_stage):
             with pytest.raises(asyncio.CancelledError):
                 await pour
             stopped = await stage.now()
-            await asyncio.sleep(0.5)
+            await asyncio.sleep(0.5)  # an arm that moves on would be seen to
             return await stage.moved(stopped), (await stage.site.fault("state"))["runtime_state"]
 
     moved, program = asyncio.run(play())

@@ -54,7 +54,7 @@ def test_a_pour_whose_motion_was_forgotten_is_unknown_and_the_next_one_is_poured
             if line.startswith("tilts"):
                 break
         program.send_signal(signal.SIGSTOP)  # the arm's own process goes on, and completes the pour
-        time.sleep(135.0 / PACE)
+        time.sleep(135.0 / PACE)  # the bench's pour and its settling, of which the stopped program sees nothing
         program.send_signal(signal.SIGCONT)
         outcomes = [line for line in program.stdout if line.startswith("outcome")]
     finally:

@@ -209,7 +209,7 @@ def test_a_cancelled_pour_stops_the_arm_and_the_liquid(open_bench, scene, action
             pour.cancel()
             with pytest.raises(NotPouredError, match="nothing was poured"):
                 await pour
-            await asyncio.sleep(0.1)
+            await asyncio.sleep(0.1)  # an arm that moves on would be seen to
             state = await laboratory.bench.arm.state()
             assert not state.moving
             assert state.stopped

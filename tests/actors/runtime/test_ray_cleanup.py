@@ -249,6 +249,6 @@ class Counter:
         self._count = 0
 
     def add(self, seconds: float = 0.0) -> int:
-        time.sleep(seconds)
+        time.sleep(seconds)  # how long this call takes
         self._count += 1
         return self._count

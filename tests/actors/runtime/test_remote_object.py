@@ -41,7 +41,7 @@ def test_what_a_call_says_after_nobody_waits_for_it_any_more_is_no_stray_message
             calling.cancel()
         await asyncio.wait({calling})
         stuck.released.set()
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0.1)  # the abandoned call ends meanwhile, which must change nothing
         assert calling.cancelled() or isinstance(calling.exception(), DeviceLostError)
         await device.close()
         del calling

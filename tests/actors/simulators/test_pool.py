@@ -273,7 +273,7 @@ def test_a_job_cancelled_in_the_queue_never_begins(make_pool, fake, task, tmp_pa
         first = asyncio.create_task(pool.simulate(task(seed=1)))
         await until(lambda: count(log, "begin") == 1)
         second = asyncio.create_task(pool.simulate(task(seed=2)))
-        await asyncio.sleep(0.05)
+        await asyncio.sleep(0.05)  # it waits behind the first, and must not be given to a worker
         second.cancel()
         await first
         await pool.simulate(task(seed=3))
@@ -289,7 +289,7 @@ def test_busy_time_counts_the_jobs_and_not_the_waiting(make_pool, fake, task):
         pool = make_pool(fake(0.3))
         await pool.simulate(task(name="quick"))
         before = pool.statistics().busy_s
-        await asyncio.sleep(0.3)
+        await asyncio.sleep(0.3)  # the pool is idle, which must not be counted
         await asyncio.gather(*(pool.simulate(task(seed=s)) for s in range(3)))
         after = pool.statistics()
         await pool.close()

@@ -50,7 +50,7 @@ class Slow:
     """A simulator that takes its time, and never comes back in between."""
 
     def simulate(self, task: object) -> object:
-        time.sleep(0.4)
+        time.sleep(0.4)  # longer than the console waits before it shows progress
         return task
 
     def close(self) -> None:

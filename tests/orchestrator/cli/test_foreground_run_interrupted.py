@@ -29,7 +29,7 @@ def interrupted(directory: Path, times: int) -> None:
         await wait_async(lambda: laboratory.bench.received, "pour")
         for _ in range(times):
             task.cancel()
-            await asyncio.sleep(0.05)
+            await asyncio.sleep(0.05)  # two interrupts, and not one
         with pytest.raises(asyncio.CancelledError):
             await task
 

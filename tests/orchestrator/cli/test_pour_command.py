@@ -162,7 +162,7 @@ async def is_interrupted_twice(plan: CampaignPlan, laboratory: object, directory
     for _again in range(2):
         os.kill(os.getpid(), signal.SIGINT)
         with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.sleep(60.0)
+            await asyncio.sleep(60.0)  # it is interrupted here
     raise asyncio.CancelledError
 
 

@@ -83,13 +83,13 @@ def test_what_to_do_what_was_wrong_and_what_is_expected_stand_on_the_screen(keyb
 def test_enter_alone_and_keys_typed_before_the_question_confirm_nothing(keyboard: Keyboard) -> None:
     async def scene() -> None:
         keyboard.type("done\n")  # too early: meant for something else
-        await asyncio.sleep(0.1)
+        await asyncio.sleep(0.1)  # the line is in the terminal before the question
         asking = asyncio.create_task(keyboard.operator().ask(DONE))
         await keyboard.shows("> ")
-        await asyncio.sleep(0.2)
+        await asyncio.sleep(0.2)  # an answer that counts would have ended the question
         assert not asking.done()
         keyboard.type("\n")
-        await asyncio.sleep(0.2)
+        await asyncio.sleep(0.2)  # an answer that counts would have ended the question
         assert not asking.done()
         keyboard.type("what?\n")
         await keyboard.shows("'what?' is not an answer")

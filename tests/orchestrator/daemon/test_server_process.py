@@ -39,7 +39,7 @@ def test_a_pour_is_finished_before_and_its_campaign_goes_on_after(
             assert "just beginning anew" in told["detail"]
             (problem,) = (await served.get("/status"))["problems"]
             assert "Ray has lost its raylet" in problem
-            await asyncio.sleep(0.2)
+            await asyncio.sleep(0.2)  # a server that ends would have begun to
             assert not served.supervisor.left.is_set()
             assert laboratory.bench.aborted == []
             laboratory.bench.go.set()

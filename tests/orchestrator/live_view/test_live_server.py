@@ -81,7 +81,7 @@ def test_who_comes_late_gets_the_newest_first_in_the_arrangement_that_is_shown_n
         for part in (told[:8], told[8:]):
             for event in part:
                 monitor(event)
-            time.sleep(4.0 * SENDING)
+            time.sleep(4.0 * SENDING)  # each part is sent on its own
         assert monitor.close(PATIENCE)
         with viewer(live.stream, tmp_path / "seen.rrd"):
             contents = seen(

@@ -251,7 +251,7 @@ def stopped(folder: Path, bench: ToyBench, when: Callable[[], bool]) -> Path:
             await asyncio.sleep(0.01)
         for _ in range(2):
             task.cancel()
-            await asyncio.sleep(0.05)
+            await asyncio.sleep(0.05)  # two interrupts, and not one
         with pytest.raises(asyncio.CancelledError):
             await task
 

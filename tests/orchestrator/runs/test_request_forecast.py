@@ -107,7 +107,7 @@ def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:
         async def work(request: Simulate) -> Outcome:
             begun.append(request.seed)
             try:
-                await asyncio.sleep(3600.0)
+                await asyncio.sleep(3600.0)  # it is cancelled here
             except asyncio.CancelledError:
                 given_up.append(request.seed)
                 raise
@@ -119,12 +119,12 @@ def test_what_was_foreseen_makes_room_for_what_is_asked_for() -> None:
         await asyncio.sleep(0)
         assert begun == [1, 2]
         with ahead.asked_for():
-            await asyncio.sleep(0.01)
+            await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
             assert given_up == [2]
             with ahead.asked_for():
-                await asyncio.sleep(0.01)
+                await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
                 assert given_up == [2, 1]
-        await asyncio.sleep(0.01)
+        await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
         assert begun == [1, 2, 1, 2], "made anew when there is room"
         await ahead.close()
         assert given_up == [2, 1, 1, 2]
@@ -159,7 +159,7 @@ def test_one_that_is_being_made_is_waited_for_and_not_made_twice() -> None:
 
         async def work(request: Simulate) -> Outcome:
             begun.append(request.seed)
-            await asyncio.sleep(0.01)
+            await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
             return Failed("invalid_action", "cups touch")
 
         ahead = SpeculativeExecution(work, width=1)
@@ -182,7 +182,7 @@ def test_bad_luck_is_not_kept(outcome: Outcome | Exception) -> None:
 
         ahead = SpeculativeExecution(work, width=1)
         ahead.predict(simulate(1))
-        await asyncio.sleep(0.01)
+        await asyncio.sleep(0.01)  # turns of the event loop, for what was started or cancelled
         assert not ahead.knows(simulate(1))
         ahead.predict(simulate(2))
         assert await ahead.take(simulate(2)) is None

@@ -288,7 +288,7 @@ async def interrupt(directory: Path, laboratory: ToyLaboratory, strategy: Script
     task = asyncio.create_task(run_toy(directory, laboratory, stages=one_stage(strategy), subscribers=[watch]))
     await begun.wait()
     for _ in range(cancels):
-        await asyncio.sleep(0.01)
+        await asyncio.sleep(0.01)  # several cancellations, and not one
         task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
@@ -332,7 +332,7 @@ def test_a_bench_that_calls_its_own_abortion_a_failure_does_not_make_it_known(tm
     async def sulk(scene: Any, action: Any, *, seed: int, progress: Any = None, dose: Any = None) -> Any:
         progress(None)
         try:
-            await asyncio.sleep(60)
+            await asyncio.sleep(60)  # it is cancelled here
         except asyncio.CancelledError:
             raise LaboratoryError("arm stopped") from None
 

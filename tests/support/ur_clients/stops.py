@@ -29,10 +29,10 @@ def protective_stop(address: str) -> dict[str, Any]:
     seen["safetymode"] = client.safetymode()
     seen["too early"] = attempt(client.unlockProtectiveStop)
     seen["unlocked"] = until(lambda: attempt(client.unlockProtectiveStop) is None)
-    time.sleep(0.3)
+    time.sleep(0.3)  # a robot that moves on would be seen to
     seen["stayed at"] = receive.getActualQ()[0]
     client.stop()
-    time.sleep(0.1)
+    time.sleep(0.1)  # the client's script has ended
     control.reuploadScript()
     seen["program runs"] = until(control.isProgramRunning)
     seen["moves again"] = control.moveJ([*HOME], 2.0, 4.0)

@@ -112,7 +112,7 @@ def test_a_pour_whose_time_passes_by_order_weighs_the_same_to_the_bit_however_th
             far.put(Load((0.0, 4.0), (0.41, 0.4157)))
             for _ in range(5):
                 far.advance(1.7)
-                time.sleep(pause)
+                time.sleep(pause)  # wall time, which must not show in the masses
                 driver.read()
             masses.append(driver.weigh().mass)
             driver.close()
